@@ -1,0 +1,63 @@
+"""Arrays at the border: checked once, then read-only float64."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from chsel.errors import ChselError, PointsError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+def frozen(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    *,
+    dtype: Any = np.float64,
+    error: type[ChselError] = PointsError,
+) -> NDArray[Any]:
+    """A read-only, C-ordered copy of `value` with the given shape (None: any length).
+
+    Takes numpy arrays, torch tensors and nested lists. Raises `error` with `name` in the message
+    if the value is no array of numbers, has another shape, or holds a value that is not finite.
+    """
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().numpy()
+    try:
+        array = np.array(value, dtype=dtype, order="C")
+    except (TypeError, ValueError):
+        raise error(f"{name} is not an array of numbers; accepted: shape {_show(shape)}") from None
+    fits = array.ndim == len(shape)
+    fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
+    if not fits and array.size == 0 and 0 in array.shape and shape[0] is None:
+        array = np.zeros([0 if length is None else length for length in shape], dtype=dtype)
+    elif not fits:
+        raise error(f"{name} has shape {array.shape}; accepted: {_show(shape)}")
+    if not np.isfinite(array).all():
+        row = int(np.argwhere(~np.isfinite(array))[0][0]) if array.ndim else 0
+        raise error(f"{name}[{row}] is not finite; accepted: finite numbers")
+    array.setflags(write=False)
+    return array
+
+
+def digest(*arrays: NDArray[Any]) -> str:
+    """BLAKE2b (128 bit, hexadecimal) of the types, shapes and bytes of arrays, in order."""
+    state = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        array = np.ascontiguousarray(array)
+        array = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        state.update(f"{array.dtype.str}{array.shape};".encode())
+        state.update(array.tobytes())
+    return state.hexdigest()
+
+
+def _show(shape: tuple[int | None, ...]) -> str:
+    return "(" + ", ".join("any" if length is None else str(length) for length in shape) + ")"

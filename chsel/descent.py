@@ -1,0 +1,73 @@
+"""Stage 1: gradient descent on the relaxed cost from many starts (CHSEL, Alg. 1, line 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.adam import Adam
+from chsel.arrays import FloatArray
+from chsel.errors import SettingError, require_positive
+from chsel.objective import Objective
+from chsel.observer import Observer
+from chsel.space import transforms_of
+
+
+@dataclass(frozen=True)
+class DescentSettings:
+    """Adam on all starts at once.
+
+    restarts x iterations: after each block of iterations Adam starts afresh and the rotations are
+    made orthonormal again. rate: Adam's step size. stop_below: end when a block lowers the costs
+    by less than this fraction in the mean over the starts; negative: never end early.
+    """
+
+    restarts: int = 10
+    iterations: int = 50
+    rate: float = 0.01
+    stop_below: float = 1e-6
+
+    def __post_init__(self) -> None:
+        require_positive("restarts", self.restarts, zero=True)
+        require_positive("iterations", self.iterations)
+        require_positive("rate", self.rate)
+        if not np.isfinite(self.stop_below):
+            raise SettingError(f"stop_below is {self.stop_below}; accepted: a finite number")
+
+
+def descend(
+    objective: Objective,
+    initial_set: FloatArray,
+    settings: DescentSettings,
+    observer: Observer,
+) -> tuple[FloatArray, FloatArray]:
+    """Estimates E' as transforms (B, 4, 4), with their costs (B,), from E_0 (B, 4, 4).
+
+    Each start runs on its own; the costs are those of the returned transforms.
+    """
+    estimates = initial_set
+    costs = previous = objective.costs(objective.space.encode(estimates))
+    count = len(estimates)
+    for restart in range(settings.restarts):
+        vectors = objective.space.encode(estimates)
+        adam = Adam(settings.rate)
+        for _ in range(settings.iterations):
+            _, gradient = objective.costs_and_gradients(vectors)
+            vectors = vectors - adam.step(gradient / count)
+        estimates = transforms_of(objective.space, vectors)
+        vectors = objective.space.encode(estimates)
+        costs = objective.costs(vectors)
+        done = (restart + 1) * settings.iterations
+        observer.trace("descent", done, vectors, costs)
+        observer.progress("descent", done, settings.restarts * settings.iterations)
+        if _mean_gain(previous, costs) <= settings.stop_below:
+            break
+        previous = costs
+    return transforms_of(objective.space, objective.space.encode(estimates)), costs
+
+
+def _mean_gain(before: FloatArray, after: FloatArray) -> float:
+    """Mean over the starts of the fraction by which the cost fell; a cost of 0 gains nothing."""
+    gain = np.where(before > 0.0, (before - after) / np.where(before > 0.0, before, 1.0), 0.0)
+    return float(gain.mean())

@@ -1,0 +1,52 @@
+"""Every error that a caller of the library can cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class ChselError(Exception):
+    """Base of all errors with a message meant for the user: what, where, what is accepted."""
+
+
+class SettingError(ChselError):
+    """A setting has a value that is not accepted, or a name that does not exist."""
+
+
+class PointsError(ChselError):
+    """Known points are malformed: wrong shape, not finite, or empty where some are needed."""
+
+
+class MeshError(ChselError):
+    """A mesh cannot be found, read or used."""
+
+
+class SdfError(ChselError):
+    """A signed distance grid is malformed."""
+
+
+class PoseError(ChselError):
+    """A pose is not a rigid transform."""
+
+
+class SessionError(ChselError):
+    """A probe session cannot be opened or continued."""
+
+
+class RecordingError(ChselError):
+    """A recording cannot be read or written."""
+
+
+def require_choice(name: str, value: object, accepted: Iterable[str]) -> None:
+    """Raise SettingError unless `value` is one of the accepted names."""
+    accepted = list(accepted)
+    if value not in accepted:
+        raise SettingError(f"{name} is {value!r}; accepted: {', '.join(accepted)}")
+
+
+def require_positive(name: str, value: float, *, zero: bool = False) -> None:
+    """Raise SettingError unless `value` is a finite number above zero (or at zero, if `zero`)."""
+    finite = isinstance(value, int | float) and value == value and abs(value) != float("inf")
+    if not finite or value < 0 or (value == 0 and not zero):
+        bound = "of at least 0" if zero else "above 0"
+        raise SettingError(f"{name} is {value!r}; accepted: a finite number {bound}")

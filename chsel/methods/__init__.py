@@ -1,0 +1,66 @@
+"""The registration methods, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from chsel import presets
+from chsel.errors import require_choice
+from chsel.methods.chsel import Chsel, ChselSettings
+from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
+from chsel.methods.method import Method
+from chsel.settings import build_settings
+
+
+def _chsel(preset: str) -> ChselSettings:
+    return ChselSettings(
+        cost=presets.COST[preset],
+        descent=presets.DESCENT[preset],
+        archive=presets.ARCHIVE[preset],
+        emitter=presets.EMITTER[preset],
+        output=presets.OUTPUT[preset],
+        online=presets.ONLINE[preset],
+    )
+
+
+def _chsel_cma_me(preset: str) -> ChselSettings:
+    return replace(_chsel(preset), search="cma_me")
+
+
+def _gradient_descent(preset: str) -> GradientDescentSettings:
+    return GradientDescentSettings(
+        cost=presets.COST[preset], descent=presets.DESCENT[preset], online=presets.ONLINE[preset]
+    )
+
+
+_METHODS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
+    "chsel": (Chsel, _chsel),
+    "chsel_cma_me": (Chsel, _chsel_cma_me),
+    "gradient_descent": (GradientDescent, _gradient_descent),
+}
+METHODS = tuple(_METHODS)
+
+
+def preset_settings(name: str, preset: str = "default") -> Any:
+    """The settings of a method by name, as a preset has them."""
+    require_choice("method", name, METHODS)
+    require_choice("preset", preset, presets.PRESETS)
+    return _METHODS[name][1](preset)
+
+
+def build_method(name: str, settings: Any = None) -> Method:
+    """A method by name.
+
+    settings: its settings, a mapping of them (unnamed ones keep their default), or None for the
+    default preset. Raises SettingError for names and values that do not exist.
+    """
+    require_choice("method", name, METHODS)
+    make, preset = _METHODS[name]
+    default = preset("default")
+    if settings is None:
+        settings = default
+    elif isinstance(settings, Mapping):
+        settings = build_settings(type(default), settings, f"method {name}")
+    return make(settings)

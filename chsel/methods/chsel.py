@@ -1,0 +1,131 @@
+"""CHSEL: gradient descent, then quality-diversity search over an archive (Alg. 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.cost import CostSettings, RelaxedCost
+from chsel.descent import DescentSettings, descend
+from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.errors import require_choice, require_positive
+from chsel.measures import measure_named
+from chsel.objective import Objective
+from chsel.observer import NullObserver, Observer
+from chsel.online import OnlineSettings
+from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.refinement import resampled_around_best
+from chsel.selection import (
+    ArchiveSettings,
+    OutputSettings,
+    ranked_hypotheses,
+    select_elites,
+    sized_archive,
+)
+from chsel.space import PlaneSettings, search_space, transforms_of
+from chsel.streams import Purpose
+
+
+@dataclass(frozen=True)
+class ChselSettings:
+    """All settings of CHSEL.
+
+    search: "cma_mega" or "cma_me". passes: repetitions of the whole, each from a Gaussian around
+    the best members of the one before. plane: restricts the poses to SE(2).
+    """
+
+    search: str = "cma_mega"
+    passes: int = 1
+    cost: CostSettings = field(default_factory=CostSettings)
+    descent: DescentSettings = field(default_factory=DescentSettings)
+    archive: ArchiveSettings = field(default_factory=ArchiveSettings)
+    emitter: EmitterSettings = field(default_factory=EmitterSettings)
+    output: OutputSettings = field(default_factory=OutputSettings)
+    online: OnlineSettings = field(default_factory=OnlineSettings)
+    plane: PlaneSettings | None = None
+
+    def __post_init__(self) -> None:
+        require_choice("search", self.search, SEARCHES)
+        require_positive("passes", self.passes)
+        measure_named(self.archive.measure, planar=self.plane is not None)
+
+
+class Chsel:
+    """Registers by Algorithm 1 of the paper."""
+
+    def __init__(self, settings: ChselSettings | None = None) -> None:
+        self.settings = settings or ChselSettings()
+        planar = self.settings.plane is not None
+        self._measure = measure_named(self.settings.archive.measure, planar=planar)
+        self._search = SEARCHES[self.settings.search]
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem."""
+        return self.settings.online
+
+    def register(
+        self, problem: RegistrationProblem, observer: Observer | None = None
+    ) -> Hypotheses:
+        """Hypotheses for the known points of a problem, best first."""
+        observer = observer or NullObserver()
+        space = search_space(self.settings.plane, problem.sdf)
+        objective = Objective(RelaxedCost.of(problem, self.settings.cost), space)
+        estimates = self._pass(
+            problem, objective, problem.initial_set, problem.low_cost_set, 0, observer
+        )
+        for index in range(1, self.settings.passes):
+            stream = problem.key.stream(Purpose.REFINEMENT, index)
+            poses = estimates.object_from_world
+            initial_set = resampled_around_best(poses, estimates.cost, space, stream)
+            low_cost_set = estimates.elites
+            estimates = self._pass(problem, objective, initial_set, low_cost_set, index, observer)
+        return estimates
+
+    def _pass(
+        self,
+        problem: RegistrationProblem,
+        objective: Objective,
+        initial_set: FloatArray,
+        low_cost_set: FloatArray,
+        index: int,
+        observer: Observer,
+    ) -> Hypotheses:
+        """Algorithm 1, line by line."""
+        settings, space, measure = self.settings, objective.space, self._measure
+        known_count, count = len(problem.points.known), len(initial_set)
+        # 1: E' <- SGD on E_0 with C^
+        estimates, costs = descend(objective, initial_set, settings.descent, observer)
+        # 2: P <- m(E')
+        vectors = space.encode(estimates)
+        measures = objective.measures(measure, vectors)
+        # 3, 4: M <- grid with dimensions mean(P) +- b_sigma std(P)
+        archive = sized_archive(
+            measure, measures, costs, settings.archive, known_count, space.dimension
+        )
+        # 5: M <- UpdateCells(M, E' and E_l)
+        low_vectors = space.encode(low_cost_set)
+        low_costs = objective.costs(low_vectors)
+        archive.add(vectors, -costs, measures)
+        archive.add(low_vectors, -low_costs, objective.measures(measure, low_vectors))
+        # 6: M <- CMA-MEGA(M, C^, n_o)
+        start = _lowest(np.concatenate([vectors, low_vectors]), np.concatenate([costs, low_costs]))
+        if settings.emitter.start == "initial":
+            start = space.encode(initial_set[:1])[0]
+        draws, watch = Draws(problem.key, index), ArchiveWatch(observer, index)
+        watch.start(archive)
+        self._search(objective, archive, start, count, settings.emitter, draws, watch)
+        # 7: E <- cells of M with the |E_0| lowest costs
+        stream = problem.key.stream(Purpose.RESAMPLE, index)
+        chosen = select_elites(archive.costs, count, settings.output, known_count, stream)
+        elites = transforms_of(space, archive.solutions)
+        snapshot = archive.snapshot(settings.emitter.iterations, index)
+        cells = archive.occupied[chosen]
+        return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)
+
+
+def _lowest(vectors: FloatArray, costs: FloatArray) -> FloatArray:
+    """The vector (d,) of lowest cost."""
+    return vectors[int(np.argmin(costs))]

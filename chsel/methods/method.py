@@ -1,0 +1,25 @@
+"""What every registration method offers."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from chsel.observer import Observer
+from chsel.online import OnlineSettings
+from chsel.problem import Hypotheses, RegistrationProblem
+
+
+class Method(Protocol):
+    """A pure function of a problem, with settings of its own."""
+
+    settings: Any
+    """A frozen dataclass."""
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem for this method."""
+
+    def register(
+        self, problem: RegistrationProblem, observer: Observer | None = None
+    ) -> Hypotheses:
+        """Hypotheses, best first. The observer sees the way there and changes nothing."""

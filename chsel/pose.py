@@ -1,0 +1,128 @@
+"""Rigid transforms: rotations, the continuous 6-D representation, sampling."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chsel.arrays import FloatArray
+from chsel.errors import PoseError
+
+RIGID_TOLERANCE = 1e-6
+
+
+def check_rigid(name: str, transforms: FloatArray) -> None:
+    """Raise PoseError unless every (4, 4) of transforms (B, 4, 4) is a rotation and translation."""
+    rotations = transforms[:, :3, :3]
+    products = np.einsum("bij,bkj->bik", rotations, rotations) - np.eye(3)
+    handed = np.einsum("bi,bi->b", np.cross(rotations[:, 0], rotations[:, 1]), rotations[:, 2])
+    good = (np.abs(products).max(axis=(1, 2), initial=0.0) < RIGID_TOLERANCE) & (handed > 0)
+    good &= (transforms[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    if not good.all():
+        index = int(np.argmin(good))
+        raise PoseError(
+            f"{name}[{index}] is not a rigid transform; accepted: a (4, 4) matrix of a rotation "
+            "matrix (determinant +1), a translation, and the last row 0 0 0 1"
+        )
+
+
+def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Homogeneous transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    transforms = np.zeros((*rotation.shape[:-2], 4, 4))
+    transforms[..., :3, :3] = rotation
+    transforms[..., :3, 3] = translation
+    transforms[..., 3, 3] = 1.0
+    return transforms
+
+
+def inverse(transforms: FloatArray) -> FloatArray:
+    """The inverse of rigid transforms (..., 4, 4)."""
+    rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    return compose(rotation, -np.einsum("...ij,...j->...i", rotation, transforms[..., :3, 3]))
+
+
+def apply(transforms: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (N, 3) moved by transforms (..., 4, 4): (..., N, 3)."""
+    moved = np.einsum("...ij,nj->...ni", transforms[..., :3, :3], points)
+    return moved + transforms[..., None, :3, 3]
+
+
+def axis_angle(axis: FloatArray, angle: FloatArray | float) -> FloatArray:
+    """Rotations (..., 3, 3) about unit axes (..., 3) by angles (...) in radians (Rodrigues)."""
+    sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    hat = np.zeros((*axis.shape[:-1], 3, 3))
+    hat[..., 0, 1], hat[..., 0, 2] = -axis[..., 2], axis[..., 1]
+    hat[..., 1, 0], hat[..., 1, 2] = axis[..., 2], -axis[..., 0]
+    hat[..., 2, 0], hat[..., 2, 1] = -axis[..., 1], axis[..., 0]
+    outer = axis[..., :, None] * axis[..., None, :]
+    return cosine * np.eye(3) + sine * hat + (1.0 - cosine) * outer
+
+
+def rotation_vector(vectors: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3): the exponential map of SO(3)."""
+    angle = np.sqrt((vectors**2).sum(axis=-1))
+    safe = np.where(angle > 0.0, angle, 1.0)
+    axis = np.where(angle[..., None] > 0.0, vectors / safe[..., None], [1.0, 0.0, 0.0])
+    return axis_angle(axis, angle)
+
+
+def random_rotations(stream: np.random.Generator, count: int) -> FloatArray:
+    """Rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
+    quaternion = stream.standard_normal((count, 4))
+    w, x, y, z = (quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def rotation_angle(rotation: FloatArray) -> FloatArray:
+    """Angle in radians of rotations (..., 3, 3), in [0, pi], exact for small angles too."""
+    skew = np.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    return np.arctan2(np.sqrt((skew**2).sum(axis=-1)), trace - 1.0)
+
+
+def encode_9d(object_from_world: FloatArray) -> FloatArray:
+    """The 9-D vectors (B, 9) of transforms (B, 4, 4): first two rows of R, then t (CHSEL, IV-B)."""
+    rows = object_from_world[:, :2, :3].reshape(-1, 6)
+    return np.concatenate([rows, object_from_world[:, :3, 3]], axis=1)
+
+
+def decode_6d(rows: Tensor) -> Tensor:
+    """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
+    first, second = rows[:, 0:3], rows[:, 3:6]
+    b1 = first / _length(first)
+    b2 = second - (b1 * second).sum(dim=1, keepdim=True) * b1
+    b2 = b2 / _length(b2)
+    b3 = torch.stack(
+        [
+            b1[:, 1] * b2[:, 2] - b1[:, 2] * b2[:, 1],
+            b1[:, 2] * b2[:, 0] - b1[:, 0] * b2[:, 2],
+            b1[:, 0] * b2[:, 1] - b1[:, 1] * b2[:, 0],
+        ],
+        dim=1,
+    )
+    return torch.stack([b1, b2, b3], dim=1)
+
+
+def _length(vectors: Tensor) -> Tensor:
+    # Kept away from 0, so that a degenerate 6-D vector decodes to finite numbers.
+    return torch.sqrt((vectors * vectors).sum(dim=1, keepdim=True)).clamp_min(1e-12)
+
+
+def as_tensor(value: Any) -> Tensor:
+    """A float64 tensor that shares no memory with a read-only array."""
+    return torch.tensor(np.asarray(value), dtype=torch.float64)

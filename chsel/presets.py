@@ -1,0 +1,44 @@
+"""Three sets of settings: `paper` as printed, `reference` as its authors ran it, `default` ours."""
+
+from __future__ import annotations
+
+from chsel.cost import CostSettings
+from chsel.descent import DescentSettings
+from chsel.emitters import EmitterSettings
+from chsel.online import OnlineSettings
+from chsel.selection import ArchiveSettings, OutputSettings
+
+PRESETS = ("default", "paper", "reference")
+
+COST = {
+    "default": CostSettings(),
+    "paper": CostSettings(lookup="nearest"),
+    "reference": CostSettings(
+        free_term="interior", occupied_scale=0.0, lookup="nearest", outside="bounding_box"
+    ),
+}
+DESCENT = {
+    "default": DescentSettings(),
+    "paper": DescentSettings(stop_below=-1e9),
+    "reference": DescentSettings(),
+}
+ARCHIVE = {
+    "default": ArchiveSettings(),
+    "paper": ArchiveSettings(outliers="none", least_deviation=1e-4),
+    "reference": ArchiveSettings(least_deviation=1e-4, tolerance_per_point=0.0, tolerance=0.1),
+}
+EMITTER = {
+    "default": EmitterSettings(),
+    "paper": EmitterSettings(start="initial"),
+    "reference": EmitterSettings(start="initial", ribs_parity=True),
+}
+OUTPUT = {
+    "default": OutputSettings(),
+    "paper": OutputSettings(limit="none", shortage="fewer"),
+    "reference": OutputSettings(limit="ratio", shortage="resample"),
+}
+ONLINE = {
+    "default": OnlineSettings(),
+    "paper": OnlineSettings(rotation_law="axis_gauss", keep_best=False),
+    "reference": OnlineSettings(initial="upright"),
+}

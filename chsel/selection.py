@@ -1,0 +1,148 @@
+"""Which estimates size the archive, and which elites become hypotheses (Alg. 1, lines 2-4, 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.archive import GridArchive
+from chsel.arrays import BoolArray, FloatArray, IntArray
+from chsel.errors import require_choice, require_positive
+from chsel.measures import Measure
+from chsel.objective import Objective
+from chsel.problem import ArchiveSnapshot, Hypotheses
+
+_SAME_POSE = 1e-12
+
+
+@dataclass(frozen=True)
+class ArchiveSettings:
+    """The grid of the archive: mean +- range_sigmas standard deviations of the measures of E'.
+
+    measure: see chsel.measures. bins: cells per measure. range_sigmas: b_sigma of the paper.
+    least_deviation: floor of the standard deviation (metres or radians).
+    outliers: which of E' are left out of mean and deviation: "ratio" those above
+    ratio x lowest cost + tolerance, "quantile" those above the 80 % quantile, "none".
+    tolerance_per_point: tolerance per known point; tolerance: its floor.
+    """
+
+    measure: str = "position_2"
+    bins: int = 40
+    range_sigmas: float = 3.0
+    least_deviation: float = 0.005
+    outliers: str = "ratio"
+    ratio: float = 5.0
+    tolerance_per_point: float = 1e-3
+    tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        require_choice("outliers", self.outliers, ("ratio", "quantile", "none"))
+        for name in ("bins", "range_sigmas", "least_deviation", "ratio"):
+            require_positive(name, getattr(self, name))
+        for name in ("tolerance_per_point", "tolerance"):
+            require_positive(name, getattr(self, name), zero=True)
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """How hypotheses are chosen from the archive.
+
+    limit: "none" for the cells of lowest cost whatever it is, "ratio" for those below
+    ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
+    and lowest cost + tolerance_per_point x known points + free_tolerance.
+    shortage: what fills a set of too few: "next_best" the next cells, then copies; "resample"
+    copies drawn with replacement; "fewer" nothing.
+    """
+
+    limit: str = "noise"
+    ratio: float = 5.0
+    tolerance: float = 1e-6
+    tolerance_per_point: float = 2e-3
+    free_tolerance: float = 0.2
+    shortage: str = "next_best"
+
+    def __post_init__(self) -> None:
+        require_choice("limit", self.limit, ("none", "ratio", "noise"))
+        require_choice("shortage", self.shortage, ("next_best", "resample", "fewer"))
+        require_positive("ratio", self.ratio)
+        for name in ("tolerance", "tolerance_per_point", "free_tolerance"):
+            require_positive(name, getattr(self, name), zero=True)
+
+
+def sized_archive(
+    measure: Measure,
+    measures: FloatArray,
+    costs: FloatArray,
+    settings: ArchiveSettings,
+    known_count: int,
+    dimension: int,
+) -> GridArchive:
+    """The empty archive whose range the measures (B, k) of E' with costs (B,) set."""
+    kept = measures[_inliers(costs, settings, known_count)]
+    mean, deviation = measure.moments(kept if len(kept) >= 2 else measures)
+    half = settings.range_sigmas * np.maximum(deviation, settings.least_deviation)
+    if measure.circular:
+        half = np.minimum(half, np.pi)
+    return GridArchive(measure, mean - half, mean + half, bins=settings.bins, dimension=dimension)
+
+
+def _inliers(costs: FloatArray, settings: ArchiveSettings, known_count: int) -> BoolArray:
+    if settings.outliers == "none":
+        return np.ones(len(costs), dtype=bool)
+    if settings.outliers == "quantile":
+        return costs < np.quantile(costs, 0.8)
+    tolerance = max(settings.tolerance_per_point * known_count, settings.tolerance)
+    return costs < settings.ratio * costs.min() + tolerance
+
+
+def select_elites(
+    costs: FloatArray,
+    count: int,
+    settings: OutputSettings,
+    known_count: int,
+    stream: np.random.Generator,
+) -> IntArray:
+    """Indices (count,), or fewer if so set, of the elites with costs (C,) to return, best first."""
+    order = np.argsort(costs, kind="stable")
+    good = order[costs[order] <= _limit(costs, settings, known_count)]
+    if len(good) >= count or settings.shortage == "fewer":
+        return good[:count]
+    if settings.shortage == "resample":
+        return good[np.sort(stream.integers(0, len(good), count))]
+    return order[np.sort(np.resize(np.arange(len(order)), count))]
+
+
+def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:
+    best = float(costs.min())
+    if settings.limit == "none":
+        return float("inf")
+    if settings.limit == "ratio":
+        return settings.ratio * best + settings.tolerance
+    tolerance = settings.tolerance_per_point * known_count + settings.free_tolerance
+    return max(settings.ratio * best, best + tolerance)
+
+
+def repeated(object_from_world: FloatArray) -> BoolArray:
+    """True (B,) for each transform of (B, 4, 4) that equals an earlier one."""
+    rounded = (
+        np.round(object_from_world / _SAME_POSE) if len(object_from_world) else object_from_world
+    )
+    _, first = np.unique(rounded.reshape(len(rounded), -1), axis=0, return_index=True)
+    flags = np.ones(len(rounded), dtype=bool)
+    flags[first] = False
+    return flags
+
+
+def ranked_hypotheses(
+    objective: Objective,
+    object_from_world: FloatArray,
+    cells: IntArray,
+    elites: FloatArray,
+    archive: ArchiveSnapshot | None,
+) -> Hypotheses:
+    """Poses (B, 4, 4) from archive cells (B,), costed as they are and put in order of cost."""
+    cost = objective.costs(objective.space.encode(object_from_world))
+    order = np.argsort(cost, kind="stable")
+    poses = object_from_world[order]
+    return Hypotheses(poses, cost[order], repeated(poses), cells[order], elites, archive)

@@ -1,0 +1,159 @@
+"""What happens in a session: the values that recorders write and readers give back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.points import KnownPoints, Workspace
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.sdf import SdfGrid
+
+
+@dataclass(frozen=True, eq=False)
+class SessionStarted:
+    """Opens every recording.
+
+    config: the resolved configuration, plain values. mesh: of the object, in its frame, metres.
+    world_from_object (4, 4): the true pose, where known. initial_points: known before any probe.
+    environment: versions, platform, processor, state of the checkout; no clock, no paths.
+    """
+
+    runner: str
+    object: str
+    session: str
+    method: str
+    seed: int
+    config: Mapping[str, Any]
+    mesh: trimesh.Trimesh
+    sdf: SdfGrid
+    workspace: Workspace
+    free_resolution: float
+    initial_points: KnownPoints
+    world_from_object: FloatArray | None = None
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """One probe and what it told.
+
+    step: index of the probe, from 0. gripper_path (P, 4, 4): world_from_gripper, in order of time,
+    P may be 0. contacts (C, 3): on the object's surface, in the world. contact_normals (C, 3):
+    unit, pointing out of the object, zero where unknown. outcome: "contact", "free" or "points".
+    new_points: all that becomes known with this probe, contacts included.
+    """
+
+    step: int
+    outcome: str
+    new_points: KnownPoints
+    gripper_path: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    contacts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    contact_normals: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemPosed:
+    """A registration starts; with the events before it, this is the whole problem."""
+
+    step: int
+    problem: RegistrationProblem
+
+
+@dataclass(frozen=True, eq=False)
+class SnapshotTaken:
+    """The archive at one moment of a registration."""
+
+    step: int
+    archive: ArchiveSnapshot
+
+
+@dataclass(frozen=True)
+class Traced:
+    """Where a stage of a registration stands after a block of iterations.
+
+    digest: of the search vectors and costs. costs: lowest, median and highest, over B.
+    """
+
+    step: int
+    stage: str
+    iteration: int
+    digest: str
+    costs: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesesFound:
+    """A registration ends."""
+
+    step: int
+    hypotheses: Hypotheses
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Numbers about a step that follow from the recorded values alone (no clock among them).
+
+    Names are `snake_case` and carry the unit where it is not SI, such as
+    best_position_error, best_rotation_error, distinct_hypotheses, coverage_mm2.
+    """
+
+    step: int
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Timed:
+    """Wall-clock seconds by stage. Shown to people, never part of a byte-stable recording."""
+
+    step: int
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Logged:
+    """A line of text; level is "info" or "warning"."""
+
+    step: int
+    level: str
+    text: str
+
+
+@dataclass(frozen=True)
+class SessionEnded:
+    """Closes a recording; outcome is "finished", "interrupted" or "failed: REASON"."""
+
+    step: int
+    outcome: str
+
+
+Event = (
+    SessionStarted
+    | Probe
+    | ProblemPosed
+    | SnapshotTaken
+    | Traced
+    | HypothesesFound
+    | Measured
+    | Timed
+    | Logged
+    | SessionEnded
+)
+
+
+class Recorder(Protocol):
+    """Writes events down."""
+
+    def record(self, event: Event) -> None:
+        """Take one event; events of one session come in the order in which things happen."""
+
+    def flush(self) -> None:
+        """Make sure that all events so far survive the end of the process."""
+
+    def close(self) -> None:
+        """Finish what was written. Closing twice is closing once."""

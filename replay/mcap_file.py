@@ -1,0 +1,191 @@
+"""The messages and attachments of an MCAP file of this project, or a clear error."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import zstandard
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+from chsel.errors import RecordingError
+
+UNFINISHED = "unfinished"
+_ACCEPTED = "accepted: a recording.mcap that this project wrote"
+_DAMAGE = (
+    McapError,
+    ValueError,
+    struct.error,
+    zstandard.ZstdError,
+    KeyError,
+    OverflowError,
+    MemoryError,
+)
+# What chunks hold is bounded by the size of the file: arrays of equal numbers compress to next to
+# nothing, whole recordings do not.
+_PLAUSIBLE_SIZE = 256 * 2**20
+_PLAUSIBLE_RATIO = 100
+
+
+@dataclass(frozen=True)
+class StoredMessage:
+    """One message as it stands in the file; log_time in nanoseconds."""
+
+    topic: str
+    log_time: int
+    data: bytes
+
+
+class McapFile:
+    """Reads one file from start to end, checking every checksum on the way.
+
+    schemas: the full name of the message on every topic that matters; others are skipped.
+    partial: take what is whole from an unfinished or damaged file, up to the first damage.
+    attachments: by name, those met so far. damage: what ended a partial reading, or None.
+    """
+
+    def __init__(self, path: Path, schemas: Mapping[str, str], *, partial: bool = False) -> None:
+        self.path = path
+        self.attachments: dict[str, bytes] = {}
+        self.damage: str | None = None
+        self._schemas = schemas
+        self._partial = partial
+        self._names: dict[int, str] = {}  # of schemas, by id
+        self._topics: dict[int, str] = {}  # by id of channel
+        self._count = 0  # messages met so far
+        self._data_end = 0
+
+    def messages(self) -> Iterator[StoredMessage]:
+        """All messages in the order of writing. Raises RecordingError if the file is no good."""
+        try:
+            with self.path.open("rb") as file:
+                size = file.seek(0, 2)
+                self._check_kind(file, size)
+                yield from self._whole_messages(file, size)
+        except IsADirectoryError:
+            raise RecordingError(f"recording {self.path} is a folder; {_ACCEPTED}") from None
+        except FileNotFoundError:
+            raise RecordingError(f"recording {self.path} does not exist; {_ACCEPTED}") from None
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise RecordingError(f"recording {self.path} cannot be read: {reason}") from error
+
+    def _check_kind(self, file: IO[bytes], size: int) -> None:
+        file.seek(0)
+        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise RecordingError(f"recording {self.path} is no MCAP file; {_ACCEPTED}")
+        file.seek(max(0, size - len(MCAP0_MAGIC)))
+        if size < 2 * len(MCAP0_MAGIC) or file.read() != MCAP0_MAGIC:
+            self._stop_at(UNFINISHED)
+        file.seek(0)
+
+    def _whole_messages(self, file: IO[bytes], size: int) -> Iterator[StoredMessage]:
+        stream = _Bounded(file, size)
+        limit = _PLAUSIBLE_SIZE + _PLAUSIBLE_RATIO * size
+        reader = StreamReader(
+            stream,  # type: ignore[arg-type]
+            emit_chunks=True,
+            validate_crcs=True,
+            record_size_limit=size,
+        )
+        records = iter(reader.records)
+        while True:
+            try:
+                record = next(records, None)
+                if record is None:
+                    return self._check_end(file, size)
+                found = self._take(record, limit)
+            except _DAMAGE as error:
+                reason = "it ends early" if isinstance(error, EndOfFile) else str(error)
+                return self._stop_at(f"damaged before byte {file.tell()}: {reason}")
+            if isinstance(record, Chunk):
+                limit -= record.uncompressed_size
+            yield from found
+
+    def _take(self, record: Any, limit: int) -> list[StoredMessage]:
+        """The messages in a record; ValueError if it is not as this project writes it."""
+        match record:
+            case Header() if record.profile != "chsel":
+                raise RecordingError(f"recording {self.path} is another program's; {_ACCEPTED}")
+            case Attachment():
+                self.attachments[record.name] = record.data
+            case Chunk():
+                _check_size(record, limit)
+                found = [self._message(part) for part in breakup_chunk(record, validate_crc=True)]
+                return [message for message in found if message is not None]
+            case DataEnd() if record.data_section_crc == 0:
+                raise ValueError("the data section has no checksum")
+            case Footer():
+                self._footer = record
+        return []
+
+    def _message(self, part: Any) -> StoredMessage | None:
+        """A message on a topic that matters; takes note of schemas and channels."""
+        match part:
+            case Schema():
+                self._names[part.id] = part.name
+            case Channel():
+                name = self._names[part.schema_id]
+                if self._schemas.get(part.topic, name) != name:
+                    raise ValueError(f"topic {part.topic} carries {name}")
+                self._topics[part.id] = part.topic
+            case Message():
+                if part.sequence != self._count:
+                    raise ValueError(f"message {self._count} is missing, {part.sequence} follows")
+                self._count += 1
+                topic = self._topics[part.channel_id]
+                if topic in self._schemas:
+                    return StoredMessage(topic, part.log_time, part.data)
+        return None
+
+    def _check_end(self, file: IO[bytes], size: int) -> None:
+        """The summary's checksum, which reading in order passes by, and what stands in it."""
+        if file.tell() != size:
+            return self._stop_at(f"damaged: it ends at byte {file.tell()} of {size}")
+        crc_size = 4
+        file.seek(self._footer.summary_start)
+        summary = file.read(size - self._footer.summary_start - len(MCAP0_MAGIC) - crc_size)
+        if zlib.crc32(summary) != self._footer.summary_crc:
+            return self._stop_at("damaged: the checksum of its summary is wrong")
+        missing = sorted(set(self._schemas) - set(self._topics.values()))
+        if missing:
+            raise RecordingError(f"recording {self.path} lacks topics: {', '.join(missing)}")
+        return None
+
+    def _stop_at(self, damage: str) -> None:
+        """Keep the damage in mind, or raise it if all is wanted."""
+        if not self._partial:
+            hint = "accepted: a closed recording, or partial reading" if damage == UNFINISHED else ""
+            raise RecordingError(f"recording {self.path} is {damage}" + (hint and f"; {hint}"))
+        self.damage = self.damage or damage
+
+
+class _Bounded:
+    """A file that never makes room for more bytes than it has left."""
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file = file
+        self._size = size
+
+    def read(self, length: int) -> bytes:
+        return self._file.read(min(length, self._size - self._file.tell()))
+
+
+def _check_size(chunk: Chunk, limit: int) -> None:
+    """Raise ValueError unless a chunk says truly and plausibly how large it is."""
+    if chunk.compression not in ("", "zstd"):
+        raise ValueError(f"a chunk is compressed by {chunk.compression!r}; accepted: zstd")
+    if chunk.uncompressed_crc == 0:
+        raise ValueError("a chunk has no checksum")
+    size = len(chunk.data)
+    if chunk.compression:
+        size = zstandard.frame_content_size(chunk.data)
+    if size != chunk.uncompressed_size or size > limit:
+        raise ValueError(f"a chunk claims {chunk.uncompressed_size} bytes")

@@ -1,0 +1,154 @@
+"""The archive of quality-diversity search as a heat map over its first two measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from chsel.arrays import FloatArray, IntArray
+from chsel.problem import ArchiveSnapshot, Hypotheses
+from replay.rerun_colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
+from replay.rerun_hypotheses import shown_hypotheses
+from replay.rerun_plane import Frame, Label, lines, texts, ticks
+
+_FLATTEST = 4  # a map wider or higher than this has its shorter side stretched
+_BAR = (0.06, 0.11)  # left and right edge of the colour bar, beyond the map, in map widths
+
+
+class ArchiveMap:
+    """Draws snapshots of archives under the entity `root`; a unit of the view is one cell."""
+
+    def __init__(self, stream: rr.RecordingStream, root: str = "archive") -> None:
+        self._stream = stream
+        self._root = root
+        self._scale: CostScale | None = None
+        self._last: ArchiveSnapshot | None = None
+
+    def start(self) -> None:
+        """A registration starts, with a new archive: the marks on the last one are gone."""
+        self._scale = self._last = None
+        self._mark(np.zeros((0, 2)), [])
+
+    def draw(self, step: int, archive: ArchiveSnapshot) -> None:
+        """The lowest cost in each cell, empty cells in grey; axes, colour bar and a caption."""
+        scale = CostScale.of(-archive.objectives)
+        scale = scale if self._scale is None else self._scale.including(scale)
+        self._scale, self._last = scale, archive
+        costs = lowest_costs(archive)
+        frame = Frame(costs.shape[1], costs.shape[0])
+        # The costs lie under the colours, so that the viewer tells them where the mouse points.
+        self._log("cost", rr.Image(costs, color_model="L", draw_order=-30.0))
+        self._log("colors", rr.Image(heat_map(costs, scale), opacity=1.0, draw_order=-20.0))
+        self._log("frame", lines(frame.outline()))
+        self._log("axes", texts(_labels(archive, frame, scale, step)))
+
+    def mark(self, hypotheses: Hypotheses) -> None:
+        """Mark the cells that the hypotheses come from, each with its cost."""
+        shown = shown_hypotheses(hypotheses)
+        shown = shown[hypotheses.cell[shown] >= 0]
+        archive = hypotheses.archive or self._last
+        if archive is None:
+            self._log("axes", texts([(0.0, 0.0, "no archive: the method does not keep one")]))
+            return
+        height, width = lowest_costs(archive).shape
+        columns, rows = _places(archive, hypotheses.cell[shown])
+        x = (columns + 0.5) * width / archive.shape[0]
+        y = height - (rows + 0.5) * height / (_rows(archive))
+        costs = hypotheses.cost[shown]
+        self._mark(np.stack([x, y], axis=1), [f"cost {number(cost)}" for cost in costs.tolist()])
+
+    def _mark(self, places: FloatArray, labels: list[str]) -> None:
+        points = rr.Points2D(
+            places.astype(np.float32),
+            labels=labels,
+            show_labels=False,
+            colors=[(255, 255, 255)],
+            radii=rr.Radius.ui_points([2.5]),
+        )
+        self._log("hypotheses", points)
+
+    def _log(self, name: str, what: rr.AsComponents) -> None:
+        self._stream.log(f"{self._root}/{name}", what)
+
+
+def lowest_costs(archive: ArchiveSnapshot) -> np.ndarray:
+    """The map (height, width) as float32: the lowest cost over all further measures, NaN if empty.
+
+    The first measure runs to the right, the second upwards. The shorter side is stretched by a
+    whole factor where the map would be a thin strip, as with one measure alone.
+    """
+    width, height = archive.shape[0], _rows(archive)
+    costs = np.full((height, width), np.inf)
+    columns, rows = _places(archive, archive.cells)
+    np.minimum.at(costs, (height - 1 - rows, columns), -archive.objectives)
+    costs[np.isinf(costs)] = np.nan
+    stretched = np.repeat(costs, max(1, width // (_FLATTEST * height)), axis=0)
+    stretched = np.repeat(stretched, max(1, height // (_FLATTEST * width)), axis=1)
+    return stretched.astype(np.float32)
+
+
+def heat_map(costs: np.ndarray, scale: CostScale) -> ColorArray:
+    """The picture (height, width', 4) of costs (height, width), with the colour bar beside it."""
+    height, width = costs.shape
+    empty = np.isnan(costs)
+    colors = cost_colors(scale.fraction(np.where(empty, scale.high, costs)))
+    colors[empty] = EMPTY_CELL
+    left, right = _bar_edges(width)
+    picture = np.zeros((height, right, 4), dtype=np.uint8)
+    picture[:, :width, :3] = colors
+    picture[:, :width, 3] = 255
+    bar = cost_colors(1.0 - (np.arange(height)[::-1] + 0.5) / height)
+    picture[:, left:, :3] = bar[::-1][:, None]
+    picture[:, left:, 3] = 255
+    return picture
+
+
+def _bar_edges(width: int) -> tuple[int, int]:
+    left = width + max(1, round(_BAR[0] * width))
+    return left, left + max(1, round((_BAR[1] - _BAR[0]) * width))
+
+
+def _rows(archive: ArchiveSnapshot) -> int:
+    return archive.shape[1] if len(archive.shape) > 1 else 1
+
+
+def _places(archive: ArchiveSnapshot, cells: IntArray) -> tuple[IntArray, IntArray]:
+    """Column and row of cells, along the first two measures."""
+    indices = np.unravel_index(cells, archive.shape)
+    columns = np.asarray(indices[0], dtype=np.int64)
+    rows = np.asarray(indices[1], dtype=np.int64) if len(indices) > 1 else np.zeros_like(columns)
+    return columns, rows
+
+
+def _labels(archive: ArchiveSnapshot, frame: Frame, scale: CostScale, step: int) -> list[Label]:
+    """Caption, tick values and axis names."""
+    pad = 0.04 * max(frame.width, frame.height)
+    caption = (
+        f"probe {step}, iteration {archive.iteration}"
+        + (f", refinement {archive.refinement}" if archive.refinement else "")
+        + f": {len(archive.cells)} of {int(np.prod(archive.shape))} cells filled"
+    )
+    middle = frame.width / 2
+    labels: list[Label] = [(middle, -3.0 * pad, caption)]
+    labels += [(frame.x(f), frame.height + 0.3 * pad, text) for f, text in _ticks(archive, 0)]
+    labels += [(middle, frame.height + 2.2 * pad, archive.measure_names[0])]
+    if len(archive.shape) > 1:
+        labels += [(-1.4 * pad, frame.y(f) - 0.6 * pad, text) for f, text in _ticks(archive, 1)]
+        labels += [(0.0, -1.6 * pad, archive.measure_names[1])]
+    if len(archive.shape) > 2:
+        others = ", ".join(archive.measure_names[2:])
+        labels += [(middle, frame.height + 4.0 * pad, f"lowest cost over {others}")]
+    left, right = _bar_edges(round(frame.width))
+    places = [0.0, 0.5, 1.0] if scale.high > scale.low else [0.0]
+    for place in places:
+        text = number(scale.cost_at(place))
+        labels.append((right + 1.4 * pad, frame.y(1.0 - place) - 0.6 * pad, text))
+    labels.append(((left + right) / 2, -1.6 * pad, "cost"))
+    return labels
+
+
+def _ticks(archive: ArchiveSnapshot, measure: int) -> list[tuple[float, str]]:
+    """Round values of a measure: their place along its axis, in [0, 1], and their text."""
+    lower, upper = float(archive.lower[measure]), float(archive.upper[measure])
+    span = upper - lower if upper > lower else 1.0
+    return [((value - lower) / span, number(value)) for value in ticks(lower, upper)]

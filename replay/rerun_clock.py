@@ -1,0 +1,56 @@
+"""Where an event stands on the two timelines of a Rerun recording."""
+
+from __future__ import annotations
+
+import rerun as rr
+
+PROBE = "probe"
+ITERATION = "iteration"
+
+
+class Clock:
+    """Counts iterations on over the whole session, so that no two registrations share a moment.
+
+    On the timeline `probe` a moment is the step of a probe, and shows what was known and found by
+    its end. On `iteration` it is a running count of the iterations of all stages of all
+    registrations, one extra per registration, so that scrubbing it plays every snapshot in order,
+    with the scene of its time.
+    """
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._first = 0
+        self._now = 0
+        self._stages: dict[str, int] = {}
+        self.set_probe(0)
+
+    @property
+    def iteration(self) -> int:
+        """Iterations of this registration so far, of all stages."""
+        return self._now - self._first
+
+    def set_probe(self, step: int) -> None:
+        """All that is logged from here on belongs to probe `step`."""
+        self._step = step
+        self._set()
+
+    def start_registration(self, step: int) -> None:
+        """A registration starts: one moment after all that was before."""
+        self._now += 1
+        self._first = self._now
+        self._stages = {}
+        self.set_probe(step)
+
+    def advance(self, stage: str, iteration: int) -> None:
+        """A stage of this registration has done `iteration` iterations; stages follow each other."""
+        start = self._stages.setdefault(stage, self._now)
+        self._now = max(self._now, start + iteration)
+        self._set()
+
+    def hide_probe(self) -> None:
+        """What is logged next has no place on the timeline of probes, until the clock moves."""
+        self._stream.disable_timeline(PROBE)
+
+    def _set(self) -> None:
+        self._stream.set_time(PROBE, sequence=self._step)
+        self._stream.set_time(ITERATION, sequence=self._now)

@@ -1,0 +1,103 @@
+"""Colours of the Rerun recording: costs on a perceptual map, and one colour per kind of thing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from chsel.arrays import FloatArray
+
+Rgb = tuple[int, int, int]
+ColorArray = NDArray[np.uint8]
+
+BACKGROUND: Rgb = (22, 24, 29)
+EMPTY_CELL: Rgb = (52, 55, 62)
+FRAME: Rgb = (120, 125, 135)
+TEXT: Rgb = (205, 210, 218)
+OBJECT: Rgb = (215, 218, 224)
+CONTACT: Rgb = (255, 60, 90)
+FREE: Rgb = (96, 160, 225)
+OCCUPIED: Rgb = (240, 140, 40)
+KNOWN: Rgb = (225, 120, 220)
+GRIPPER: Rgb = (255, 255, 255)
+PAST: Rgb = (140, 146, 156)
+
+CURVES: dict[str, Rgb] = {
+    "lowest": (253, 220, 60),
+    "median": (53, 183, 121),
+    "highest": (120, 130, 200),
+}
+"""Colours of the three curves of a set of costs."""
+
+# Viridis, at equal steps from dark to bright; between them, colours are interpolated.
+_VIRIDIS = np.array(
+    [
+        (68, 1, 84),
+        (72, 40, 120),
+        (62, 74, 137),
+        (49, 104, 142),
+        (38, 130, 142),
+        (31, 158, 137),
+        (53, 183, 121),
+        (110, 206, 88),
+        (181, 222, 43),
+        (253, 231, 37),
+    ],
+    dtype=np.float64,
+)
+_FLOOR = 1e-4  # costs below this fraction of the highest one have the colour of the lowest
+
+
+@dataclass(frozen=True)
+class CostScale:
+    """Logarithmic scale from the lowest cost (0, bright) to the highest (1, dark)."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, cost: ArrayLike) -> CostScale:
+        """The scale of a set of costs; finite ones count, of none at all the scale is 0 to 0."""
+        values = np.asarray(cost, dtype=np.float64).ravel()
+        values = values[np.isfinite(values)]
+        return cls(float(values.min()), float(values.max())) if len(values) else cls(0.0, 0.0)
+
+    def including(self, other: CostScale) -> CostScale:
+        """The scale that covers both."""
+        return CostScale(min(self.low, other.low), max(self.high, other.high))
+
+    def fraction(self, cost: ArrayLike) -> FloatArray:
+        """Place of each cost on the scale, in [0, 1]."""
+        values = np.asarray(cost, dtype=np.float64)
+        start = max(self.low, self.high * _FLOOR)
+        if not start < self.high:
+            return np.zeros(values.shape)
+        logs = np.log(np.clip(values, start, self.high) / start)
+        return np.clip(logs / np.log(self.high / start), 0.0, 1.0)
+
+    def cost_at(self, fraction: float) -> float:
+        """The cost at a place on the scale: the inverse of `fraction`."""
+        start = max(self.low, self.high * _FLOOR)
+        if fraction <= 0.0 or not start < self.high:
+            return self.low
+        return float(start * (self.high / start) ** fraction)
+
+
+def cost_colors(fraction: ArrayLike) -> ColorArray:
+    """Colours (..., 3) of places on a cost scale (...): bright where the cost is low."""
+    place = (1.0 - np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0)) * (len(_VIRIDIS) - 1)
+    steps = np.arange(len(_VIRIDIS))
+    channels = [np.interp(place, steps, _VIRIDIS[:, channel]) for channel in range(3)]
+    return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
+
+
+def with_alpha(color: Rgb, alpha: int) -> tuple[int, int, int, int]:
+    """A colour at an opacity of 0 to 255."""
+    return (*color, alpha)
+
+
+def number(value: float) -> str:
+    """A number for a label: three digits that count."""
+    return f"{value:.3g}"

@@ -1,0 +1,123 @@
+"""Numbers of a session as curves: over probes, and over the iterations of one registration."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from chsel.problem import Hypotheses
+from replay.events import Traced
+from replay.rerun_colors import CURVES, FRAME, CostScale, number
+from replay.rerun_plane import Frame, Label, lines, texts, ticks
+
+_SEARCH = Frame(1.6, 1.0)
+_CURVE_NAMES = ("lowest", "median", "highest")
+
+
+class Curves:
+    """Scalars over probes: costs, pose errors, seconds by stage, and whatever else is measured."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._named: set[str] = set()
+        for name, color in CURVES.items():
+            self._style(f"cost/{name}", name, color)
+            self._style(f"search/{name}", name, color)
+
+    def add_hypotheses(self, hypotheses: Hypotheses) -> None:
+        """Lowest, median and highest cost of the hypotheses, and how many differ."""
+        cost = hypotheses.cost
+        if len(cost):
+            values = (cost.min(), np.median(cost), cost.max())
+            for name, value in zip(_CURVE_NAMES, values, strict=True):
+                self._scalar(f"cost/{name}", name, float(value))
+        self._scalar("distinct/hypotheses", "distinct hypotheses", float(hypotheses.distinct))
+
+    def add_measured(self, name: str, value: float) -> None:
+        """One measured number; its name says where it is shown."""
+        if name == "distinct_hypotheses":  # told by the hypotheses themselves
+            return
+        text = name.replace("_", " ")
+        for kind in ("position", "rotation"):
+            if f"{kind}_error" in name:
+                self._scalar(f"error/{kind}/{name}", text.replace(f" {kind} error", ""), value)
+                return
+        self._scalar(f"measured/{name}", text, value)
+
+    def add_seconds(self, stage: str, seconds: float) -> None:
+        """Wall-clock time of a stage."""
+        self._scalar(f"seconds/{stage.replace(' ', '_')}", stage.replace("_", " "), seconds)
+
+    def add_trace(self, traced: Traced) -> None:
+        """Costs of the search at this iteration."""
+        for name, value in zip(_CURVE_NAMES, traced.costs, strict=True):
+            self._scalar(f"search/{name}", name, float(value))
+
+    def _scalar(self, entity: str, name: str, value: float) -> None:
+        if not np.isfinite(value):
+            return
+        self._style(entity, name)
+        self._stream.log(entity, rr.Scalars(value))
+
+    def _style(self, entity: str, name: str, color: tuple[int, int, int] | None = None) -> None:
+        if entity in self._named:
+            return
+        self._named.add(entity)
+        colors = None if color is None else [color]
+        line = rr.SeriesLines(names=[name], colors=colors, widths=[2.0])
+        point = rr.SeriesPoints(names=[name], colors=colors, marker_sizes=[2.5])
+        self._stream.log(entity, line, point, static=True)
+
+
+class SearchPlot:
+    """The costs over the iterations of one registration, drawn under the entity `root`.
+
+    A plot of its own: on the timeline of probes, all iterations of a registration are one moment.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, root: str = "search_plot") -> None:
+        self._stream = stream
+        self._root = root
+        self._points: list[tuple[int, tuple[float, float, float]]] = []
+        self._stages: list[tuple[int, str]] = []
+
+    def start(self) -> None:
+        """A registration starts."""
+        self._points, self._stages = [], []
+
+    def add(self, iteration: int, traced: Traced) -> None:
+        """A block of iterations is done; `iteration` counts those of all stages."""
+        if not self._stages or self._stages[-1][1] != traced.stage:
+            self._stages.append((iteration, traced.stage))
+        self._points.append((iteration, traced.costs))
+
+    def draw(self, step: int) -> None:
+        """Draw the whole registration."""
+        if not self._points:
+            return
+        iterations = np.array([iteration for iteration, _ in self._points], dtype=np.float64)
+        costs = np.array([costs for _, costs in self._points])
+        scale = CostScale.of(costs)
+        last = max(float(iterations[-1]), 1.0)
+        x = _SEARCH.width * iterations / last
+        y = (1.0 - scale.fraction(costs)) * _SEARCH.height
+        for column, name in enumerate(_CURVE_NAMES):
+            curve = lines([np.stack([x, y[:, column]], axis=1)], CURVES[name], width=2.0)
+            self._stream.log(f"{self._root}/{name}", curve)
+        starts = [_SEARCH.width * first / last for first, _ in self._stages]
+        walls = [[(start, 0.0), (start, _SEARCH.height)] for start in starts]
+        self._stream.log(f"{self._root}/frame", lines([*_SEARCH.outline(), *walls], FRAME))
+        labels = self._labels(step, scale, last)
+        self._stream.log(f"{self._root}/axes", texts(labels))
+
+    def _labels(self, step: int, scale: CostScale, last: float) -> list[Label]:
+        labels: list[Label] = [
+            (_SEARCH.x(value / last), 1.02, number(value)) for value in ticks(0.0, last, most=4)
+        ]
+        for place in (0.0, 0.5, 1.0):
+            labels.append((-0.1, _SEARCH.y(place) - 0.04, number(scale.cost_at(place))))
+        ends = [first for first, _ in self._stages[1:]] + [last]
+        for (first, stage), end in zip(self._stages, ends, strict=True):
+            labels.append((_SEARCH.x((first + end) / 2 / last), -0.1, stage.replace("_", " ")))
+        labels.append((_SEARCH.width / 2, 1.12, f"iteration of the registration after probe {step}"))
+        return labels

@@ -1,0 +1,106 @@
+"""The hypotheses of a registration as translucent meshes, coloured by cost."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+import trimesh
+
+from chsel.arrays import FloatArray, IntArray
+from chsel.pose import inverse
+from chsel.problem import Hypotheses
+from replay.rerun_colors import CostScale, cost_colors
+from replay.rerun_scene import display_mesh
+
+LEVELS = 8
+"""Steps of the cost scale; a mesh entity has one colour, so each step is an entity."""
+MOST = 200
+"""More hypotheses than these are not drawn: the lowest in cost are."""
+DISPLAY_FACES = 6000
+"""Meshes with more faces are coarsened for display."""
+
+_BEST_ALPHA = 235
+_ALPHA = (120, 28)  # of the lowest and the highest step
+
+
+class HypothesisMeshes:
+    """Draws sets of hypotheses under the entity `root`: one mesh a step of the scale, and poses."""
+
+    def __init__(self, stream: rr.RecordingStream, root: str = "scene/hypotheses") -> None:
+        self._stream = stream
+        self._root = root
+
+    def set_up(self, mesh: trimesh.Trimesh) -> None:
+        """Store the object's mesh once for each colour."""
+        coarse = coarsened(mesh, DISPLAY_FACES)
+        best = (*_rgb(0.0), _BEST_ALPHA)
+        self._stream.log(f"{self._root}/best", display_mesh(coarse, best), static=True)
+        for level in range(LEVELS):
+            fraction = level / (LEVELS - 1)
+            alpha = round(_ALPHA[0] + fraction * (_ALPHA[1] - _ALPHA[0]))
+            drawn = display_mesh(coarse, (*_rgb((level + 0.5) / LEVELS), alpha))
+            self._stream.log(self._level(level), drawn, static=True)
+
+    def draw(self, hypotheses: Hypotheses) -> None:
+        """Show the hypotheses that repeat no other, at most MOST; the first is the best."""
+        shown = shown_hypotheses(hypotheses)
+        poses = inverse(hypotheses.object_from_world[shown])
+        cost = hypotheses.cost[shown]
+        levels = cost_levels(cost)
+        levels[:1] = -1
+        self._poses(f"{self._root}/best", poses[:1], cost[:1])
+        for level in range(LEVELS):
+            chosen = levels == level
+            self._poses(self._level(level), poses[chosen], cost[chosen])
+
+    def clear(self) -> None:
+        """Show none, until the registration that starts has found some."""
+        self._poses(f"{self._root}/best", np.zeros((0, 4, 4)), np.zeros(0))
+        for level in range(LEVELS):
+            self._poses(self._level(level), np.zeros((0, 4, 4)), np.zeros(0))
+
+    def _level(self, level: int) -> str:
+        return f"{self._root}/cost_step_{level + 1}"
+
+    def _poses(self, entity: str, world_from_object: FloatArray, cost: FloatArray) -> None:
+        poses = rr.InstancePoses3D(
+            translations=world_from_object[:, :3, 3].astype(np.float32),
+            mat3x3=world_from_object[:, :3, :3].astype(np.float32),
+        )
+        self._stream.log(entity, poses, rr.AnyValues(cost=cost))
+
+
+def shown_hypotheses(hypotheses: Hypotheses) -> IntArray:
+    """Indices of the hypotheses that are drawn: no duplicates, the lowest in cost."""
+    return np.flatnonzero(~hypotheses.duplicate)[:MOST]
+
+
+def cost_levels(cost: FloatArray) -> IntArray:
+    """The step of the cost scale, from 0, of each cost (B,) among its like."""
+    fraction = CostScale.of(cost).fraction(cost)
+    return np.minimum((fraction * LEVELS).astype(np.int64), LEVELS - 1)
+
+
+def coarsened(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
+    """A mesh of roughly `most_faces` faces for the eye alone: vertices of a cell become one.
+
+    The cell is doubled in number of faces it swallows until few enough are left.
+    """
+    faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
+    cell = float(np.sqrt(mesh.area / max(most_faces, 1)))
+    coarse = mesh
+    while len(coarse.faces) > most_faces:
+        _, group = np.unique(np.rint(vertices / cell), axis=0, return_inverse=True)
+        group = group.reshape(-1)
+        count = np.bincount(group)
+        centres = [np.bincount(group, vertices[:, axis]) / count for axis in range(3)]
+        a, b, c = group[faces].T
+        kept = (a != b) & (b != c) & (c != a)
+        coarse = trimesh.Trimesh(np.stack(centres, axis=1), group[faces][kept], process=False)
+        cell *= 1.2
+    return coarse
+
+
+def _rgb(fraction: float) -> tuple[int, int, int]:
+    red, green, blue = cost_colors(fraction).tolist()
+    return red, green, blue

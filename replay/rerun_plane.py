@@ -1,0 +1,69 @@
+"""Drawings with axes in a 2-D view: a unit of the view is whatever the drawing says it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from replay.rerun_colors import FRAME, TEXT, Rgb
+
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+Label = tuple[float, float, str]
+"""A place in the view, y down, and the text around it."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The rectangle of a drawing: width and height in units of the view, origin at the top left."""
+
+    width: float
+    height: float
+
+    def x(self, fraction: float) -> float:
+        """Place of a fraction of the horizontal axis, from the left."""
+        return fraction * self.width
+
+    def y(self, fraction: float) -> float:
+        """Place of a fraction of the vertical axis, from the bottom."""
+        return (1.0 - fraction) * self.height
+
+    def outline(self) -> list[list[tuple[float, float]]]:
+        """The border as one closed line."""
+        width, height = self.width, self.height
+        return [[(0.0, 0.0), (width, 0.0), (width, height), (0.0, height), (0.0, 0.0)]]
+
+
+def ticks(lower: float, upper: float, *, most: int = 5) -> list[float]:
+    """Round numbers in [lower, upper], at most `most` of them; the ends if none is round."""
+    span = upper - lower
+    if not span > 0.0 or not np.isfinite(span):
+        return [lower]
+    power = 10.0 ** np.floor(np.log10(span / most))
+    for factor in _STEPS:
+        step = factor * power
+        first, last = np.ceil(lower / step - 1e-9), np.floor(upper / step + 1e-9)
+        if last - first + 1 <= most:
+            return [float(n * step) + 0.0 for n in np.arange(first, last + 1)] or [lower, upper]
+    return [lower, upper]
+
+
+def texts(labels: Sequence[Label], color: Rgb = TEXT) -> rr.Points2D:
+    """Texts without points, each centred on its place."""
+    return rr.Points2D(
+        np.array([label[:2] for label in labels], dtype=np.float32).reshape(-1, 2),
+        labels=[label[2] for label in labels],
+        colors=[color] * len(labels),
+        radii=[rr.Radius.ui_points(0.0)] * len(labels),
+        show_labels=True,
+    )
+
+
+def lines(strips: Sequence[object], color: Rgb = FRAME, *, width: float = 1.0) -> rr.LineStrips2D:
+    """Line strips, each a sequence of (x, y), of a width in points of the screen."""
+    arrays = [np.asarray(strip, dtype=np.float32).reshape(-1, 2) for strip in strips]
+    return rr.LineStrips2D(
+        arrays, colors=[color] * len(arrays), radii=[rr.Radius.ui_points(width / 2)] * len(arrays)
+    )

@@ -1,0 +1,99 @@
+"""The 3-D scene of a Rerun recording: workspace, object, known points, gripper, hypotheses."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.points import KnownPoints, Workspace
+from replay.events import Probe
+from replay.rerun_colors import CONTACT, FREE, GRIPPER, KNOWN, OBJECT, OCCUPIED, PAST, Rgb
+
+NORMAL_LENGTH = 0.04  # m
+CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
+"""What each probe adds to: a view shows these over all probes up to the moment."""
+
+
+class Scene:
+    """Draws everything but the hypotheses under the entity `root`."""
+
+    def __init__(self, stream: rr.RecordingStream, root: str = "scene") -> None:
+        self._stream = stream
+        self._root = root
+
+    def set_up(
+        self, mesh: trimesh.Trimesh, workspace: Workspace, world_from_object: FloatArray | None
+    ) -> None:
+        """What does not change: the workspace, and the object at its true pose where known."""
+        self._log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        lower, upper = workspace.bounds
+        box = rr.Boxes3D(mins=[lower], sizes=[upper - lower], colors=[PAST], radii=[_ui(0.6)])
+        self._log("workspace", box, static=True)
+        if world_from_object is None:
+            return
+        pose = rr.Transform3D(
+            translation=world_from_object[:3, 3], mat3x3=world_from_object[:3, :3]
+        )
+        self._log("object", display_mesh(mesh, (*OBJECT, 255)), pose, static=True)
+
+    def add_points(self, points: KnownPoints, *, new: bool) -> None:
+        """Points that become known; `new` ones are also shown stronger until the next probe."""
+        exact = points.sdf == 0.0
+        self._points("free", points.free, FREE, size=1.1, alpha=70)
+        self._points("occupied", points.occupied, OCCUPIED, size=2.5)
+        self._points("known", points.known[~exact], KNOWN, size=3.0)
+        self._points("contacts", points.known[exact], CONTACT, size=4.0)
+        if new:
+            self._points("free/new", points.free, FREE, size=1.8, alpha=190)
+
+    def add_probe(self, probe: Probe) -> None:
+        """The gripper's path, what it met, and what became known."""
+        self.add_points(probe.new_points, new=True)
+        path = probe.gripper_path[:, :3, 3].astype(np.float32)
+        self._log("gripper/past", _path(path, PAST, 0.8))
+        self._log("gripper/path", _path(path, GRIPPER, 1.6))
+        end = path[-1:]
+        self._log("gripper/end", rr.Points3D(end, colors=[GRIPPER], radii=_ui(4.0)))
+        self._normals(probe)
+        self._points("contacts/new", probe.contacts, CONTACT, size=6.5)
+
+    def _normals(self, probe: Probe) -> None:
+        known = np.abs(probe.contact_normals).sum(axis=1) > 0.0
+        arrows = rr.Arrows3D(
+            origins=probe.contacts[known].astype(np.float32),
+            vectors=(NORMAL_LENGTH * probe.contact_normals[known]).astype(np.float32),
+            colors=[CONTACT],
+            radii=_ui(1.2),
+        )
+        self._log("contacts/normals", arrows)
+
+    def _points(
+        self, name: str, points: FloatArray, color: Rgb, *, size: float, alpha: int = 255
+    ) -> None:
+        positions = np.ascontiguousarray(points, dtype=np.float32)
+        self._log(name, rr.Points3D(positions, colors=[(*color, alpha)], radii=_ui(size)))
+
+    def _log(self, name: str, what: rr.AsComponents, *more: rr.AsComponents, static: bool = False) -> None:
+        self._stream.log(f"{self._root}/{name}" if name else self._root, what, *more, static=static)
+
+
+def display_mesh(mesh: trimesh.Trimesh, color: tuple[int, int, int, int]) -> rr.Mesh3D:
+    """A mesh for the viewer, float32, smoothly shaded, of one colour."""
+    return rr.Mesh3D(
+        vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
+        triangle_indices=np.asarray(mesh.faces, dtype=np.uint32),
+        vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float32),
+        albedo_factor=color,
+    )
+
+
+def _path(path: np.ndarray, color: Rgb, width: float) -> rr.LineStrips3D:
+    strips = [path] if len(path) > 1 else []
+    return rr.LineStrips3D(strips, colors=[color], radii=_ui(width / 2))
+
+
+def _ui(size: float) -> float:
+    """A radius in points of the screen."""
+    return float(rr.Radius.ui_points(size)[0])

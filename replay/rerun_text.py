@@ -1,0 +1,51 @@
+"""What a session is, as text for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from replay.events import SessionStarted
+
+
+def session_markdown(started: SessionStarted) -> str:
+    """A table that says what was run, then the whole configuration, then where it ran."""
+    rows = {
+        "object": started.object,
+        "session": started.session,
+        "method": started.method,
+        "preset": _find(started.config, "preset") or "-",
+        "seed": started.seed,
+        "runner": started.runner,
+        "true pose": "known" if started.world_from_object is not None else "unknown",
+    }
+    table = ["| | |", "|---|---|", *(f"| {name} | **{text}** |" for name, text in rows.items())]
+    parts = ["\n".join(table)]
+    for title, mapping in (("Configuration", started.config), ("Environment", started.environment)):
+        if mapping:
+            parts.append(f"### {title}\n```\n" + "\n".join(_indented(mapping)) + "\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def _find(config: Mapping[str, Any], name: str) -> Any:
+    """The value of a key at the top, or in the group `method`."""
+    method = config.get("method")
+    return config.get(name) or (method.get(name) if isinstance(method, Mapping) else None)
+
+
+def _indented(value: Any, depth: int = 0) -> list[str]:
+    """Nested mappings as indented lines of `key: value`."""
+    lines: list[str] = []
+    for key, inner in value.items():
+        start = "  " * depth + f"{key}:"
+        if isinstance(inner, Mapping) and inner:
+            lines += [start, *_indented(inner, depth + 1)]
+        else:
+            lines.append(f"{start} {_plain(inner)}")
+    return lines
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "[" + ", ".join(_plain(item) for item in value) + "]"
+    return "-" if value is None else str(value)

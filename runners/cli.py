@@ -1,0 +1,134 @@
+"""The shell around every command: Hydra, one-line errors, exit statuses."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from chsel.errors import ChselError
+from runners.presets import store_presets
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+TRACEBACK = "--traceback"
+_USER_ERRORS = (ChselError, HydraException, OmegaConfBaseException, OSError)
+
+
+def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Make `main(config)` a program configured by conf/<config_name>.yaml.
+
+    A user's mistake is one line on stderr and exit status 2; Ctrl-C is exit status 130.
+    `--traceback` (or HYDRA_FULL_ERROR=1) shows where an error came from.
+    """
+
+    def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
+        def program() -> None:
+            show_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1" or TRACEBACK in sys.argv
+            sys.argv = [argument for argument in sys.argv if argument != TRACEBACK]
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
+            warnings.showwarning = _print_warning
+            store_presets()
+            _register_resolvers()
+
+            def job(config: DictConfig) -> None:
+                # Caught here as well: Hydra would print a line of its own about a failed job.
+                _exit_on_error(lambda: main(config), config_name, show_traceback)
+
+            run = hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
+            _exit_on_error(run(job), config_name, show_traceback)
+
+        return program
+
+    return decorate
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """The resolved configuration as plain dictionaries, lists and scalars."""
+    container = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
+
+
+def choices(group: str) -> list[str]:
+    """The options of a group of conf/, those of nested folders with their path."""
+    folder = CONF / group
+    files = sorted(folder.rglob("*.yaml"), key=lambda file: (len(file.parts), file))
+    return [str(file.relative_to(folder).with_suffix("")) for file in files]
+
+
+def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bool) -> None:
+    try:
+        run()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except _USER_ERRORS as error:
+        if show_traceback:
+            raise
+        print(f"error: {_message(error, config_name)}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _message(error: Exception, config_name: str) -> str:
+    """One line: what was wrong, and what is accepted."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, choice = str(error.missing_cfg_file).partition("/")
+        if (CONF / group).is_dir():
+            return _not_accepted(group, f"has no option {choice!r}", choice, choices(group))
+    unknown = re.match(r"Could not override '([^']+)'", str(error))
+    if unknown and isinstance(error, ConfigCompositionException):
+        return _unknown_key(unknown.group(1), config_name)
+    text = str(error)
+    if isinstance(error, HydraException) and error.__cause__ is not None:
+        text = f"{text}: {error.__cause__}"
+    text = re.split(r"\nConfig search path:|\nSee https?://|\n\s*full_key:", text)[0]
+    return re.sub(r"\s*\n\s*", " ", text).strip()
+
+
+def _unknown_key(key: str, config_name: str) -> str:
+    """Where the path of an override leaves the configuration, and what stands there."""
+    groups = [argument for argument in sys.argv[1:] if argument.split("=")[0] in _groups()]
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        node: Any = hydra.compose(config_name, groups)
+    parts = key.split("@")[0].split(".")
+    for depth, part in enumerate(parts):
+        if not isinstance(node, Mapping | DictConfig) or part not in node:
+            where = ".".join(parts[:depth]) or config_name
+            names = [str(name) for name in node] if isinstance(node, Mapping | DictConfig) else []
+            return _not_accepted(where, f"has no key {part!r}", part, names)
+        node = node._get_node(part) if node._is_missing(part) else node[part]
+    return f"{key} is not a key"
+
+
+def _not_accepted(where: str, what: str, value: str, accepted: list[str]) -> str:
+    close = difflib.get_close_matches(value, accepted, n=1, cutoff=0.5)
+    hint = f"; did you mean {close[0]}?" if close else ";"
+    return f"{where} {what}{hint} accepted: {', '.join(accepted) or 'no key below it'}"
+
+
+def _groups() -> list[str]:
+    return sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and choices(folder.name))
+
+
+def _register_resolvers() -> None:
+    """Resolvers that the files in conf/ use."""
+    OmegaConf.register_new_resolver(
+        "options", lambda: "\n".join(f"  {g}={'|'.join(choices(g))}" for g in _groups()), replace=True
+    )
+    OmegaConf.register_new_resolver("slug", lambda name: name.replace("/", "-"), replace=True)
+    OmegaConf.register_new_resolver(
+        "run_id", lambda: os.urandom(2).hex(), replace=True, use_cache=True
+    )
+
+
+def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"warning: {message}", file=sys.stderr)

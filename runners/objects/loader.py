@@ -1,0 +1,74 @@
+"""From the choice of an object to its mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+
+from chsel.errors import SettingError, require_choice, require_positive
+from chsel.mesh import clean_mesh, load_mesh
+from runners.objects.scans import scan_file
+
+KINDS = ("model", "scan", "file")
+
+
+@dataclass(frozen=True)
+class ObjectConfig:
+    """Which object, and how large.
+
+    name: its short name. kind: "model" (ships with the project), "scan" (of the YCB set, in the
+    assets folder) or "file". scale: multiplies the mesh into the metres of the session. epsilon:
+    tolerance of the plausible set, metres (CHSEL, Sec. V). path: the mesh, for "file". scan:
+    official folder name, for "scan". configuration: how simulated sessions place and probe it.
+    """
+
+    name: str
+    scale: float
+    epsilon: float
+    configuration: str
+    kind: str = "model"
+    path: str | None = None
+    scan: str | None = None
+
+    def __post_init__(self) -> None:
+        require_choice("kind", self.kind, KINDS)
+        require_positive("scale", self.scale)
+        require_positive("epsilon", self.epsilon)
+        if self.kind == "file" and not self.path:
+            raise SettingError("path is missing; pass object.path=FILE, a mesh file")
+        if self.kind == "scan" and not self.scan:
+            raise SettingError("scan is missing; pass object.scan=FOLDER, such as 035_power_drill")
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """An object as a session sees it: its mesh in metres, with the scale already applied."""
+
+    name: str
+    mesh: trimesh.Trimesh
+    scale: float
+    epsilon: float
+    configuration: str
+
+
+def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
+    """The object that `config` names; scans come from the folder `assets`.
+
+    Raises SettingError for an unknown model, MeshError if the mesh is missing or unusable.
+    """
+    mesh = _load(config, assets)
+    return ObjectModel(config.name, mesh, config.scale, config.epsilon, config.configuration)
+
+
+def _load(config: ObjectConfig, assets: Path) -> trimesh.Trimesh:
+    if config.kind == "file":
+        return load_mesh(config.path or "", scale=config.scale)
+    if config.kind == "scan":
+        return load_mesh(scan_file(assets, config.scan or ""), scale=config.scale)
+    from runners.objects.models import MODELS  # takes manifold3d, which scans and files do not
+
+    require_choice("object.name", config.name, MODELS)
+    model = MODELS[config.name]()
+    return clean_mesh(model.vertices, model.faces, name=f"model {config.name}", scale=config.scale)

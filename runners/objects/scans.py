@@ -1,0 +1,101 @@
+"""Scans of the YCB Object and Model Set: where they lie, and what they have to look like."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from chsel.errors import MeshError, SettingError
+from chsel.mesh import load_mesh
+from runners.download import require_web_address
+
+# By official folder: the choice's name, and the scan's extents in metres.
+SCANS = {
+    "035_power_drill": ("drill", (0.1605, 0.1210, 0.1915)),
+    "006_mustard_bottle": ("mustard", (0.0829, 0.0940, 0.1875)),
+    "048_hammer": ("hammer", (0.1064, 0.3326, 0.0447)),
+    "003_cracker_box": ("cracker_box", (0.0900, 0.1678, 0.2384)),
+    "010_potted_meat_can": ("spam_can", (0.0967, 0.0884, 0.0852)),
+    "050_medium_clamp": ("clamp", (0.0435, 0.0625, 0.0835)),
+}
+EXTENT_TOLERANCE = 0.01  # of the expected extent
+RESOLUTION = "google_16k"
+MESH_FILE = "nontextured.ply"
+
+
+@dataclass(frozen=True)
+class AssetsConfig:
+    """Where scans lie, and where they come from.
+
+    dir: the folder; ~ is the home folder. url: address of the folder of the official archives.
+    """
+
+    dir: str
+    url: str
+
+    def __post_init__(self) -> None:
+        if not self.dir.strip():
+            raise SettingError("dir is empty; accepted: a folder")
+        require_web_address("url", self.url)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the scans."""
+        return Path(self.dir).expanduser()
+
+    def archive_url(self, scan: str) -> str:
+        """Address of the official archive of a scan."""
+        return f"{self.url.rstrip('/')}/{scan}_{RESOLUTION}.tgz"
+
+
+def scan_folder(assets: Path, scan: str) -> Path:
+    """Where the scan with the official folder name `scan` lies, as in the official archives."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", scan):
+        raise SettingError(f"object.scan is {scan!r}; accepted: a name such as 035_power_drill")
+    return assets / scan / RESOLUTION
+
+
+def scan_file(assets: Path, scan: str) -> Path:
+    """The mesh file of a scan; MeshError, with what to run, if it is not there."""
+    path = scan_folder(assets, scan) / MESH_FILE
+    if not path.is_file():
+        raise MeshError(
+            f"scan {path} does not exist; run `python -m runners.fetch {_choice(scan)}`, or set "
+            "assets.dir (or CHSEL_ASSETS) to a folder that has it"
+        )
+    return path
+
+
+def check_scan(path: Path, scan: str) -> str:
+    """Check the mesh file of a scan against what is known of it, and describe it in one line.
+
+    Raises MeshError if it cannot be read, is not watertight, or differs by more than 1 % from
+    the expected extents.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # an open mesh is an error below
+        mesh = load_mesh(path)
+    if not mesh.is_watertight:
+        raise MeshError(f"scan {scan} is not watertight")
+    extents = np.asarray(mesh.extents)
+    expected = np.asarray(SCANS[scan][1] if scan in SCANS else extents)
+    if np.any(np.abs(extents - expected) > EXTENT_TOLERANCE * expected):
+        raise MeshError(
+            f"scan {scan} measures {_millimetres(extents)}; "
+            f"expected: {_millimetres(expected)}, to 1 % along each axis"
+        )
+    return f"{len(mesh.vertices)} vertices, {_millimetres(extents)}, watertight"
+
+
+def _choice(scan: str) -> str:
+    if scan in SCANS:
+        return f"object=ycb/{SCANS[scan][0]}"
+    return f"object=ycb/drill object.scan={scan}"
+
+
+def _millimetres(extents: np.ndarray) -> str:
+    return " x ".join(f"{1000.0 * extent:.1f}" for extent in extents) + " mm"

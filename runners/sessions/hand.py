@@ -1,0 +1,96 @@
+"""The gripper: a Franka hand with closed fingers, as two convex solids of the same outer size."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.pose import compose
+
+# World axes of the hand's axes: the fingers (hand z) point along world x, and the wide side of
+# the hand (hand y) lies along world y.
+ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+# Rings (z, half width along x, half width along y) in metres, in the hand frame. The real hand is
+# flat where these solids bulge by a few millimetres, so that they meet a flat object at one point.
+_PALM = (
+    (-0.0260, 0.0060, 0.0600),
+    (-0.0150, 0.0170, 0.0900),
+    (0.0050, 0.0316, 0.1020),
+    (0.0500, 0.0220, 0.1005),
+    (0.0560, 0.0190, 0.0950),
+    (0.0605, 0.0150, 0.0780),
+    (0.0635, 0.0110, 0.0560),
+    (0.0653, 0.0060, 0.0300),
+    (0.0659, 0.0030, 0.0140),
+    (0.0660, 0.0, 0.0),
+)
+_FINGERS = (
+    (0.0584, 0.0105, 0.0263),
+    (0.0770, 0.0103, 0.0253),
+    (0.1020, 0.0092, 0.0175),
+    (0.1070, 0.0080, 0.0145),
+    (0.1098, 0.0062, 0.0110),
+    (0.1114, 0.0042, 0.0072),
+    (0.1121, 0.0020, 0.0034),
+    (0.1123, 0.0, 0.0),
+)
+_CORNERS = 36  # of a ring
+_ROUNDNESS = 2.5  # exponent of a ring's superellipse: 2 is an ellipse, infinity is a rectangle
+
+
+def world_from_gripper(positions: FloatArray) -> FloatArray:
+    """Poses (..., 4, 4) of the hand at positions (..., 3); its orientation never changes."""
+    return compose(np.broadcast_to(ROTATION, (*positions.shape[:-1], 3, 3)), positions)
+
+
+@cache
+def solids() -> tuple[trimesh.Trimesh, ...]:
+    """Palm and closed fingers, convex, their axes those of the world, origin at the hand's."""
+    return tuple(_solid(rings) for rings in (_PALM, _FINGERS))
+
+
+@cache
+def surface_points(spacing: float) -> FloatArray:
+    """Points (S, 3) that cover the surface about `spacing` apart, all corners among them."""
+    points = []
+    for solid, other in zip(solids(), reversed(solids()), strict=True):
+        fine, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, spacing / 2.0)
+        _, kept = np.unique(np.rint(fine / spacing), axis=0, return_index=True)
+        covering = np.concatenate([solid.vertices, fine[kept]])
+        points.append(covering[_depth(other, covering) < 0.0])
+    return np.unique(np.concatenate(points), axis=0)
+
+
+@cache
+def interior_points(spacing: float, depth: float) -> FloatArray:
+    """Nodes (M, 3) of a lattice through the origin that lie deeper than `depth` in a solid."""
+    bounds = np.array([solid.bounds for solid in solids()])
+    first = np.floor(bounds[:, 0].min(axis=0) / spacing)
+    last = np.ceil(bounds[:, 1].max(axis=0) / spacing)
+    axes = [np.arange(low, high + 1) * spacing for low, high in zip(first, last, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return nodes[np.max([_depth(solid, nodes) for solid in solids()], axis=0) > depth]
+
+
+def _solid(rings: tuple[tuple[float, float, float], ...]) -> trimesh.Trimesh:
+    vertices = np.concatenate([_ring(*ring) for ring in rings]) @ ROTATION.T
+    return trimesh.convex.convex_hull(vertices)
+
+
+def _ring(z: float, half_x: float, half_y: float) -> FloatArray:
+    """Corners of one cross-section (C, 3) in the hand frame; a single point where it is closed."""
+    if half_x == 0.0:
+        return np.array([[0.0, 0.0, z]])
+    angle = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
+    x, y = (np.sign(w) * np.abs(w) ** (2.0 / _ROUNDNESS) for w in (np.cos(angle), np.sin(angle)))
+    return np.stack([half_x * x, half_y * y, np.full(_CORNERS, z)], axis=1)
+
+
+def _depth(solid: trimesh.Trimesh, points: FloatArray) -> FloatArray:
+    """Distance (N,) from points (N, 3) to the surface of a convex solid, negative outside."""
+    offsets = np.einsum("fi,fi->f", solid.face_normals, solid.triangles[:, 0])
+    return (offsets - points @ solid.face_normals.T).min(axis=1)

@@ -1,0 +1,95 @@
+"""How an object gets to the floor: let go as a configuration says, and rolled to rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, QhullError
+
+from chsel.arrays import FloatArray
+from chsel.errors import SessionError
+from chsel.pose import apply, axis_angle, compose
+from runners.sessions.configurations import MESH_YAW, Configuration
+
+CLEARANCE = 0.01  # m: at least so high above the floor an object is let go
+_FLAT = 1e-6  # m: vertices lower than this touch the floor
+_MOST_ROLLS = 1000
+
+
+def spawn_pose(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
+    """The pose world_from_object (4, 4) at which the object is let go, its lowest point in the air.
+
+    The configuration places the centre of mass, and turns the object's own axes.
+    """
+    roll, pitch, yaw = (
+        axis_angle(np.eye(3)[axis], angle) for axis, angle in enumerate(configuration.rotation)
+    )
+    own_yaw = axis_angle(np.eye(3)[2], MESH_YAW.get(configuration.object, 0.0))
+    rotation = yaw @ pitch @ roll @ own_yaw
+    position = np.array(configuration.position)
+    turned = compose(rotation, position - rotation @ centre_of_mass(mesh))
+    turned[2, 3] += max(0.0, CLEARANCE - lowest(mesh, turned))
+    return turned
+
+
+def centre_of_mass(mesh: trimesh.Trimesh) -> FloatArray:
+    """Centre of mass (3,) in the mesh's frame; that of the convex hull where the mesh is open."""
+    solid = mesh if mesh.is_watertight else mesh.convex_hull
+    return np.asarray(solid.center_mass, dtype=np.float64)
+
+
+def lowest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> float:
+    """Height in metres of the mesh's lowest point above the floor."""
+    return float(apply(world_from_object, np.asarray(mesh.vertices))[:, 2].min())
+
+
+def roll_to_rest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
+    """The pose (4, 4) in which a mesh rests that is put down on the floor without any swing.
+
+    It sinks to the floor and, as long as its centre of mass is not above where it stands, tilts
+    over the nearest point of support until its next vertex meets the floor.
+    Raises SessionError if it never comes to rest.
+    """
+    vertices = np.asarray(mesh.convex_hull.vertices, dtype=np.float64)
+    rotation, translation = world_from_object[:3, :3], world_from_object[:3, 3].copy()
+    centre = centre_of_mass(mesh)
+    for _ in range(_MOST_ROLLS):
+        placed = vertices @ rotation.T + translation
+        translation[2] -= placed[:, 2].min()
+        placed[:, 2] -= placed[:, 2].min()
+        weight = rotation @ centre + translation
+        pivot = _nearest_support(placed[placed[:, 2] < _FLAT, :2], weight[:2])
+        away = weight[:2] - pivot
+        if np.sqrt(away @ away) < _FLAT:
+            return compose(rotation, translation)
+        turn, pivot3 = _tilt(placed, pivot, away), np.array([*pivot, 0.0])
+        rotation = turn @ rotation
+        translation = turn @ (translation - pivot3) + pivot3
+    raise SessionError(f"the object does not come to rest within {_MOST_ROLLS} rolls")
+
+
+def _tilt(placed: FloatArray, pivot: FloatArray, away: FloatArray) -> FloatArray:
+    """Rotation (3, 3) that tilts vertices (V, 3) over a pivot towards `away` (2,) till one lands."""
+    direction = away / np.sqrt(away @ away)
+    distance = (placed[:, :2] - pivot) @ direction
+    height = placed[:, 2]
+    free = height >= _FLAT
+    angle = float(np.arctan2(height[free], distance[free]).min())
+    return axis_angle(np.array([-direction[1], direction[0], 0.0]), angle)
+
+
+def _nearest_support(support: FloatArray, point: FloatArray) -> FloatArray:
+    """The point (2,) nearest to `point` of the polygon spanned by touching vertices (S, 2)."""
+    try:
+        hull = ConvexHull(support)
+        corners = support[hull.vertices]
+        if (hull.equations @ [*point, 1.0] <= 0.0).all():
+            return point
+    except (QhullError, ValueError):  # one point, or all on a line
+        order = np.argsort(support @ (np.ptp(support, axis=0) + [1e-9, 0.0]))
+        corners = support[order[[0, -1]]]
+    start, side = corners, np.roll(corners, -1, axis=0) - corners
+    length = np.maximum((side**2).sum(axis=1), 1e-30)
+    along = np.clip(((point - start) * side).sum(axis=1) / length, 0.0, 1.0)
+    nearest = start + along[:, None] * side
+    return nearest[np.argmin(((nearest - point) ** 2).sum(axis=1))]

@@ -1,0 +1,291 @@
+"""Probe sessions with a gripper: what the physics engine and plain geometry have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.errors import require_choice, require_positive
+from chsel.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.pose import apply, inverse
+from chsel.sdf import mesh_sdf
+from chsel.streams import Purpose, StreamKey
+from replay.events import Probe
+from runners.sessions import hand
+from runners.sessions.configurations import WORKSPACE, Configuration
+
+BOUNDARIES = ("floor_slab", "box_shell", "both")
+SWEEPS = ("mini_steps", "control_steps")
+COLLISION_MESHES = ("visual", "vhacd")
+WORKSPACES = ("reference", "paper")
+
+MINI_STEPS = 15  # of a control step
+START = (0.0, 0.0, 0.2)  # m: where the gripper is before the first probe
+X_REST = -0.05  # m: where it moves sideways, before the object
+GAIN = 30.0  # command per metre of error
+TOLERANCE = 3e-4  # m: what counts as arrived
+MOST_STEPS = 60  # control steps after which a move that something blocks is given up
+NOISE_ROWS = 5000  # of the table that all methods share
+SLAB_MARGIN = 0.15  # m: by which the floor slab is wider than the object
+SLAB_LAYERS = 2
+
+
+@dataclass(frozen=True)
+class ProbingSettings:
+    """How the gripper probes, and what is written down of it.
+
+    configuration: name of one of the 17; the object's own if None. boundary: voxels known to be
+    free from the start, two layers below the floor, the six faces of the workspace, or both.
+    workspace: the hammer's is larger in "reference" and like all others in "paper".
+    sweep: free space is what the hand's interior sweeps at every mini-step, or only where control
+    steps end. free_resolution: side of a free voxel, m. object_resolution, object_padding: of the
+    object's SDF grid, m. interior_spacing, interior_depth: of the hand's interior points, m.
+    collision_mesh: what PyBullet's contacts are with, the mesh itself or its convex parts.
+    start_contacts, start_probe: registration begins when there are so many contacts, and after
+    the probe of that index. step_length: of a control step at full command, m. push_steps: most
+    control steps of a push. stop_force: ends a push, N. max_force: of the hand's holder, N.
+    noise: standard deviation of the noise on a command between -1 and 1.
+    """
+
+    configuration: str | None = None
+    boundary: str = "floor_slab"
+    workspace: str = "reference"
+    sweep: str = "mini_steps"
+    collision_mesh: str = "visual"
+    free_resolution: float = 0.025
+    object_resolution: float = 0.010
+    object_padding: float = 0.05
+    interior_spacing: float = 0.005
+    interior_depth: float = 0.010
+    start_contacts: int = 4
+    start_probe: int = 4
+    step_length: float = 0.03
+    push_steps: int = 10
+    stop_force: float = 5.0
+    max_force: float = 30.0
+    noise: float = 0.005
+
+    def __post_init__(self) -> None:
+        require_choice("boundary", self.boundary, BOUNDARIES)
+        require_choice("workspace", self.workspace, WORKSPACES)
+        require_choice("sweep", self.sweep, SWEEPS)
+        require_choice("collision_mesh", self.collision_mesh, COLLISION_MESHES)
+        for name in (
+            "free_resolution",
+            "object_resolution",
+            "object_padding",
+            "interior_spacing",
+            "interior_depth",
+            "step_length",
+            "push_steps",
+            "stop_force",
+            "max_force",
+        ):
+            require_positive(name, getattr(self, name))
+        for name in ("start_contacts", "start_probe", "noise"):
+            require_positive(name, getattr(self, name), zero=True)
+
+
+PROBING_PRESETS = {
+    "default": ProbingSettings(),
+    "paper": ProbingSettings(
+        boundary="box_shell", workspace="paper", start_contacts=0, start_probe=0
+    ),
+    "reference": ProbingSettings(sweep="control_steps", collision_mesh="vhacd"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """What a gripper sees and feels at the end of a mini-step.
+
+    position (3,): of the hand, in the world. force: on the object, newtons. contact (3,) on the
+    object's surface, and its normal (3,) out of the object, where the hand is in contact.
+    """
+
+    position: FloatArray
+    force: float = 0.0
+    contact: FloatArray | None = None
+    normal: FloatArray | None = None
+
+
+class Engine(Protocol):
+    """A world with a fixed object and a gripper that starts at START."""
+
+    world_from_object: FloatArray
+    """Pose (4, 4) of the mesh."""
+
+    def advance(self, target: FloatArray) -> Touch:
+        """Move the hand towards target (3,), a mini-step away, as far as it goes."""
+
+    def close(self) -> None:
+        """End the world. Ending twice is ending once."""
+
+
+class ProbingSession:
+    """Probes one configuration with a gripper in either engine; see `Session`."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        mesh: trimesh.Trimesh,
+        configuration: Configuration,
+        settings: ProbingSettings,
+        seed: int,
+    ) -> None:
+        """mesh: in its own frame, metres. seed: of the noise on the gripper's commands."""
+        self.configuration = configuration
+        self.settings = settings
+        self.workspace = choose_workspace(configuration, settings)
+        self.free_resolution = settings.free_resolution
+        self.world_from_object = engine.world_from_object
+        self.count = len(configuration.grid)
+        self._voxels = FreeVoxels(Lattice(self.workspace.lower, settings.free_resolution))
+        self.initial_points = KnownPoints(free=self._voxels.add(self._boundary(mesh)))
+        self._interior = hand.interior_points(settings.interior_spacing, settings.interior_depth)
+        self._gripper = _Gripper(engine, settings, seed)
+        self._engine = engine
+
+    def probes(self) -> Iterator[Probe]:
+        """Move before the object, push, return; once for every point of the grid."""
+        for step, (y, z) in enumerate(self.configuration.grid):
+            self._gripper.forget()
+            self._gripper.move_to(y, z)
+            self._gripper.push()
+            self._gripper.withdraw()
+            yield self._probe(step)
+
+    def close(self) -> None:
+        """Let go of the engine."""
+        self._engine.close()
+
+    def _probe(self, step: int) -> Probe:
+        """What the gripper has done since it last forgot."""
+        path = np.array(self._gripper.path)
+        ends = np.array(self._gripper.ends)
+        contacts = np.array(self._gripper.contacts).reshape(-1, 3)
+        swept = path if self.settings.sweep == "mini_steps" else ends
+        free = self._voxels.add(_swept(self._voxels.lattice, self._interior, swept))
+        return Probe(
+            step=step,
+            outcome="contact" if len(contacts) else "free",
+            new_points=KnownPoints(free=free, known=contacts),
+            gripper_path=hand.world_from_gripper(ends),
+            contacts=contacts,
+            contact_normals=np.array(self._gripper.normals).reshape(-1, 3),
+        )
+
+    def _boundary(self, mesh: trimesh.Trimesh) -> FloatArray:
+        """Centres (N, 3) of the voxels where the object is known not to be."""
+        lattice, chosen = self._voxels.lattice, self.settings.boundary
+        points = np.zeros((0, 3))
+        if chosen in ("box_shell", "both"):
+            points = np.concatenate([points, _box_shell(lattice, self.workspace)])
+        if chosen in ("floor_slab", "both"):
+            vertices = apply(self.world_from_object, np.asarray(mesh.vertices))
+            points = np.concatenate([points, _floor_slab(lattice, vertices)])
+        # Some configurations reach out of their workspace; free points within the object would lie.
+        distance, _ = mesh_sdf(mesh, apply(inverse(self.world_from_object), points))
+        return points[distance > 0.0]
+
+
+class _Gripper:
+    """The hand's control: proportional, noisy, in control steps of MINI_STEPS mini-steps."""
+
+    def __init__(self, engine: Engine, settings: ProbingSettings, seed: int) -> None:
+        self._engine = engine
+        self._settings = settings
+        stream = StreamKey(seed, 0).stream(Purpose.CONTROL_NOISE)
+        self._noise = settings.noise * stream.standard_normal((NOISE_ROWS, 3))
+        self._steps = 0
+        self._position = np.array(START)
+        self.path: list[FloatArray] = [self._position]
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin to write down positions and contacts anew."""
+        self.path = self.path[-1:]
+        self.ends = self.path[-1:]
+        self.contacts: list[FloatArray] = []
+        self.normals: list[FloatArray] = []
+
+    def move_to(self, y: float, z: float) -> None:
+        """Go sideways to y and z, metres."""
+        for _ in range(MOST_STEPS):
+            error = np.array([0.0, y, z]) - self._position * [0.0, 1.0, 1.0]
+            if np.sqrt(error @ error) < TOLERANCE:
+                return
+            self._control_step(GAIN * error)
+
+    def push(self) -> None:
+        """Go forward until something resists, or for so many control steps."""
+        for _ in range(self._settings.push_steps):
+            if self._control_step(np.array([1.0, 0.0, 0.0])) > self._settings.stop_force:
+                return
+
+    def withdraw(self) -> None:
+        """Go back before the object."""
+        for _ in range(MOST_STEPS):
+            error = X_REST - float(self._position[0])
+            if abs(error) < TOLERANCE:
+                return
+            self._control_step(np.array([GAIN * error, 0.0, 0.0]))
+
+    def _control_step(self, command: FloatArray) -> float:
+        """Follow a command (3,) within [-1, 1]; the median force over mini-steps, newtons."""
+        noisy = np.clip(command + self._noise[self._steps % NOISE_ROWS], -1.0, 1.0)
+        self._steps += 1
+        start, displacement = self._position, self._settings.step_length * noisy
+        forces = []
+        for mini_step in range(MINI_STEPS):
+            fraction = (mini_step + 1) / MINI_STEPS
+            touch = self._engine.advance(start + fraction * displacement)
+            self.path.append(touch.position)
+            forces.append(touch.force)
+        self._position = touch.position
+        self.ends.append(touch.position)
+        if touch.contact is not None and touch.normal is not None:
+            self.contacts.append(touch.contact)
+            self.normals.append(touch.normal)
+        return float(np.median(forces))
+
+
+def choose_workspace(configuration: Configuration, settings: ProbingSettings) -> Workspace:
+    """The box in which the object is sought."""
+    return WORKSPACE if settings.workspace == "paper" else configuration.workspace
+
+
+def _floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
+    """Centres of the lattice's lowest layers, below the floor, under and around vertices (V, 3)."""
+    low = lattice.voxels(vertices.min(axis=0, keepdims=True) - SLAB_MARGIN)[0]
+    high = lattice.voxels(vertices.max(axis=0, keepdims=True) + SLAB_MARGIN)[0]
+    low[2], high[2] = 0, SLAB_LAYERS - 1
+    return lattice.centres(low + _box(high - low + 1))
+
+
+def _box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
+    """Centres of one layer of voxels on the six faces of the workspace."""
+    last = lattice.voxels(workspace.bounds[1:])[0]
+    voxels = _box(last + 1)
+    return lattice.centres(voxels[((voxels == 0) | (voxels == last)).any(axis=1)])
+
+
+def _swept(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:
+    """Centres of the voxels that interior (M, 3) meets at any of the hand's positions (P, 3)."""
+    bounds = np.array([positions.min(axis=0), positions.max(axis=0)])
+    bounds += [interior.min(axis=0), interior.max(axis=0)]
+    low, high = lattice.voxels(bounds)
+    met = np.zeros(high - low + 1, dtype=bool)
+    for position in positions:
+        met[tuple((lattice.voxels(interior + position) - low).T)] = True
+    return lattice.centres(low + np.argwhere(met))
+
+
+def _box(shape: np.ndarray) -> np.ndarray:
+    """All indices (N, 3) of an array of that shape (3,)."""
+    return np.stack(np.indices(tuple(shape)), axis=-1).reshape(-1, 3)

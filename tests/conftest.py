@@ -1,0 +1,30 @@
+"""Where tests find the optional data directory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def _optional_data(part: str) -> Path:
+    """The folder `part` of the directory CHSEL_DATA names, by default `shared` beside the checkout."""
+    directory = Path(os.environ.get("CHSEL_DATA", REPOSITORY.parent / "shared")) / part
+    if not directory.is_dir():
+        pytest.skip(f"optional data directory is missing: no folder {part}/ (set CHSEL_DATA)")
+    return directory
+
+
+@pytest.fixture(scope="session")
+def ycb_directory() -> Path:
+    """Real scans, laid out as the official archives: OBJECT/google_16k/nontextured.ply."""
+    return _optional_data("ycb")
+
+
+@pytest.fixture(scope="session")
+def real_directory() -> Path:
+    """Real touch measurements with their meshes."""
+    return _optional_data("real")
