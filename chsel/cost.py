@@ -256,7 +256,7 @@ class _InteriorPoints:
         if int(inside.sum()) < FEW_INTERIOR_POINTS:
             warnings.warn(
                 f"free_term interior uses {int(inside.sum())} points; a finer interior_spacing "
-                "than {spacing} m describes the object better",
+                f"than {spacing} m describes the object better",
                 stacklevel=3,
             )
         scale = settings.free_scale

@@ -14,12 +14,12 @@ from chsel.errors import PoseError
 RIGID_TOLERANCE = 1e-6
 
 
-def check_rigid(name: str, transforms: FloatArray) -> None:
+def check_rigid(name: str, transforms: FloatArray, tolerance: float = RIGID_TOLERANCE) -> None:
     """Raise PoseError unless every (4, 4) of transforms (B, 4, 4) is a rotation and translation."""
     rotations = transforms[:, :3, :3]
     products = np.einsum("bij,bkj->bik", rotations, rotations) - np.eye(3)
     handed = np.einsum("bi,bi->b", np.cross(rotations[:, 0], rotations[:, 1]), rotations[:, 2])
-    good = (np.abs(products).max(axis=(1, 2), initial=0.0) < RIGID_TOLERANCE) & (handed > 0)
+    good = (np.abs(products).max(axis=(1, 2), initial=0.0) < tolerance) & (handed > 0)
     good &= (transforms[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
     if not good.all():
         index = int(np.argmin(good))
@@ -27,6 +27,16 @@ def check_rigid(name: str, transforms: FloatArray) -> None:
             f"{name}[{index}] is not a rigid transform; accepted: a (4, 4) matrix of a rotation "
             "matrix (determinant +1), a translation, and the last row 0 0 0 1"
         )
+
+
+def nearest_rigid(name: str, transforms: FloatArray) -> FloatArray:
+    """Transforms (B, 4, 4) with rotations made exact, as numbers from a file are often rounded.
+
+    Raises PoseError unless they are rigid within 1e-3.
+    """
+    check_rigid(name, transforms, 1e-3)
+    left, _, right = np.linalg.svd(transforms[:, :3, :3])
+    return compose(left @ right, transforms[:, :3, 3])
 
 
 def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:

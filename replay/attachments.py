@@ -9,7 +9,7 @@ import trimesh
 
 from chsel.errors import RecordingError
 from chsel.sdf import SdfGrid
-from replay.schemas import decode, encode
+from replay.encoding import decode, encode
 
 MESH = "mesh.ply"
 SDF_GRID = "sdf_grid"

@@ -54,7 +54,9 @@ def cloud_points(data: bytes, columns: int) -> FloatArray:
         names = ", ".join(_NAMES[:columns])
         raise RecordingError(f"a point cloud has other fields than {names} as float64")
     if len(message.data) % stride:
-        raise RecordingError(f"a point cloud has {len(message.data)} bytes, no multiple of {stride}")
+        raise RecordingError(
+            f"a point cloud has {len(message.data)} bytes, no multiple of {stride}"
+        )
     return np.frombuffer(message.data, "<f8").astype(np.float64, copy=False).reshape(-1, columns)
 
 

@@ -16,6 +16,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
+from replay.schemas import PROFILE
 
 UNFINISHED = "unfinished"
 _ACCEPTED = "accepted: a recording.mcap that this project wrote"
@@ -24,7 +25,6 @@ _DAMAGE = (
     ValueError,
     struct.error,
     zstandard.ZstdError,
-    KeyError,
     OverflowError,
     MemoryError,
 )
@@ -60,7 +60,8 @@ class McapFile:
         self._names: dict[int, str] = {}  # of schemas, by id
         self._topics: dict[int, str] = {}  # by id of channel
         self._count = 0  # messages met so far
-        self._data_end = 0
+        self._data_ended = False
+        self._footer = Footer(summary_start=0, summary_offset_start=0, summary_crc=0)
 
     def messages(self) -> Iterator[StoredMessage]:
         """All messages in the order of writing. Raises RecordingError if the file is no good."""
@@ -112,7 +113,7 @@ class McapFile:
     def _take(self, record: Any, limit: int) -> list[StoredMessage]:
         """The messages in a record; ValueError if it is not as this project writes it."""
         match record:
-            case Header() if record.profile != "chsel":
+            case Header() if record.profile != PROFILE:
                 raise RecordingError(f"recording {self.path} is another program's; {_ACCEPTED}")
             case Attachment():
                 self.attachments[record.name] = record.data
@@ -120,8 +121,10 @@ class McapFile:
                 _check_size(record, limit)
                 found = [self._message(part) for part in breakup_chunk(record, validate_crc=True)]
                 return [message for message in found if message is not None]
-            case DataEnd() if record.data_section_crc == 0:
-                raise ValueError("the data section has no checksum")
+            case DataEnd():  # its checksum, of all before it, has been compared by now
+                self._data_ended = True
+            case Footer() if not self._data_ended:
+                raise ValueError("the end of its data is missing")
             case Footer():
                 self._footer = record
         return []
@@ -132,7 +135,7 @@ class McapFile:
             case Schema():
                 self._names[part.id] = part.name
             case Channel():
-                name = self._names[part.schema_id]
+                name = self._names.get(part.schema_id)
                 if self._schemas.get(part.topic, name) != name:
                     raise ValueError(f"topic {part.topic} carries {name}")
                 self._topics[part.id] = part.topic
@@ -140,7 +143,9 @@ class McapFile:
                 if part.sequence != self._count:
                     raise ValueError(f"message {self._count} is missing, {part.sequence} follows")
                 self._count += 1
-                topic = self._topics[part.channel_id]
+                topic = self._topics.get(part.channel_id)
+                if topic is None:
+                    raise ValueError(f"channel {part.channel_id} does not exist")
                 if topic in self._schemas:
                     return StoredMessage(topic, part.log_time, part.data)
         return None
@@ -155,15 +160,16 @@ class McapFile:
         if zlib.crc32(summary) != self._footer.summary_crc:
             return self._stop_at("damaged: the checksum of its summary is wrong")
         missing = sorted(set(self._schemas) - set(self._topics.values()))
-        if missing:
+        if missing and self._count > 0:
             raise RecordingError(f"recording {self.path} lacks topics: {', '.join(missing)}")
         return None
 
     def _stop_at(self, damage: str) -> None:
         """Keep the damage in mind, or raise it if all is wanted."""
         if not self._partial:
-            hint = "accepted: a closed recording, or partial reading" if damage == UNFINISHED else ""
-            raise RecordingError(f"recording {self.path} is {damage}" + (hint and f"; {hint}"))
+            hint = "; accepted: a closed recording, or partial reading"
+            hint = hint if damage == UNFINISHED else ""
+            raise RecordingError(f"recording {self.path} is {damage}{hint}")
         self.damage = self.damage or damage
 
 
@@ -182,8 +188,6 @@ def _check_size(chunk: Chunk, limit: int) -> None:
     """Raise ValueError unless a chunk says truly and plausibly how large it is."""
     if chunk.compression not in ("", "zstd"):
         raise ValueError(f"a chunk is compressed by {chunk.compression!r}; accepted: zstd")
-    if chunk.uncompressed_crc == 0:
-        raise ValueError("a chunk has no checksum")
     size = len(chunk.data)
     if chunk.compression:
         size = zstandard.frame_content_size(chunk.data)

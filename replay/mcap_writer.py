@@ -1,4 +1,4 @@
-"""Writes the events of a session to an MCAP file: complete, checksummed, the same bytes each time."""
+"""Writes a session to an MCAP file: complete, checksummed, the same bytes each time."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from chsel.points import KnownPoints
 from chsel.pose import inverse
 from chsel.problem import ArchiveSnapshot
 from replay.attachments import MEDIA_TYPES, MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
+from replay.encoding import encode
 from replay.events import (
     Event,
     HypothesesFound,
@@ -39,11 +40,14 @@ from replay.foxglove_messages import (
     point_cloud,
     poses_in_world,
 )
-from replay.schemas import FORMAT_VERSION, RECORDS, descriptor_set, encode, message_class
-
-PROFILE = "chsel"
-STEP = 10**9
-"""Nanoseconds of log time from one step to the next."""
+from replay.schemas import (
+    FORMAT_VERSION,
+    PROFILE,
+    RECORDS,
+    STEP_TIME,
+    descriptor_set,
+    message_class,
+)
 
 _BEFORE_ALL_STEPS = -1
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
@@ -113,6 +117,8 @@ class McapRecorder(Recorder):
                 described = descriptor_set(kind)
                 schemas[name] = self._writer.register_schema(name, "protobuf", described)
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", schemas[name])
+        grid = message_class("SdfGrid")  # so that the file describes its attachment too
+        self._writer.register_schema(grid.DESCRIPTOR.full_name, "protobuf", descriptor_set(grid))
 
     def _write(self, event: Event) -> None:
         match event:
@@ -239,9 +245,9 @@ class McapRecorder(Recorder):
 
     def _time(self, step: int) -> int:
         """Log time of the next message."""
-        if step < _BEFORE_ALL_STEPS:
+        if not _BEFORE_ALL_STEPS <= step < 2**31:
             raise RecordingError(f"step is {step}; accepted: an integer from {_BEFORE_ALL_STEPS}")
-        return (step - _BEFORE_ALL_STEPS) * STEP + self._count
+        return (step - _BEFORE_ALL_STEPS) * STEP_TIME + self._count
 
     def _add(self, topic: str, time: int, data: bytes) -> None:
         self._writer.add_message(self._channels[topic], time, data, time, sequence=self._count)
@@ -249,16 +255,23 @@ class McapRecorder(Recorder):
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turn errors of the disk into one RecordingError, after which the file is left alone."""
+        """Turn errors of the disk into one RecordingError; leave the file alone after any break."""
         try:
             yield
         except OSError as error:
-            self._closed = True
-            if hasattr(self, "_file"):
-                with suppress(OSError):
-                    self._file.close()
+            self._abandon()
             reason = error.strerror or str(error)
             raise RecordingError(f"recording {self._path} cannot be written: {reason}") from error
+        except KeyboardInterrupt:
+            self._abandon()  # it may have come within a record
+            raise
+
+    def _abandon(self) -> None:
+        """Close the file as it stands: unfinished, whole up to the last flush."""
+        self._closed = True
+        if hasattr(self, "_file"):
+            with suppress(OSError):
+                self._file.close()
 
 
 def _snapshot_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
@@ -274,8 +287,8 @@ def _same(a: FloatArray, b: FloatArray) -> bool:
 
 def _json(config: Mapping[str, Any]) -> str:
     """The configuration as JSON, in its own order."""
-    _check_plain("config", config)
-    return json.dumps(config, ensure_ascii=False)
+    _check_plain("config", dict(config))
+    return json.dumps(dict(config), ensure_ascii=False)
 
 
 def _check_plain(where: str, value: Any) -> None:

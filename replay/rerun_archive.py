@@ -34,28 +34,27 @@ class ArchiveMap:
         scale = CostScale.of(-archive.objectives)
         scale = scale if self._scale is None else self._scale.including(scale)
         self._scale, self._last = scale, archive
-        costs = lowest_costs(archive)
-        frame = Frame(costs.shape[1], costs.shape[0])
+        costs, frame = lowest_costs(archive), map_frame(archive)
         # The costs lie under the colours, so that the viewer tells them where the mouse points.
         self._log("cost", rr.Image(costs, color_model="L", draw_order=-30.0))
         self._log("colors", rr.Image(heat_map(costs, scale), opacity=1.0, draw_order=-20.0))
         self._log("frame", lines(frame.outline()))
         self._log("axes", texts(_labels(archive, frame, scale, step)))
 
-    def mark(self, hypotheses: Hypotheses) -> None:
+    def mark(self, step: int, hypotheses: Hypotheses) -> None:
         """Mark the cells that the hypotheses come from, each with its cost."""
+        if self._last is None and hypotheses.archive is not None:
+            self.draw(step, hypotheses.archive)
+        if self._last is None:
+            return
         shown = shown_hypotheses(hypotheses)
         shown = shown[hypotheses.cell[shown] >= 0]
-        archive = hypotheses.archive or self._last
-        if archive is None:
-            self._log("axes", texts([(0.0, 0.0, "no archive: the method does not keep one")]))
-            return
-        height, width = lowest_costs(archive).shape
-        columns, rows = _places(archive, hypotheses.cell[shown])
-        x = (columns + 0.5) * width / archive.shape[0]
-        y = height - (rows + 0.5) * height / (_rows(archive))
-        costs = hypotheses.cost[shown]
-        self._mark(np.stack([x, y], axis=1), [f"cost {number(cost)}" for cost in costs.tolist()])
+        frame = map_frame(self._last)
+        columns, rows = _places(self._last, hypotheses.cell[shown])
+        x = frame.x(1.0) * (columns + 0.5) / self._last.shape[0]
+        y = frame.height * (1.0 - (rows + 0.5) / _rows(self._last))
+        costs = hypotheses.cost[shown].tolist()
+        self._mark(np.stack([x, y], axis=1), [f"cost {number(cost)}" for cost in costs])
 
     def _mark(self, places: FloatArray, labels: list[str]) -> None:
         points = rr.Points2D(
@@ -71,20 +70,23 @@ class ArchiveMap:
         self._stream.log(f"{self._root}/{name}", what)
 
 
+def map_frame(archive: ArchiveSnapshot) -> Frame:
+    """Size of the map, in cells: one measure alone makes a strip."""
+    across, up = _stretch(archive)
+    return Frame(archive.shape[0] * across, _rows(archive) * up)
+
+
 def lowest_costs(archive: ArchiveSnapshot) -> np.ndarray:
     """The map (height, width) as float32: the lowest cost over all further measures, NaN if empty.
 
-    The first measure runs to the right, the second upwards. The shorter side is stretched by a
-    whole factor where the map would be a thin strip, as with one measure alone.
+    The first measure runs to the right, the second upwards; the map has the size of `map_frame`.
     """
-    width, height = archive.shape[0], _rows(archive)
-    costs = np.full((height, width), np.inf)
     columns, rows = _places(archive, archive.cells)
-    np.minimum.at(costs, (height - 1 - rows, columns), -archive.objectives)
+    costs = np.full((_rows(archive), archive.shape[0]), np.inf)
+    np.minimum.at(costs, (len(costs) - 1 - rows, columns), -archive.objectives)
     costs[np.isinf(costs)] = np.nan
-    stretched = np.repeat(costs, max(1, width // (_FLATTEST * height)), axis=0)
-    stretched = np.repeat(stretched, max(1, height // (_FLATTEST * width)), axis=1)
-    return stretched.astype(np.float32)
+    across, up = _stretch(archive)
+    return np.repeat(np.repeat(costs, up, axis=0), across, axis=1).astype(np.float32)
 
 
 def heat_map(costs: np.ndarray, scale: CostScale) -> ColorArray:
@@ -97,8 +99,7 @@ def heat_map(costs: np.ndarray, scale: CostScale) -> ColorArray:
     picture = np.zeros((height, right, 4), dtype=np.uint8)
     picture[:, :width, :3] = colors
     picture[:, :width, 3] = 255
-    bar = cost_colors(1.0 - (np.arange(height)[::-1] + 0.5) / height)
-    picture[:, left:, :3] = bar[::-1][:, None]
+    picture[:, left:, :3] = cost_colors((np.arange(height) + 0.5) / height)[:, None]
     picture[:, left:, 3] = 255
     return picture
 
@@ -106,6 +107,12 @@ def heat_map(costs: np.ndarray, scale: CostScale) -> ColorArray:
 def _bar_edges(width: int) -> tuple[int, int]:
     left = width + max(1, round(_BAR[0] * width))
     return left, left + max(1, round((_BAR[1] - _BAR[0]) * width))
+
+
+def _stretch(archive: ArchiveSnapshot) -> tuple[int, int]:
+    """By how much a cell is drawn wider and higher, so that the map is no thin line."""
+    width, height = archive.shape[0], _rows(archive)
+    return max(1, height // (_FLATTEST * width)), max(1, width // (_FLATTEST * height))
 
 
 def _rows(archive: ArchiveSnapshot) -> int:
@@ -129,21 +136,21 @@ def _labels(archive: ArchiveSnapshot, frame: Frame, scale: CostScale, step: int)
         + f": {len(archive.cells)} of {int(np.prod(archive.shape))} cells filled"
     )
     middle = frame.width / 2
-    labels: list[Label] = [(middle, -3.0 * pad, caption)]
+    labels: list[Label] = [(middle, -3.6 * pad, caption)]
     labels += [(frame.x(f), frame.height + 0.3 * pad, text) for f, text in _ticks(archive, 0)]
     labels += [(middle, frame.height + 2.2 * pad, archive.measure_names[0])]
     if len(archive.shape) > 1:
         labels += [(-1.4 * pad, frame.y(f) - 0.6 * pad, text) for f, text in _ticks(archive, 1)]
-        labels += [(0.0, -1.6 * pad, archive.measure_names[1])]
+        labels += [(0.0, -1.9 * pad, archive.measure_names[1])]
     if len(archive.shape) > 2:
         others = ", ".join(archive.measure_names[2:])
-        labels += [(middle, frame.height + 4.0 * pad, f"lowest cost over {others}")]
+        labels += [(middle, frame.height + 3.9 * pad, f"lowest cost over {others}")]
     left, right = _bar_edges(round(frame.width))
     places = [0.0, 0.5, 1.0] if scale.high > scale.low else [0.0]
     for place in places:
         text = number(scale.cost_at(place))
-        labels.append((right + 1.4 * pad, frame.y(1.0 - place) - 0.6 * pad, text))
-    labels.append(((left + right) / 2, -1.6 * pad, "cost"))
+        labels.append((right + 1.8 * pad, frame.y(1.0 - place) - 0.6 * pad, text))
+    labels.append(((left + right) / 2, -1.9 * pad, "cost"))
     return labels
 
 

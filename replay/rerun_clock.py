@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import rerun as rr
 
 PROBE = "probe"
@@ -47,9 +50,12 @@ class Clock:
         self._now = max(self._now, start + iteration)
         self._set()
 
-    def hide_probe(self) -> None:
-        """What is logged next has no place on the timeline of probes, until the clock moves."""
+    @contextmanager
+    def iterations_alone(self) -> Iterator[None]:
+        """What is logged within has no place on the timeline of probes."""
         self._stream.disable_timeline(PROBE)
+        yield
+        self._set()
 
     def _set(self) -> None:
         self._stream.set_time(PROBE, sequence=self._step)

@@ -15,10 +15,12 @@ ColorArray = NDArray[np.uint8]
 BACKGROUND: Rgb = (22, 24, 29)
 EMPTY_CELL: Rgb = (52, 55, 62)
 FRAME: Rgb = (120, 125, 135)
+GRID: Rgb = (40, 43, 50)
 TEXT: Rgb = (205, 210, 218)
 OBJECT: Rgb = (215, 218, 224)
 CONTACT: Rgb = (255, 60, 90)
 FREE: Rgb = (96, 160, 225)
+FREE_FAINT: Rgb = (58, 84, 116)
 OCCUPIED: Rgb = (240, 140, 40)
 KNOWN: Rgb = (225, 120, 220)
 GRIPPER: Rgb = (255, 255, 255)
@@ -30,6 +32,16 @@ CURVES: dict[str, Rgb] = {
     "highest": (120, 130, 200),
 }
 """Colours of the three curves of a set of costs."""
+SERIES: tuple[Rgb, ...] = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 190, 130),
+    (204, 121, 167),
+    (240, 228, 66),
+    (213, 94, 0),
+    (150, 150, 255),
+)
+"""Colours of other curves, in the order in which they come."""
 
 # Viridis, at equal steps from dark to bright; between them, colours are interpolated.
 _VIRIDIS = np.array(
@@ -93,11 +105,6 @@ def cost_colors(fraction: ArrayLike) -> ColorArray:
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
 
-def with_alpha(color: Rgb, alpha: int) -> tuple[int, int, int, int]:
-    """A colour at an opacity of 0 to 255."""
-    return (*color, alpha)
-
-
 def number(value: float) -> str:
-    """A number for a label: three digits that count."""
-    return f"{value:.3g}"
+    """A number for a label: three digits that count, and no exponent where it would be longer."""
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}"

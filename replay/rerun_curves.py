@@ -7,10 +7,10 @@ import rerun as rr
 
 from chsel.problem import Hypotheses
 from replay.events import Traced
-from replay.rerun_colors import CURVES, FRAME, CostScale, number
+from replay.rerun_colors import CURVES, FRAME, SERIES, CostScale, Rgb, number
 from replay.rerun_plane import Frame, Label, lines, texts, ticks
 
-_SEARCH = Frame(1.6, 1.0)
+SEARCH_FRAME = Frame(1.5, 1.0)
 _CURVE_NAMES = ("lowest", "median", "highest")
 
 
@@ -20,6 +20,9 @@ class Curves:
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._named: set[str] = set()
+
+    def set_up(self) -> None:
+        """The curves that every session has."""
         for name, color in CURVES.items():
             self._style(f"cost/{name}", name, color)
             self._style(f"search/{name}", name, color)
@@ -59,11 +62,13 @@ class Curves:
         self._style(entity, name)
         self._stream.log(entity, rr.Scalars(value))
 
-    def _style(self, entity: str, name: str, color: tuple[int, int, int] | None = None) -> None:
+    def _style(self, entity: str, name: str, color: Rgb | None = None) -> None:
+        """Name and colour a curve, once; by default, the next colour of its view."""
         if entity in self._named:
             return
+        siblings = sum(other.rpartition("/")[0] == entity.rpartition("/")[0] for other in self._named)
         self._named.add(entity)
-        colors = None if color is None else [color]
+        colors = [color or SERIES[siblings % len(SERIES)]]
         line = rr.SeriesLines(names=[name], colors=colors, widths=[2.0])
         point = rr.SeriesPoints(names=[name], colors=colors, marker_sizes=[2.5])
         self._stream.log(entity, line, point, static=True)
@@ -99,25 +104,25 @@ class SearchPlot:
         costs = np.array([costs for _, costs in self._points])
         scale = CostScale.of(costs)
         last = max(float(iterations[-1]), 1.0)
-        x = _SEARCH.width * iterations / last
-        y = (1.0 - scale.fraction(costs)) * _SEARCH.height
+        x = SEARCH_FRAME.width * iterations / last
+        y = (1.0 - scale.fraction(costs)) * SEARCH_FRAME.height
         for column, name in enumerate(_CURVE_NAMES):
             curve = lines([np.stack([x, y[:, column]], axis=1)], CURVES[name], width=2.0)
             self._stream.log(f"{self._root}/{name}", curve)
-        starts = [_SEARCH.width * first / last for first, _ in self._stages]
-        walls = [[(start, 0.0), (start, _SEARCH.height)] for start in starts]
-        self._stream.log(f"{self._root}/frame", lines([*_SEARCH.outline(), *walls], FRAME))
+        starts = [SEARCH_FRAME.width * first / last for first, _ in self._stages]
+        walls = [[(start, 0.0), (start, SEARCH_FRAME.height)] for start in starts]
+        self._stream.log(f"{self._root}/frame", lines([*SEARCH_FRAME.outline(), *walls], FRAME))
         labels = self._labels(step, scale, last)
         self._stream.log(f"{self._root}/axes", texts(labels))
 
     def _labels(self, step: int, scale: CostScale, last: float) -> list[Label]:
         labels: list[Label] = [
-            (_SEARCH.x(value / last), 1.02, number(value)) for value in ticks(0.0, last, most=4)
+            (SEARCH_FRAME.x(value / last), 1.05, number(value)) for value in ticks(0.0, last, most=4)
         ]
         for place in (0.0, 0.5, 1.0):
-            labels.append((-0.1, _SEARCH.y(place) - 0.04, number(scale.cost_at(place))))
-        ends = [first for first, _ in self._stages[1:]] + [last]
-        for (first, stage), end in zip(self._stages, ends, strict=True):
-            labels.append((_SEARCH.x((first + end) / 2 / last), -0.1, stage.replace("_", " ")))
-        labels.append((_SEARCH.width / 2, 1.12, f"iteration of the registration after probe {step}"))
+            labels.append((-0.18, SEARCH_FRAME.y(place) - 0.06, number(scale.cost_at(place))))
+        for row, (first, stage) in enumerate(self._stages):  # neighbours may be narrow
+            height = -0.2 - 0.14 * (row % 2)
+            labels.append((SEARCH_FRAME.x(first / last), height, stage.replace("_", " ")))
+        labels.append((SEARCH_FRAME.width / 2, 1.2, f"iteration, probe {step}"))
         return labels

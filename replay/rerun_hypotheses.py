@@ -19,8 +19,11 @@ MOST = 200
 DISPLAY_FACES = 6000
 """Meshes with more faces are coarsened for display."""
 
-_BEST_ALPHA = 235
-_ALPHA = (120, 28)  # of the lowest and the highest step
+_NO_POSES = np.zeros((0, 4, 4))
+_HIDDEN = np.zeros((1, 4, 4))  # without any pose, the viewer draws the mesh once, at the origin
+_NO_COST = np.full(1, np.nan)
+_BEST_ALPHA = 130
+_ALPHA = (70, 18)  # of the lowest and the highest step
 
 
 class HypothesisMeshes:
@@ -31,7 +34,7 @@ class HypothesisMeshes:
         self._root = root
 
     def set_up(self, mesh: trimesh.Trimesh) -> None:
-        """Store the object's mesh once for each colour."""
+        """Store the object's mesh once for each colour, and show none."""
         coarse = coarsened(mesh, DISPLAY_FACES)
         best = (*_rgb(0.0), _BEST_ALPHA)
         self._stream.log(f"{self._root}/best", display_mesh(coarse, best), static=True)
@@ -40,6 +43,8 @@ class HypothesisMeshes:
             alpha = round(_ALPHA[0] + fraction * (_ALPHA[1] - _ALPHA[0]))
             drawn = display_mesh(coarse, (*_rgb((level + 0.5) / LEVELS), alpha))
             self._stream.log(self._level(level), drawn, static=True)
+        for entity in (f"{self._root}/best", *map(self._level, range(LEVELS))):
+            self._poses(entity, _NO_POSES, np.zeros(0))
 
     def draw(self, hypotheses: Hypotheses) -> None:
         """Show the hypotheses that repeat no other, at most MOST; the first is the best."""
@@ -53,16 +58,12 @@ class HypothesisMeshes:
             chosen = levels == level
             self._poses(self._level(level), poses[chosen], cost[chosen])
 
-    def clear(self) -> None:
-        """Show none, until the registration that starts has found some."""
-        self._poses(f"{self._root}/best", np.zeros((0, 4, 4)), np.zeros(0))
-        for level in range(LEVELS):
-            self._poses(self._level(level), np.zeros((0, 4, 4)), np.zeros(0))
-
     def _level(self, level: int) -> str:
         return f"{self._root}/cost_step_{level + 1}"
 
     def _poses(self, entity: str, world_from_object: FloatArray, cost: FloatArray) -> None:
+        if len(world_from_object) == 0:
+            world_from_object, cost = _HIDDEN, _NO_COST
         poses = rr.InstancePoses3D(
             translations=world_from_object[:, :3, 3].astype(np.float32),
             mat3x3=world_from_object[:, :3, :3].astype(np.float32),

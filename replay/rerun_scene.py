@@ -9,7 +9,18 @@ import trimesh
 from chsel.arrays import FloatArray
 from chsel.points import KnownPoints, Workspace
 from replay.events import Probe
-from replay.rerun_colors import CONTACT, FREE, GRIPPER, KNOWN, OBJECT, OCCUPIED, PAST, Rgb
+from replay.rerun_colors import (
+    CONTACT,
+    FRAME,
+    FREE,
+    FREE_FAINT,
+    GRIPPER,
+    KNOWN,
+    OBJECT,
+    OCCUPIED,
+    PAST,
+    Rgb,
+)
 
 NORMAL_LENGTH = 0.04  # m
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
@@ -29,7 +40,7 @@ class Scene:
         """What does not change: the workspace, and the object at its true pose where known."""
         self._log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         lower, upper = workspace.bounds
-        box = rr.Boxes3D(mins=[lower], sizes=[upper - lower], colors=[PAST], radii=[_ui(0.6)])
+        box = rr.Boxes3D(mins=[lower], sizes=[upper - lower], colors=[FRAME], radii=[_ui(0.6)], fill_mode="MajorWireframe")
         self._log("workspace", box, static=True)
         if world_from_object is None:
             return
@@ -41,12 +52,12 @@ class Scene:
     def add_points(self, points: KnownPoints, *, new: bool) -> None:
         """Points that become known; `new` ones are also shown stronger until the next probe."""
         exact = points.sdf == 0.0
-        self._points("free", points.free, FREE, size=1.1, alpha=70)
+        self._points("free", points.free, FREE_FAINT, size=0.9)
         self._points("occupied", points.occupied, OCCUPIED, size=2.5)
         self._points("known", points.known[~exact], KNOWN, size=3.0)
         self._points("contacts", points.known[exact], CONTACT, size=4.0)
         if new:
-            self._points("free/new", points.free, FREE, size=1.8, alpha=190)
+            self._points("free/new", points.free, FREE, size=1.4)
 
     def add_probe(self, probe: Probe) -> None:
         """The gripper's path, what it met, and what became known."""
@@ -69,11 +80,9 @@ class Scene:
         )
         self._log("contacts/normals", arrows)
 
-    def _points(
-        self, name: str, points: FloatArray, color: Rgb, *, size: float, alpha: int = 255
-    ) -> None:
+    def _points(self, name: str, points: FloatArray, color: Rgb, *, size: float) -> None:
         positions = np.ascontiguousarray(points, dtype=np.float32)
-        self._log(name, rr.Points3D(positions, colors=[(*color, alpha)], radii=_ui(size)))
+        self._log(name, rr.Points3D(positions, colors=[color], radii=_ui(size)))
 
     def _log(self, name: str, what: rr.AsComponents, *more: rr.AsComponents, static: bool = False) -> None:
         self._stream.log(f"{self._root}/{name}" if name else self._root, what, *more, static=static)
@@ -96,4 +105,4 @@ def _path(path: np.ndarray, color: Rgb, width: float) -> rr.LineStrips3D:
 
 def _ui(size: float) -> float:
     """A radius in points of the screen."""
-    return float(rr.Radius.ui_points(size)[0])
+    return float(rr.Radius.ui_points(size))

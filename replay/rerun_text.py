@@ -10,20 +10,20 @@ from replay.events import SessionStarted
 
 def session_markdown(started: SessionStarted) -> str:
     """A table that says what was run, then the whole configuration, then where it ran."""
+    preset = _find(started.config, "preset")
     rows = {
         "object": started.object,
         "session": started.session,
-        "method": started.method,
-        "preset": _find(started.config, "preset") or "-",
+        "method": f"{started.method}, preset {preset}" if preset else started.method,
         "seed": started.seed,
-        "runner": started.runner,
         "true pose": "known" if started.world_from_object is not None else "unknown",
     }
-    table = ["| | |", "|---|---|", *(f"| {name} | **{text}** |" for name, text in rows.items())]
+    lines = [f"| {name} | **{text}** |" for name, text in rows.items()]
+    table = [lines[0], "|---|---|", *lines[1:]]
     parts = ["\n".join(table)]
     for title, mapping in (("Configuration", started.config), ("Environment", started.environment)):
         if mapping:
-            parts.append(f"### {title}\n```\n" + "\n".join(_indented(mapping)) + "\n```")
+            parts.append(f"**{title}**\n```\n" + "\n".join(_indented(mapping)) + "\n```")
     return "\n\n".join(parts) + "\n"
 
 

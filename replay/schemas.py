@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,12 +10,16 @@ from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from google.protobuf.message import DecodeError, Message
-
-from chsel.errors import RecordingError
+from google.protobuf.message import Message
 
 FORMAT_VERSION = 1
 """Of the recording. A reader refuses all others, so any change of meaning needs a new number."""
+
+PROFILE = "chsel"
+"""How the file's header names this use of MCAP."""
+
+STEP_TIME = 10**9
+"""Nanoseconds of log time from one step to the next; step k begins at k + 1 times this."""
 
 # A field is a protobuf scalar, a message of this table, or an array with its type and shape. In a
 # shape, a letter is a length that is the same wherever it stands in the message. "?" after a field
@@ -130,13 +133,12 @@ RECORDS: Mapping[str, str] = {
 }
 """Topics that carry messages of the table."""
 
-_PACKAGE = "chsel"
+PACKAGE = "chsel"
 _ARRAY_KIND = re.compile(r"([fib]\d)\[(.*)\]")
-_LONGEST = 2**40  # of an array's side; what is beyond overflows numpy before it can be checked
 
 
 @dataclass(frozen=True)
-class _Kind:
+class Kind:
     """One field of the table, taken apart; `dtype` is None for all but arrays."""
 
     type: str
@@ -152,7 +154,7 @@ class _Kind:
 
 def message_class(name: str) -> type[Message]:
     """The protobuf class of a message of the table."""
-    return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{_PACKAGE}.{name}"))
+    return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{PACKAGE}.{name}"))
 
 
 def descriptor_set(message: type[Message]) -> bytes:
@@ -171,124 +173,14 @@ def descriptor_set(message: type[Message]) -> bytes:
     return collected.SerializeToString(deterministic=True)
 
 
-def encode(name: str, values: Mapping[str, Any]) -> bytes:
-    """The bytes of a message, from a value for each of its fields.
-
-    Raises RecordingError if a value does not have the type or shape that the table gives.
-    """
-    message = message_class(name)()
-    _fill(message, name, values)
-    return message.SerializeToString(deterministic=True)
-
-
-def decode(name: str, data: bytes) -> dict[str, Any]:
-    """The values of a message's fields; arrays are read-only, absent fields are None.
-
-    Raises RecordingError if the bytes are no such message or an array is not as the table says.
-    """
-    message = message_class(name)()
-    try:
-        message.ParseFromString(data)
-    except DecodeError:
-        raise RecordingError(f"a message is no valid {_PACKAGE}.{name}") from None
-    return _values(message, name)
-
-
-def _fill(message: Any, name: str, values: Mapping[str, Any]) -> None:
-    lengths: dict[str, int] = {}
-    for field, kind in _kinds(name).items():
-        value = values[field]
-        if value is None and kind.optional:
-            continue
-        try:
-            _set(message, field, kind, value, lengths)
-        except (TypeError, ValueError) as error:
-            raise RecordingError(f"{name}.{field} cannot be recorded: {error}") from None
-
-
-def _set(message: Any, field: str, kind: _Kind, value: Any, lengths: dict[str, int]) -> None:
-    if kind.dtype is not None:
-        value = np.asarray(value)
-        _check_array(kind, value.dtype, value.shape, lengths)
-        target = getattr(message, field)
-        target.dtype = kind.dtype.str
-        target.shape.extend(value.shape)
-        target.data = value.astype(kind.dtype, copy=False).tobytes()
-    elif kind.is_message and kind.repeated:
-        for item in value:
-            _fill(getattr(message, field).add(), kind.type, item)
-    elif kind.is_message:
-        getattr(message, field).SetInParent()
-        _fill(getattr(message, field), kind.type, value)
-    elif kind.repeated:
-        getattr(message, field).extend(value)
-    else:
-        setattr(message, field, value)
-
-
-def _values(message: Any, name: str) -> dict[str, Any]:
-    lengths: dict[str, int] = {}
-    return {
-        field: _get(message, f"{name}.{field}", field, kind, lengths)
-        for field, kind in _kinds(name).items()
-    }
-
-
-def _get(message: Any, where: str, field: str, kind: _Kind, lengths: dict[str, int]) -> Any:
-    if kind.repeated:
-        items = getattr(message, field)
-        return tuple(_values(item, kind.type) for item in items) if kind.is_message else tuple(items)
-    if not kind.is_message:
-        return getattr(message, field)
-    if not message.HasField(field):
-        if kind.optional:
-            return None
-        raise RecordingError(f"{where} is missing")
-    value = getattr(message, field)
-    return _values(value, kind.type) if kind.dtype is None else _array(where, kind, value, lengths)
-
-
-def _array(where: str, kind: _Kind, message: Any, lengths: dict[str, int]) -> np.ndarray:
-    """The array in an Array message, in the machine's byte order; read-only."""
-    dtype, shape, data = kind.dtype, tuple(message.shape), message.data
-    assert dtype is not None
-    if message.dtype != dtype.str:
-        raise RecordingError(f"{where} is of type {message.dtype!r}; accepted: {dtype.str!r}")
-    try:
-        _check_array(kind, dtype, shape, lengths)
-    except ValueError as error:
-        raise RecordingError(f"{where}: {error}") from None
-    if max(shape) > _LONGEST or len(data) != math.prod(shape) * dtype.itemsize:
-        raise RecordingError(f"{where} has {len(data)} bytes, which do not fill its shape {shape}")
-    if dtype.kind == "b" and data.strip(b"\0\1"):
-        raise RecordingError(f"{where} holds bytes other than 0 and 1")
-    array = np.frombuffer(data, dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
-    array.setflags(write=False)
-    return array
-
-
-def _check_array(
-    kind: _Kind, dtype: np.dtype[Any], shape: tuple[int, ...], lengths: dict[str, int]
-) -> None:
-    """Raise ValueError unless type and shape are right; keeps the lengths of letters."""
-    assert kind.dtype is not None
-    fits = dtype.newbyteorder("<") == kind.dtype and len(shape) == len(kind.shape)
-    for wanted, length in zip(kind.shape, shape, strict=False):
-        known = int(wanted) if wanted.isdigit() else lengths.setdefault(wanted, length)
-        fits = fits and known == length
-    if not fits:
-        wanted = ", ".join(str(lengths.get(letter, letter)) for letter in kind.shape)
-        raise ValueError(f"it is {dtype} {shape}; accepted: {kind.dtype} ({wanted})")
-
-
 @cache
-def _kinds(name: str) -> dict[str, _Kind]:
+def field_kinds(name: str) -> dict[str, Kind]:
     """The fields of a message, taken apart."""
     kinds = {}
     for field, text in MESSAGES[name].items():
         bare = text.rstrip("?*")
         array = _ARRAY_KIND.fullmatch(bare)
-        kinds[field] = _Kind(
+        kinds[field] = Kind(
             type="Array" if array else bare,
             repeated=text.endswith("*"),
             optional=text.endswith("?"),
@@ -310,13 +202,13 @@ def _pool() -> descriptor_pool.DescriptorPool:
 def _file(name: str) -> descriptor_pb2.FileDescriptorProto:
     """The .proto file of one message."""
     file = descriptor_pb2.FileDescriptorProto(
-        name=_path(name), package=_PACKAGE, syntax="proto3", message_type=[{"name": name}]
+        name=_path(name), package=PACKAGE, syntax="proto3", message_type=[{"name": name}]
     )
-    for number, (field, kind) in enumerate(_kinds(name).items(), start=1):
+    for number, (field, kind) in enumerate(field_kinds(name).items(), start=1):
         proto = file.message_type[0].field.add(name=field, number=number)
         proto.label = proto.LABEL_REPEATED if kind.repeated else proto.LABEL_OPTIONAL
         if kind.is_message:
-            proto.type, proto.type_name = proto.TYPE_MESSAGE, f".{_PACKAGE}.{kind.type}"
+            proto.type, proto.type_name = proto.TYPE_MESSAGE, f".{PACKAGE}.{kind.type}"
             if _path(kind.type) not in file.dependency:
                 file.dependency.append(_path(kind.type))
         else:
@@ -325,4 +217,4 @@ def _file(name: str) -> descriptor_pb2.FileDescriptorProto:
 
 
 def _path(name: str) -> str:
-    return f"{_PACKAGE}/{name}.proto"
+    return f"{PACKAGE}/{name}.proto"

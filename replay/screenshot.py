@@ -3,52 +3,107 @@
 from __future__ import annotations
 
 import argparse
-import os
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
+from typing import IO
 
-import rerun_cli
 from rerun.experimental import ViewerClient
 
 from chsel.errors import RecordingError
+from replay.rerun_clock import PROBE
+from replay.rerun_live import HOST, is_listening, viewer_program
 
 START_SECONDS = 60.0
-ATTEMPTS = 5
+SETTLE_SECONDS = 8.0  # until the layout stands and the notice of the start is gone
 
 
 def save_screenshot(
     rrd: Path, png: Path, *, step: int | None = None, width: int = 1600, height: int = 900
 ) -> None:
-    """Save a picture of `rrd` at probe `step` (None: the last) as `png`, width x height points.
+    """Save what the viewer shows of `rrd` at probe `step` (None: the last), in points of a screen.
 
-    Needs Vulkan: a graphics card, or the software one (Debian: mesa-vulkan-drivers). Raises
-    RecordingError if the file is missing or no picture could be taken, with the viewer's reason.
+    Needs Vulkan: a graphics card's, or the software one (Debian: mesa-vulkan-drivers). Raises
+    RecordingError if the file does not exist or no picture could be taken, with the reason.
     """
     if not rrd.is_file():
         raise RecordingError(f"recording {rrd} does not exist; accepted: a .rrd file")
     port = _free_port()
-    viewer = _start(rrd.resolve(), port, f"{width}x{height}")
-    try:
-        client = _connect(viewer, port)
-        picture = _picture(client, viewer, step)
-    finally:
-        viewer.kill()
-        viewer.wait()
+    options = ["--headless", "--hide-welcome-screen", "--bind", HOST, "--port", str(port)]
+    command = [str(viewer_program()), *options, "--window-size", f"{width}x{height}"]
+    with tempfile.TemporaryFile("w+") as output:
+        viewer = subprocess.Popen(
+            [*command, str(rrd.resolve())], stdin=subprocess.DEVNULL, stdout=output, stderr=output
+        )
+        try:
+            picture = _picture(viewer, port, step, output)
+        finally:
+            viewer.kill()
+            viewer.wait()
     png.parent.mkdir(parents=True, exist_ok=True)
     png.write_bytes(picture)
 
 
-def _start(rrd: Path, port: int, size: str) -> subprocess.Popen[str]:
-    """The viewer's own program, not its wrapper, so that ending it ends all of it."""
-    program = Path(os.path.dirname(rerun_cli.__file__)) / "rerun"
-    options = ["--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", str(port)]
-    return subprocess.Popen(
-        [str(program), *options, "--window-size", size, str(rrd)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def _picture(viewer: subprocess.Popen[bytes], port: int, step: int | None, output: IO[str]) -> bytes:
+    """The picture as PNG; asks again until the viewer is ready or its time is over."""
+    deadline = time.monotonic() + START_SECONDS
+    reason = "it does not answer"
+    while time.monotonic() < deadline and viewer.poll() is None:
+        time.sleep(0.5)
+        if not is_listening(port):
+            continue
+        try:
+            client = ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy")
+            state = client.get_state()
+            if state.loading or not any(shown.timelines for shown in state.recordings):
+                continue
+            if step is not None:
+                client.set_time(PROBE, sequence=step, play_state="paused")
+            client.take_screenshot()
+            time.sleep(SETTLE_SECONDS)
+            return client.take_screenshot()
+        except (RuntimeError, ConnectionError, ValueError) as error:
+            reason = str(error)
+    if viewer.poll() is not None:
+        output.seek(0)
+        reason = _reason(output.read())
+    raise RecordingError(f"the Rerun viewer gave no picture: {reason}")
+
+
+def _reason(text: str) -> str:
+    """Why the viewer ended, from what it printed."""
+    if "adapter" in text:
+        return "it found no Vulkan driver; accepted: a graphics card's, or mesa-vulkan-drivers"
+    return f"it ended: {' '.join(text.split())[-300:]}"
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def main() -> int:
+    """`python -m replay.screenshot FILE.rrd OUT.png`."""
+    parser = argparse.ArgumentParser(prog="replay.screenshot", description=__doc__)
+    parser.add_argument("rrd", type=Path)
+    parser.add_argument("png", type=Path)
+    parser.add_argument("--step", type=int, help="probe to show; by default the last")
+    parser.add_argument("--size", default="1600x900", metavar="WIDTHxHEIGHT")
+    given = parser.parse_args()
+    try:
+        width, height = (int(side) for side in given.size.split("x"))
+        save_screenshot(given.rrd, given.png, step=given.step, width=width, height=height)
+    except ValueError:
+        parser.error(f"--size is {given.size}; accepted: WIDTHxHEIGHT, as 1600x900")
+    except RecordingError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -101,11 +101,11 @@ def _unknown_key(key: str, config_name: str) -> str:
         node: Any = hydra.compose(config_name, groups)
     parts = key.split("@")[0].split(".")
     for depth, part in enumerate(parts):
-        if not isinstance(node, Mapping | DictConfig) or part not in node:
+        if not isinstance(node, DictConfig) or part not in node:
             where = ".".join(parts[:depth]) or config_name
-            names = [str(name) for name in node] if isinstance(node, Mapping | DictConfig) else []
+            names = [str(name) for name in node] if isinstance(node, DictConfig) else []
             return _not_accepted(where, f"has no key {part!r}", part, names)
-        node = node._get_node(part) if node._is_missing(part) else node[part]
+        node = OmegaConf.select(node, part)
     return f"{key} is not a key"
 
 
@@ -116,13 +116,17 @@ def _not_accepted(where: str, what: str, value: str, accepted: list[str]) -> str
 
 
 def _groups() -> list[str]:
-    return sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and choices(folder.name))
+    return sorted(
+        folder.name for folder in CONF.iterdir() if folder.is_dir() and choices(folder.name)
+    )
 
 
 def _register_resolvers() -> None:
     """Resolvers that the files in conf/ use."""
     OmegaConf.register_new_resolver(
-        "options", lambda: "\n".join(f"  {g}={'|'.join(choices(g))}" for g in _groups()), replace=True
+        "options",
+        lambda: "\n".join(f"  {g}={'|'.join(choices(g))}" for g in _groups()),
+        replace=True,
     )
     OmegaConf.register_new_resolver("slug", lambda name: name.replace("/", "-"), replace=True)
     OmegaConf.register_new_resolver(

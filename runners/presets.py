@@ -18,4 +18,5 @@ def store_presets() -> None:
             settings = settings_mapping(preset_settings(method, preset))
             store.store(group=f"method/presets/{method}", name=preset, node=settings)
         probing = settings_mapping(PROBING_PRESETS[preset])
+        probing["configuration"] = "${configuration}"  # a key of the top file, for short commands
         store.store(group="session/presets/probing", name=preset, node=probing)

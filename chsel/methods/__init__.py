@@ -62,5 +62,5 @@ def build_method(name: str, settings: Any = None) -> Method:
     if settings is None:
         settings = default
     elif isinstance(settings, Mapping):
-        settings = build_settings(type(default), settings, f"method {name}")
+        settings = build_settings(type(default), settings, "method")
     return make(settings)

@@ -1,0 +1,43 @@
+"""Where known points come from: one file a session, found by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from chsel.errors import require_choice
+from chsel.settings import build_settings
+from runners.objects.loader import ObjectModel
+from runners.sessions.points import PointsSession, PointsSettings
+from runners.sessions.probing import ProbingSettings
+from runners.sessions.recorded import RecordedSession, RecordedSettings
+from runners.sessions.session import Session
+
+SESSIONS: dict[str, type[Any]] = {
+    "simulated": ProbingSettings,
+    "kinematic": ProbingSettings,
+    "points": PointsSettings,
+    "recorded": RecordedSettings,
+}
+
+
+def session_settings(kind: str, config: Mapping[str, Any]) -> Any:
+    """The settings of a session of this kind."""
+    require_choice("session.kind", kind, SESSIONS)
+    return build_settings(SESSIONS[kind], config, "session")
+
+
+def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int) -> Session:
+    """Open a session with settings from `session_settings`."""
+    if kind == "points":
+        return PointsSession(settings, object_model)
+    if kind == "recorded":
+        return RecordedSession(settings)
+    configuration = settings.configuration or object_model.configuration
+    if kind == "kinematic":
+        from runners.sessions.kinematic import open_kinematic
+
+        return open_kinematic(object_model.mesh, configuration, settings, seed)
+    from runners.sessions.simulated import open_simulated  # imports the physics engine
+
+    return open_simulated(object_model.mesh, configuration, settings, seed)

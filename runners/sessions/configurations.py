@@ -47,7 +47,7 @@ _ALL = (
     Configuration(
         name="drill",
         object="drill",
-        position=(0.25, 0.0, 0.2),
+        position=(0.27, 0.0, 0.2),
         rotation=(0.0, 0.0, 0.0),
         y=_DRILL_Y,
         z=(0.05, 0.15, 0.25, 0.325, 0.4, 0.5),
@@ -55,7 +55,7 @@ _ALL = (
     Configuration(
         name="drill_opposite",
         object="drill",
-        position=(0.42, 0.0, 0.2),
+        position=(0.33, 0.0, 0.2),
         rotation=(0.0, 0.0, pi),
         y=_DRILL_Y,
         z=(0.05, 0.15, 0.25, 0.4, 0.51),
@@ -111,8 +111,8 @@ _ALL = (
     Configuration(
         name="hammer",
         object="hammer",
-        position=(0.25, -0.18, 0.42),
-        rotation=(-pi / 2.0, pi, pi / 2.0),
+        position=(0.25, 0.1, 0.2),
+        rotation=(0.0, 0.0, 0.0),
         y=(0.0, -0.2, 0.2, 0.4),
         z=(0.05, 0.15, 0.25, 0.4),
         workspace=HAMMER_WORKSPACE,
@@ -177,7 +177,7 @@ _ALL = (
     Configuration(
         name="clamp_sideways",
         object="clamp",
-        position=(0.27, 0.0, 0.2),
+        position=(0.32, 0.0, 0.2),
         rotation=(pi / 2.0, 0.0, 2.0),
         y=(0.0, 0.22, -0.23),
         z=(0.05, 0.18, 0.26, 0.32),

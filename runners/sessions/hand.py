@@ -58,11 +58,11 @@ def surface_points(spacing: float) -> FloatArray:
     """Points (S, 3) that cover the surface about `spacing` apart, all corners among them."""
     points = []
     for solid, other in zip(solids(), reversed(solids()), strict=True):
-        fine, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, spacing / 2.0)
+        fine, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, spacing)
         _, kept = np.unique(np.rint(fine / spacing), axis=0, return_index=True)
         covering = np.concatenate([solid.vertices, fine[kept]])
         points.append(covering[_depth(other, covering) < 0.0])
-    return np.unique(np.concatenate(points), axis=0)
+    return np.concatenate(points)
 
 
 @cache
@@ -92,5 +92,7 @@ def _ring(z: float, half_x: float, half_y: float) -> FloatArray:
 
 def _depth(solid: trimesh.Trimesh, points: FloatArray) -> FloatArray:
     """Distance (N,) from points (N, 3) to the surface of a convex solid, negative outside."""
-    offsets = np.einsum("fi,fi->f", solid.face_normals, solid.triangles[:, 0])
-    return (offsets - points @ solid.face_normals.T).min(axis=1)
+    depth = np.full(len(points), np.inf)
+    for normal, corner in zip(solid.face_normals, solid.triangles[:, 0], strict=True):
+        np.minimum(depth, (corner - points) @ normal, out=depth)
+    return depth

@@ -1,4 +1,4 @@
-"""How an object gets to the floor: let go as a configuration says, and rolled to rest."""
+"""How an object comes to lie on the floor: turned as a configuration says, and rolled to rest."""
 
 from __future__ import annotations
 
@@ -11,25 +11,30 @@ from chsel.errors import SessionError
 from chsel.pose import apply, axis_angle, compose
 from runners.sessions.configurations import MESH_YAW, Configuration
 
-CLEARANCE = 0.01  # m: at least so high above the floor an object is let go
 _FLAT = 1e-6  # m: vertices lower than this touch the floor
 _MOST_ROLLS = 1000
 
 
-def spawn_pose(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
-    """The pose world_from_object (4, 4) at which the object is let go, its lowest point in the air.
+def laid_down(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
+    """The pose world_from_object (4, 4) in which a configuration's object lies on the floor.
 
-    The configuration places the centre of mass, and turns the object's own axes.
+    The object is turned as the configuration says, sinks and rolls to rest, and is slid back until
+    its centre of mass has the configuration's x and y.
     """
+    resting = roll_to_rest(mesh, spawn_pose(mesh, configuration))
+    slide = np.array(configuration.position) - apply(resting, centre_of_mass(mesh)[None])[0]
+    resting[:2, 3] += slide[:2]
+    return resting
+
+
+def spawn_pose(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
+    """The pose world_from_object (4, 4) that a configuration gives its object, floor or not."""
     roll, pitch, yaw = (
         axis_angle(np.eye(3)[axis], angle) for axis, angle in enumerate(configuration.rotation)
     )
     own_yaw = axis_angle(np.eye(3)[2], MESH_YAW.get(configuration.object, 0.0))
     rotation = yaw @ pitch @ roll @ own_yaw
-    position = np.array(configuration.position)
-    turned = compose(rotation, position - rotation @ centre_of_mass(mesh))
-    turned[2, 3] += max(0.0, CLEARANCE - lowest(mesh, turned))
-    return turned
+    return compose(rotation, np.array(configuration.position) - rotation @ centre_of_mass(mesh))
 
 
 def centre_of_mass(mesh: trimesh.Trimesh) -> FloatArray:

@@ -25,8 +25,8 @@ COLLISION_MESHES = ("visual", "vhacd")
 WORKSPACES = ("reference", "paper")
 
 MINI_STEPS = 15  # of a control step
-START = (0.0, 0.0, 0.2)  # m: where the gripper is before the first probe
-X_REST = -0.05  # m: where it moves sideways, before the object
+X_REST = -0.05  # m: where the gripper moves sideways, before the object
+START = (X_REST, 0.0, 0.2)  # m: where it is before the first probe
 GAIN = 30.0  # command per metre of error
 TOLERANCE = 3e-4  # m: what counts as arrived
 MOST_STEPS = 60  # control steps after which a move that something blocks is given up

@@ -1,0 +1,129 @@
+"""One call from points to hypotheses, for programs that need no session and no files."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from chsel.arrays import frozen
+from chsel.errors import MeshError, PointsError
+from chsel.mesh import clean_mesh
+from chsel.methods import build_method, preset_settings
+from chsel.observer import Observer
+from chsel.online import pose_problem
+from chsel.points import KnownPoints, Workspace
+from chsel.problem import Hypotheses
+from chsel.sdf import SdfGrid
+from chsel.settings import settings_mapping
+from chsel.streams import StreamKey
+
+_VOXELS_PER_EXTENT = 20
+
+
+def register(
+    target: trimesh.Trimesh | SdfGrid,
+    *,
+    surface: Any = None,
+    free: Any = None,
+    occupied: Any = None,
+    known: Any = None,
+    known_sdf: Any = None,
+    method: str = "chsel",
+    preset: str = "default",
+    settings: Any = None,
+    hypotheses: int | None = None,
+    workspace: Workspace | None = None,
+    initial_set: Any = None,
+    previous: Hypotheses | None = None,
+    resolution: float | None = None,
+    free_resolution: float = 0.01,
+    seed: int = 0,
+    step: int = 0,
+    observer: Observer | None = None,
+) -> Hypotheses:
+    """Plausible poses of an object from what is known of points in the world.
+
+    target: the object's mesh in metres, or its signed distance grid. surface (M, 3), free (N, 3),
+    occupied (K, 3): points on, outside and inside of the object. known (L, 3), known_sdf (L,):
+    points of known signed distance, metres. Numpy arrays, torch tensors or lists.
+    method, preset: see chsel.methods. settings: a mapping of single settings over the preset's,
+    such as {"emitter": {"iterations": 500}}, or a whole settings object.
+    hypotheses: B, 30 by default. workspace: where the object can be; by default the bounds of the
+    points padded by the object's diameter. initial_set (B, 4, 4): E_0 as object_from_world.
+    previous: the last result, when points were added since (CHSEL, Alg. 2). resolution: of the
+    SDF grid of a mesh, metres; by default a twentieth of the object's smallest extent, at most
+    1 cm. free_resolution: voxel side of free space, metres; used by free_term interior.
+    seed, step: of the random streams.
+
+    Returns hypotheses with costs, best first, repeated poses flagged.
+    Raises ChselError, with what is accepted, for malformed input; at least one point is needed.
+    """
+    points = _known_points(surface, free, occupied, known, known_sdf)
+    solver = build_method(method, _settings(method, preset, settings, hypotheses))
+    sdf = _grid(target, resolution)
+    workspace = workspace or Workspace.around(points.all_points(), sdf.diameter)
+    key = StreamKey(seed, step)
+    problem = pose_problem(sdf, points, workspace, free_resolution, key, solver.online, previous)
+    if initial_set is not None:
+        problem = replace(problem, initial_set=initial_set)
+    return solver.register(problem, observer)
+
+
+def _known_points(surface: Any, free: Any, occupied: Any, known: Any, sdf: Any) -> KnownPoints:
+    """All classes together; None stands for no points."""
+    surface, free, occupied, known = (
+        frozen(name, np.zeros((0, 3)) if value is None else value, (None, 3))
+        for name, value in zip(
+            ("surface", "free", "occupied", "known"), (surface, free, occupied, known), strict=True
+        )
+    )
+    sdf = frozen("known_sdf", np.zeros(0) if sdf is None else sdf, (None,))
+    if len(known) != len(sdf):
+        raise PointsError(
+            f"known has {len(known)} points and known_sdf {len(sdf)}; accepted: equal"
+        )
+    points = KnownPoints(
+        free,
+        occupied,
+        known=np.concatenate([surface, known]),
+        known_sdf=np.concatenate([np.zeros(len(surface)), sdf]),
+    )
+    if points.count == 0:
+        raise PointsError("no point was given; accepted: surface, free, occupied or known points")
+    return points
+
+
+def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGrid:
+    if isinstance(target, SdfGrid):
+        return target
+    if not isinstance(target, trimesh.Trimesh):
+        raise MeshError(f"target is a {type(target).__name__}; accepted: Trimesh or SdfGrid")
+    mesh = clean_mesh(target.vertices, target.faces, name="target")
+    if resolution is None:
+        resolution = min(0.01, float(np.min(mesh.extents)) / _VOXELS_PER_EXTENT)
+    return SdfGrid.from_mesh(mesh, resolution)
+
+
+def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> dict[str, Any]:
+    """The preset's settings with changes laid over them, as a mapping."""
+    settings = settings_mapping(preset_settings(method, preset))
+    if dataclasses.is_dataclass(changes):
+        settings = settings_mapping(changes)
+    elif changes is not None:
+        settings = _merged(settings, changes)
+    if hypotheses is not None:
+        settings = _merged(settings, {"online": {"hypotheses": hypotheses}})
+    return settings
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for name, value in changes.items():
+        both = isinstance(value, Mapping) and isinstance(base.get(name), Mapping)
+        merged[name] = _merged(base[name], value) if both else value
+    return merged

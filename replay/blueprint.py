@@ -1,0 +1,168 @@
+"""How the viewer lays a Rerun recording out, so that it needs no click."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint import encodings
+
+from chsel.points import Workspace
+from replay.rerun_clock import ITERATION, PROBE
+from replay.rerun_colors import BACKGROUND, GRID
+from replay.rerun_curves import SEARCH_FRAME
+from replay.rerun_legend import LEGEND_FRAME
+from replay.rerun_plane import Frame
+from replay.rerun_scene import CUMULATIVE
+
+USUAL_ARCHIVE = Frame(40, 40)
+"""Cells of the map that is made room for until the first snapshot is there."""
+_EYE_DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the workspace's middle; probes move along +x
+_EYE_DISTANCE = 1.06  # in diagonals of the workspace
+_LOOK_DOWN = 0.04  # in heights of the workspace, whose near corner would be cut off
+_GRID_SPACING = 0.1  # m
+
+
+def session_blueprint(
+    workspace: Workspace, *, pose_known: bool, archive: Frame | None = USUAL_ARCHIVE
+) -> rrb.Blueprint:
+    """Scene, archive and text above, curves below; opens at the last probe.
+
+    archive: size of the heat map in cells; None for a method without an archive.
+    """
+    scene = rrb.Vertical(scene_view(workspace), legend_view(), row_shares=[9, 1])
+    upper: list[rrb.View | rrb.Container] = [scene, _text_views()]
+    shares = [9.0, 4.0]
+    if archive is not None:
+        upper.insert(1, archive_view(archive))
+        shares = [9.0, 7.0, 4.0]
+    above = rrb.Horizontal(*upper, column_shares=shares)
+    below = rrb.Horizontal(*_curve_views(pose_known=pose_known))
+    return rrb.Blueprint(
+        rrb.Vertical(above, below, row_shares=[65, 35]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=PROBE, play_state="following"),
+    )
+
+
+def scene_view(
+    workspace: Workspace, root: str = "scene", name: str = "Scene"
+) -> rrb.Spatial3DView:
+    """The scene under the entity `root`, looked at obliquely from where the probes come from."""
+    lower, upper = workspace.bounds
+    centre = (lower + upper) / 2
+    away = _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION) * np.linalg.norm(upper - lower)
+    return rrb.Spatial3DView(
+        origin=f"/{root}",
+        name=name,
+        background=rrb.Background(color=BACKGROUND, kind="SolidColor"),
+        line_grid=rrb.LineGrid3D(
+            visible=True,
+            spacing=_GRID_SPACING,
+            plane=rr.components.Plane3D((0.0, 0.0, 1.0), float(lower[2])),
+            stroke_width=1.0,
+            color=GRID,
+        ),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=centre + _EYE_DISTANCE * away,
+            look_target=centre - (0.0, 0.0, _LOOK_DOWN * (upper[2] - lower[2])),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+        overrides={f"/{root}/{path}": _up_to_now() for path in CUMULATIVE},
+    )
+
+
+def archive_view(
+    frame: Frame, root: str = "archive", name: str = "Archive: lowest cost by cell; dots: hypotheses"
+) -> rrb.Spatial2DView:
+    """The heat map under the entity `root`; the mouse finds its costs, not its colours."""
+    overrides = {f"/{root}/colors": rrb.EntityBehavior(interactive=False)}
+    return _plane(root, name, frame, (0.2, 0.28, 0.2, 0.24), overrides)
+
+
+def legend_view(root: str = "legend") -> rrb.Spatial2DView:
+    """What the colours of the scene mean."""
+    return _plane(root, "Legend", LEGEND_FRAME, (0.0, 0.0, 0.0, 0.0), titlebar=False)
+
+
+def _curve_views(*, pose_known: bool) -> list[rrb.View | rrb.Container]:
+    views: list[rrb.View | rrb.Container] = [
+        rrb.Tabs(
+            _curves("cost", "Cost by probe"),
+            _curves("search", "by iteration"),
+        ),
+        _plane("search_plot", "Cost of the search", SEARCH_FRAME, (0.22, 0.1, 0.28, 0.24)),
+    ]
+    if pose_known:
+        errors = [("position", "Position error [m]"), ("rotation", "Rotation error [rad]")]
+        views.append(rrb.Vertical(*(_curves(f"error/{kind}", name) for kind, name in errors)))
+    views.append(_curves("seconds", "Seconds by stage"))
+    views.append(
+        rrb.Tabs(_curves("distinct", "Distinct hypotheses"), _curves("measured", "Other"))
+    )
+    return views
+
+
+def _text_views() -> rrb.Container:
+    columns = rrb.TextLogColumns(
+        timeline_columns=[encodings.TimelineColumn(PROBE, visible=False)],
+        text_log_columns=[
+            encodings.TextLogColumn(encodings.TextLogColumnKind.LogLevel, visible=True),
+            encodings.TextLogColumn(encodings.TextLogColumnKind.Body, visible=True),
+        ],
+    )
+    return rrb.Vertical(
+        rrb.TextDocumentView(origin="/session", name="Session"),
+        rrb.TextLogView(origin="/log", name="Log", columns=columns),
+        row_shares=[5, 3],
+    )
+
+
+def _curves(root: str, name: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=f"/{root}",
+        name=name,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+        axis_x=rrb.TimeAxis(
+            view_range=rrb.TimeRange(
+                start=rrb.TimeRangeBoundary.infinite(),
+                end=rrb.TimeRangeBoundary.cursor_relative(seq=4),
+            )
+        ),
+    )
+
+
+def _plane(
+    root: str,
+    name: str,
+    frame: Frame,
+    margins: tuple[float, float, float, float],
+    overrides: Mapping[str, rrb.EntityBehavior] | None = None,
+    *,
+    titlebar: bool = True,
+) -> rrb.Spatial2DView:
+    """A drawing with room for its labels: left, right, top and bottom, in longer sides of it."""
+    side = max(frame.width, frame.height)
+    left, right, top, bottom = (margin * side for margin in margins)
+    return rrb.Spatial2DView(
+        origin=f"/{root}",
+        name=name,
+        titlebar=titlebar,
+        background=BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(-left, frame.width + right), y_range=(-top, frame.height + bottom)
+        ),
+        overrides=overrides,
+    )
+
+
+def _up_to_now() -> rrb.VisibleTimeRanges:
+    """All moments from the first one to that of the cursor, on both timelines."""
+    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=0)
+    return rrb.VisibleTimeRanges(
+        [rrb.VisibleTimeRange(name, start=start, end=end) for name in (PROBE, ITERATION)]
+    )

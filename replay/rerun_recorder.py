@@ -1,0 +1,176 @@
+"""Writes a session as a Rerun recording: what people look at."""
+
+from __future__ import annotations
+
+import warnings
+from functools import singledispatchmethod
+from pathlib import Path
+
+import rerun as rr
+
+from chsel.errors import RecordingError
+from chsel.problem import ArchiveSnapshot
+from replay import events
+from replay.blueprint import USUAL_ARCHIVE, session_blueprint
+from replay.events import Recorder
+from replay.rerun_archive import ArchiveMap, map_frame
+from replay.rerun_clock import Clock
+from replay.rerun_curves import Curves, SearchPlot
+from replay.rerun_hypotheses import HypothesisMeshes
+from replay.rerun_legend import Legend
+from replay.rerun_live import live_sink
+from replay.rerun_plane import Frame
+from replay.rerun_scene import Scene
+from replay.rerun_text import session_markdown
+
+APPLICATION = "chsel"
+_LOG_LEVELS = {"info": rr.TextLogLevel.INFO, "warning": rr.TextLogLevel.WARN}
+_FLUSH_SECONDS = 10.0
+
+
+class RerunRecorder(Recorder):
+    """A recorder whose file, live viewer or both show a session as it happens.
+
+    path: where the recording goes; None for a live viewer alone. live: also show it in a viewer on
+    this machine; without one, a warning. Timelines are those of `Clock`; no wall clock is written.
+    Raises RecordingError if the file cannot be written.
+    """
+
+    def __init__(self, path: Path | None, *, live: bool = False) -> None:
+        self._stream = rr.RecordingStream(APPLICATION, send_properties=False)
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+        self._open(path, live=live)
+        self._closed = False
+        self._clock = Clock(self._stream)
+        self._scene = Scene(self._stream)
+        self._meshes = HypothesisMeshes(self._stream)
+        self._legend = Legend(self._stream)
+        self._archive = ArchiveMap(self._stream)
+        self._curves = Curves(self._stream)
+        self._search = SearchPlot(self._stream)
+        self._started: events.SessionStarted | None = None
+        self._laid_out = False
+
+    def record(self, event: events.Event) -> None:
+        """Draw one event."""
+        self._draw(event)
+
+    def flush(self) -> None:
+        """Hand all events so far to the operating system, and to the viewer if there is one."""
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_SECONDS)
+        except (RuntimeError, ValueError) as error:
+            warnings.warn(f"the Rerun recording lags behind: {error}", stacklevel=2)
+
+    def close(self) -> None:
+        """Finish the file. Closing twice is closing once."""
+        if not self._closed:
+            self._closed = True
+            self.flush()
+            self._stream.disconnect()
+
+    def _open(self, path: Path | None, *, live: bool) -> None:
+        sinks: list[rr.FileSink | rr.GrpcSink] = []
+        if path is not None:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.touch()
+            except OSError as error:
+                raise RecordingError(
+                    f"{path} cannot be written ({error.strerror}); accepted: a new .rrd file"
+                ) from None
+            sinks.append(rr.FileSink(path))
+        if live and (viewer := live_sink()) is not None:
+            sinks.append(viewer)
+        if sinks:
+            self._stream.set_sinks(*sinks)
+        else:
+            self._stream.disconnect()
+
+    @singledispatchmethod
+    def _draw(self, event: events.Event) -> None:
+        raise TypeError(f"{type(event).__name__} is not an event")
+
+    @_draw.register
+    def _(self, event: events.SessionStarted) -> None:
+        name = f"{event.object}, {event.method}, seed {event.seed}"
+        known = event.world_from_object is not None
+        self._stream.send_recording_name(name)
+        self._started = event
+        self._lay_out(USUAL_ARCHIVE)
+        text = rr.TextDocument(session_markdown(event), media_type=rr.MediaType.MARKDOWN)
+        self._stream.log("session", text, static=True)
+        self._scene.set_up(event.mesh, event.workspace, event.world_from_object)
+        self._meshes.set_up(event.mesh)
+        self._legend.set_up(pose_known=known)
+        self._curves.set_up()
+        self._clock.set_probe(0)
+        self._scene.add_points(event.initial_points, new=False)
+
+    @_draw.register
+    def _(self, event: events.Probe) -> None:
+        self._clock.set_probe(event.step)
+        self._scene.add_probe(event)
+
+    @_draw.register
+    def _(self, event: events.ProblemPosed) -> None:
+        self._clock.start_registration(event.step)
+        self._archive.start()
+        self._search.start()
+
+    @_draw.register
+    def _(self, event: events.SnapshotTaken) -> None:
+        self._clock.advance(f"archive {event.archive.refinement}", event.archive.iteration)
+        self._archive.draw(event.step, event.archive)
+        self._fit_layout(event.archive)
+
+    @_draw.register
+    def _(self, event: events.Traced) -> None:
+        self._clock.advance(event.stage, event.iteration)
+        self._search.add(self._clock.iteration, event)
+        with self._clock.iterations_alone():
+            self._curves.add_trace(event)
+
+    @_draw.register
+    def _(self, event: events.HypothesesFound) -> None:
+        self._meshes.draw(event.hypotheses)
+        self._legend.draw(event.hypotheses)
+        self._archive.mark(event.step, event.hypotheses)
+        self._fit_layout(event.hypotheses.archive)
+        self._curves.add_hypotheses(event.hypotheses)
+        self._search.draw(event.step)
+
+    @_draw.register
+    def _(self, event: events.Measured) -> None:
+        for name, value in event.values.items():
+            self._curves.add_measured(name, value)
+
+    @_draw.register
+    def _(self, event: events.Timed) -> None:
+        for stage, seconds in event.seconds.items():
+            self._curves.add_seconds(stage, seconds)
+
+    @_draw.register
+    def _(self, event: events.Logged) -> None:
+        self._log(event.text, event.level)
+
+    @_draw.register
+    def _(self, event: events.SessionEnded) -> None:
+        level = "info" if event.outcome == "finished" else "warning"
+        self._log(f"session {event.outcome}", level)
+
+    def _fit_layout(self, archive: ArchiveSnapshot | None) -> None:
+        """Lay the views out anew once the first registration shows what archive there is."""
+        if not self._laid_out:
+            self._laid_out = True
+            self._lay_out(None if archive is None else map_frame(archive))
+
+    def _lay_out(self, archive: Frame | None) -> None:
+        if self._started is not None:
+            known = self._started.world_from_object is not None
+            layout = session_blueprint(self._started.workspace, pose_known=known, archive=archive)
+            self._stream.send_blueprint(layout)
+
+    def _log(self, text: str, level: str) -> None:
+        self._stream.log("log", rr.TextLog(text, level=_LOG_LEVELS.get(level, level.upper())))

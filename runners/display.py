@@ -1,0 +1,91 @@
+"""What a run says on the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+
+class Display:
+    """One line a probe, a bar within a registration, a table at the end."""
+
+    def __init__(self, title: str, count: int) -> None:
+        self._console = Console(highlight=False)
+        self._count = count
+        self._bar = Progress(
+            TextColumn("  {task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total}"),
+            TimeElapsedColumn(),
+            console=self._console,
+            transient=True,
+            disable=not self._console.is_terminal,
+        )
+        self._task: Any = None
+        self._console.print(title, style="bold", soft_wrap=True)
+
+    def working(self, stage: str, iteration: int, total: int) -> None:
+        """A stage of the registration stands at `iteration` of `total`."""
+        if self._task is None:
+            self._bar.start()
+            self._task = self._bar.add_task(stage, total=total)
+        self._bar.update(self._task, description=stage, completed=iteration, total=total)
+
+    def probe(self, index: int, row: Mapping[str, Any]) -> None:
+        """A probe, and the registration after it if there was one, are done."""
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+            self._bar.stop()
+            self._task = None
+        text = f"probe {index + 1:>3}/{self._count}  {row['outcome']:<8}"
+        text += f" contacts {row['contacts']:>3}  free points {row['free_points']:>6}"
+        if "best_cost" in row:
+            text += f"  best cost {row['best_cost']:.4g}  distinct {row['distinct']:>2}"
+        text += f"  {row['seconds']:.2f} s"
+        self._console.print(text, soft_wrap=True)
+
+    def say(self, text: str) -> None:
+        """A line of its own."""
+        self._console.print(text)
+
+    def table(self, rows: list[dict[str, Any]]) -> None:
+        """The registrations of the session, with errors to the true pose where it is known."""
+        rows = [row for row in rows if "best_cost" in row]
+        if not rows:
+            self._console.print("no registration: too few contacts or probes for one")
+            return
+        truth = "best_position_error" in rows[-1]
+        table = Table(title="registrations", title_justify="left")
+        names = ["probe", "contacts", "best cost", "distinct"]
+        errors = ["error of best", "closest of set"] if truth else []
+        for name in [*names, *errors, "time"]:
+            table.add_column(name, justify="right")
+        for row in rows:
+            cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
+            cells.append(str(row["distinct"]))
+            cells += [_error(row, which) for which in ("best", "closest")] if truth else []
+            table.add_row(*cells, f"{row['seconds']:.2f} s")
+        self._console.print(table)
+
+    def written(self, folder: Path, files: Mapping[str, int]) -> None:
+        """What lies in the run's folder, and how to look at it."""
+        for name, size in files.items():
+            self._console.print(f"{folder / name}  {size / 1e6:.2f} MB", soft_wrap=True)
+        if "recording.rrd" in files:
+            self._console.print(f"look at it: rerun {folder / 'recording.rrd'}", soft_wrap=True)
+
+    def close(self) -> None:
+        """Give the terminal back."""
+        self._bar.stop()
+
+
+def _error(row: Mapping[str, Any], which: str) -> str:
+    millimetres = 1000.0 * row[f"{which}_position_error"]
+    degrees = math.degrees(row[f"{which}_rotation_error"])
+    return f"{millimetres:.1f} mm {degrees:.1f}°"

@@ -1,0 +1,56 @@
+"""What a result could depend on besides its inputs: versions, platform, checkout."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import subprocess
+from pathlib import Path
+
+PACKAGES = ("chsel-replay", "numpy", "torch", "libigl", "trimesh", "manifold3d", "pybullet", "mcap")
+
+
+def environment() -> dict[str, str]:
+    """Names and values, equal for every run of one checkout on one machine."""
+    values = {
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "checkout": _checkout(),
+    }
+    return values | {f"package {name}": _version(name) for name in PACKAGES}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _processor() -> str:
+    """Model name of the processor."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or "unknown"
+
+
+def _checkout() -> str:
+    """Commit of the checkout that runs, and whether files differ from it; "none" if installed."""
+    folder = Path(__file__).resolve().parent
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return "none"
+    return described.stdout.strip()

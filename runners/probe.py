@@ -1,0 +1,224 @@
+"""`python -m runners.probe`: probe an object, register after every probe, record everything."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import trimesh
+import yaml
+from omegaconf import DictConfig
+
+from chsel.errors import require_positive
+from chsel.methods import build_method
+from chsel.methods.method import Method
+from chsel.sdf import SdfGrid
+from chsel.settings import build_settings
+from chsel.streams import StreamKey
+from replay.events import Logged, Recorder, SessionEnded, SessionStarted
+from runners.cli import command, plain
+from runners.display import Display
+from runners.environment import environment
+from runners.interrupt import Interrupt
+from runners.objects.loader import ObjectConfig, load_object
+from runners.objects.scans import AssetsConfig
+from runners.recording import RecordingConfig, make_run_folder, open_recorder
+from runners.session_run import Row, SessionRun
+from runners.sessions import open_session, session_settings
+from runners.sessions.recorded import RecordedSession
+from runners.sessions.session import Session
+
+_NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
+
+
+@dataclass(frozen=True)
+class PresetName:
+    """The preset that the other choices followed."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class ProbeConfig:
+    """conf/probe.yaml, checked. session and method: checked by whoever they name."""
+
+    object: ObjectConfig
+    session: Any
+    method: Any
+    preset: PresetName
+    recording: RecordingConfig
+    assets: AssetsConfig
+    logs: str
+    seed: int = 0
+    threads: int | None = None
+    configuration: str | None = None
+
+    def __post_init__(self) -> None:
+        StreamKey(self.seed, 0)
+        if self.threads is not None:
+            require_positive("threads", self.threads)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The session and the object that it hides."""
+
+    session: Session
+    object_name: str
+    mesh: trimesh.Trimesh
+    sdf: SdfGrid
+    start: tuple[int, int]
+
+
+@command("probe")
+def main(config: DictConfig) -> None:
+    """Run one session."""
+    values = plain(config)
+    checked = build_settings(ProbeConfig, values, "probe")
+    if checked.threads is not None:
+        torch.set_num_threads(checked.threads)
+    method_config = dict(checked.method)
+    method_name = str(method_config.pop("name", None))
+    method = build_method(method_name, method_config)
+    scene = open_scene(checked)
+    try:
+        folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
+        (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+        started = session_started(checked, values, method_name, scene)
+        with Interrupt() as interrupt:
+            interrupted = run(folder, checked, method, scene, started, interrupt)
+    finally:
+        scene.session.close()
+    if interrupted:
+        sys.exit(130)
+
+
+def open_scene(config: ProbeConfig) -> Scene:
+    """Open the session with its object; a recorded session brings its own."""
+    session_config = dict(config.session)
+    kind = str(session_config.pop("kind", None))
+    settings = session_settings(kind, session_config)
+    start = (settings.start_contacts, settings.start_probe)
+    if kind == "recorded":
+        recorded = RecordedSession(settings)
+        of = recorded.recorded
+        return Scene(recorded, of.object, of.mesh, of.sdf, start)
+    object_model = load_object(config.object, config.assets.folder)
+    session = open_session(kind, settings, object_model, config.seed)
+    sdf = SdfGrid.from_mesh(
+        object_model.mesh, settings.object_resolution, padding=settings.object_padding
+    )
+    return Scene(session, object_model.name, object_model.mesh, sdf, start)
+
+
+def session_started(
+    config: ProbeConfig, values: Mapping[str, Any], method_name: str, scene: Scene
+) -> SessionStarted:
+    """The first event of the recording."""
+    session = scene.session
+    return SessionStarted(
+        runner="probe",
+        object=scene.object_name,
+        session=str(config.session["kind"]),
+        method=method_name,
+        seed=config.seed,
+        config={key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT},
+        mesh=scene.mesh,
+        sdf=scene.sdf,
+        workspace=session.workspace,
+        free_resolution=session.free_resolution,
+        initial_points=session.initial_points,
+        world_from_object=session.world_from_object,
+        environment=environment(),
+    )
+
+
+def run(
+    folder: Path,
+    config: ProbeConfig,
+    method: Method,
+    scene: Scene,
+    started: SessionStarted,
+    interrupt: Interrupt,
+) -> bool:
+    """Run the session to its end or to Ctrl-C; whether it was interrupted."""
+    title = f"{started.object}, {started.session} session, {started.method}, "
+    display = Display(
+        title + f"preset {config.preset.name}, seed {config.seed}", scene.session.count
+    )
+
+    def show(stage: str, iteration: int, total: int) -> None:
+        interrupt.check()
+        display.working(stage, iteration, total)
+
+    recorder = open_recorder(folder, config.recording)
+    session_run = SessionRun(
+        scene.session,
+        method,
+        scene.sdf,
+        recorder,
+        seed=config.seed,
+        start=scene.start,
+        snapshot_interval=config.recording.snapshot_interval,
+        show=show,
+    )
+    rows: list[Row] = []
+    outcome = "failed"
+    try:
+        recorder.record(started)
+        recorder.flush()
+        for index, (_, row) in enumerate(session_run.steps()):
+            rows.append(row)
+            display.probe(index, row)
+            interrupt.check()
+        outcome = "finished"
+    except KeyboardInterrupt:
+        outcome = "interrupted"
+    except Exception as error:
+        outcome = f"failed: {error}"
+        raise
+    finally:
+        _end(recorder, session_run.step, outcome)
+        display.close()
+        _summarise(folder, started, rows, outcome)
+    display.table(rows)
+    if outcome == "interrupted":
+        display.say("interrupted: the recording holds everything up to here")
+    display.written(folder, _sizes(folder))
+    return outcome == "interrupted"
+
+
+def _end(recorder: Recorder, step: int, outcome: str) -> None:
+    level = "info" if outcome == "finished" else "warning"
+    recorder.record(Logged(step, level, f"session {outcome}"))
+    recorder.record(SessionEnded(step, outcome))
+    recorder.close()
+
+
+def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: str) -> None:
+    """Write summary.json: the outcome and the numbers of every step, wall-clock times included."""
+    summary = {
+        "runner": started.runner,
+        "object": started.object,
+        "session": started.session,
+        "method": started.method,
+        "seed": started.seed,
+        "outcome": outcome,
+        "steps": rows,
+        "bytes": _sizes(folder),
+        "environment": dict(started.environment),
+    }
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    return {file.name: file.stat().st_size for file in sorted(folder.iterdir())}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""A session from its first probe to its last: probe, register, record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from chsel.evaluation.pose_error import pose_errors
+from chsel.methods.method import Method
+from chsel.online import pose_problem
+from chsel.points import KnownPoints
+from chsel.problem import Hypotheses
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.events import HypothesesFound, Measured, Probe, ProblemPosed, Recorder, Timed
+from runners.recording import StepObserver
+from runners.sessions.session import Session
+
+Row = dict[str, Any]
+
+
+class SessionRun:
+    """Registers after every probe for which there is enough to go by (CHSEL, Alg. 2)."""
+
+    def __init__(
+        self,
+        session: Session,
+        method: Method,
+        sdf: SdfGrid,
+        recorder: Recorder,
+        *,
+        seed: int,
+        start: tuple[int, int],
+        snapshot_interval: int,
+        show: Callable[[str, int, int], None],
+    ) -> None:
+        """start: a registration needs so many contacts, and this probe index."""
+        self._session, self._method, self._sdf, self._recorder = session, method, sdf, recorder
+        self._seed = seed
+        self._start = start
+        self._snapshot_interval = snapshot_interval
+        self._show = show
+        self.points = session.initial_points
+        self.contact_count = len(session.initial_points.contacts)
+        self.previous: Hypotheses | None = None
+        self.step = 0
+
+    def steps(self) -> Iterator[tuple[Probe, Row]]:
+        """Each probe with the row of numbers that is shown and summarised about it."""
+        begun = time.perf_counter()
+        for probe in self._session.probes():
+            self.step = probe.step
+            seconds = {"probe": time.perf_counter() - begun}
+            self._take(probe)
+            row: Row = {
+                "step": probe.step,
+                "outcome": probe.outcome,
+                "contacts": self.contact_count,
+                "free_points": len(self.points.free),
+            }
+            if self._enough(probe):
+                row |= self._register(probe.step, seconds)
+            self._recorder.record(Timed(probe.step, seconds))
+            self._recorder.flush()
+            row |= {"seconds": sum(seconds.values()), "seconds_by_stage": seconds}
+            yield probe, row
+            begun = time.perf_counter()
+
+    def _take(self, probe: Probe) -> None:
+        self._recorder.record(probe)
+        self.points = self.points.merged(probe.new_points)
+        self.contact_count = len(self.points.contacts)
+
+    def _enough(self, probe: Probe) -> bool:
+        contacts, index = self._start
+        return self.contact_count >= contacts and probe.step >= index and self.points.count > 0
+
+    def _register(self, step: int, seconds: dict[str, float]) -> Row:
+        """Pose the problem, register, and record both; numbers about the result."""
+        problem = pose_problem(
+            self._sdf,
+            self.points,
+            self._session.workspace,
+            self._session.free_resolution,
+            StreamKey(self._seed, step),
+            self._method.online,
+            self.previous,
+        )
+        self._recorder.record(ProblemPosed(step, problem))
+        observer = StepObserver(self._recorder, step, self._snapshot_interval, self._show)
+        begun = time.perf_counter()
+        hypotheses = self._method.register(problem, observer)
+        seconds |= observer.seconds
+        seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
+        self._recorder.record(HypothesesFound(step, hypotheses))
+        measured = measure(hypotheses, self.points, self._session)
+        self._recorder.record(Measured(step, measured))
+        self.previous = hypotheses
+        row = {"best_cost": float(hypotheses.cost[0]), "distinct": hypotheses.distinct}
+        return row | {"digest": hypotheses.digest} | measured
+
+
+def measure(hypotheses: Hypotheses, points: KnownPoints, session: Session) -> dict[str, float]:
+    """Numbers about a result, among them the error to the true pose where it is known."""
+    values = {
+        "distinct_hypotheses": float(hypotheses.distinct),
+        "known_points": float(points.count),
+    }
+    if hypotheses.archive is not None:
+        values["archive_coverage"] = hypotheses.archive.coverage
+        values["archive_qd_score"] = hypotheses.archive.qd_score
+    if session.world_from_object is not None:
+        position, rotation = pose_errors(hypotheses.object_from_world, session.world_from_object)
+        closest = int(np.argmin(position))
+        for name, index in (("best", 0), ("closest", closest)):
+            values[f"{name}_position_error"] = float(position[index])
+            values[f"{name}_rotation_error"] = float(rotation[index])
+    return values

@@ -1,0 +1,146 @@
+"""Probe sessions by geometry alone: the first contact of two rigid bodies, one of them fixed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import igl
+import numpy as np
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.pose import apply
+from runners.sessions import hand
+from runners.sessions.configurations import find_configuration
+from runners.sessions.placement import laid_down
+from runners.sessions.probing import START, ProbingSession, ProbingSettings, Touch
+
+SPACING = 0.001  # m: of the points on the hand that can touch
+PATCH = 0.010  # m: side of the patches of these points that are passed over as one
+PRECISION = 1e-6  # m: of the first contact along a mini-step
+
+
+def open_kinematic(
+    mesh: trimesh.Trimesh, configuration_name: str, settings: ProbingSettings, seed: int
+) -> ProbingSession:
+    """A session without a physics engine; mesh in its own frame, metres.
+
+    Raises SessionError for an unknown configuration.
+    """
+    configuration = find_configuration(configuration_name)
+    engine = KinematicEngine(mesh, laid_down(mesh, configuration), settings)
+    return ProbingSession(engine, mesh, configuration, settings, seed)
+
+
+class KinematicEngine:
+    """The hand goes where it is told until a point of its surface meets the object, and waits."""
+
+    def __init__(
+        self, mesh: trimesh.Trimesh, world_from_object: FloatArray, settings: ProbingSettings
+    ) -> None:
+        """mesh: metres, in its frame, fixed at world_from_object (4, 4)."""
+        self.world_from_object = world_from_object
+        self._object = _Surface(mesh, world_from_object)
+        self._patches = _patches()
+        self._position = np.array(START)
+        self._force = settings.max_force
+        # No point of a patch is nearer to the object than this; kept true as the hand moves.
+        self._clearance = np.zeros(len(self._patches.centres))
+
+    def advance(self, target: FloatArray) -> Touch:
+        """Move to target (3,), or as far as the first contact on the straight way there."""
+        motion = target - self._position
+        length = float(np.sqrt(motion @ motion))
+        self._clearance -= length
+        near = np.flatnonzero(self._clearance <= 0.0)
+        if len(near) > 0:
+            patches = self._patches
+            distance = self._object.distance(patches.centres[near] + target)
+            self._clearance[near] = distance - patches.radii[near]
+            # Only what is nearer now than the way it went can have gone through the surface.
+            close = near[self._clearance[near] <= length]
+            points = patches.points[np.isin(patches.labels, close)]
+            points = points[self._object.distance(points + target) <= length]
+            if len(points) > 0 and self._object.closest(points + target)[0].min() <= 0.0:
+                return self._touch(points, motion, length)
+        self._position = target
+        return Touch(target)
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    def _touch(self, points: FloatArray, motion: FloatArray, length: float) -> Touch:
+        """Bisect for the moment at which points (S, 3) of the hand first meet the object."""
+        start, free, blocked = self._position, 0.0, 1.0
+        while (blocked - free) * length > PRECISION:
+            middle = 0.5 * (free + blocked)
+            signed = self._object.closest(points + start + middle * motion)[0]
+            free, blocked = (middle, blocked) if signed.min() > 0.0 else (free, middle)
+        self._position = start + free * motion
+        # The clearances above hold at the target; the hand has stopped short of it.
+        self._clearance -= (1.0 - free) * length
+        distance, contacts, normals = self._object.closest(points + self._position)
+        first = int(np.argmin(distance))
+        return Touch(self._position, self._force, contacts[first], normals[first])
+
+
+@dataclass(frozen=True, eq=False)
+class _Patches:
+    """The hand's surface points (S, 3), their patches (S,), each one's centre and radius."""
+
+    points: FloatArray
+    labels: np.ndarray
+    centres: FloatArray
+    radii: FloatArray
+
+
+@cache
+def _patches() -> _Patches:
+    points = hand.surface_points(SPACING)
+    _, labels = np.unique(np.rint(points / PATCH), axis=0, return_inverse=True)
+    count = np.bincount(labels)
+    centres = np.stack([np.bincount(labels, axis) / count for axis in points.T], axis=1)
+    radii = np.zeros(len(centres))
+    np.maximum.at(radii, labels, np.sqrt(((points - centres[labels]) ** 2).sum(axis=1)))
+    return _Patches(points, labels, centres, radii)
+
+
+class _Surface:
+    """Exact signed distance to a fixed mesh in the world, its search tree built only once.
+
+    The sign is that of the pseudonormal of the nearest face, edge or corner, which needs no more
+    than the surface around it.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> None:
+        self._vertices = np.ascontiguousarray(apply(world_from_object, np.asarray(mesh.vertices)))
+        self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._faces)
+        rotation = world_from_object[:3, :3].T
+        self._face_normals = np.asarray(mesh.face_normals) @ rotation
+        self._corner_normals = np.asarray(mesh.vertex_normals) @ rotation
+        neighbours, _ = igl.triangle_triangle_adjacency(self._faces)
+        across = np.where(neighbours[..., None] < 0, 0.0, self._face_normals[neighbours])
+        self._edge_normals = self._face_normals[:, None] + across  # by face and first corner
+
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Unsigned distance (N,) in metres at points (N, 3)."""
+        return np.sqrt(self._tree.squared_distance(self._vertices, self._faces, points)[0])
+
+    def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of points (N, 3): signed distance (N,), nearest points (N, 3), their normals (N, 3)."""
+        squared, face, nearest = self._tree.squared_distance(self._vertices, self._faces, points)
+        triangles = self._vertices[self._faces[face]]
+        weights = trimesh.triangles.points_to_barycentric(triangles, nearest)
+        on_side = weights < 1e-9  # of the edge opposite to this corner
+        normals = self._face_normals[face]
+        edge = on_side.sum(axis=1) == 1
+        opposite = np.argmax(on_side[edge], axis=1)
+        normals[edge] = self._edge_normals[face[edge], (opposite + 1) % 3]
+        corner = on_side.sum(axis=1) == 2
+        heaviest = np.argmax(weights[corner], axis=1)
+        normals[corner] = self._corner_normals[self._faces[face[corner], heaviest]]
+        outside = ((points - nearest) * normals).sum(axis=1) >= 0.0
+        return np.where(outside, 1.0, -1.0) * np.sqrt(squared), nearest, self._face_normals[face]

@@ -1,0 +1,80 @@
+"""A session whose known points come from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.errors import SettingError, require_positive
+from chsel.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from replay.events import Probe
+from runners.objects.loader import ObjectModel
+from runners.sessions.point_files import read_points
+
+
+@dataclass(frozen=True)
+class PointsSettings:
+    """path: .npz, .csv, .ply, .off, .xyz or .stl. workspace: x, y, z bounds, metres
+    [[x0, x1], [y0, y1], [z0, z1]]; by default the bounds of the points, padded by the object's
+    diameter. free_resolution: voxel side of free space, metres. merge_free: keep one free point
+    a voxel, at its centre. object_resolution, object_padding: of the SDF grid, metres.
+    start_contacts, start_probe: a registration needs so many contacts and this probe index.
+    """
+
+    path: str | None = None
+    workspace: tuple[tuple[float, float], ...] | None = None
+    free_resolution: float = 0.01
+    merge_free: bool = False
+    object_resolution: float = 0.005
+    object_padding: float = 0.05
+    start_contacts: int = 0
+    start_probe: int = 0
+
+    def __post_init__(self) -> None:
+        require_positive("free_resolution", self.free_resolution)
+        if not self.path:
+            raise SettingError("path is missing; pass session.path=FILE, a file of known points")
+        if self.workspace is not None and [len(pair) for pair in self.workspace] != [2, 2, 2]:
+            raise SettingError(
+                f"workspace is {self.workspace}; accepted: [[x0, x1], [y0, y1], [z0, z1]]"
+            )
+
+
+class PointsSession:
+    """Replays the steps of a file; a probe's index is the file's step."""
+
+    def __init__(self, settings: PointsSettings, object_model: ObjectModel) -> None:
+        assert settings.path is not None
+        self._file = read_points(settings.path)
+        self._steps = self._file.steps
+        self._merge = settings.merge_free
+        self.free_resolution = settings.free_resolution
+        self.workspace = self._workspace(settings, object_model)
+        self.world_from_object = self._file.world_from_object
+        self.initial_points = KnownPoints()
+        self.count = len(self._steps)
+
+    def _workspace(self, settings: PointsSettings, object_model: ObjectModel) -> Workspace:
+        if settings.workspace is not None:
+            (x0, x1), (y0, y1), (z0, z1) = settings.workspace
+            return Workspace((x0, y0, z0), (x1, y1, z1))
+        points = np.concatenate([group.points for group in self._file.classes.values()])
+        diameter = float(np.sqrt((np.asarray(object_model.mesh.extents) ** 2).sum()))
+        return Workspace.around(points, diameter)
+
+    def probes(self) -> Iterator[Probe]:
+        """One probe per step of the file."""
+        voxels = FreeVoxels(Lattice(self.workspace.lower, self.free_resolution))
+        for step in self._steps:
+            points = self._file.at(step)
+            if self._merge:
+                points = KnownPoints(
+                    voxels.add(points.free), points.occupied, points.known, points.sdf
+                )
+            contacts = points.contacts
+            yield Probe(step, "points", points, contacts=contacts, contact_normals=0.0 * contacts)
+
+    def close(self) -> None:
+        """Nothing is held open."""

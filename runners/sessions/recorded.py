@@ -1,0 +1,48 @@
+"""A session that repeats the probes of an earlier recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from chsel.errors import SettingError
+from replay.events import Probe
+from replay.mcap_reader import read_recording
+
+
+@dataclass(frozen=True)
+class RecordedSettings:
+    """path: the recording.mcap; it brings its own object, workspace and resolutions.
+
+    start_contacts, start_probe: a registration needs so many contacts and this probe index.
+    """
+
+    path: str | None = None
+    start_contacts: int = 0
+    start_probe: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.path:
+            raise SettingError("path is missing; pass session.path=FILE, a recording.mcap")
+
+
+class RecordedSession:
+    """Gives the probes of a recording, with every point as it was."""
+
+    def __init__(self, settings: RecordedSettings) -> None:
+        assert settings.path is not None
+        recording = read_recording(settings.path)
+        self.recorded = recording.start
+        self.workspace = self.recorded.workspace
+        self.free_resolution = self.recorded.free_resolution
+        self.world_from_object = self.recorded.world_from_object
+        self.initial_points = self.recorded.initial_points
+        self._probes = recording.probes
+        self.count = len(self._probes)
+
+    def probes(self) -> Iterator[Probe]:
+        """The recorded probes in their order."""
+        yield from self._probes
+
+    def close(self) -> None:
+        """Nothing is held open."""

@@ -1,0 +1,244 @@
+"""Probe sessions in PyBullet: an object settled under gravity, and a hand that pushes at it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from chsel.arrays import FloatArray
+from chsel.errors import SessionError
+from chsel.pose import apply, compose, inverse
+from runners.sessions import hand
+from runners.sessions.configurations import Configuration, find_configuration
+from runners.sessions.placement import centre_of_mass, laid_down, lowest
+from runners.sessions.probing import START, ProbingSession, ProbingSettings, Touch
+
+TIME_STEP = 1.0 / 240.0  # s
+GRAVITY = -10.0  # m/s^2
+FLOOR_FRICTION = 0.6
+FLOOR_SPINNING_FRICTION = 0.8
+FINGER_FRICTION = 2.0
+SETTLING_STEPS = 1000
+OBJECT_MASS = 2.0  # kg, while it settles
+HAND_MASS = 0.9  # kg
+LETTING_GO = 0.001  # m: how far above the floor the object is let go
+MINI_STEP = 21  # steps of the engine
+FORCE_STEP = 5  # of a mini-step: when the force is read
+READINGS = 50  # how many readings of contact are looked back upon
+ENOUGH_READINGS = 2
+TOUCHING = 1e-3  # m: records of contact further apart than this are only near
+
+
+def open_simulated(
+    mesh: trimesh.Trimesh, configuration_name: str, settings: ProbingSettings, seed: int
+) -> ProbingSession:
+    """A session in PyBullet; mesh in its own frame, metres.
+
+    Raises SessionError for an unknown configuration, or where PyBullet is not installed.
+    """
+    configuration = find_configuration(configuration_name)
+    engine = PyBulletEngine(mesh, configuration, settings)
+    return ProbingSession(engine, mesh, configuration, settings, seed)
+
+
+class PyBulletEngine:
+    """The hand is drawn along by a fixed constraint of limited force, and cannot turn."""
+
+    def __init__(
+        self, mesh: trimesh.Trimesh, configuration: Configuration, settings: ProbingSettings
+    ) -> None:
+        """Settle the object of a configuration, fix it, and put the hand at its start."""
+        self._max_force = settings.max_force
+        self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
+        self._world: Any = _new_world()
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                self.world_from_object = _settle(self._world, mesh, laid_down(mesh, configuration))
+                file = _collision_file(self._world, mesh, Path(folder), settings.collision_mesh)
+                concave = settings.collision_mesh == "visual"
+                self._object = _fixed_object(self._world, file, self.world_from_object, concave)
+                self._hand = _hand(self._world, Path(folder))
+        except BaseException:
+            self.close()
+            raise
+        self._holder = self._world.createConstraint(
+            self._hand, -1, -1, -1, self._world.JOINT_FIXED, [0, 0, 0], [0, 0, 0], START
+        )
+
+    def advance(self, target: FloatArray) -> Touch:
+        """Draw the hand towards target (3,) for the time of one mini-step."""
+        world = self._world
+        world.changeConstraint(self._holder, target.tolist(), maxForce=self._max_force)
+        force = 0.0
+        for step in range(MINI_STEP):
+            world.stepSimulation()
+            reading = self._read()
+            self._readings.append(reading)
+            if step == FORCE_STEP and reading is not None:
+                force = reading.force
+        position = np.array(world.getBasePositionAndOrientation(self._hand)[0])
+        touching = [reading for reading in self._readings if reading is not None]
+        if len(touching) < ENOUGH_READINGS:
+            return Touch(position, force)
+        return Touch(position, force, touching[-1].contact, touching[-1].normal)
+
+    def close(self) -> None:
+        """Disconnect from the engine."""
+        if self._world.isConnected():
+            self._world.disconnect()
+
+    def _read(self) -> _Reading | None:
+        """The contact between hand and object after a step: where it presses hardest."""
+        records = self._world.getContactPoints(self._hand, self._object)
+        records = [record for record in records if record[_DISTANCE] < TOUCHING]
+        if not records:
+            return None
+        forces = [record[_FORCE] * np.array(record[_NORMAL_ON_B]) for record in records]
+        total = np.sum(forces, axis=0)
+        hardest = max(records, key=lambda record: record[_FORCE])
+        contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
+        return _Reading(contact, normal, float(np.sqrt(total @ total)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """contact (3,) on the object, its normal (3,) out of it, and the force on the hand, newtons."""
+
+    contact: FloatArray
+    normal: FloatArray
+    force: float
+
+
+# Where a contact record of PyBullet has what; B is the object.
+_POINT_ON_B, _NORMAL_ON_B, _DISTANCE, _FORCE = 6, 7, 8, 9
+
+
+def _new_world() -> Any:
+    """A world of its own with a floor; SessionError where PyBullet is not installed."""
+    with _silent():
+        try:
+            import pybullet
+            from pybullet_utils.bullet_client import BulletClient
+        except ImportError:
+            raise SessionError(
+                "PyBullet is not installed (it has wheels for Python 3.11 only); "
+                "use session=kinematic, the same session without a physics engine"
+            ) from None
+        world = BulletClient(pybullet.DIRECT)
+    world.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
+    world.setTimeStep(TIME_STEP)
+    floor = world.createMultiBody(0, world.createCollisionShape(world.GEOM_PLANE))
+    world.changeDynamics(
+        floor, -1, lateralFriction=FLOOR_FRICTION, spinningFriction=FLOOR_SPINNING_FRICTION
+    )
+    return world
+
+
+def _settle(world: Any, mesh: trimesh.Trimesh, laid: FloatArray) -> FloatArray:
+    """The pose (4, 4) at which the mesh, put at `laid` on the floor, has settled under gravity.
+
+    On a plane only the convex hull can touch; mass and inertia are those of the mesh itself.
+    """
+    solid = mesh if mesh.is_watertight else mesh.convex_hull
+    inertia, axes = np.linalg.eigh(solid.moment_inertia * (OBJECT_MASS / solid.mass))
+    axes[:, 2] *= np.linalg.det(axes)
+    object_from_inertial = compose(axes, centre_of_mass(mesh))
+    body_pose = laid @ object_from_inertial
+    body_pose[2, 3] += LETTING_GO
+    vertices = apply(inverse(object_from_inertial), np.asarray(mesh.convex_hull.vertices))
+    body = world.createMultiBody(
+        OBJECT_MASS,
+        world.createCollisionShape(world.GEOM_MESH, vertices=vertices.tolist()),
+        **_placed(body_pose),
+    )
+    world.changeDynamics(body, -1, localInertiaDiagonal=inertia.tolist())
+    world.setGravity(0.0, 0.0, GRAVITY)
+    for _ in range(SETTLING_STEPS):
+        world.stepSimulation()
+    position, quaternion = world.getBasePositionAndOrientation(body)
+    world.removeBody(body)
+    # From here on only the hand moves, and what holds it carries its weight.
+    world.setGravity(0.0, 0.0, 0.0)
+    rotation = np.array(world.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+    settled = compose(rotation, np.array(position)) @ inverse(object_from_inertial)
+    settled[2, 3] -= lowest(mesh, settled)  # the engine lets bodies hover by its margin
+    return settled
+
+
+def _collision_file(world: Any, mesh: trimesh.Trimesh, folder: Path, kind: str) -> Path:
+    """A file with the mesh, or with its convex parts."""
+    whole, parts = folder / "object.obj", folder / "parts.obj"
+    _write_obj(whole, [mesh])
+    if kind == "visual":
+        return whole
+    with _silent():
+        world.vhacd(str(whole), str(parts), str(folder / "log.txt"))
+    return parts
+
+
+def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave: bool) -> int:
+    flags = world.GEOM_FORCE_CONCAVE_TRIMESH if concave else 0
+    shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(file), flags=flags)
+    body: int = world.createMultiBody(0, shape, **_placed(world_from_object))
+    world.changeDynamics(body, -1, collisionMargin=0.0)
+    return body
+
+
+def _hand(world: Any, folder: Path) -> int:
+    """The hand at its start. Without inertia the engine leaves its orientation alone."""
+    _write_obj(folder / "hand.obj", list(hand.solids()))
+    shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(folder / "hand.obj"))
+    body: int = world.createMultiBody(HAND_MASS, shape, basePosition=START)
+    world.changeDynamics(
+        body,
+        -1,
+        lateralFriction=FINGER_FRICTION,
+        localInertiaDiagonal=[0.0, 0.0, 0.0],
+        collisionMargin=0.0,
+    )
+    return body
+
+
+def _placed(pose: FloatArray) -> dict[str, list[float]]:
+    """Arguments of createMultiBody that put a body at a pose (4, 4)."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return {"basePosition": pose[:3, 3].tolist(), "baseOrientation": quaternion.tolist()}
+
+
+def _write_obj(path: Path, meshes: list[trimesh.Trimesh]) -> None:
+    """Write meshes as separate objects of one file; PyBullet makes each one's hull a part."""
+    lines, first = [], 1
+    for number, mesh in enumerate(meshes):
+        lines.append(f"o part{number}")
+        lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + first).tolist()]
+        first += len(mesh.vertices)
+    path.write_text("\n".join(lines) + "\n")
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Swallow what compiled code prints meanwhile: PyBullet greets, and VHACD reports at length."""
+    library = ctypes.CDLL(None)
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+    try:
+        yield
+    finally:
+        library.fflush(None)
+        os.dup2(kept, 1)
+        os.close(kept)

@@ -1,0 +1,169 @@
+"""The archive and both emitters against pyribs."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+import chsel.emitters
+from chsel.adam import Adam
+from chsel.archive import GridArchive
+from chsel.arrays import FloatArray
+from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.measures import Measure
+from chsel.observer import NullObserver
+from chsel.streams import StreamKey
+
+ribs_archives = pytest.importorskip("ribs.archives", reason="pyribs is a test dependency")
+ribs_emitters = pytest.importorskip("ribs.emitters", reason="pyribs is a test dependency")
+
+BINS = 40
+LOWER, UPPER = np.array([-0.5, -0.5]), np.array([0.5, 0.5])
+BATCH = 29
+SEEDS = 20
+ITERATIONS = 100
+
+
+class Quadratic:
+    """Cost |A (x - c)|^2 over 9 dimensions; the measures are the last coordinates but one."""
+
+    def __init__(self) -> None:
+        self.centre = np.linspace(-0.3, 0.3, 9)
+        self.weights = np.linspace(1.0, 3.0, 9)
+
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        return ((self.weights * (vectors - self.centre)) ** 2).sum(axis=1)
+
+    def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self.costs(vectors), 2.0 * self.weights**2 * (vectors - self.centre)
+
+    def measures(self, measure: Measure, vectors: FloatArray) -> FloatArray:
+        return vectors[:, 6:8]
+
+    def measure_gradients(self, measure: Measure, vector: FloatArray) -> FloatArray:
+        return np.eye(9)[6:8]
+
+
+MEASURE = Measure(("x", "y"), lambda vectors, rotation, translation: vectors[:, 6:8])
+START = np.linspace(0.4, -0.2, 9)
+
+
+def search(name: str, seed: int, **settings: Any) -> GridArchive:
+    """Our search on the quadratic."""
+    archive = GridArchive(MEASURE, LOWER, UPPER, bins=BINS, dimension=9)
+    quadratic: Any = Quadratic()
+    archive.add(START[None], -quadratic.costs(START[None]), START[None, 6:8])
+    count = BATCH + 1 if name == "cma_mega" else BATCH
+    draws = Draws(StreamKey(seed, 0))
+    options = EmitterSettings(iterations=ITERATIONS, **settings)
+    watch = ArchiveWatch(NullObserver(), 0)
+    SEARCHES[name](quadratic, archive, START, count, options, draws, watch)
+    return archive
+
+
+class SharedNormals:
+    """Stands in for the generator of a pyribs strategy: our draws, in our order."""
+
+    def __init__(self, normals: FloatArray) -> None:
+        self._rows = iter(normals)
+
+    def normal(self, mean: float, sigma: float, shape: tuple[int, int]) -> FloatArray:
+        rows = next(self._rows)
+        assert rows.shape == shape
+        return mean + sigma * rows
+
+
+def ribs_archive() -> Any:
+    ranges = list(zip(LOWER, UPPER, strict=True))
+    return ribs_archives.GridArchive(
+        solution_dim=9, dims=[BINS, BINS], ranges=ranges, qd_score_offset=-100.0, epsilon=1e-6
+    )
+
+
+def ribs_emitter(name: str, archive: Any, seed: int, sigma0: float, adam: dict[str, float]) -> Any:
+    common = {
+        "x0": START,
+        "sigma0": sigma0,
+        "ranker": "2imp",
+        "selection_rule": "filter",
+        "restart_rule": "no_improvement",
+        "batch_size": BATCH,
+        "seed": seed,
+    }
+    if name == "cma_me":
+        return ribs_emitters.EvolutionStrategyEmitter(archive, **common)
+    return ribs_emitters.GradientArborescenceEmitter(
+        archive, lr=0.05, grad_opt="adam", normalize_grad=True, grad_opt_kwargs=adam, **common
+    )
+
+
+def ribs_search(name: str, seed: int, *, sigma0: float = 1.0, shared: bool = False) -> Any:
+    """The same search by pyribs; `shared` gives it our random numbers."""
+    quadratic: Any = Quadratic()
+    archive = ribs_archive()
+    emitter = ribs_emitter(name, archive, seed, sigma0, {"epsilon": 0.0} if shared else {})
+    dimension = 9 if name == "cma_me" else 3
+    draws = Draws(StreamKey(seed, 0))
+    iteration = 0
+    if shared:
+        emitter._opt._rng = SharedNormals(draws.normals(ITERATIONS, BATCH, dimension))
+        elites = draws.elites(ITERATIONS)
+
+        def our_elite(count: int, **_: Any) -> dict[str, FloatArray]:
+            data = archive.data(["solution", "index"], return_type="dict")
+            order = np.argsort(data["index"])
+            chosen = order[int(elites[iteration] * len(order))]
+            return {"solution": data["solution"][chosen][None]}
+
+        archive.sample_elites = our_elite
+    archive.add(START[None], -quadratic.costs(START[None]), START[None, 6:8])
+    for iteration in range(ITERATIONS):  # noqa: B007  read by our_elite
+        if name == "cma_mega":
+            theta = emitter.ask_dqd()
+            cost, gradient = quadratic.costs_and_gradients(theta)
+            info = archive.add(theta, -cost, theta[:, 6:8])
+            jacobian = np.concatenate([-gradient, np.eye(9)[6:8]])[None]
+            emitter.tell_dqd(theta, -cost, theta[:, 6:8], jacobian, info)
+        solutions = emitter.ask()
+        objective = -quadratic.costs(solutions)
+        info = archive.add(solutions, objective, solutions[:, 6:8])
+        emitter.tell(solutions, objective, solutions[:, 6:8], info)
+    return archive
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma0"), [("cma_mega", 1.0), ("cma_mega", 0.1), ("cma_me", 0.2)]
+)
+def test_with_its_formulas_and_shared_random_numbers_the_archive_is_that_of_pyribs(
+    name: str, sigma0: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # pyribs adds Adam's epsilon before the bias correction; without it the two are one formula.
+    monkeypatch.setattr(chsel.emitters, "Adam", partial(Adam, epsilon=0.0))
+    ours = search(name, 3, sigma0=sigma0, ribs_parity=True)
+    data = ribs_search(name, 3, sigma0=sigma0, shared=True).data(return_type="dict")
+    order = np.argsort(data["index"])
+    np.testing.assert_array_equal(ours.occupied, data["index"][order])
+    np.testing.assert_allclose(-ours.costs, data["objective"][order], rtol=1e-7)
+    np.testing.assert_allclose(ours.solutions, data["solution"][order], rtol=0, atol=1e-7)
+    assert len(ours.occupied) > 100
+
+
+@pytest.mark.parametrize("name", ["cma_mega", "cma_me"])
+def test_coverage_and_qd_score_are_within_one_deviation_of_pyribs(name: str) -> None:
+    ours = [search(name, seed).snapshot(0, 0) for seed in range(SEEDS)]
+    theirs = [ribs_search(name, seed).stats for seed in range(SEEDS)]
+    for mine, other in (
+        ([s.coverage for s in ours], [s.coverage for s in theirs]),
+        ([s.qd_score for s in ours], [s.norm_qd_score for s in theirs]),
+    ):
+        print(name, np.mean(mine), np.std(mine), np.mean(other), np.std(other))
+        assert abs(np.mean(mine) - np.mean(other)) <= max(np.std(mine), np.std(other))
+
+
+def test_cma_mega_fills_the_archive_of_a_quadratic_and_finds_its_optimum() -> None:
+    archive = search("cma_mega", 0, sigma0=0.1)
+    assert archive.snapshot(0, 0).coverage > 0.6
+    assert archive.costs.min() < 0.05

@@ -1,0 +1,237 @@
+"""A small session whose events have everything that a recording can hold."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.arrays import digest
+from chsel.points import KnownPoints, Workspace
+from chsel.pose import compose, random_rotations
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Logged,
+    Measured,
+    Probe,
+    ProblemPosed,
+    SessionEnded,
+    SessionStarted,
+    SnapshotTaken,
+    Timed,
+    Traced,
+)
+
+WORKSPACE = Workspace((-0.3, -0.3, 0.0), (0.3, 0.3, 0.5))
+FREE_RESOLUTION = 0.02
+
+
+def example_events(
+    *, steps: int = 3, elites: int = 12, free: int = 40, snapshots: int = 2, seed: int = 7
+) -> list[Event]:
+    """Events of a session with a box; step 0 has a probe in free space and no registration."""
+    random = np.random.default_rng(seed)
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    start = SessionStarted(
+        runner="probe",
+        object="Bohrmaschine ½″ 电钻",
+        session="kinematic",
+        method="chsel",
+        seed=2**64 - 1,
+        config={"object": {"name": "电钻", "scale": 1.5}, "flags": [True, None, -1, 1e-300]},
+        mesh=mesh,
+        sdf=SdfGrid.from_mesh(mesh, 0.02, padding=0.03),
+        workspace=WORKSPACE,
+        free_resolution=FREE_RESOLUTION,
+        initial_points=KnownPoints(free=random.normal(size=(free, 3))),
+        world_from_object=_poses(random, 1)[0],
+        environment={"torch": "2.13.0", "numpy": "2.4.6", "platform": "Linux"},
+    )
+    events: list[Event] = [start, Logged(-1, "info", "ready — los geht's")]
+    points, low_cost_set = start.initial_points, np.zeros((0, 4, 4))
+    for step in range(steps):
+        probe = _probe(random, step, free)
+        points = points.merged(probe.new_points)
+        events.append(probe)
+        if step > 0:
+            problem = RegistrationProblem(
+                sdf=start.sdf,
+                points=points,
+                initial_set=_poses(random, 5),
+                workspace=WORKSPACE,
+                free_resolution=FREE_RESOLUTION,
+                key=StreamKey(start.seed, step),
+                low_cost_set=low_cost_set,
+            )
+            found = _registration(random, problem, elites, snapshots)
+            low_cost_set = found[-1].hypotheses.elites
+            events += [*found, Timed(step, {"registration": random.uniform()})]
+            events.append(Measured(step, {"best_cost": -0.0, "coverage_mm2": float("nan")}))
+    return [*events, Logged(steps - 1, "warning", ""), SessionEnded(steps - 1, "finished")]
+
+
+def bare_events() -> list[Event]:
+    """Events of a session in which all that can be absent or empty is."""
+    start = dataclasses.replace(
+        example_events(steps=0)[0],
+        config={},
+        initial_points=KnownPoints(),
+        world_from_object=None,
+        environment={},
+        object="",
+    )
+    point = KnownPoints(occupied=[[0.0, -0.0, 5e-324]])
+    problem = RegistrationProblem(
+        start.sdf, point, np.eye(4)[None], WORKSPACE, FREE_RESOLUTION, StreamKey(0, 0)
+    )
+    nothing = Hypotheses(
+        object_from_world=np.zeros((0, 4, 4)),
+        cost=np.zeros(0),
+        duplicate=np.zeros(0, dtype=bool),
+        cell=np.zeros(0, dtype=np.int64),
+        elites=np.zeros((0, 4, 4)),
+    )
+    empty_archive = dataclasses.replace(
+        _archive(np.random.default_rng(0), 0, 0), solutions=np.zeros((0, 9))
+    )
+    return [
+        start,
+        Probe(0, "free", KnownPoints()),
+        Probe(0, "points", point),
+        ProblemPosed(0, problem),
+        SnapshotTaken(0, empty_archive),
+        HypothesesFound(0, nothing),
+        Measured(0, {}),
+    ]
+
+
+def same_bits(a: Any, b: Any) -> bool:
+    """Whether two values are equal down to the types and bytes of their arrays."""
+    if isinstance(a, trimesh.Trimesh):
+        return same_bits(
+            (a.vertices.view(np.ndarray), a.faces.view(np.ndarray)),
+            (b.vertices.view(np.ndarray), b.faces.view(np.ndarray)),
+        )
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, float):
+        return np.float64(a).tobytes() == np.float64(b).tobytes()
+    if isinstance(a, tuple | list):
+        return type(a) is type(b) and len(a) == len(b) and all(map(same_bits, a, b))
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same_bits(a[name], b[name]) for name in a)
+    if dataclasses.is_dataclass(a):
+        names = [field.name for field in dataclasses.fields(a)]
+        return type(a) is type(b) and all(
+            same_bits(getattr(a, name), getattr(b, name)) for name in names
+        )
+    return type(a) is type(b) and bool(a == b)
+
+
+def _poses(random: np.random.Generator, count: int) -> np.ndarray:
+    return compose(random_rotations(random, count), random.normal(size=(count, 3)))
+
+
+def _probe(random: np.random.Generator, step: int, free: int) -> Probe:
+    contacts = random.normal(size=(step, 3))
+    known = np.concatenate([contacts, random.normal(size=(step, 3))])
+    new = KnownPoints(
+        free=random.normal(size=(free, 3)),
+        occupied=random.normal(size=(2, 3)),
+        known=known,
+        known_sdf=np.repeat([0.0, 0.01], step),
+    )
+    outcome = "contact" if step else "free"
+    return Probe(step, outcome, new, _poses(random, 4), contacts, -contacts)
+
+
+def _registration(
+    random: np.random.Generator, problem: RegistrationProblem, elites: int, snapshots: int
+) -> list[Any]:
+    step = problem.key.step
+    costs = (0.1, np.pi, 1e9)
+    events: list[Any] = [
+        ProblemPosed(step, problem),
+        Traced(step, "descent", 100, digest(problem.initial_set), costs),
+    ]
+    archives = [_archive(random, 10 * i, elites) for i in range(snapshots)]
+    events += [SnapshotTaken(step, archive) for archive in archives]
+    found = Hypotheses(
+        object_from_world=_poses(random, 5),
+        cost=np.sort(random.uniform(size=5)),
+        duplicate=np.array([False, False, True, False, True]),
+        cell=np.array([3, -1, 5, 1599, 0]),
+        elites=_poses(random, elites),
+        archive=dataclasses.replace(archives[-1]),
+    )
+    return [*events, HypothesesFound(step, found)]
+
+
+def _archive(random: np.random.Generator, iteration: int, elites: int) -> ArchiveSnapshot:
+    return ArchiveSnapshot(
+        iteration=iteration,
+        refinement=1,
+        measure_names=("x (m)", "y (m)"),
+        shape=(40, 40),
+        lower=np.array([-0.3, -0.3]),
+        upper=np.array([0.3, 0.3]),
+        cells=np.sort(random.choice(1600, elites, replace=False)),
+        solutions=random.normal(size=(elites, 9)),
+        objectives=-random.uniform(size=elites),
+        measures=random.uniform(-0.3, 0.3, size=(elites, 2)),
+    )
+
+
+@pytest.fixture
+def events() -> list[Event]:
+    return example_events()
+
+
+@pytest.fixture
+def make_events() -> Callable[..., list[Event]]:
+    return example_events
+
+
+@pytest.fixture(params=["full", "bare", "start alone"])
+def any_events(request: pytest.FixtureRequest) -> list[Event]:
+    if request.param == "bare":
+        return bare_events()
+    return example_events() if request.param == "full" else example_events()[:1]
+
+
+@pytest.fixture
+def assert_same() -> Callable[[Any, Any], None]:
+    """Asserts that two lists of events are equal to the bit, but for wall-clock times."""
+
+    def check(read: Any, written: Any) -> None:
+        read, written = list(read), [e for e in written if not isinstance(e, Timed)]
+        assert [type(e).__name__ for e in read] == [type(e).__name__ for e in written]
+        for index, (a, b) in enumerate(zip(read, written, strict=True)):
+            assert same_bits(a, b), f"event {index} of type {type(a).__name__} differs"
+
+    return check
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[list[Event]], Path]:
+    """Records events to a new file."""
+    from replay.mcap_writer import McapRecorder
+
+    def record(events: list[Event]) -> Path:
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
+        recorder = McapRecorder(path)
+        for event in events:
+            recorder.record(event)
+        recorder.close()
+        return path
+
+    return record
