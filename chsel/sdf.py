@@ -12,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from chsel.arrays import FloatArray, digest, frozen
+from chsel.arrays import FloatArray, IntArray, digest, frozen
 from chsel.errors import SdfError, require_choice, require_positive
 from chsel.pose import as_tensor
 
@@ -43,7 +43,7 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     length = np.sqrt((away**2).sum(axis=1))
     near = length < _NORMAL_RANGE
     gradient = away / np.where(near, 1.0, length)[:, None]
-    gradient[near] = np.asarray(mesh.face_normals, dtype=np.float64)[face[near]]
+    gradient[near] = _face_normals(vertices, faces[face[near]])
     return np.asarray(signed, dtype=np.float64), gradient
 
 
@@ -206,8 +206,15 @@ class SdfGrid:
         return ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).to(torch.int64)
 
 
+def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """Unit normals (F, 3) from positions alone: a mesh may carry others from its file."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    return normal / np.maximum(np.sqrt((normal**2).sum(axis=1, keepdims=True)), 1e-300)
+
+
 def _rounded(values: FloatArray) -> FloatArray:
-    return values.astype(np.float32).astype(np.float64)
+    return values.astype(np.float32).astype(np.float64) + 0.0  # and no negative zeros
 
 
 def _border(values: FloatArray) -> list[FloatArray]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -48,9 +46,7 @@ def session_blueprint(
     )
 
 
-def scene_view(
-    workspace: Workspace, root: str = "scene", name: str = "Scene"
-) -> rrb.Spatial3DView:
+def scene_view(workspace: Workspace, root: str = "scene", name: str = "Scene") -> rrb.Spatial3DView:
     """The scene under the entity `root`, looked at obliquely from where the probes come from."""
     lower, upper = workspace.bounds
     centre = (lower + upper) / 2
@@ -77,11 +73,12 @@ def scene_view(
 
 
 def archive_view(
-    frame: Frame, root: str = "archive", name: str = "Archive: lowest cost by cell; dots: hypotheses"
+    frame: Frame,
+    root: str = "archive",
+    name: str = "Archive: lowest cost by cell; dots: hypotheses",
 ) -> rrb.Spatial2DView:
     """The heat map under the entity `root`; the mouse finds its costs, not its colours."""
-    overrides = {f"/{root}/colors": rrb.EntityBehavior(interactive=False)}
-    return _plane(root, name, frame, (0.2, 0.28, 0.2, 0.24), overrides)
+    return _plane(root, name, frame, (0.2, 0.28, 0.2, 0.24), inert=f"/{root}/colors")
 
 
 def legend_view(root: str = "legend") -> rrb.Spatial2DView:
@@ -101,9 +98,7 @@ def _curve_views(*, pose_known: bool) -> list[rrb.View | rrb.Container]:
         errors = [("position", "Position error [m]"), ("rotation", "Rotation error [rad]")]
         views.append(rrb.Vertical(*(_curves(f"error/{kind}", name) for kind, name in errors)))
     views.append(_curves("seconds", "Seconds by stage"))
-    views.append(
-        rrb.Tabs(_curves("distinct", "Distinct hypotheses"), _curves("measured", "Other"))
-    )
+    views.append(rrb.Tabs(_curves("distinct", "Distinct hypotheses"), _curves("measured", "Other")))
     return views
 
 
@@ -141,11 +136,14 @@ def _plane(
     name: str,
     frame: Frame,
     margins: tuple[float, float, float, float],
-    overrides: Mapping[str, rrb.EntityBehavior] | None = None,
     *,
+    inert: str = "",
     titlebar: bool = True,
 ) -> rrb.Spatial2DView:
-    """A drawing with room for its labels: left, right, top and bottom, in longer sides of it."""
+    """A drawing with room for its labels: left, right, top and bottom, in longer sides of it.
+
+    inert: an entity that the mouse does not find.
+    """
     side = max(frame.width, frame.height)
     left, right, top, bottom = (margin * side for margin in margins)
     return rrb.Spatial2DView(
@@ -156,7 +154,7 @@ def _plane(
         visual_bounds=rrb.VisualBounds2D(
             x_range=(-left, frame.width + right), y_range=(-top, frame.height + bottom)
         ),
-        overrides=overrides,
+        overrides={inert: rrb.EntityBehavior(interactive=False)} if inert else None,
     )
 
 

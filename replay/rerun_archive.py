@@ -9,7 +9,7 @@ from chsel.arrays import FloatArray, IntArray
 from chsel.problem import ArchiveSnapshot, Hypotheses
 from replay.rerun_colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
 from replay.rerun_hypotheses import shown_hypotheses
-from replay.rerun_plane import Frame, Label, lines, texts, ticks
+from replay.rerun_plane import Frame, Label, lines, on_screen, texts, ticks
 
 _FLATTEST = 4  # a map wider or higher than this has its shorter side stretched
 _BAR = (0.06, 0.11)  # left and right edge of the colour bar, beyond the map, in map widths
@@ -62,7 +62,7 @@ class ArchiveMap:
             labels=labels,
             show_labels=False,
             colors=[(255, 255, 255)],
-            radii=rr.Radius.ui_points([2.5]),
+            radii=on_screen(2.5),
         )
         self._log("hypotheses", points)
 

@@ -24,8 +24,8 @@ class Clock:
         self._stream = stream
         self._first = 0
         self._now = 0
+        self._step = 0
         self._stages: dict[str, int] = {}
-        self.set_probe(0)
 
     @property
     def iteration(self) -> int:
@@ -37,15 +37,15 @@ class Clock:
         self._step = step
         self._set()
 
-    def start_registration(self, step: int) -> None:
+    def start_registration(self) -> None:
         """A registration starts: one moment after all that was before."""
         self._now += 1
         self._first = self._now
         self._stages = {}
-        self.set_probe(step)
+        self._set()
 
     def advance(self, stage: str, iteration: int) -> None:
-        """A stage of this registration has done `iteration` iterations; stages follow each other."""
+        """A stage of this registration has done `iteration` iterations; stages come in turn."""
         start = self._stages.setdefault(stage, self._now)
         self._now = max(self._now, start + iteration)
         self._set()

@@ -66,7 +66,9 @@ class Curves:
         """Name and colour a curve, once; by default, the next colour of its view."""
         if entity in self._named:
             return
-        siblings = sum(other.rpartition("/")[0] == entity.rpartition("/")[0] for other in self._named)
+        siblings = sum(
+            other.rpartition("/")[0] == entity.rpartition("/")[0] for other in self._named
+        )
         self._named.add(entity)
         colors = [color or SERIES[siblings % len(SERIES)]]
         line = rr.SeriesLines(names=[name], colors=colors, widths=[2.0])
@@ -117,7 +119,8 @@ class SearchPlot:
 
     def _labels(self, step: int, scale: CostScale, last: float) -> list[Label]:
         labels: list[Label] = [
-            (SEARCH_FRAME.x(value / last), 1.05, number(value)) for value in ticks(0.0, last, most=4)
+            (SEARCH_FRAME.x(value / last), 1.05, number(value))
+            for value in ticks(0.0, last, most=4)
         ]
         for place in (0.0, 0.5, 1.0):
             labels.append((-0.18, SEARCH_FRAME.y(place) - 0.06, number(scale.cost_at(place))))

@@ -18,7 +18,7 @@ from replay.rerun_colors import (
     number,
 )
 from replay.rerun_hypotheses import LEVELS, shown_hypotheses
-from replay.rerun_plane import Frame, lines, texts
+from replay.rerun_plane import Frame, lines, on_screen, texts
 
 LEGEND_FRAME = Frame(16.0, 1.0)
 """Size of the strip in units of its view."""
@@ -46,7 +46,7 @@ class Legend:
         chips = rr.Points2D(
             np.stack([x, np.full(len(x), 0.25)], axis=1),
             colors=list(kinds.values()),
-            radii=rr.Radius.ui_points([5.0]),
+            radii=on_screen(5.0),
             labels=list(kinds),
             show_labels=True,
         )
@@ -62,7 +62,11 @@ class Legend:
         """The costs at the ends of the bar, and how many hypotheses are drawn."""
         shown = shown_hypotheses(hypotheses)
         scale = CostScale.of(hypotheses.cost[shown])
-        ends = [(_BAR[0], number(scale.low)), (sum(_BAR) / 2, "cost"), (_BAR[1], number(scale.high))]
+        ends = [
+            (_BAR[0], number(scale.low)),
+            (sum(_BAR) / 2, "cost"),
+            (_BAR[1], number(scale.high)),
+        ]
         labels = [(x, 0.42, text) for x, text in ends]
         drawn, total = len(shown), len(hypotheses.cost)
         labels.append((14.5, 0.1, f"{drawn} of {total} drawn"))

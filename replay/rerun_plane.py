@@ -50,13 +50,18 @@ def ticks(lower: float, upper: float, *, most: int = 5) -> list[float]:
     return [lower, upper]
 
 
+def on_screen(radius: float) -> float:
+    """A radius in points of the screen, however far away, as the viewer takes it."""
+    return float(np.asarray(rr.Radius.ui_points(radius), dtype=np.float64))
+
+
 def texts(labels: Sequence[Label], color: Rgb = TEXT) -> rr.Points2D:
     """Texts without points, each centred on its place."""
     return rr.Points2D(
         np.array([label[:2] for label in labels], dtype=np.float32).reshape(-1, 2),
         labels=[label[2] for label in labels],
         colors=[color] * len(labels),
-        radii=[rr.Radius.ui_points(0.0)] * len(labels),
+        radii=[on_screen(0.0)] * len(labels),
         show_labels=True,
     )
 
@@ -65,5 +70,5 @@ def lines(strips: Sequence[object], color: Rgb = FRAME, *, width: float = 1.0) -
     """Line strips, each a sequence of (x, y), of a width in points of the screen."""
     arrays = [np.asarray(strip, dtype=np.float32).reshape(-1, 2) for strip in strips]
     return rr.LineStrips2D(
-        arrays, colors=[color] * len(arrays), radii=[rr.Radius.ui_points(width / 2)] * len(arrays)
+        arrays, colors=[color] * len(arrays), radii=[on_screen(width / 2)] * len(arrays)
     )

@@ -51,17 +51,21 @@ class RerunRecorder(Recorder):
         self._search = SearchPlot(self._stream)
         self._started: events.SessionStarted | None = None
         self._laid_out = False
+        self._lagging = False
 
     def record(self, event: events.Event) -> None:
         """Draw one event."""
+        self._clock.set_probe(getattr(event, "step", 0))
         self._draw(event)
 
     def flush(self) -> None:
         """Hand all events so far to the operating system, and to the viewer if there is one."""
         try:
             self._stream.flush(timeout_sec=_FLUSH_SECONDS)
-        except (RuntimeError, ValueError) as error:
-            warnings.warn(f"the Rerun recording lags behind: {error}", stacklevel=2)
+        except RuntimeError as error:
+            if not self._lagging:
+                self._lagging = True
+                warnings.warn(f"the live view or the file does not follow: {error}", stacklevel=2)
 
     def close(self) -> None:
         """Finish the file. Closing twice is closing once."""
@@ -75,7 +79,7 @@ class RerunRecorder(Recorder):
         if path is not None:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.touch()
+                path.open("wb").close()
             except OSError as error:
                 raise RecordingError(
                     f"{path} cannot be written ({error.strerror}); accepted: a new .rrd file"
@@ -105,17 +109,15 @@ class RerunRecorder(Recorder):
         self._meshes.set_up(event.mesh)
         self._legend.set_up(pose_known=known)
         self._curves.set_up()
-        self._clock.set_probe(0)
         self._scene.add_points(event.initial_points, new=False)
 
     @_draw.register
     def _(self, event: events.Probe) -> None:
-        self._clock.set_probe(event.step)
         self._scene.add_probe(event)
 
     @_draw.register
     def _(self, event: events.ProblemPosed) -> None:
-        self._clock.start_registration(event.step)
+        self._clock.start_registration()
         self._archive.start()
         self._search.start()
 

@@ -21,6 +21,7 @@ from replay.rerun_colors import (
     PAST,
     Rgb,
 )
+from replay.rerun_plane import on_screen
 
 NORMAL_LENGTH = 0.04  # m
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
@@ -40,7 +41,13 @@ class Scene:
         """What does not change: the workspace, and the object at its true pose where known."""
         self._log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         lower, upper = workspace.bounds
-        box = rr.Boxes3D(mins=[lower], sizes=[upper - lower], colors=[FRAME], radii=[_ui(0.6)], fill_mode="MajorWireframe")
+        box = rr.Boxes3D(
+            mins=[lower],
+            sizes=[upper - lower],
+            colors=[FRAME],
+            radii=[on_screen(0.6)],
+            fill_mode="MajorWireframe",
+        )
         self._log("workspace", box, static=True)
         if world_from_object is None:
             return
@@ -66,7 +73,7 @@ class Scene:
         self._log("gripper/past", _path(path, PAST, 0.8))
         self._log("gripper/path", _path(path, GRIPPER, 1.6))
         end = path[-1:]
-        self._log("gripper/end", rr.Points3D(end, colors=[GRIPPER], radii=_ui(4.0)))
+        self._log("gripper/end", rr.Points3D(end, colors=[GRIPPER], radii=on_screen(4.0)))
         self._normals(probe)
         self._points("contacts/new", probe.contacts, CONTACT, size=6.5)
 
@@ -76,15 +83,17 @@ class Scene:
             origins=probe.contacts[known].astype(np.float32),
             vectors=(NORMAL_LENGTH * probe.contact_normals[known]).astype(np.float32),
             colors=[CONTACT],
-            radii=_ui(1.2),
+            radii=on_screen(1.2),
         )
         self._log("contacts/normals", arrows)
 
     def _points(self, name: str, points: FloatArray, color: Rgb, *, size: float) -> None:
         positions = np.ascontiguousarray(points, dtype=np.float32)
-        self._log(name, rr.Points3D(positions, colors=[color], radii=_ui(size)))
+        self._log(name, rr.Points3D(positions, colors=[color], radii=on_screen(size)))
 
-    def _log(self, name: str, what: rr.AsComponents, *more: rr.AsComponents, static: bool = False) -> None:
+    def _log(
+        self, name: str, what: rr.AsComponents, *more: rr.AsComponents, static: bool = False
+    ) -> None:
         self._stream.log(f"{self._root}/{name}" if name else self._root, what, *more, static=static)
 
 
@@ -100,9 +109,4 @@ def display_mesh(mesh: trimesh.Trimesh, color: tuple[int, int, int, int]) -> rr.
 
 def _path(path: np.ndarray, color: Rgb, width: float) -> rr.LineStrips3D:
     strips = [path] if len(path) > 1 else []
-    return rr.LineStrips3D(strips, colors=[color], radii=_ui(width / 2))
-
-
-def _ui(size: float) -> float:
-    """A radius in points of the screen."""
-    return float(rr.Radius.ui_points(size))
+    return rr.LineStrips3D(strips, colors=[color], radii=on_screen(width / 2))

@@ -31,7 +31,9 @@ def save_screenshot(
     """
     if not rrd.is_file():
         raise RecordingError(f"recording {rrd} does not exist; accepted: a .rrd file")
-    port = _free_port()
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        port = int(probe.getsockname()[1])
     options = ["--headless", "--hide-welcome-screen", "--bind", HOST, "--port", str(port)]
     command = [str(viewer_program()), *options, "--window-size", f"{width}x{height}"]
     with tempfile.TemporaryFile("w+") as output:
@@ -47,7 +49,9 @@ def save_screenshot(
     png.write_bytes(picture)
 
 
-def _picture(viewer: subprocess.Popen[bytes], port: int, step: int | None, output: IO[str]) -> bytes:
+def _picture(
+    viewer: subprocess.Popen[bytes], port: int, step: int | None, output: IO[str]
+) -> bytes:
     """The picture as PNG; asks again until the viewer is ready or its time is over."""
     deadline = time.monotonic() + START_SECONDS
     reason = "it does not answer"
@@ -80,25 +84,17 @@ def _reason(text: str) -> str:
     return f"it ended: {' '.join(text.split())[-300:]}"
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        return int(probe.getsockname()[1])
-
-
 def main() -> int:
     """`python -m replay.screenshot FILE.rrd OUT.png`."""
     parser = argparse.ArgumentParser(prog="replay.screenshot", description=__doc__)
     parser.add_argument("rrd", type=Path)
     parser.add_argument("png", type=Path)
     parser.add_argument("--step", type=int, help="probe to show; by default the last")
-    parser.add_argument("--size", default="1600x900", metavar="WIDTHxHEIGHT")
+    parser.add_argument("--size", type=int, nargs=2, default=(1600, 900))
     given = parser.parse_args()
+    width, height = given.size
     try:
-        width, height = (int(side) for side in given.size.split("x"))
         save_screenshot(given.rrd, given.png, step=given.step, width=width, height=height)
-    except ValueError:
-        parser.error(f"--size is {given.size}; accepted: WIDTHxHEIGHT, as 1600x900")
     except RecordingError as error:
         print(error, file=sys.stderr)
         return 2

@@ -197,7 +197,9 @@ def test_free_term_leaves_no_violated_point_out(seed: int, count: int, poses: in
 def test_a_pose_costs_the_same_alone_and_in_any_batch(sphere: SdfGrid) -> None:
     stream = np.random.default_rng(1)
     transforms = compose(random_rotations(stream, 9), stream.uniform(-0.1, 0.1, (9, 3)))
-    points = KnownPoints(stream.uniform(-0.2, 0.2, (500, 3)), known=stream.uniform(-0.2, 0.2, (9, 3)))
+    points = KnownPoints(
+        stream.uniform(-0.2, 0.2, (500, 3)), known=stream.uniform(-0.2, 0.2, (9, 3))
+    )
     cost = RelaxedCost(sphere, points)
     alone = [cost.evaluate(one[None])[0] for one in transforms]
     np.testing.assert_array_equal(cost.evaluate(transforms), alone)

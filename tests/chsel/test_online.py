@@ -50,7 +50,11 @@ def test_axis_of_axis_gauss_is_uniform_on_the_sphere() -> None:
     world = inverse(updated_initial_set(result(), KEY, settings))[1:, :3, :3]
     turn = world @ inverse(result().object_from_world[0])[:3, :3].T
     vector = np.stack(
-        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]]
+        [
+            turn[:, 2, 1] - turn[:, 1, 2],
+            turn[:, 0, 2] - turn[:, 2, 0],
+            turn[:, 1, 0] - turn[:, 0, 1],
+        ]
     )
     axis = vector / np.sqrt((vector**2).sum(axis=0))
     np.testing.assert_allclose(np.cov(axis), np.eye(3) / 3, atol=0.01)
@@ -63,7 +67,9 @@ def test_first_set_is_uniform_in_workspace_and_rotations() -> None:
     assert (world[:, :3, 3] >= lower).all()
     assert (world[:, :3, 3] <= upper).all()
     np.testing.assert_allclose(world[:, :3, 3].mean(axis=0), (lower + upper) / 2, atol=0.005)
-    np.testing.assert_allclose(world[:, :3, 3].std(axis=0), (upper - lower) / np.sqrt(12), rtol=0.02)
+    np.testing.assert_allclose(
+        world[:, :3, 3].std(axis=0), (upper - lower) / np.sqrt(12), rtol=0.02
+    )
     # Uniform on SO(3): every column is uniform on the sphere, and E[angle] = pi/2 + 2/pi.
     np.testing.assert_allclose(np.cov(world[:, :3, 0].T), np.eye(3) / 3, atol=0.01)
     assert rotation_angle(world[:, :3, :3]).mean() == pytest.approx(np.pi / 2 + 2 / np.pi, abs=0.01)

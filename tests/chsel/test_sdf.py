@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel import SdfGrid
+from chsel.errors import SdfError, SettingError
+from chsel.sdf import mesh_sdf
+
+SIZE = np.array([0.2, 0.12, 0.08])
+
+
+@pytest.fixture(scope="module")
+def box() -> trimesh.Trimesh:
+    return trimesh.creation.box(SIZE)
+
+
+@pytest.fixture(scope="module")
+def grid(box: trimesh.Trimesh) -> SdfGrid:
+    return SdfGrid.from_mesh(box, 0.01)
+
+
+def box_sdf(points: np.ndarray) -> np.ndarray:
+    q = np.abs(points) - SIZE / 2
+    outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(axis=1))
+    return outside + np.minimum(q.max(axis=1), 0.0)
+
+
+def test_distance_to_a_box_has_its_closed_form(box: trimesh.Trimesh) -> None:
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
+    sdf, gradient = mesh_sdf(box, points)
+    np.testing.assert_allclose(sdf, box_sdf(points), atol=1e-12)
+    np.testing.assert_allclose((gradient**2).sum(axis=1), 1.0, atol=1e-12)
+    away = np.abs(sdf) > 2e-3
+    ahead = box_sdf(points + 1e-7 * gradient)
+    np.testing.assert_allclose((ahead - sdf)[away], 1e-7, rtol=1e-3)
+
+
+def test_an_open_mesh_gets_its_sign_from_the_winding_number(box: trimesh.Trimesh) -> None:
+    opened = trimesh.Trimesh(box.vertices, box.faces[:-1], process=False)
+    assert not opened.is_watertight
+    sdf, _ = mesh_sdf(opened, np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.3]]))
+    assert sdf[0] < 0
+    assert (sdf[1:] > 0).all()
+
+
+def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid: SdfGrid) -> None:
+    lower, upper = grid.bounds
+    assert (lower <= -SIZE / 2 - 0.05 + 1e-12).all()
+    assert (upper >= SIZE / 2 + 0.05 - 1e-12).all()
+    nodes = grid.origin + np.indices(grid.shape).reshape(3, -1).T * grid.resolution
+    np.testing.assert_allclose(grid.values.reshape(-1), box_sdf(nodes), atol=1e-8)
+
+
+def test_nearest_lookup_reads_the_nearest_node(grid: SdfGrid) -> None:
+    stream = np.random.default_rng(1)
+    index = stream.integers(0, np.array(grid.shape), (200, 3))
+    offset = stream.uniform(-0.0049, 0.0049, (200, 3))
+    points = np.clip(grid.origin + index * grid.resolution + offset, *grid.bounds)
+    sdf, gradient = grid.query(points, lookup="nearest")
+    np.testing.assert_array_equal(sdf, grid.values[tuple(index.T)])
+    np.testing.assert_array_equal(gradient, grid.gradients[tuple(index.T)])
+
+
+def test_trilinear_lookup_is_exact_for_a_linear_field() -> None:
+    nodes = np.stack(np.meshgrid(*[np.arange(6) * 0.1] * 3, indexing="ij"), -1)
+    slope = np.array([0.3, 0.5, 0.2])
+    linear = SdfGrid(np.zeros(3), 0.1, nodes @ slope + 0.01, np.broadcast_to(slope, nodes.shape))
+    points = np.random.default_rng(2).uniform(0.0, 0.5, (300, 3))
+    points[:2] = [[0.5, 0.5, 0.5], [0.0, 0.0, 0.0]]
+    sdf, gradient = linear.query(points, lookup="trilinear")
+    np.testing.assert_allclose(sdf, points @ slope + 0.01, atol=1e-14)
+    np.testing.assert_allclose(gradient, np.tile(slope, (300, 1)), atol=1e-14)
+
+
+@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
+def test_beyond_the_grid_the_distance_stays_close_to_the_true_one(
+    grid: SdfGrid, lookup: str
+) -> None:
+    points = np.random.default_rng(3).uniform(-2.0, 2.0, (2000, 3))
+    sdf, gradient = grid.query(points, lookup=lookup, outside="surface_point")
+    true = box_sdf(points)
+    far = true > 0.2
+    assert far.sum() > 1500
+    assert (sdf.numpy()[far] > true[far] - 0.01).all()
+    assert (sdf.numpy()[far] < 1.1 * true[far] + 0.01).all()
+    np.testing.assert_allclose((gradient.numpy()[far] ** 2).sum(axis=1), 1.0, atol=1e-9)
+
+
+def test_bounding_box_distance_is_that_to_the_grid(grid: SdfGrid) -> None:
+    _, upper = grid.bounds
+    sdf, gradient = grid.query([[upper[0] + 0.3, 0.0, 0.0]], outside="bounding_box")
+    assert float(sdf[0]) == pytest.approx(0.3)
+    np.testing.assert_allclose(gradient.numpy(), [[1.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
+def test_active_cells_are_those_that_read_a_value_below_the_level(
+    grid: SdfGrid, lookup: str
+) -> None:
+    import torch
+
+    active = grid.active_cells(-0.01, lookup).numpy()
+    points = torch.tensor(np.random.default_rng(4).uniform(*grid.bounds, (20_000, 3)))
+    sdf, _ = grid.query(points, lookup=lookup)
+    flags = active[grid.cells(points, lookup).numpy()]
+    assert flags[(sdf < -0.01).numpy()].all()
+    if lookup == "nearest":
+        assert not flags[(sdf >= -0.01).numpy()].any()
+    assert 0.01 < flags.mean() < 0.3
+
+
+def test_two_builds_have_the_same_digest_and_another_object_has_not(box: trimesh.Trimesh) -> None:
+    again = SdfGrid.from_mesh(box.copy(), 0.01)
+    assert SdfGrid.from_mesh(box, 0.01).digest == again.digest
+    wider = trimesh.creation.box(SIZE * [1.0, 1.0, 1.0001])
+    assert SdfGrid.from_mesh(wider, 0.01).digest != again.digest
+
+
+def test_grids_that_make_no_sense_are_refused(grid: SdfGrid, box: trimesh.Trimesh) -> None:
+    with pytest.raises(SdfError, match="border"):
+        SdfGrid(grid.origin, 0.01, grid.values[10:], grid.gradients[10:])
+    with pytest.raises(SdfError, match=r"SDF gradients has shape"):
+        SdfGrid(grid.origin, 0.01, grid.values, grid.gradients[1:])
+    with pytest.raises(SdfError, match="not finite"):
+        SdfGrid(
+            grid.origin, 0.01, np.where(grid.values < -0.03, np.nan, grid.values), grid.gradients
+        )
+    with pytest.raises(SdfError, match="coarser resolution"):
+        SdfGrid.from_mesh(box, 1e-5)
+    with pytest.raises(SettingError, match="SDF resolution is 0"):
+        SdfGrid.from_mesh(box, 0)

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.optimize import minimize_scalar
+
+from chsel import SdfGrid
+from chsel.errors import SettingError
+from chsel.measures import MEASURES, measure_named
+from chsel.pose import apply, axis_angle, compose, inverse, random_rotations, rotation_vector
+from chsel.space import PlaneSettings, SE2Space, SE3Space, transforms_of
+
+BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
+STREAM = np.random.default_rng(0)
+
+
+def random_transforms(count: int) -> np.ndarray:
+    return compose(random_rotations(STREAM, count), STREAM.uniform(-0.3, 0.3, (count, 3)))
+
+
+def test_nine_numbers_and_transforms_are_inverse_to_each_other() -> None:
+    transforms = random_transforms(50)
+    vectors = SE3Space().encode(transforms)
+    np.testing.assert_allclose(transforms_of(SE3Space(), vectors), transforms, atol=1e-14)
+
+
+def test_raw_rows_decode_to_the_rotation_of_gram_schmidt() -> None:
+    transforms = random_transforms(20)
+    vectors = SE3Space().encode(transforms)
+    vectors[:, 3:6] = 1.7 * vectors[:, 3:6] - 0.4 * vectors[:, 0:3]  # same span, same halves
+    vectors[:, 0:3] *= 0.2
+    np.testing.assert_allclose(transforms_of(SE3Space(), vectors), transforms, atol=1e-12)
+
+
+def test_degenerate_rows_decode_to_finite_numbers() -> None:
+    vectors = torch.zeros((2, 9), dtype=torch.float64)
+    vectors[1, 0] = vectors[1, 3] = 1.0
+    rotation, _ = SE3Space().decode(vectors)
+    assert bool(torch.isfinite(rotation).all())
+
+
+def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius() -> None:
+    axis = np.array([0.0, 0.6, 0.8])
+    space = SE2Space(PlaneSettings(axis=tuple(axis), offset=-0.1), BOX)
+    for theta in np.linspace(-3.0, 3.0, 9):
+        tilt = axis_angle(np.array([0.8, 0.0, 0.6]), np.deg2rad(10.0))
+        rotation = axis_angle(axis, theta) @ tilt
+        found = space.encode(compose(rotation, np.zeros(3))[None])[0, 0]
+
+        def distance(angle: float, rotation: np.ndarray = rotation) -> float:
+            return float(((axis_angle(axis, angle) - rotation) ** 2).sum())
+
+        best = minimize_scalar(distance, bracket=(theta - 0.3, theta, theta + 0.3), tol=1e-12).x
+        turns = (found - best) / (2 * np.pi)
+        assert abs(turns - round(turns)) * 2 * np.pi < 1e-6
+
+
+def test_plane_poses_survive_encoding_and_stay_on_the_plane() -> None:
+    settings = PlaneSettings(axis=(0, 0, 2.0), offset=-0.1, resting_rotation=(np.pi / 2, 0, 0))
+    space = SE2Space(settings, BOX)
+    vectors = STREAM.uniform(-1.0, 1.0, (30, 3))
+    transforms = transforms_of(space, vectors)
+    np.testing.assert_allclose(space.encode(transforms), vectors, atol=1e-12)
+    np.testing.assert_allclose(transforms[:, 2, 3], -0.1, atol=1e-15)
+    rest = rotation_vector(np.array([np.pi / 2, 0, 0]))
+    np.testing.assert_allclose(transforms[:, 2, :3], np.tile(rest[2], (30, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("resting", "normal", "half"),
+    [((0, 0, 0), (0, 0, 1), 0.03), ((np.pi / 2, 0, 0), (0, 1, 0), 0.05)],
+)
+def test_plane_height_puts_the_object_onto_the_plane(
+    resting: tuple[float, ...], normal: tuple[float, ...], half: float
+) -> None:
+    """A box at rest on a table at height 0.4, in every pose of the plane."""
+    world_axis = np.array([0.0, 0.0, 1.0])
+    axis = rotation_vector(np.array(resting)) @ world_axis
+    settings = PlaneSettings(axis=tuple(axis), plane_height=0.4, resting_rotation=resting)
+    transforms = transforms_of(SE2Space(settings, BOX), STREAM.uniform(-1.0, 1.0, (5, 3)))
+    corners = trimesh.creation.box((0.2, 0.1, 0.06)).vertices
+    for transform in transforms:
+        heights = apply(inverse(transform), corners)[:, 2]
+        assert heights.min() == pytest.approx(0.4, abs=1e-3)
+        assert heights.max() == pytest.approx(0.4 + 2 * half, abs=1e-3)
+    np.testing.assert_allclose(np.abs(axis), normal, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(MEASURES))
+def test_measures_have_the_gradients_of_their_values(name: str) -> None:
+    planar = name.startswith("plane")
+    space = SE2Space(PlaneSettings(offset=0.0), BOX) if planar else SE3Space()
+    measure = measure_named(name, planar=planar)
+    x = torch.tensor(STREAM.uniform(-1.0, 1.0, (1, space.dimension)), requires_grad=True)
+
+    def values(vectors: torch.Tensor) -> torch.Tensor:
+        return measure.function(vectors, *space.decode(vectors))
+
+    assert values(x).shape == (1, measure.count)
+    assert torch.autograd.gradcheck(values, (x,), eps=1e-6, atol=1e-6)
+
+
+def test_object_measures_are_of_world_from_object() -> None:
+    transforms = random_transforms(10)
+    vectors = torch.tensor(SE3Space().encode(transforms))
+    decoded = SE3Space().decode(vectors)
+    world = inverse(transforms)
+    xy = MEASURES["object_xy"].function(vectors, *decoded).numpy()
+    np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
+    yaw = MEASURES["object_yaw"].function(vectors, *decoded).numpy()[:, 0]
+    np.testing.assert_allclose(yaw, np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
+
+
+def test_a_measure_of_the_other_space_names_those_that_fit() -> None:
+    with pytest.raises(SettingError, match="only with plane; accepted: object_xy"):
+        measure_named("plane_angle", planar=False)
+    with pytest.raises(SettingError, match="only without plane; accepted: .*plane_position"):
+        measure_named("rotation_3", planar=True)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"plane_height": 0.0, "offset": 0.0}, {"axis": (0, 0, 0), "offset": 0.0}]
+)
+def test_planes_that_say_too_little_or_too_much_are_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(SettingError):
+        PlaneSettings(**changes)  # type: ignore[arg-type]
