@@ -62,7 +62,8 @@ class KinematicEngine:
             close = near[self._clearance[near] <= length]
             points = patches.points[np.isin(patches.labels, close)]
             points = points[self._object.distance(points + target) <= length]
-            if len(points) > 0 and self._object.closest(points + target)[0].min() <= 0.0:
+            points = points[self._object.closest(points + target)[0] <= 0.0]
+            if len(points) > 0:
                 return self._touch(points, motion, length)
         self._position = target
         return Touch(target)
@@ -71,12 +72,15 @@ class KinematicEngine:
         """Nothing to let go of."""
 
     def _touch(self, points: FloatArray, motion: FloatArray, length: float) -> Touch:
-        """Bisect for the moment at which points (S, 3) of the hand first meet the object."""
+        """Bisect for the moment at which the first of points (S, 3), all inside at last, gets in."""
         start, free, blocked = self._position, 0.0, 1.0
         while (blocked - free) * length > PRECISION:
             middle = 0.5 * (free + blocked)
-            signed = self._object.closest(points + start + middle * motion)[0]
-            free, blocked = (middle, blocked) if signed.min() > 0.0 else (free, middle)
+            inside = self._object.closest(points + start + middle * motion)[0] <= 0.0
+            if inside.any():
+                blocked, points = middle, points[inside]
+            else:
+                free = middle
         self._position = start + free * motion
         # The clearances above hold at the target; the hand has stopped short of it.
         self._clearance -= (1.0 - free) * length

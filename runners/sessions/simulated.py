@@ -92,7 +92,8 @@ class PyBulletEngine:
         touching = [reading for reading in self._readings if reading is not None]
         if len(touching) < ENOUGH_READINGS:
             return Touch(position, force)
-        return Touch(position, force, touching[-1].contact, touching[-1].normal)
+        k = 0 if os.environ.get("ONSET") else -1
+        return Touch(position, force, touching[k].contact, touching[k].normal)
 
     def close(self) -> None:
         """Disconnect from the engine."""
@@ -107,7 +108,10 @@ class PyBulletEngine:
             return None
         forces = [record[_FORCE] * np.array(record[_NORMAL_ON_B]) for record in records]
         total = np.sum(forces, axis=0)
-        hardest = max(records, key=lambda record: record[_FORCE])
+        pick = os.environ.get("PICK", "force")
+        if pick == "force": hardest = max(records, key=lambda record: record[_FORCE])
+        elif pick == "deep": hardest = min(records, key=lambda record: record[_DISTANCE])
+        else: hardest = records[0]
         contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
         return _Reading(contact, normal, float(np.sqrt(total @ total)))
 

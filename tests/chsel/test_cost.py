@@ -36,7 +36,7 @@ def value_and_translation_gradient(
     translation = ORIGIN.clone().requires_grad_()
     value = cost(EYE, translation)
     (gradient,) = torch.autograd.grad(value.sum(), translation)
-    return float(value), gradient[0].numpy()
+    return float(value.detach()), gradient[0].numpy()
 
 
 @pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
@@ -208,7 +208,10 @@ def test_a_pose_costs_the_same_alone_and_in_any_batch(sphere: SdfGrid) -> None:
 
 def test_no_interior_point_is_an_error_that_says_what_to_do(sphere: SdfGrid) -> None:
     changes = CostSettings(free_term="interior", penetration_tolerance=-0.2)
-    with pytest.raises(SettingError, match="penetration_tolerance nearer to 0"):
+    with (
+        pytest.warns(UserWarning, match="cannot be violated"),
+        pytest.raises(SettingError, match="penetration_tolerance nearer to 0"),
+    ):
         RelaxedCost(sphere, KnownPoints(free=[[0, 0, 0]]), changes)
 
 

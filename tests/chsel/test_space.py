@@ -116,7 +116,7 @@ def test_object_measures_are_of_world_from_object() -> None:
 def test_a_measure_of_the_other_space_names_those_that_fit() -> None:
     with pytest.raises(SettingError, match="only with plane; accepted: object_xy"):
         measure_named("plane_angle", planar=False)
-    with pytest.raises(SettingError, match="only without plane; accepted: .*plane_position"):
+    with pytest.raises(SettingError, match=r"only without plane; accepted: .*plane_position"):
         measure_named("rotation_3", planar=True)
 
 
