@@ -59,7 +59,7 @@ def descend(
         vectors = objective.space.encode(estimates)
         costs = objective.costs(vectors)
         done = (restart + 1) * settings.iterations
-        observer.trace("descent", done, vectors, costs)
+        observer.trace("descent", done, vectors.copy(), costs.copy())
         observer.progress("descent", done, settings.restarts * settings.iterations)
         if _mean_gain(previous, costs) <= settings.stop_below:
             break

@@ -13,7 +13,6 @@ from chsel.measures import Measure
 from chsel.objective import Objective
 from chsel.problem import ArchiveSnapshot, Hypotheses
 
-_SAME_POSE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -125,11 +124,8 @@ def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> flo
 
 def repeated(object_from_world: FloatArray) -> BoolArray:
     """True (B,) for each transform of (B, 4, 4) that equals an earlier one."""
-    rounded = (
-        np.round(object_from_world / _SAME_POSE) if len(object_from_world) else object_from_world
-    )
-    _, first = np.unique(rounded.reshape(len(rounded), -1), axis=0, return_index=True)
-    flags = np.ones(len(rounded), dtype=bool)
+    _, first = np.unique(object_from_world.reshape(-1, 16), axis=0, return_index=True)
+    flags = np.ones(len(object_from_world), dtype=bool)
     flags[first] = False
     return flags
 

@@ -20,7 +20,7 @@ USUAL_ARCHIVE = Frame(40, 40)
 _EYE_DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the workspace's middle; probes move along +x
 _EYE_DISTANCE = 1.06  # in diagonals of the workspace
 _LOOK_DOWN = 0.04  # in heights of the workspace, whose near corner would be cut off
-_GRID_SPACING = 0.1  # m
+_GRID_LINES = 5  # at least these across the diagonal of the workspace
 
 
 def session_blueprint(
@@ -50,14 +50,15 @@ def scene_view(workspace: Workspace, root: str = "scene", name: str = "Scene") -
     """The scene under the entity `root`, looked at obliquely from where the probes come from."""
     lower, upper = workspace.bounds
     centre = (lower + upper) / 2
-    away = _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION) * np.linalg.norm(upper - lower)
+    diagonal = float(np.linalg.norm(upper - lower))
+    away = _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION) * diagonal
     return rrb.Spatial3DView(
         origin=f"/{root}",
         name=name,
         background=rrb.Background(color=BACKGROUND, kind="SolidColor"),
         line_grid=rrb.LineGrid3D(
             visible=True,
-            spacing=_GRID_SPACING,
+            spacing=10.0 ** np.floor(np.log10(diagonal / _GRID_LINES)),
             plane=rr.components.Plane3D((0.0, 0.0, 1.0), float(lower[2])),
             stroke_width=1.0,
             color=GRID,

@@ -12,6 +12,7 @@ from google.protobuf.message import DecodeError
 from chsel.errors import RecordingError
 from replay.schemas import PACKAGE, Kind, field_kinds, message_class
 
+_NARROW = np.dtype("<f4")
 _LONGEST = 2**40  # of an array's side: what is beyond overflows numpy before it can be checked
 
 
@@ -55,9 +56,12 @@ def _set(message: Any, field: str, kind: Kind, value: Any, lengths: dict[str, in
         value = np.asarray(value)
         _check_array(kind, value.dtype, value.shape, lengths)
         target = getattr(message, field)
-        target.dtype = kind.dtype.str
+        stored = value.astype(kind.dtype, copy=False)
+        if kind.narrow and (stored.astype(_NARROW).astype(kind.dtype) == stored).all():
+            stored = stored.astype(_NARROW)
+        target.dtype = stored.dtype.str
         target.shape.extend(value.shape)
-        target.data = value.astype(kind.dtype, copy=False).tobytes()
+        target.data = stored.tobytes()
     elif kind.is_message and kind.repeated:
         for item in value:
             _fill(getattr(message, field).add(), kind.type, item)
@@ -96,19 +100,21 @@ def _get(message: Any, where: str, field: str, kind: Kind, lengths: dict[str, in
 
 def _array(where: str, kind: Kind, message: Any, lengths: dict[str, int]) -> np.ndarray:
     """The array in an Array message, in the machine's byte order; read-only."""
-    dtype, shape, data = kind.dtype, tuple(message.shape), message.data
-    assert dtype is not None
+    wide, shape, data = kind.dtype, tuple(message.shape), message.data
+    assert wide is not None
+    dtype = _NARROW if kind.narrow and message.dtype == _NARROW.str else wide
     if message.dtype != dtype.str:
         raise RecordingError(f"{where} is of type {message.dtype!r}; accepted: {dtype.str!r}")
     try:
-        _check_array(kind, dtype, shape, lengths)
+        _check_array(kind, wide, shape, lengths)
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from None
     if max(shape) > _LONGEST or len(data) != math.prod(shape) * dtype.itemsize:
         raise RecordingError(f"{where} has {len(data)} bytes, which do not fill its shape {shape}")
     if dtype.kind == "b" and data.strip(b"\0\1"):
         raise RecordingError(f"{where} holds bytes other than 0 and 1")
-    array = np.frombuffer(data, dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
+    array = np.frombuffer(data, dtype).reshape(shape)
+    array = array.astype(wide.newbyteorder("="), copy=False)
     array.setflags(write=False)
     return array
 

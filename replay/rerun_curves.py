@@ -126,6 +126,6 @@ class SearchPlot:
             labels.append((-0.18, SEARCH_FRAME.y(place) - 0.06, number(scale.cost_at(place))))
         for row, (first, stage) in enumerate(self._stages):  # neighbours may be narrow
             height = -0.2 - 0.14 * (row % 2)
-            labels.append((SEARCH_FRAME.x(first / last), height, stage.replace("_", " ")))
+            labels.append((SEARCH_FRAME.x(first / last) + 0.1, height, stage.replace("_", " ")))
         labels.append((SEARCH_FRAME.width / 2, 1.2, f"iteration, probe {step}"))
         return labels

@@ -10,6 +10,7 @@ from replay.rerun_colors import (
     CONTACT,
     FREE,
     GRIPPER,
+    KNOWN,
     OBJECT,
     OCCUPIED,
     CostScale,
@@ -26,10 +27,11 @@ _KINDS: dict[str, Rgb] = {
     "contact": CONTACT,
     "free": FREE,
     "occupied": OCCUPIED,
+    "known": KNOWN,
     "gripper": GRIPPER,
     "true pose": OBJECT,
 }
-_BAR = (8.6, 12.6)  # left and right end of the cost bar
+_BAR = (9.7, 12.7)  # left and right end of the cost bar
 
 
 class Legend:
@@ -42,7 +44,7 @@ class Legend:
     def set_up(self, *, pose_known: bool) -> None:
         """The kinds of things in the scene, and the bar of cost steps."""
         kinds = {name: color for name, color in _KINDS.items() if pose_known or color != OBJECT}
-        x = 0.7 + 1.55 * np.arange(len(kinds))
+        x = 0.7 + 1.45 * np.arange(len(kinds))
         chips = rr.Points2D(
             np.stack([x, np.full(len(x), 0.25)], axis=1),
             colors=list(kinds.values()),

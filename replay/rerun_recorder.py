@@ -155,12 +155,12 @@ class RerunRecorder(Recorder):
 
     @_draw.register
     def _(self, event: events.Logged) -> None:
-        self._log(event.text, event.level)
+        level = _LOG_LEVELS.get(event.level, event.level.upper())
+        self._stream.log("log", rr.TextLog(event.text, level=level))
 
     @_draw.register
     def _(self, event: events.SessionEnded) -> None:
-        level = "info" if event.outcome == "finished" else "warning"
-        self._log(f"session {event.outcome}", level)
+        """Nothing to draw: runners also log the outcome as text."""
 
     def _fit_layout(self, archive: ArchiveSnapshot | None) -> None:
         """Lay the views out anew once the first registration shows what archive there is."""
@@ -173,6 +173,3 @@ class RerunRecorder(Recorder):
             known = self._started.world_from_object is not None
             layout = session_blueprint(self._started.workspace, pose_known=known, archive=archive)
             self._stream.send_blueprint(layout)
-
-    def _log(self, text: str, level: str) -> None:
-        self._stream.log("log", rr.TextLog(text, level=_LOG_LEVELS.get(level, level.upper())))

@@ -23,7 +23,7 @@ from replay.rerun_colors import (
 )
 from replay.rerun_plane import on_screen
 
-NORMAL_LENGTH = 0.04  # m
+NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
 """What each probe adds to: a view shows these over all probes up to the moment."""
 
@@ -34,6 +34,7 @@ class Scene:
     def __init__(self, stream: rr.RecordingStream, root: str = "scene") -> None:
         self._stream = stream
         self._root = root
+        self._normal_length = 0.0
 
     def set_up(
         self, mesh: trimesh.Trimesh, workspace: Workspace, world_from_object: FloatArray | None
@@ -41,6 +42,7 @@ class Scene:
         """What does not change: the workspace, and the object at its true pose where known."""
         self._log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         lower, upper = workspace.bounds
+        self._normal_length = NORMAL_LENGTH * float(np.linalg.norm(upper - lower))
         box = rr.Boxes3D(
             mins=[lower],
             sizes=[upper - lower],
@@ -81,7 +83,7 @@ class Scene:
         known = np.abs(probe.contact_normals).sum(axis=1) > 0.0
         arrows = rr.Arrows3D(
             origins=probe.contacts[known].astype(np.float32),
-            vectors=(NORMAL_LENGTH * probe.contact_normals[known]).astype(np.float32),
+            vectors=(self._normal_length * probe.contact_normals[known]).astype(np.float32),
             colors=[CONTACT],
             radii=on_screen(1.2),
         )

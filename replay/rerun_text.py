@@ -28,9 +28,10 @@ def session_markdown(started: SessionStarted) -> str:
 
 
 def _find(config: Mapping[str, Any], name: str) -> Any:
-    """The value of a key at the top, or in the group `method`."""
+    """The choice of a group at the top of the configuration, or in its group `method`."""
     method = config.get("method")
-    return config.get(name) or (method.get(name) if isinstance(method, Mapping) else None)
+    found = config.get(name) or (method.get(name) if isinstance(method, Mapping) else None)
+    return found.get("name") if isinstance(found, Mapping) else found
 
 
 def _indented(value: Any, depth: int = 0) -> list[str]:

@@ -23,7 +23,7 @@ STEP_TIME = 10**9
 
 # A field is a protobuf scalar, a message of this table, or an array with its type and shape. In a
 # shape, a letter is a length that is the same wherever it stands in the message. "?" after a field
-# says that it may be absent, "*" that it repeats. Field numbers follow the order: only append.
+# says that it may be absent, "*" that it repeats. "f8~" is stored in 32 bits where that is exact. Field numbers follow the order: only append.
 MESSAGES: Mapping[str, Mapping[str, str]] = {
     # The bytes are little-endian, in C order; the type is named as numpy names it.
     "Array": {"dtype": "string", "shape": "uint64*", "data": "bytes"},
@@ -115,8 +115,8 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
     "SdfGrid": {
         "origin": "f8[3]",
         "resolution": "double",
-        "values": "f8[x,y,z]",
-        "gradients": "f8[x,y,z,3]",
+        "values": "f8~[x,y,z]",
+        "gradients": "f8~[x,y,z,3]",
     },
 }
 
@@ -134,7 +134,7 @@ RECORDS: Mapping[str, str] = {
 """Topics that carry messages of the table."""
 
 PACKAGE = "chsel"
-_ARRAY_KIND = re.compile(r"([fib]\d)\[(.*)\]")
+_ARRAY_KIND = re.compile(r"([fib]\d)(~?)\[(.*)\]")
 
 
 @dataclass(frozen=True)
@@ -146,6 +146,7 @@ class Kind:
     optional: bool
     dtype: np.dtype[Any] | None
     shape: tuple[str, ...]
+    narrow: bool
 
     @property
     def is_message(self) -> bool:
@@ -185,7 +186,8 @@ def field_kinds(name: str) -> dict[str, Kind]:
             repeated=text.endswith("*"),
             optional=text.endswith("?"),
             dtype=np.dtype(f"<{array[1]}") if array else None,
-            shape=tuple(array[2].split(",")) if array else (),
+            shape=tuple(array[3].split(",")) if array else (),
+            narrow=bool(array and array[2]),
         )
     return kinds
 

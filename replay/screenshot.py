@@ -63,6 +63,7 @@ def _picture(
             client = ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy")
             state = client.get_state()
             if state.loading or not any(shown.timelines for shown in state.recordings):
+                reason = "it found no recording in the file"
                 continue
             if step is not None:
                 client.set_time(PROBE, sequence=step, play_state="paused")
@@ -79,7 +80,7 @@ def _picture(
 
 def _reason(text: str) -> str:
     """Why the viewer ended, from what it printed."""
-    if "adapter" in text:
+    if "render context" in text or "No graphics adapter" in text:
         return "it found no Vulkan driver; accepted: a graphics card's, or mesa-vulkan-drivers"
     return f"it ended: {' '.join(text.split())[-300:]}"
 

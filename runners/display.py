@@ -61,9 +61,12 @@ class Display:
             self._console.print("no registration: too few contacts or probes for one")
             return
         truth = "best_position_error" in rows[-1]
-        table = Table(title="registrations", title_justify="left")
+        title = "registrations"
+        if truth:
+            title += "; errors to the true pose, of the hypothesis ranked best and the closest"
+        table = Table(title=title, title_justify="left")
         names = ["probe", "contacts", "best cost", "distinct"]
-        errors = ["error of best", "closest of set"] if truth else []
+        errors = ["best: mm / °", "closest: mm / °"] if truth else []
         for name in [*names, *errors, "time"]:
             table.add_column(name, justify="right")
         for row in rows:
@@ -88,4 +91,4 @@ class Display:
 def _error(row: Mapping[str, Any], which: str) -> str:
     millimetres = 1000.0 * row[f"{which}_position_error"]
     degrees = math.degrees(row[f"{which}_rotation_error"])
-    return f"{millimetres:.1f} mm {degrees:.1f}°"
+    return f"{millimetres:.1f} / {degrees:.1f}"

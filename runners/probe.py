@@ -55,13 +55,12 @@ class ProbeConfig:
     assets: AssetsConfig
     logs: str
     seed: int = 0
-    threads: int | None = None
+    threads: int = 1
     configuration: str | None = None
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
-        if self.threads is not None:
-            require_positive("threads", self.threads)
+        require_positive("threads", self.threads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +79,7 @@ def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
     checked = build_settings(ProbeConfig, values, "probe")
-    if checked.threads is not None:
-        torch.set_num_threads(checked.threads)
+    torch.set_num_threads(checked.threads)
     method_config = dict(checked.method)
     method_name = str(method_config.pop("name", None))
     method = build_method(method_name, method_config)

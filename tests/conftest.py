@@ -6,8 +6,10 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+torch.set_num_threads(1)  # two threads on two busy cores are many times slower
 
 
 def _optional_data(part: str) -> Path:

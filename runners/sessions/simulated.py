@@ -103,15 +103,18 @@ class PyBulletEngine:
     def _read(self) -> _Reading | None:
         """The contact between hand and object after a step: where it presses hardest."""
         records = self._world.getContactPoints(self._hand, self._object)
-        records = [record for record in records if record[_DISTANCE] < TOUCHING]
+        records = [record for record in records if record[_FORCE] > 0.0]
         if not records:
             return None
         forces = [record[_FORCE] * np.array(record[_NORMAL_ON_B]) for record in records]
         total = np.sum(forces, axis=0)
         pick = os.environ.get("PICK", "force")
-        if pick == "force": hardest = max(records, key=lambda record: record[_FORCE])
-        elif pick == "deep": hardest = min(records, key=lambda record: record[_DISTANCE])
-        else: hardest = records[0]
+        if pick == "force":
+            hardest = max(records, key=lambda record: record[_FORCE])
+        elif pick == "deep":
+            hardest = min(records, key=lambda record: record[_DISTANCE])
+        else:
+            hardest = records[0]
         contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
         return _Reading(contact, normal, float(np.sqrt(total @ total)))
 

@@ -138,7 +138,8 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
         return message_factory.GetMessageClass(pool.FindMessageTypeByName(name)).FromString(data)
 
     def array(message):
-        return np.frombuffer(message.data, message.dtype).reshape(tuple(message.shape))
+        stored = np.frombuffer(message.data, message.dtype).reshape(tuple(message.shape))
+        return stored.astype(np.float64)  # a grid may be stored in 32 bits
 
     points, elites = {"free": [], "occupied": [], "known": []}, None
     for topic, name, message in stored:

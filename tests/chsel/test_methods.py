@@ -1,0 +1,232 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from chsel import Hypotheses, KnownPoints, RegistrationProblem, SdfGrid, Workspace
+from chsel.cost import RelaxedCost
+from chsel.evaluation.pose_error import pose_errors
+from chsel.methods import METHODS, build_method, preset_settings
+from chsel.methods.method import Method
+from chsel.online import pose_problem
+from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.presets import PRESETS
+from chsel.problem import ArchiveSnapshot
+from chsel.settings import settings_mapping
+from chsel.streams import StreamKey
+
+WORLD_FROM_OBJECT = compose(
+    axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3])
+)
+WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
+
+
+def l_shape() -> trimesh.Trimesh:
+    """A body without symmetry."""
+    parts = [
+        trimesh.creation.box(bounds=[[0, 0, 0], [0.2, 0.06, 0.05]]),
+        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.14, 0.05]]),
+        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.06, 0.1]]),
+    ]
+    return trimesh.boolean.union(parts, engine="manifold")
+
+
+MESH = l_shape()
+GRID = SdfGrid.from_mesh(MESH, 0.01)
+
+
+def known_points(contacts: int = 60) -> KnownPoints:
+    surface = trimesh.sample.sample_surface(MESH, contacts, seed=1)[0]
+    lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.05)] * 3, indexing="ij"), -1)
+    free = lattice.reshape(-1, 3)
+    sdf, _ = GRID.query(apply(inverse(WORLD_FROM_OBJECT), free))
+    return KnownPoints(free=free[sdf.numpy() > 0.02], known=apply(WORLD_FROM_OBJECT, surface))
+
+
+def quick(name: str, preset: str = "default", **changes: object) -> Method:
+    settings = settings_mapping(preset_settings(name, preset))
+    settings["descent"] |= {"restarts": 2, "iterations": 15}
+    if "emitter" in settings:
+        settings["emitter"] |= {"iterations": 6}
+    return build_method(name, settings | changes)
+
+
+def posed(
+    method: Method, previous: Hypotheses | None = None, **changes: object
+) -> RegistrationProblem:
+    points = known_points(12)
+    key = StreamKey(3, 1)
+    return pose_problem(GRID, points, WORKSPACE, 0.05, key, method.online, previous)
+
+
+class Watcher:
+    """Keeps everything that it is shown."""
+
+    snapshot_interval = 2
+
+    def __init__(self) -> None:
+        self.stages: list[tuple[str, int]] = []
+        self.archives: list[ArchiveSnapshot] = []
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        self.stages.append((stage, iteration))
+
+    def trace(self, stage: str, iteration: int, vectors: np.ndarray, cost: np.ndarray) -> None:
+        vectors[:] = np.nan  # even one that scribbles over what it sees
+        cost[:] = np.nan
+
+    def snapshot(self, archive: ArchiveSnapshot) -> None:
+        self.archives.append(archive)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_finds_the_pose_of_an_object_touched_all_over(name: str) -> None:
+    method = build_method(name)
+    problem = pose_problem(
+        GRID, known_points(), WORKSPACE, 0.05, StreamKey(0, 0), method.online, None
+    )
+    found = method.register(problem)
+    position, rotation = pose_errors(found.object_from_world, WORLD_FROM_OBJECT)
+    assert position[0] < 0.005
+    assert rotation[0] < 0.05
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", METHODS)
+def test_hypotheses_are_sorted_by_the_cost_of_exactly_these_poses(name: str, preset: str) -> None:
+    method = quick(name, preset)
+    problem = posed(method)
+    found = method.register(problem)
+    assert found.object_from_world.shape == (30, 4, 4)
+    assert (np.diff(found.cost) >= 0.0).all()
+    cost = RelaxedCost.of(problem, method.settings.cost).evaluate(found.object_from_world)
+    np.testing.assert_allclose(found.cost, cost, rtol=1e-9, atol=1e-12)
+    assert found.duplicate.sum() == 30 - len(np.unique(found.object_from_world, axis=0))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", METHODS)
+def test_watching_and_threads_change_no_bit(name: str, preset: str) -> None:
+    method = quick(name, preset)
+    problem = posed(method)
+    alone = method.register(problem).digest
+    assert method.register(problem, Watcher()).digest == alone
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert method.register(problem).digest == alone
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_fresh_processes_give_the_same_bits_on_any_number_of_threads() -> None:
+    code = (
+        "import sys, torch; torch.set_num_threads(int(sys.argv[1]));"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r});"
+        "from test_methods import METHODS, posed, quick;"
+        "print([quick(n).register(posed(quick(n))).digest for n in METHODS])"
+    )
+    outputs = {
+        subprocess.run(
+            [sys.executable, "-c", code, threads], capture_output=True, text=True, check=True
+        ).stdout
+        for threads in ("1", "2")
+    }
+    here = f"{[quick(n).register(posed(quick(n))).digest for n in METHODS]}\n"
+    assert outputs == {here}
+
+
+def test_a_whole_session_step_is_a_function_of_its_problem_alone() -> None:
+    method = quick("chsel")
+    first = method.register(posed(method))
+    second = posed(method, first)
+    expected = method.register(second).digest
+    again = quick("chsel")
+    rebuilt = RegistrationProblem(
+        SdfGrid(GRID.origin, GRID.resolution, GRID.values, GRID.gradients),
+        KnownPoints(second.points.free, known=second.points.known),
+        second.initial_set.copy(),
+        WORKSPACE,
+        0.05,
+        StreamKey(3, 1),
+        second.low_cost_set.copy(),
+    )
+    assert rebuilt.digest == second.digest
+    assert again.register(rebuilt).digest == expected
+
+
+def test_snapshots_come_at_start_interval_and_end_and_only_improve() -> None:
+    watcher = Watcher()
+    method = quick("chsel")
+    found = method.register(posed(method), watcher)
+    assert [archive.iteration for archive in watcher.archives] == [0, 2, 4, 6]
+    coverage = [archive.coverage for archive in watcher.archives]
+    assert coverage == sorted(coverage)
+    assert found.archive is not None
+    assert found.archive.digest == watcher.archives[-1].digest
+    assert ("descent", 30) in watcher.stages
+    assert watcher.stages[-1] == ("cma_mega", 6)
+
+
+def test_hypotheses_name_the_archive_cells_that_they_come_from() -> None:
+    method = quick("chsel")
+    found = method.register(posed(method))
+    assert found.archive is not None
+    rows = [list(found.archive.cells).index(cell) for cell in found.cell]
+    np.testing.assert_array_equal(found.elites[rows], found.object_from_world)
+
+
+def test_elites_of_the_last_result_enter_the_archive() -> None:
+    method = quick("chsel")
+    first = method.register(posed(method))
+    problem = posed(method, first)
+    assert len(problem.low_cost_set) == len(first.elites)
+    assert method.register(problem).cost[0] <= first.cost[0] + 1e-9
+
+
+def test_more_passes_do_not_worsen_the_best_cost() -> None:
+    problem = posed(quick("chsel"))
+    costs = [quick("chsel", passes=passes).register(problem).cost[0] for passes in (1, 2, 3)]
+    assert costs[1] <= costs[0] + 1e-12
+    assert costs[2] <= costs[1] + 1e-12
+
+
+@pytest.mark.parametrize("measure", ["plane_position", "plane_angle", "object_xy"])
+def test_on_a_plane_every_hypothesis_stands_on_it(measure: str) -> None:
+    settings = settings_mapping(preset_settings("chsel"))
+    settings["plane"] = {"plane_height": 0.3}
+    settings["archive"] |= {"measure": measure}
+    settings["descent"] |= {"restarts": 4, "iterations": 40}
+    settings["emitter"] |= {"iterations": 20}
+    method = build_method("chsel", settings)
+    standing = compose(
+        axis_angle(np.array([0.0, 0.0, 1.0]), np.array(2.0)), np.array([0.2, 0.1, 0.3])
+    )
+    surface = trimesh.sample.sample_surface(MESH, 40, seed=1)[0]
+    points = KnownPoints(known=apply(standing, surface))
+    problem = pose_problem(GRID, points, WORKSPACE, 0.05, StreamKey(0, 0), method.online, None)
+    found = method.register(problem)
+    world = inverse(found.object_from_world)
+    np.testing.assert_allclose(world[:, 2, 3], 0.3, atol=1e-3)
+    np.testing.assert_allclose(world[:, 2, 2], 1.0, atol=1e-12)
+    position, rotation = pose_errors(found.object_from_world[:1], standing)
+    assert position[0] < 0.01
+    assert rotation[0] < 0.05
+
+
+def test_presets_differ_where_paper_and_code_differ() -> None:
+    paper, reference, ours = (
+        preset_settings("chsel", p) for p in ("paper", "reference", "default")
+    )
+    assert (paper.cost.free_term, reference.cost.free_term) == ("direct", "interior")
+    assert (paper.online.initial, reference.online.initial) == ("so3", "upright")
+    assert (paper.cost.lookup, ours.cost.lookup) == ("nearest", "trilinear")
+    assert (paper.online.keep_best, reference.online.keep_best) == (False, True)
+    assert reference.cost.occupied_scale == 0.0
+    assert (paper.output.shortage, reference.output.shortage) == ("fewer", "resample")

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.errors import PointsError, SettingError
+from runners.objects.loader import ObjectModel
+from runners.sessions.point_files import read_points
+from runners.sessions.points import PointsSession, PointsSettings
+
+BOX = ObjectModel("box", trimesh.creation.box((0.03, 0.04, 0.12)), 1.0, 0.001, "box")
+SURFACE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
+
+
+def npz(folder: Path, **arrays: Any) -> Path:
+    path = folder / "points.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def text(folder: Path, content: str, name: str = "points.csv") -> Path:
+    path = folder / name
+    path.write_text(content)
+    return path
+
+
+def test_a_file_without_steps_is_one_probe(tmp_path: Path) -> None:
+    free = np.full((4, 3), 0.3)
+    path = npz(tmp_path, surface=SURFACE, free=free, world_from_object=np.eye(4))
+    session = PointsSession(PointsSettings(str(path)), BOX)
+    (probe,) = session.probes()
+    assert (session.count, probe.step, probe.outcome) == (1, 0, "points")
+    np.testing.assert_array_equal(probe.new_points.known, SURFACE)
+    np.testing.assert_array_equal(probe.new_points.free, free)
+    np.testing.assert_array_equal(probe.contacts, SURFACE)
+    np.testing.assert_array_equal(session.world_from_object, np.eye(4))
+
+
+def test_steps_make_a_sequence_and_all_classes_arrive_at_theirs(tmp_path: Path) -> None:
+    path = npz(
+        tmp_path,
+        surface=SURFACE,
+        surface_step=np.array([5, 0, 5]),
+        occupied=SURFACE + 1.0,
+        occupied_step=np.array([2, 2, 0]),
+        known=SURFACE + 2.0,
+        known_sdf=np.array([0.1, -0.2, 0.0]),
+        known_step=np.array([0, 5, 5]),
+    )
+    probes = list(PointsSession(PointsSettings(str(path)), BOX).probes())
+    assert [probe.step for probe in probes] == [0, 2, 5]
+    last = probes[2].new_points
+    np.testing.assert_array_equal(last.known, np.concatenate([SURFACE[[0, 2]], SURFACE[1:] + 2.0]))
+    np.testing.assert_array_equal(last.sdf, [0.0, 0.0, -0.2, 0.0])
+    np.testing.assert_array_equal(probes[1].new_points.occupied, SURFACE[:2] + 1.0)
+    assert len(last.contacts) == 3
+
+
+def test_csv_holds_every_kind(tmp_path: Path) -> None:
+    rows = "x, y, z, kind, sdf, step\n0,0,0,surface,,0\n1,0,0,free,,0\n"
+    rows += "0,1,0,known,-0.02,1\n2,2,2,occupied,,1\n"
+    content = read_points(text(tmp_path, rows))
+    assert content.steps == [0, 1]
+    later = content.at(1)
+    np.testing.assert_array_equal(later.sdf, [-0.02])
+    np.testing.assert_array_equal(later.occupied, [[2, 2, 2]])
+    np.testing.assert_array_equal(content.at(0).free, [[1, 0, 0]])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "off", "stl", "xyz"])
+def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"points.{suffix}"
+    if suffix == "xyz":
+        np.savetxt(path, SURFACE)
+    else:
+        trimesh.Trimesh(SURFACE, [[0, 1, 2]]).export(path)
+    points = read_points(path).at(0)
+    found = points.known[np.lexsort(points.known.T)]
+    np.testing.assert_allclose(found, SURFACE[np.lexsort(SURFACE.T)], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"surface": np.zeros((3, 2))}, r"surface has shape \(3, 2\); accepted: \(any, 3\)"),
+        ({"free": np.full((2, 3), np.nan)}, r"free\[0\] is not finite"),
+        ({"contacts": SURFACE}, "array contacts is unknown; accepted: surface, free"),
+        ({"world_from_object": np.eye(4)}, "no array of points"),
+        ({"known": SURFACE}, "known and known_sdf stand only together"),
+        ({"known": SURFACE, "known_sdf": np.zeros(2)}, r"known_sdf has shape \(2,\)"),
+        ({"surface": SURFACE, "surface_step": np.zeros(3)}, "surface_step has type float64"),
+        ({"surface": SURFACE, "surface_step": np.array([0, -1, 0])}, r"surface_step\[1\] is -1"),
+        ({"surface": SURFACE, "world_from_object": 2 * np.eye(4)}, "not a rigid transform"),
+        ({"surface": np.zeros((0, 3))}, "holds no points"),
+        ({"surface": np.array([[object()] * 3])}, "not a readable .npz"),
+    ],
+)
+def test_malformed_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
+    with pytest.raises(PointsError, match=rf"points.npz.*{message}"):
+        read_points(npz(tmp_path, **arrays))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("x,y,z\n0,0,0\n", "line 1 is 'x,y,z'; accepted: the header x,y,z,kind"),
+        ("x,y,z,kind,colour\n0,0,0,free,red\n", "line 1 is"),
+        ("x,y,z,kind,kind\n0,0,0,free,free\n", "names a column twice"),
+        ("x,y,z,kind\n0,0,0,solid\n", "line 2: kind is 'solid'; accepted: surface, free"),
+        ("x,y,z,kind\n0,0,0,free\n0,b,0,free\n", "line 3: y is 'b'"),
+        ("x,y,z,kind\n0,0,inf,free\n", "line 2: z is 'inf'"),
+        ("x,y,z,kind\n0,0\n", "line 2 has another number of fields"),
+        ("x,y,z,kind,sdf\n0,0,0,known,\n", "line 2: a known point needs an sdf"),
+        ("x,y,z,kind,sdf\n0,0,0,free,0.1\n", "line 2: a free point has an sdf"),
+        ("x,y,z,kind,sdf\n0,0,0,surface,0.1\n", "line 2: a surface point has sdf 0.1"),
+        ("x,y,z,kind,step\n0,0,0,free,1.5\n", "line 2: step is 1.5"),
+        ("x,y,z,kind\n", "holds no points"),
+        ("", "line 1 is ''"),
+    ],
+)
+def test_malformed_lines_are_named(tmp_path: Path, content: str, message: str) -> None:
+    with pytest.raises(PointsError, match=rf"points.csv.*{message}"):
+        read_points(text(tmp_path, content))
+
+
+def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path: Path) -> None:
+    for suffix in ("npz", "ply", "off", "stl", "csv", "xyz"):
+        path = tmp_path / f"noise.{suffix}"
+        path.write_bytes(b"\xff\x00\x81" * 50)
+        with pytest.raises(PointsError, match=f"noise.{suffix}"):
+            read_points(path)
+    with pytest.raises(PointsError, match=r"accepted: \.npz, \.csv"):
+        read_points(tmp_path / "points.txt")
+    with pytest.raises(PointsError, match="does not exist"):
+        read_points(tmp_path / "nothing.npz")
+
+
+def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "evil.npz"
+    np.savez(path, surface=np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(PointsError, match=r"not a readable \.npz file"):
+        read_points(path)
+
+
+def test_workspace_is_that_of_the_points_padded_by_the_diameter(tmp_path: Path) -> None:
+    path = str(npz(tmp_path, surface=SURFACE, free=SURFACE - 1.0))
+    session = PointsSession(PointsSettings(path), BOX)
+    lower, upper = session.workspace.bounds
+    np.testing.assert_allclose(lower, -1.0 - 0.13)
+    np.testing.assert_allclose(upper, [0.23, 0.33, 0.13])
+    chosen = PointsSettings(path, workspace=((0, 1), (0, 2), (0, 3)))
+    assert PointsSession(chosen, BOX).workspace.upper == (1, 2, 3)
+    with pytest.raises(PointsError, match="lower bound below"):
+        PointsSession(PointsSettings(path, workspace=((0, 1), (2, 0), (0, 3))), BOX)
+
+
+def test_free_points_of_one_voxel_merge_when_asked(tmp_path: Path) -> None:
+    free = np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    path = str(npz(tmp_path, free=free, free_step=np.array([0, 1, 1])))
+    merged = PointsSettings(path, merge_free=True, workspace=((0, 1), (0, 1), (0, 1)))
+    counts = [len(p.new_points.free) for p in PointsSession(merged, BOX).probes()]
+    assert counts == [1, 1]
+
+
+def test_settings_without_a_path_say_which_key_is_missing() -> None:
+    with pytest.raises(SettingError, match=r"session\.path=FILE"):
+        PointsSettings()
+    with pytest.raises(SettingError, match=r"\[\[x0, x1\]"):
+        PointsSettings("x", workspace=((0, 1), (0, 1)))

@@ -1,0 +1,252 @@
+"""The command, as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from chsel.methods import build_method
+from chsel.pose import apply, axis_angle, compose
+from replay.mcap_reader import read_recording
+
+POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
+QUICK = (
+    "method.descent.restarts=2",
+    "method.descent.iterations=20",
+    "method.emitter.iterations=10",
+    "recording.snapshot_interval=5",
+)
+
+
+@pytest.fixture(scope="module")
+def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """A session of three steps on a box, and the overrides that select it."""
+    folder = tmp_path_factory.mktemp("points")
+    box = trimesh.creation.box((0.1, 0.06, 0.2))
+    box.export(folder / "box.ply")
+    surface = apply(POSE, trimesh.sample.sample_surface(box, 15, seed=0)[0])
+    free = np.random.default_rng(0).uniform(0.3, 0.6, (40, 3))
+    np.savez(
+        folder / "box.npz",
+        surface=surface,
+        surface_step=np.arange(15) // 5,
+        free=free,
+        free_step=np.arange(40) % 3,
+        world_from_object=POSE,
+    )
+    return (
+        "session=points",
+        f"session.path={folder / 'box.npz'}",
+        "object=mesh",
+        f"object.path={folder / 'box.ply'}",
+    )
+
+
+def run(folder: Path, *overrides: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "runners.probe", *overrides, f"logs={folder}"]
+    environment = {**os.environ, "COLUMNS": "120", "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment)
+
+
+def run_folder(logs: Path) -> Path:
+    (folder,) = (logs / "probe").iterdir()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(
+    points: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    logs = tmp_path_factory.mktemp("logs")
+    done = run(logs, *points, *QUICK)
+    assert done.returncode == 0, done.stderr
+    return run_folder(logs), done
+
+
+def test_a_run_leaves_recordings_config_and_summary(
+    finished: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    folder, done = finished
+    names = {file.name for file in folder.iterdir()}
+    assert names == {"recording.mcap", "recording.rrd", "config.yaml", "summary.json"}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["outcome"] == "finished"
+    assert [row["step"] for row in summary["steps"]] == [0, 1, 2]
+    assert [row["contacts"] for row in summary["steps"]] == [5, 10, 15]
+    assert set(summary["steps"][0]["seconds_by_stage"]) >= {"probe", "descent", "cma_mega"}
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["method"]["descent"]["iterations"] == 20
+    assert done.stdout.count("\nprobe ") == 3
+    assert "errors to the true pose" in done.stdout
+    assert f"{folder / 'recording.mcap'}" in done.stdout
+    assert done.stderr == ""
+
+
+def test_every_problem_of_the_recording_gives_the_recorded_result(
+    finished: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    recording = read_recording(finished[0] / "recording.mcap")
+    settings = dict(recording.start.config["method"])
+    method = build_method(settings.pop("name"), settings)
+    for step in recording.steps:
+        again = method.register(recording.problem(step))
+        assert again.digest == recording.hypotheses(step).digest
+        assert again.archive is not None
+        assert again.archive.digest == recording.snapshots(step)[-1].digest
+    assert recording.steps == (0, 1, 2)
+
+
+def test_the_same_command_writes_the_same_bytes_and_no_path_or_clock(
+    points: tuple[str, ...], finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    logs = tmp_path / "elsewhere"
+    assert run(logs, *points, *QUICK, cwd=tmp_path).returncode == 0
+    again = (run_folder(logs) / "recording.mcap").read_bytes()
+    assert again == (finished[0] / "recording.mcap").read_bytes()
+
+
+def test_recording_snapshots_and_threads_change_no_result(
+    points: tuple[str, ...], finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    done = run(
+        tmp_path, *points, *QUICK, "recording=none", "recording.snapshot_interval=0", "threads=2"
+    )
+    assert done.returncode == 0, done.stderr
+    folder = run_folder(tmp_path)
+    assert {file.name for file in folder.iterdir()} == {"config.yaml", "summary.json"}
+    digests = [
+        [row["digest"] for row in json.loads((f / "summary.json").read_text())["steps"]]
+        for f in (folder, finished[0])
+    ]
+    assert digests[0] == digests[1]
+
+
+def test_a_recorded_session_repeats_the_probes_with_another_method(
+    finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    source = finished[0] / "recording.mcap"
+    done = run(
+        tmp_path,
+        "session=recorded",
+        f"session.path={source}",
+        "method=gradient_descent",
+        *QUICK[:2],
+        "recording=mcap",
+    )
+    assert done.returncode == 0, done.stderr
+    again = read_recording(run_folder(tmp_path) / "recording.mcap")
+    before = read_recording(source)
+    assert again.problem(2).points.digest == before.problem(2).points.digest
+    assert again.start.sdf.digest == before.start.sdf.digest
+    assert again.start.object == "mesh"
+    assert again.hypotheses(2).archive is None
+
+
+def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
+    points: tuple[str, ...], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "runners.probe", *points, f"logs={tmp_path}"]
+    slow = ["method.emitter.iterations=2000", "recording=mcap"]
+    process = subprocess.Popen(command + slow, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    recordings: list[Path] = []
+    deadline = time.monotonic() + 60
+    while not recordings and time.monotonic() < deadline:
+        recordings = list(tmp_path.rglob("recording.mcap"))
+        time.sleep(0.1)
+    time.sleep(2.0)
+    process.send_signal(signal.SIGINT)
+    output = process.communicate(timeout=60)[0]
+    assert process.returncode == 130
+    assert "interrupted: the recording holds everything up to here" in output
+    recording = read_recording(recordings[0])
+    assert recording.ended is not None
+    assert recording.ended.outcome == "interrupted"
+
+
+def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> None:
+    overrides = ["-m", *points, *QUICK[:2], "method=gradient_descent", "seed=1,2", "recording=none"]
+    done = run(tmp_path, *overrides)
+    assert done.returncode == 0, done.stderr
+    summaries = [json.loads(f.read_text()) for f in tmp_path.rglob("summary.json")]
+    assert sorted(summary["seed"] for summary in summaries) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("+typo=3", "probe.typo does not exist; accepted: assets"),
+        ("+method.typo=3", "method.typo does not exist; accepted: archive"),
+        ("method.cst.alpha=1", "method has no key 'cst'; did you mean cost? accepted: "),
+        ("methd=chsel", "probe has no key 'methd'; did you mean method? accepted: "),
+        ("method=chsl", "method has no option 'chsl'; did you mean chsel? accepted: chsel, "),
+        ("object=ycb/dril", "object has no option 'ycb/dril'; did you mean ycb/drill? accepted: "),
+        ("preset=papr", "preset has no option 'papr'; did you mean paper?"),
+        (
+            "method.cost.free_term=out",
+            "method.cost: free_term is 'out'; accepted: direct, interior",
+        ),
+        ("method.cost.free_scale=many", "method.cost.free_scale is 'many'; accepted: a number"),
+        ("seed=-1", "seed is -1; accepted: an integer from 0"),
+        ("threads=0", "threads is 0; accepted"),
+        ("object.path=nothing.obj", "mesh file nothing.obj does not exist"),
+        ("session.path=nothing.npz", "point file nothing.npz does not exist"),
+        ("logs=/dev/null", "run folder /dev/null/probe"),
+        ("session.path=null", "session.path=FILE"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_2(
+    points: tuple[str, ...], tmp_path: Path, override: str, message: str
+) -> None:
+    overrides = [*points, override] if override.startswith("logs") else [f"logs={tmp_path}"]
+    overrides += [*points, override] if overrides[0].startswith("logs=/") else []
+    done = subprocess.run(
+        [sys.executable, "-m", "runners.probe", *overrides], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert not list(tmp_path.rglob("*"))
+
+
+def test_traceback_is_shown_when_asked_for(points: tuple[str, ...], tmp_path: Path) -> None:
+    done = run(tmp_path, *points, "object.path=nothing.obj", "--traceback")
+    assert "Traceback" in done.stderr
+    assert "MeshError" in done.stderr
+
+
+def test_help_names_every_group_with_its_choices(tmp_path: Path) -> None:
+    done = run(tmp_path, "--help")
+    assert done.returncode == 0
+    assert "  method=chsel|chsel_cma_me|gradient_descent\n" in done.stdout
+    assert "ycb/drill" in done.stdout
+    assert "free_scale: 20.0" in done.stdout
+
+
+@pytest.mark.parametrize(("name", "limit"), [("icub_lego", 10e-3), ("ycbv_gelatin_box", 4e-3)])
+def test_real_measurements_are_registered(
+    real_directory: Path, tmp_path: Path, name: str, limit: float
+) -> None:
+    """Mean |SDF| of the best hypothesis stays in the range of multi-start ICP."""
+    overrides = ["session=points", "object=mesh", "recording=mcap"]
+    overrides += [f"session.path={real_directory / name}.npz"]
+    overrides += [f"object.path={real_directory / name}.obj"]
+    done = run(tmp_path, *overrides)
+    assert done.returncode == 0, done.stderr
+    recording = read_recording(run_folder(tmp_path) / "recording.mcap")
+    (step,) = recording.steps
+    problem = recording.problem(step)
+    moved = apply(recording.hypotheses(step).object_from_world[0], problem.points.known)
+    sdf, _ = problem.sdf.query(moved, lookup="trilinear")
+    assert float(sdf.abs().mean()) < limit
