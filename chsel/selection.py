@@ -14,7 +14,6 @@ from chsel.objective import Objective
 from chsel.problem import ArchiveSnapshot, Hypotheses
 
 
-
 @dataclass(frozen=True)
 class ArchiveSettings:
     """The grid of the archive: mean +- range_sigmas standard deviations of the measures of E'.

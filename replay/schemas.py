@@ -23,7 +23,8 @@ STEP_TIME = 10**9
 
 # A field is a protobuf scalar, a message of this table, or an array with its type and shape. In a
 # shape, a letter is a length that is the same wherever it stands in the message. "?" after a field
-# says that it may be absent, "*" that it repeats. "f8~" is stored in 32 bits where that is exact. Field numbers follow the order: only append.
+# says that it may be absent, "*" that it repeats. "f8~" is
+# stored in 32 bits where that is exact. Field numbers follow the order: only append.
 MESSAGES: Mapping[str, Mapping[str, str]] = {
     # The bytes are little-endian, in C order; the type is named as numpy names it.
     "Array": {"dtype": "string", "shape": "uint64*", "data": "bytes"},

@@ -81,7 +81,9 @@ class Display:
         for name, size in files.items():
             self._console.print(f"{folder / name}  {size / 1e6:.2f} MB", soft_wrap=True)
         if "recording.rrd" in files:
-            self._console.print(f"look at it: rerun {folder / 'recording.rrd'}", soft_wrap=True)
+            self._console.print(
+                f"look at it: rerun --bind 127.0.0.1 {folder / 'recording.rrd'}", soft_wrap=True
+            )
 
     def close(self) -> None:
         """Give the terminal back."""

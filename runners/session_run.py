@@ -15,7 +15,15 @@ from chsel.points import KnownPoints
 from chsel.problem import Hypotheses
 from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
-from replay.events import HypothesesFound, Measured, Probe, ProblemPosed, Recorder, Timed
+from replay.events import (
+    HypothesesFound,
+    Logged,
+    Measured,
+    Probe,
+    ProblemPosed,
+    Recorder,
+    Timed,
+)
 from runners.recording import StepObserver
 from runners.sessions.session import Session
 
@@ -63,6 +71,7 @@ class SessionRun:
             }
             if self._enough(probe):
                 row |= self._register(probe.step, seconds)
+            self._recorder.record(Logged(probe.step, "info", _line(row)))
             self._recorder.record(Timed(probe.step, seconds))
             self._recorder.flush()
             row |= {"seconds": sum(seconds.values()), "seconds_by_stage": seconds}
@@ -101,6 +110,14 @@ class SessionRun:
         self.previous = hypotheses
         row = {"best_cost": float(hypotheses.cost[0]), "distinct": hypotheses.distinct}
         return row | {"digest": hypotheses.digest} | measured
+
+
+def _line(row: Row) -> str:
+    """What the recording's log says about a probe."""
+    text = f"probe {row['step']}: {row['outcome']}, {row['contacts']} contacts"
+    if "best_cost" not in row:
+        return f"{text}, too little for a registration"
+    return f"{text}, best cost {row['best_cost']:.4g}, {row['distinct']} distinct hypotheses"
 
 
 def measure(hypotheses: Hypotheses, points: KnownPoints, session: Session) -> dict[str, float]:

@@ -13,7 +13,7 @@ torch.set_num_threads(1)  # two threads on two busy cores are many times slower
 
 
 def _optional_data(part: str) -> Path:
-    """The folder `part` of the directory CHSEL_DATA names, by default `shared` beside the checkout."""
+    """The folder `part` of the directory CHSEL_DATA, by default `shared` beside the checkout."""
     directory = Path(os.environ.get("CHSEL_DATA", REPOSITORY.parent / "shared")) / part
     if not directory.is_dir():
         pytest.skip(f"optional data directory is missing: no folder {part}/ (set CHSEL_DATA)")

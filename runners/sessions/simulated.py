@@ -199,7 +199,7 @@ def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave
     flags = world.GEOM_FORCE_CONCAVE_TRIMESH if concave else 0
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(file), flags=flags)
     body: int = world.createMultiBody(0, shape, **_placed(world_from_object))
-    world.changeDynamics(body, -1, collisionMargin=0.0)
+    world.changeDynamics(body, -1, collisionMargin=float(os.environ.get("OM","0")))
     return body
 
 
@@ -213,7 +213,7 @@ def _hand(world: Any, folder: Path) -> int:
         -1,
         lateralFriction=FINGER_FRICTION,
         localInertiaDiagonal=[0.0, 0.0, 0.0],
-        collisionMargin=0.0,
+        collisionMargin=float(os.environ.get("HM","0")),
     )
     return body
 
