@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -63,16 +64,17 @@ class Display:
         truth = "best_position_error" in rows[-1]
         title = "registrations"
         if truth:
-            title += "; errors to the true pose, of the hypothesis ranked best and the closest"
-        table = Table(title=title, title_justify="left")
+            title += "; error to the true pose of the best hypothesis, and of the closest"
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
         names = ["probe", "contacts", "best cost", "distinct"]
-        errors = ["best: mm / °", "closest: mm / °"] if truth else []
+        errors = ["mm", "°", "mm", "°"] if truth else []
         for name in [*names, *errors, "time"]:
             table.add_column(name, justify="right")
         for row in rows:
             cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
             cells.append(str(row["distinct"]))
-            cells += [_error(row, which) for which in ("best", "closest")] if truth else []
+            if truth:
+                cells += [*_errors(row, "best"), *_errors(row, "closest")]
             table.add_row(*cells, f"{row['seconds']:.2f} s")
         self._console.print(table)
 
@@ -90,7 +92,7 @@ class Display:
         self._bar.stop()
 
 
-def _error(row: Mapping[str, Any], which: str) -> str:
+def _errors(row: Mapping[str, Any], which: str) -> tuple[str, str]:
+    """Position error in millimetres, rotation error in degrees."""
     millimetres = 1000.0 * row[f"{which}_position_error"]
-    degrees = math.degrees(row[f"{which}_rotation_error"])
-    return f"{millimetres:.1f} / {degrees:.1f}"
+    return f"{millimetres:.1f}", f"{math.degrees(row[f'{which}_rotation_error']):.1f}"

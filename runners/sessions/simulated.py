@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from chsel.arrays import FloatArray
@@ -85,6 +86,7 @@ class PyBulletEngine:
         for step in range(MINI_STEP):
             world.stepSimulation()
             reading = self._read()
+            if reading is not None and not any(self._readings): self._began = reading
             self._readings.append(reading)
             if step == FORCE_STEP and reading is not None:
                 force = reading.force
@@ -92,8 +94,8 @@ class PyBulletEngine:
         touching = [reading for reading in self._readings if reading is not None]
         if len(touching) < ENOUGH_READINGS:
             return Touch(position, force)
-        k = 0 if os.environ.get("ONSET") else -1
-        return Touch(position, force, touching[k].contact, touching[k].normal)
+        k = self._began if os.environ.get("ONSET") else touching[-1]
+        return Touch(position, force, k.contact, k.normal)
 
     def close(self) -> None:
         """Disconnect from the engine."""
@@ -205,7 +207,7 @@ def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave
 
 def _hand(world: Any, folder: Path) -> int:
     """The hand at its start. Without inertia the engine leaves its orientation alone."""
-    _write_obj(folder / "hand.obj", list(hand.solids()))
+    _write_obj(folder / "hand.obj", [_inset(solid, float(os.environ.get("HM","0"))) for solid in hand.solids()])
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(folder / "hand.obj"))
     body: int = world.createMultiBody(HAND_MASS, shape, basePosition=START)
     world.changeDynamics(
@@ -216,6 +218,14 @@ def _hand(world: Any, folder: Path) -> int:
         collisionMargin=float(os.environ.get("HM","0")),
     )
     return body
+
+
+def _inset(solid: trimesh.Trimesh, depth: float) -> trimesh.Trimesh:
+    """A convex solid less a layer of that depth, metres."""
+    normals, corners = solid.face_normals, solid.triangles[:, 0]
+    offsets = depth - np.einsum("fi,fi->f", normals, corners)
+    inside = HalfspaceIntersection(np.column_stack([normals, offsets]), solid.center_mass)
+    return trimesh.convex.convex_hull(inside.intersections)
 
 
 def _placed(pose: FloatArray) -> dict[str, list[float]]:
