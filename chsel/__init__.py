@@ -7,6 +7,7 @@ Free Space Data", Robotics: Science and Systems, 2023.
 from chsel.api import register
 from chsel.cost import CostSettings, RelaxedCost
 from chsel.errors import ChselError
+from chsel.mesh import load_mesh
 from chsel.points import KnownPoints, Workspace
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
@@ -21,5 +22,6 @@ __all__ = [
     "RelaxedCost",
     "SdfGrid",
     "Workspace",
+    "load_mesh",
     "register",
 ]
