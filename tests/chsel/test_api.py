@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import chsel
+from chsel.evaluation.pose_error import pose_errors
+from chsel.methods import preset_settings
+from chsel.pose import apply, axis_angle, compose, inverse
+
+BOX = trimesh.creation.box((0.1, 0.06, 0.04))
+POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.4)), np.array([0.3, 0.1, 0.2]))
+SURFACE = apply(POSE, trimesh.sample.sample_surface(BOX, 40, seed=0)[0])
+QUICK = {"descent": {"restarts": 2, "iterations": 10}, "emitter": {"iterations": 5}}
+POINT = [[0.1, 0.2, 0.3]]
+
+
+def register(**arguments: Any) -> chsel.Hypotheses:
+    return chsel.register(BOX, **{"settings": QUICK, **arguments})
+
+
+def test_a_mesh_and_points_are_all_it_takes() -> None:
+    found = chsel.register(BOX, surface=torch.tensor(SURFACE))
+    assert found.object_from_world.shape == (30, 4, 4)
+    world = inverse(found.object_from_world)
+    # A box looks the same after half turns about its axes, so only its centre is unique.
+    assert np.abs(world[0, :3, 3] - POSE[:3, 3]).max() < 0.005
+
+
+def test_a_grid_a_mesh_lists_and_tensors_give_the_same_bits() -> None:
+    grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
+    digests = {
+        register(surface=SURFACE).digest,
+        register(surface=SURFACE.tolist()).digest,
+        register(surface=torch.tensor(SURFACE)).digest,
+        chsel.register(grid, surface=SURFACE, settings=QUICK).digest,
+    }
+    assert len(digests) == 1
+    assert register(surface=SURFACE, seed=1).digest not in digests
+
+
+def test_points_added_later_start_from_the_previous_result() -> None:
+    first = register(surface=SURFACE[:20])
+    second = register(surface=SURFACE, previous=first, step=1)
+    cost = chsel.RelaxedCost(chsel.SdfGrid.from_mesh(BOX, 0.002), chsel.KnownPoints(known=SURFACE))
+    assert second.cost[0] <= cost.evaluate(first.elites).min() + 1e-12
+    assert second.digest != register(surface=SURFACE, step=1).digest
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        {"surface": POINT},
+        {"free": POINT},
+        {"occupied": POINT},
+        {"known": POINT, "known_sdf": [0.02]},
+        {"surface": np.zeros((30, 3)), "free": np.zeros((50, 3))},
+        {"surface": [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]},
+        {"free": np.full((1, 3), 1e6), "surface": POINT},
+    ],
+)
+@pytest.mark.parametrize("preset", ["default", "paper", "reference"])
+def test_odd_points_have_a_defined_result(points: dict[str, Any], preset: str) -> None:
+    found = register(**points, preset=preset, hypotheses=5)
+    assert found.object_from_world.shape == (5, 4, 4)
+    assert np.isfinite(found.object_from_world).all()
+    assert np.isfinite(found.cost).all()
+
+
+def test_points_far_outside_of_the_workspace_cost_their_distance() -> None:
+    workspace = chsel.Workspace((0, 0, 0), (1, 1, 1))
+    found = register(surface=[[1e6, 0, 0]], workspace=workspace)
+    assert found.cost[0] == pytest.approx(1e6, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "no point was given; accepted: surface, free"),
+        ({"surface": [[0, 0, np.nan]]}, r"surface\[0\] is not finite"),
+        ({"free": [[0, 0]]}, r"free has shape \(1, 2\); accepted: \(any, 3\)"),
+        ({"known": POINT}, "known has 1 points and known_sdf 0"),
+        ({"surface": POINT, "method": "icp"}, "method is 'icp'; accepted: chsel"),
+        ({"surface": POINT, "preset": "best"}, "preset is 'best'; accepted: default"),
+        ({"surface": POINT, "hypotheses": 0}, "hypotheses is 0"),
+        ({"surface": POINT, "settings": {"alpha": 1}}, "method.alpha does not exist"),
+        ({"surface": POINT, "resolution": -0.1}, "SDF resolution is -0.1"),
+        (
+            {"surface": POINT, "initial_set": np.zeros((2, 4, 4))},
+            r"initial_set\[0\] is not a rigid",
+        ),
+        ({"surface": POINT, "initial_set": np.zeros((0, 4, 4))}, "initial_set is empty"),
+    ],
+)
+def test_mistakes_say_what_is_accepted(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(chsel.ChselError, match=message):
+        register(**arguments)
+
+
+def test_a_target_that_is_no_mesh_is_refused() -> None:
+    with pytest.raises(chsel.ChselError, match="target is a str; accepted: Trimesh or SdfGrid"):
+        chsel.register("box.obj", surface=POINT)  # type: ignore[arg-type]
+
+
+def test_single_settings_and_whole_settings_are_both_taken() -> None:
+    whole = preset_settings("gradient_descent", "paper")
+    a = chsel.register(BOX, surface=SURFACE[:5], method="gradient_descent", settings=whole)
+    b = chsel.register(BOX, surface=SURFACE[:5], method="gradient_descent", preset="paper")
+    assert a.digest == b.digest
+
+
+def test_own_starts_are_used() -> None:
+    starts = np.tile(inverse(POSE), (4, 1, 1))
+    found = register(surface=SURFACE, initial_set=starts, method="gradient_descent", settings=None)
+    assert len(found.cost) == 4
+    assert found.duplicate.tolist() == [False, True, True, True]
+
+
+def test_pose_errors_are_distance_and_angle() -> None:
+    shift = compose(
+        axis_angle(np.array([0.0, 1.0, 0.0]), np.array(0.3)), np.array([0.0, 0.03, 0.04])
+    )
+    estimates = np.stack([inverse(POSE), inverse(POSE @ shift)])
+    position, rotation = pose_errors(estimates, POSE)
+    np.testing.assert_allclose(position, [0.0, 0.05], atol=1e-12)
+    np.testing.assert_allclose(rotation, [0.0, 0.3], atol=1e-12)
+
+
+def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    examples = re.findall(r"```python\n(import chsel.*?)```", readme, re.DOTALL)
+    examples += re.findall(r"```python\n(cost = chsel.*?)```", readme, re.DOTALL)
+    assert len(examples) == 2
+    BOX.export(tmp_path / "drill.obj")
+    names = {
+        "contacts": SURFACE,
+        "free_points": SURFACE + 0.5,
+        "free": SURFACE + 0.5,
+        "mesh": BOX,
+        "rotation": torch.eye(3, dtype=torch.float64)[None].requires_grad_(),
+        "translation": torch.full((1, 3), 0.01, dtype=torch.float64).requires_grad_(),
+    }
+    for example in examples:
+        exec(example.replace('"drill.obj"', repr(str(tmp_path / "drill.obj"))), names)
+    assert names["best"].shape == (4, 4)
+    assert float(names["translation"].grad.abs().sum()) > 0.0
