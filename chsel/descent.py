@@ -20,20 +20,20 @@ class DescentSettings:
 
     restarts x iterations: after each block of iterations Adam starts afresh and the rotations are
     made orthonormal again. rate: Adam's step size. stop_below: end when a block lowers the costs
-    by less than this fraction in the mean over the starts; negative: never end early.
+    by no more than this fraction in the mean over the starts; None: never end early.
     """
 
     restarts: int = 10
     iterations: int = 50
     rate: float = 0.01
-    stop_below: float = 1e-6
+    stop_below: float | None = 1e-6
 
     def __post_init__(self) -> None:
         require_positive("restarts", self.restarts, zero=True)
         require_positive("iterations", self.iterations)
         require_positive("rate", self.rate)
-        if not np.isfinite(self.stop_below):
-            raise SettingError(f"stop_below is {self.stop_below}; accepted: a finite number")
+        if self.stop_below is not None and not np.isfinite(self.stop_below):
+            raise SettingError(f"stop_below is {self.stop_below}; accepted: a number, or null")
 
 
 def descend(
@@ -61,7 +61,8 @@ def descend(
         done = (restart + 1) * settings.iterations
         observer.trace("descent", done, vectors.copy(), costs.copy())
         observer.progress("descent", done, settings.restarts * settings.iterations)
-        if _mean_gain(previous, costs) <= settings.stop_below:
+        stop_below = settings.stop_below
+        if stop_below is not None and _mean_gain(previous, costs) <= stop_below:
             break
         previous = costs
     return transforms_of(objective.space, objective.space.encode(estimates)), costs
