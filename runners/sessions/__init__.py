@@ -8,6 +8,7 @@ from typing import Any
 from chsel.errors import require_choice
 from chsel.settings import build_settings
 from runners.objects.loader import ObjectModel
+from runners.sessions.configurations import find_configuration
 from runners.sessions.points import PointsSession, PointsSettings
 from runners.sessions.probing import ProbingSettings
 from runners.sessions.recorded import RecordedSession, RecordedSettings
@@ -28,12 +29,16 @@ def session_settings(kind: str, config: Mapping[str, Any]) -> Any:
 
 
 def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int) -> Session:
-    """Open a session with settings from `session_settings`."""
+    """Open a session with settings from `session_settings`.
+
+    Raises SessionError if it cannot be opened, or if a configuration is one of another object.
+    """
     if kind == "points":
         return PointsSession(settings, object_model)
     if kind == "recorded":
         return RecordedSession(settings)
     configuration = settings.configuration or object_model.configuration
+    find_configuration(configuration, object_model.name)
     if kind == "kinematic":
         from runners.sessions.kinematic import open_kinematic
 

@@ -15,6 +15,7 @@ import pytest
 import trimesh
 import yaml
 
+from chsel.errors import RecordingError
 from chsel.methods import build_method
 from chsel.pose import apply, axis_angle, compose
 from replay.mcap_reader import read_recording
@@ -174,6 +175,28 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
     assert recording.ended.outcome == "interrupted"
 
 
+def test_a_killed_run_leaves_every_probe_that_it_reported(
+    points: tuple[str, ...], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-u", "-m", "runners.probe", *points, f"logs={tmp_path}"]
+    process = subprocess.Popen([*command, *QUICK], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    reported = 0
+    for line in process.stdout:
+        reported += line.startswith("probe ")
+        if reported == 2:
+            process.kill()
+            break
+    process.wait(timeout=60)
+    (path,) = tmp_path.rglob("recording.mcap")
+    with pytest.raises(RecordingError, match="unfinished"):
+        read_recording(path)
+    recording = read_recording(path, partial=True)
+    assert [probe.step for probe in recording.probes][:2] == [0, 1]
+    assert recording.steps[:2] == (0, 1)
+    assert recording.hypotheses(1).object_from_world.shape == (30, 4, 4)
+
+
 def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> None:
     overrides = ["-m", *points, *QUICK[:2], "method=gradient_descent", "seed=1,2", "recording=none"]
     done = run(tmp_path, *overrides)
@@ -203,13 +226,24 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
         ("session.path=nothing.npz", "point file nothing.npz does not exist"),
         ("logs=/dev/null", "run folder /dev/null/probe"),
         ("session.path=null", "session.path=FILE"),
+        (
+            "session=kinematic object=clamp configuration=drill",
+            "accepted for object clamp: clamp, ",
+        ),
+        ("session=kinematic configuration=dril", "configuration 'dril' does not exist; accepted: "),
+        (
+            "session=kinematic object=ycb/drill assets.dir=/nowhere",
+            "runners.fetch object=ycb/drill",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(
     points: tuple[str, ...], tmp_path: Path, override: str, message: str
 ) -> None:
-    overrides = [*points, override] if override.startswith("logs") else [f"logs={tmp_path}"]
-    overrides += [*points, override] if overrides[0].startswith("logs=/") else []
+    chosen = () if "kinematic" in override else points
+    overrides = [f"logs={tmp_path}", *chosen, *override.split()]
+    if override.startswith("logs="):
+        del overrides[0]
     done = subprocess.run(
         [sys.executable, "-m", "runners.probe", *overrides], capture_output=True, text=True
     )
