@@ -78,6 +78,11 @@ class GridArchive:
         """Costs (C,) of the occupied cells."""
         return -self._objectives[self.occupied]
 
+    @property
+    def best_solution(self) -> FloatArray:
+        """The solution (d,) of lowest cost."""
+        return self._solutions[int(np.argmax(self._objectives))]
+
     def sample_elite(self, uniform: float) -> FloatArray:
         """The solution (d,) of one occupied cell, chosen by a number from [0, 1)."""
         occupied = self.occupied

@@ -59,28 +59,27 @@ class Draws:
         return self.key.stream(Purpose.RESTART, self.refinement).random(iterations)
 
 
-class _Search:
-    """What both searches share: evaluate, add, rank, watch."""
+def update_cells(
+    archive: GridArchive,
+    objective: Objective,
+    vectors: FloatArray,
+    costs: FloatArray | None = None,
+) -> tuple[IntArray, FloatArray]:
+    """Offer search vectors (B, d) to the archive; status and value (B,) as GridArchive.add gives.
 
-    def __init__(self, objective: Objective, archive: GridArchive) -> None:
-        self.objective = objective
-        self.archive = archive
+    costs (B,): theirs, where they are known already.
+    """
+    costs = objective.costs(vectors) if costs is None else costs
+    return archive.add(vectors, -costs, objective.measures(archive.measure, vectors))
 
-    def add(
-        self, solutions: FloatArray, costs: FloatArray | None = None
-    ) -> tuple[IntArray, FloatArray]:
-        """Status and value of solutions (B, d) offered to the archive."""
-        if costs is None:
-            costs = self.objective.costs(solutions)
-        measures = self.objective.measures(self.archive.measure, solutions)
-        return self.archive.add(solutions, -costs, measures)
 
-    def rank(self, solutions: FloatArray) -> tuple[IntArray, FloatArray, int]:
-        """Order (B,), best first; ranking values (B, 2) in that order; how many improved."""
-        status, value = self.add(solutions)
-        order = rank_by_improvement(status, value)
-        values = np.stack([status, value], axis=1)[order]
-        return order, values, int((status > 0).sum())
+def _rank(
+    archive: GridArchive, objective: Objective, vectors: FloatArray
+) -> tuple[IntArray, FloatArray, int]:
+    """Offer vectors (B, d): order (B,), best first; ranking values (B, 2); how many improved."""
+    status, value = update_cells(archive, objective, vectors)
+    order = rank_by_improvement(status, value)
+    return order, np.stack([status, value], axis=1)[order], int((status > 0).sum())
 
 
 def cma_mega(
@@ -97,7 +96,6 @@ def cma_mega(
     start (d,): the first theta. An iteration evaluates theta with its gradients, and count - 1
     branches around it.
     """
-    search = _Search(objective, archive)
     batch, coefficients = max(count - 1, 1), archive.measure.count + 1
     normals = draws.normals(settings.iterations, batch, coefficients)
     elites = draws.elites(settings.iterations)
@@ -107,12 +105,12 @@ def cma_mega(
     theta, ascent = start, Adam(settings.rate)
     for iteration in range(settings.iterations):
         cost, gradient = objective.costs_and_gradients(theta[None])
-        search.add(theta[None], cost)
+        update_cells(archive, objective, theta[None], cost)
         rows = np.vstack([-gradient, objective.measure_gradients(archive.measure, theta)])
         directions = rows / (np.sqrt((rows**2).sum(axis=1, keepdims=True)) + _EPSILON)
         chosen = strategy.ask(normals[iteration])
         branches = theta + (chosen[:, :, None] * directions).sum(axis=1)
-        order, ranking, parents = search.rank(branches)
+        order, ranking, parents = _rank(archive, objective, branches)
         strategy.tell(chosen[order], parents)
         if parents == 0 or strategy.stopped(ranking):
             theta, ascent = archive.sample_elite(elites[iteration]), Adam(settings.rate)
@@ -137,7 +135,6 @@ def cma_me(
 
     start (d,): the first mean. An iteration evaluates count samples.
     """
-    search = _Search(objective, archive)
     dimension = len(start)
     normals = draws.normals(settings.iterations, count, dimension)
     elites = draws.elites(settings.iterations)
@@ -147,7 +144,7 @@ def cma_me(
     strategy.reset(start)
     for iteration in range(settings.iterations):
         samples = strategy.ask(normals[iteration])
-        order, ranking, parents = search.rank(samples)
+        order, ranking, parents = _rank(archive, objective, samples)
         strategy.tell(samples[order], parents)
         if parents == 0 or strategy.stopped(ranking):
             strategy.reset(archive.sample_elite(elites[iteration]))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from chsel.arrays import FloatArray
 from chsel.cost import CostSettings, RelaxedCost
 from chsel.descent import DescentSettings, descend
-from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
 from chsel.errors import require_choice, require_positive
 from chsel.measures import measure_named
 from chsel.objective import Objective
@@ -73,7 +71,7 @@ class Chsel:
         observer = observer or NullObserver()
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(RelaxedCost.of(problem, self.settings.cost), space)
-        estimates = self._pass(
+        estimates = self._algorithm_1(
             problem, objective, problem.initial_set, problem.low_cost_set, 0, observer
         )
         for index in range(1, self.settings.passes):
@@ -81,10 +79,12 @@ class Chsel:
             poses = estimates.object_from_world
             initial_set = resampled_around_best(poses, estimates.cost, space, stream)
             low_cost_set = estimates.elites
-            estimates = self._pass(problem, objective, initial_set, low_cost_set, index, observer)
+            estimates = self._algorithm_1(
+                problem, objective, initial_set, low_cost_set, index, observer
+            )
         return estimates
 
-    def _pass(
+    def _algorithm_1(
         self,
         problem: RegistrationProblem,
         objective: Objective,
@@ -106,14 +106,11 @@ class Chsel:
             measure, measures, costs, settings.archive, known_count, space.dimension
         )
         # 5: M <- UpdateCells(M, E' and E_l)
-        low_vectors = space.encode(low_cost_set)
-        low_costs = objective.costs(low_vectors)
-        archive.add(vectors, -costs, measures)
-        archive.add(low_vectors, -low_costs, objective.measures(measure, low_vectors))
+        update_cells(archive, objective, vectors, costs)
+        update_cells(archive, objective, space.encode(low_cost_set))
         # 6: M <- CMA-MEGA(M, C^, n_o)
-        start = _lowest(np.concatenate([vectors, low_vectors]), np.concatenate([costs, low_costs]))
-        if settings.emitter.start == "initial":
-            start = space.encode(initial_set[:1])[0]
+        first = space.encode(initial_set[:1])[0]
+        start = first if settings.emitter.start == "initial" else archive.best_solution
         draws, watch = Draws(problem.key, index), ArchiveWatch(observer, index)
         watch.start(archive)
         self._search(objective, archive, start, count, settings.emitter, draws, watch)
@@ -124,8 +121,3 @@ class Chsel:
         snapshot = archive.snapshot(settings.emitter.iterations, index)
         cells = archive.occupied[chosen]
         return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)
-
-
-def _lowest(vectors: FloatArray, costs: FloatArray) -> FloatArray:
-    """The vector (d,) of lowest cost."""
-    return vectors[int(np.argmin(costs))]
