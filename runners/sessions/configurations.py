@@ -87,7 +87,7 @@ _ALL = (
     Configuration(
         name="mustard_sideways",
         object="mustard",
-        position=(0.25, 0.0, 0.2),
+        position=(0.25, 0.03, 0.2),
         rotation=(0.0, 0.0, pi / 2.0),
         y=(0.0, 0.2, -0.2),
         z=(0.05, 0.2, 0.35, 0.52),
@@ -128,7 +128,7 @@ _ALL = (
     Configuration(
         name="hammer_fallen",
         object="hammer",
-        position=(0.3, -0.1, 0.3),
+        position=(0.3, 0.05, 0.3),
         rotation=(-0.3, 0.4, 0.4),
         y=(0.0, 0.15, 0.4, -0.15),
         z=(0.05, 0.15, 0.25),

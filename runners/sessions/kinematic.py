@@ -72,7 +72,7 @@ class KinematicEngine:
         """Nothing to let go of."""
 
     def _touch(self, points: FloatArray, motion: FloatArray, length: float) -> Touch:
-        """Bisect for the moment at which the first of points (S, 3), all inside at last, gets in."""
+        """Bisect for when the first of points (S, 3) gets in; at the end of the way all are in."""
         start, free, blocked = self._position, 0.0, 1.0
         while (blocked - free) * length > PRECISION:
             middle = 0.5 * (free + blocked)

@@ -74,7 +74,7 @@ def roll_to_rest(mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatA
 
 
 def _tilt(placed: FloatArray, pivot: FloatArray, away: FloatArray) -> FloatArray:
-    """Rotation (3, 3) that tilts vertices (V, 3) over a pivot towards `away` (2,) till one lands."""
+    """Rotation (3, 3) that tilts vertices (V, 3) over a pivot, towards `away` (2,), to the next."""
     direction = away / np.sqrt(away @ away)
     distance = (placed[:, :2] - pivot) @ direction
     height = placed[:, 2]
@@ -91,8 +91,8 @@ def _nearest_support(support: FloatArray, point: FloatArray) -> FloatArray:
         if (hull.equations @ [*point, 1.0] <= 0.0).all():
             return point
     except (QhullError, ValueError):  # one point, or all on a line
-        order = np.argsort(support @ (np.ptp(support, axis=0) + [1e-9, 0.0]))
-        corners = support[order[[0, -1]]]
+        widest = int(np.argmax(np.ptp(support, axis=0)))
+        corners = support[[np.argmin(support[:, widest]), np.argmax(support[:, widest])]]
     start, side = corners, np.roll(corners, -1, axis=0) - corners
     length = np.maximum((side**2).sum(axis=1), 1e-30)
     along = np.clip(((point - start) * side).sum(axis=1) / length, 0.0, 1.0)

@@ -18,6 +18,7 @@ from chsel.streams import Purpose, StreamKey
 from replay.events import Probe
 from runners.sessions import hand
 from runners.sessions.configurations import WORKSPACE, Configuration
+from runners.sessions.free_space import box_shell, floor_slab, swept_voxels
 
 BOUNDARIES = ("floor_slab", "box_shell", "both")
 SWEEPS = ("mini_steps", "control_steps")
@@ -31,8 +32,6 @@ GAIN = 30.0  # command per metre of error
 TOLERANCE = 3e-4  # m: what counts as arrived
 MOST_STEPS = 60  # control steps after which a move that something blocks is given up
 NOISE_ROWS = 5000  # of the table that all methods share
-SLAB_MARGIN = 0.15  # m: by which the floor slab is wider than the object
-SLAB_LAYERS = 2
 
 
 @dataclass(frozen=True)
@@ -143,10 +142,12 @@ class ProbingSession:
         self.settings = settings
         self.workspace = choose_workspace(configuration, settings)
         self.free_resolution = settings.free_resolution
-        self.world_from_object = engine.world_from_object
+        self.world_from_object: FloatArray | None = engine.world_from_object
         self.count = len(configuration.grid)
         self._voxels = FreeVoxels(Lattice(self.workspace.lower, settings.free_resolution))
-        self.initial_points = KnownPoints(free=self._voxels.add(self._boundary(mesh)))
+        self.initial_points = KnownPoints(
+            free=self._voxels.add(self._boundary(mesh, engine.world_from_object))
+        )
         self._interior = hand.interior_points(settings.interior_spacing, settings.interior_depth)
         self._gripper = _Gripper(engine, settings, seed)
         self._engine = engine
@@ -170,7 +171,7 @@ class ProbingSession:
         ends = np.array(self._gripper.ends)
         contacts = np.array(self._gripper.contacts).reshape(-1, 3)
         swept = path if self.settings.sweep == "mini_steps" else ends
-        free = self._voxels.add(_swept(self._voxels.lattice, self._interior, swept))
+        free = self._voxels.add(swept_voxels(self._voxels.lattice, self._interior, swept))
         return Probe(
             step=step,
             outcome="contact" if len(contacts) else "free",
@@ -180,17 +181,17 @@ class ProbingSession:
             contact_normals=np.array(self._gripper.normals).reshape(-1, 3),
         )
 
-    def _boundary(self, mesh: trimesh.Trimesh) -> FloatArray:
+    def _boundary(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:
         """Centres (N, 3) of the voxels where the object is known not to be."""
         lattice, chosen = self._voxels.lattice, self.settings.boundary
         points = np.zeros((0, 3))
         if chosen in ("box_shell", "both"):
-            points = np.concatenate([points, _box_shell(lattice, self.workspace)])
+            points = np.concatenate([points, box_shell(lattice, self.workspace)])
         if chosen in ("floor_slab", "both"):
-            vertices = apply(self.world_from_object, np.asarray(mesh.vertices))
-            points = np.concatenate([points, _floor_slab(lattice, vertices)])
+            vertices = apply(world_from_object, np.asarray(mesh.vertices))
+            points = np.concatenate([points, floor_slab(lattice, vertices)])
         # Some configurations reach out of their workspace; free points within the object would lie.
-        distance, _ = mesh_sdf(mesh, apply(inverse(self.world_from_object), points))
+        distance, _ = mesh_sdf(mesh, apply(inverse(world_from_object), points))
         return points[distance > 0.0]
 
 
@@ -258,34 +259,3 @@ class _Gripper:
 def choose_workspace(configuration: Configuration, settings: ProbingSettings) -> Workspace:
     """The box in which the object is sought."""
     return WORKSPACE if settings.workspace == "paper" else configuration.workspace
-
-
-def _floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
-    """Centres of the lattice's lowest layers, below the floor, under and around vertices (V, 3)."""
-    low = lattice.voxels(vertices.min(axis=0, keepdims=True) - SLAB_MARGIN)[0]
-    high = lattice.voxels(vertices.max(axis=0, keepdims=True) + SLAB_MARGIN)[0]
-    low[2], high[2] = 0, SLAB_LAYERS - 1
-    return lattice.centres(low + _box(high - low + 1))
-
-
-def _box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
-    """Centres of one layer of voxels on the six faces of the workspace."""
-    last = lattice.voxels(workspace.bounds[1:])[0]
-    voxels = _box(last + 1)
-    return lattice.centres(voxels[((voxels == 0) | (voxels == last)).any(axis=1)])
-
-
-def _swept(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:
-    """Centres of the voxels that interior (M, 3) meets at any of the hand's positions (P, 3)."""
-    bounds = np.array([positions.min(axis=0), positions.max(axis=0)])
-    bounds += [interior.min(axis=0), interior.max(axis=0)]
-    low, high = lattice.voxels(bounds)
-    met = np.zeros(high - low + 1, dtype=bool)
-    for position in positions:
-        met[tuple((lattice.voxels(interior + position) - low).T)] = True
-    return lattice.centres(low + np.argwhere(met))
-
-
-def _box(shape: np.ndarray) -> np.ndarray:
-    """All indices (N, 3) of an array of that shape (3,)."""
-    return np.stack(np.indices(tuple(shape)), axis=-1).reshape(-1, 3)

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.spatial import HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from chsel.arrays import FloatArray
@@ -39,7 +38,6 @@ MINI_STEP = 21  # steps of the engine
 FORCE_STEP = 5  # of a mini-step: when the force is read
 READINGS = 50  # how many readings of contact are looked back upon
 ENOUGH_READINGS = 2
-TOUCHING = 1e-3  # m: records of contact further apart than this are only near
 
 
 def open_simulated(
@@ -63,6 +61,7 @@ class PyBulletEngine:
         """Settle the object of a configuration, fix it, and put the hand at its start."""
         self._max_force = settings.max_force
         self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
+        self._began: _Reading | None = None
         self._world: Any = _new_world()
         try:
             with tempfile.TemporaryDirectory() as folder:
@@ -86,16 +85,18 @@ class PyBulletEngine:
         for step in range(MINI_STEP):
             world.stepSimulation()
             reading = self._read()
-            if reading is not None and not any(self._readings): self._began = reading
+            if reading is not None and not any(self._readings):
+                self._began = reading
             self._readings.append(reading)
             if step == FORCE_STEP and reading is not None:
                 force = reading.force
         position = np.array(world.getBasePositionAndOrientation(self._hand)[0])
-        touching = [reading for reading in self._readings if reading is not None]
-        if len(touching) < ENOUGH_READINGS:
+        touching = sum(reading is not None for reading in self._readings)
+        if self._began is None or touching < ENOUGH_READINGS:
             return Touch(position, force)
-        k = self._began if os.environ.get("ONSET") else touching[-1]
-        return Touch(position, force, k.contact, k.normal)
+        # As the hand presses on, the engine's contact wanders over the faces that touch by some
+        # millimetres; where the touch began is known best.
+        return Touch(position, force, self._began.contact, self._began.normal)
 
     def close(self) -> None:
         """Disconnect from the engine."""
@@ -110,13 +111,7 @@ class PyBulletEngine:
             return None
         forces = [record[_FORCE] * np.array(record[_NORMAL_ON_B]) for record in records]
         total = np.sum(forces, axis=0)
-        pick = os.environ.get("PICK", "force")
-        if pick == "force":
-            hardest = max(records, key=lambda record: record[_FORCE])
-        elif pick == "deep":
-            hardest = min(records, key=lambda record: record[_DISTANCE])
-        else:
-            hardest = records[0]
+        hardest = max(records, key=lambda record: record[_FORCE])
         contact, normal = np.array(hardest[_POINT_ON_B]), np.array(hardest[_NORMAL_ON_B])
         return _Reading(contact, normal, float(np.sqrt(total @ total)))
 
@@ -131,7 +126,7 @@ class _Reading:
 
 
 # Where a contact record of PyBullet has what; B is the object.
-_POINT_ON_B, _NORMAL_ON_B, _DISTANCE, _FORCE = 6, 7, 8, 9
+_POINT_ON_B, _NORMAL_ON_B, _FORCE = 6, 7, 9
 
 
 def _new_world() -> Any:
@@ -201,13 +196,13 @@ def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave
     flags = world.GEOM_FORCE_CONCAVE_TRIMESH if concave else 0
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(file), flags=flags)
     body: int = world.createMultiBody(0, shape, **_placed(world_from_object))
-    world.changeDynamics(body, -1, collisionMargin=float(os.environ.get("OM","0")))
+    world.changeDynamics(body, -1, collisionMargin=0.0)
     return body
 
 
 def _hand(world: Any, folder: Path) -> int:
     """The hand at its start. Without inertia the engine leaves its orientation alone."""
-    _write_obj(folder / "hand.obj", [_inset(solid, float(os.environ.get("HM","0"))) for solid in hand.solids()])
+    _write_obj(folder / "hand.obj", list(hand.solids()))
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(folder / "hand.obj"))
     body: int = world.createMultiBody(HAND_MASS, shape, basePosition=START)
     world.changeDynamics(
@@ -215,17 +210,9 @@ def _hand(world: Any, folder: Path) -> int:
         -1,
         lateralFriction=FINGER_FRICTION,
         localInertiaDiagonal=[0.0, 0.0, 0.0],
-        collisionMargin=float(os.environ.get("HM","0")),
+        collisionMargin=0.0,
     )
     return body
-
-
-def _inset(solid: trimesh.Trimesh, depth: float) -> trimesh.Trimesh:
-    """A convex solid less a layer of that depth, metres."""
-    normals, corners = solid.face_normals, solid.triangles[:, 0]
-    offsets = depth - np.einsum("fi,fi->f", normals, corners)
-    inside = HalfspaceIntersection(np.column_stack([normals, offsets]), solid.center_mass)
-    return trimesh.convex.convex_hull(inside.intersections)
 
 
 def _placed(pose: FloatArray) -> dict[str, list[float]]:
@@ -248,14 +235,19 @@ def _write_obj(path: Path, meshes: list[trimesh.Trimesh]) -> None:
 @contextmanager
 def _silent() -> Iterator[None]:
     """Swallow what compiled code prints meanwhile: PyBullet greets, and VHACD reports at length."""
-    library = ctypes.CDLL(None)
-    sys.stdout.flush()
-    kept = os.dup(1)
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    kept = [os.dup(descriptor) for descriptor in _OUTPUTS]
     with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
+        for descriptor in _OUTPUTS:
+            os.dup2(nowhere.fileno(), descriptor)
     try:
         yield
     finally:
-        library.fflush(None)
-        os.dup2(kept, 1)
-        os.close(kept)
+        ctypes.CDLL(None).fflush(None)  # what C still holds back
+        for descriptor, copy in zip(_OUTPUTS, kept, strict=True):
+            os.dup2(copy, descriptor)
+            os.close(copy)
+
+
+_OUTPUTS = (1, 2)

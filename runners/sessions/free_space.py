@@ -1,0 +1,42 @@
+"""Voxels that are known to be free: at the border of the workspace, and where the hand has been."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.points import Lattice, Workspace
+
+SLAB_MARGIN = 0.15  # m: by which the floor slab is wider than the object
+SLAB_LAYERS = 2
+
+
+def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
+    """Centres of the lattice's lowest layers, below the floor, under and around vertices (V, 3)."""
+    low = lattice.voxels(vertices.min(axis=0, keepdims=True) - SLAB_MARGIN)[0]
+    high = lattice.voxels(vertices.max(axis=0, keepdims=True) + SLAB_MARGIN)[0]
+    low[2], high[2] = 0, SLAB_LAYERS - 1
+    return lattice.centres(low + _box(high - low + 1))
+
+
+def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
+    """Centres of one layer of voxels on the six faces of the workspace."""
+    last = lattice.voxels(workspace.bounds[1:])[0]
+    voxels = _box(last + 1)
+    return lattice.centres(voxels[((voxels == 0) | (voxels == last)).any(axis=1)])
+
+
+def swept_voxels(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:
+    """Centres of the voxels that interior (M, 3) meets at any of the hand's positions (P, 3)."""
+    bounds = np.array([positions.min(axis=0), positions.max(axis=0)])
+    bounds += [interior.min(axis=0), interior.max(axis=0)]
+    low, high = lattice.voxels(bounds)
+    met = np.zeros(high - low + 1, dtype=bool)
+    for position in positions:
+        met[tuple((lattice.voxels(interior + position) - low).T)] = True
+    return lattice.centres(low + np.argwhere(met))
+
+
+def _box(shape: np.ndarray) -> np.ndarray:
+    """All indices (N, 3) of an array of that shape (3,)."""
+    return np.argwhere(np.ones(shape, dtype=bool))

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.errors import SessionError, SettingError
+from chsel.pose import apply, axis_angle, compose, rotation_angle
+from chsel.settings import build_settings
+from runners.objects.models import MODELS
+from runners.sessions.configurations import (
+    CONFIGURATIONS,
+    find_configuration,
+    fitting_configurations,
+)
+from runners.sessions.placement import laid_down, lowest, roll_to_rest
+from runners.sessions.probing import PROBING_PRESETS, ProbingSettings, choose_workspace
+
+PROBES = {
+    "drill": 30,
+    "drill_opposite": 25,
+    "drill_slanted": 25,
+    "drill_fallen": 20,
+    "mustard": 16,
+    "mustard_sideways": 12,
+    "mustard_fallen": 12,
+    "mustard_fallen_sideways": 15,
+    "hammer": 16,
+    "hammer_straight": 12,
+    "hammer_fallen": 12,
+    "box": 12,
+    "box_fallen": 12,
+    "can": 12,
+    "can_fallen": 12,
+    "clamp": 12,
+    "clamp_sideways": 12,
+}
+
+
+def test_there_are_17_configurations_with_the_probes_of_the_experiments() -> None:
+    assert {name: len(entry.grid) for name, entry in CONFIGURATIONS.items()} == PROBES
+
+
+def test_the_grid_runs_through_all_heights_before_it_goes_sideways() -> None:
+    assert find_configuration("box").grid[3:5] == [(0.0, 0.37), (0.18, 0.05)]
+
+
+def test_every_object_model_has_two_to_four_configurations() -> None:
+    assert {len(fitting_configurations(name)) for name in MODELS} == {2, 3, 4}
+
+
+def test_an_unknown_configuration_is_an_error_that_lists_all() -> None:
+    with pytest.raises(SessionError) as error:
+        find_configuration("dril")
+    assert all(name in str(error.value) for name in CONFIGURATIONS)
+
+
+def test_a_configuration_of_another_object_is_an_error_that_lists_the_fitting_ones() -> None:
+    with pytest.raises(SessionError, match="drill is one of object drill") as error:
+        find_configuration("drill", "spam_can")
+    assert str(error.value).endswith("accepted for object spam_can: can, can_fallen")
+
+
+def test_an_object_without_configurations_takes_any() -> None:
+    assert find_configuration("clamp", "mesh").object == "clamp"
+
+
+def test_the_hammer_has_a_larger_workspace_but_in_the_paper() -> None:
+    hammer = find_configuration("hammer")
+    assert choose_workspace(hammer, PROBING_PRESETS["reference"]).upper == (0.5, 0.5, 0.4)
+    assert choose_workspace(hammer, PROBING_PRESETS["paper"]).upper == (0.5, 0.3, 0.625)
+
+
+def test_presets_differ_where_paper_and_reference_do() -> None:
+    paper, reference = PROBING_PRESETS["paper"], PROBING_PRESETS["reference"]
+    assert (paper.boundary, reference.boundary) == ("box_shell", "floor_slab")
+    assert (paper.sweep, reference.sweep) == ("mini_steps", "control_steps")
+    assert (paper.start_contacts, paper.start_probe) == (0, 0)
+    assert (reference.start_contacts, reference.start_probe) == (4, 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("boundary", "walls"), ("sweep", "never"), ("stop_force", -1.0)]
+)
+def test_a_setting_out_of_range_is_an_error_that_names_it(name: str, value: object) -> None:
+    with pytest.raises(SettingError, match=f"session: {name} is {value!r}; accepted"):
+        build_settings(ProbingSettings, {name: value}, "session")
+
+
+def test_a_tilted_box_rolls_onto_the_face_below_its_centre_of_mass() -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    tilted = compose(axis_angle(np.array([1.0, 0.0, 0.0]), 0.3), np.array([0.0, 0.0, 1.0]))
+    resting = roll_to_rest(box, tilted)
+    np.testing.assert_allclose(resting[:3, :3], np.eye(3), atol=1e-9)
+    assert resting[2, 3] == pytest.approx(0.15, abs=1e-9)
+    # It rolled back over the edge that the tilt had lowered: half a width beside its middle.
+    np.testing.assert_allclose(np.abs(resting[1, 3]), 0.1 - _edge(0.3), atol=1e-9)
+
+
+def _edge(angle: float) -> float:
+    """Distance along y from the centre of the box to its lowest edge, when tilted."""
+    return abs(float(-0.1 * np.cos(angle) + 0.15 * np.sin(angle)))
+
+
+def test_a_box_tilted_beyond_its_balance_falls_over() -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    tilted = compose(axis_angle(np.array([1.0, 0.0, 0.0]), 0.8), np.zeros(3))
+    resting = roll_to_rest(box, tilted)
+    assert rotation_angle(resting[:3, :3]) == pytest.approx(np.pi / 2)
+    assert resting[2, 3] == pytest.approx(0.1, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["drill_fallen", "mustard_fallen", "hammer_straight", "clamp"])
+def test_objects_rest_on_the_floor_above_what_they_stand_on(name: str) -> None:
+    configuration = CONFIGURATIONS[name]
+    mesh = MODELS[configuration.object]().apply_scale(2.5)
+    resting = laid_down(mesh, configuration)
+    assert lowest(mesh, resting) == pytest.approx(0.0, abs=1e-6)
+    centre = apply(resting, np.asarray(mesh.center_mass)[None])[0]
+    np.testing.assert_allclose(centre[:2], configuration.position[:2], atol=1e-9)
+    vertices = apply(resting, np.asarray(mesh.vertices))
+    standing = vertices[vertices[:, 2] < 1e-5, :2]
+    assert (standing.min(axis=0) <= centre[:2]).all()
+    assert (standing.max(axis=0) >= centre[:2]).all()

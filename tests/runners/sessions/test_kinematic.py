@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.pose import apply, inverse
+from chsel.sdf import mesh_sdf
+from replay.events import Probe
+from runners.objects.models import MODELS
+from runners.sessions import hand
+from runners.sessions.configurations import CONFIGURATIONS
+from runners.sessions.kinematic import KinematicEngine, open_kinematic
+from runners.sessions.probing import START, X_REST, ProbingSession, ProbingSettings
+
+DEFAULT = ProbingSettings()
+TIP = 0.1123  # m: from the hand's origin to the end of its fingers
+
+
+def _run(
+    name: str, settings: ProbingSettings = DEFAULT, seed: int = 0
+) -> tuple[trimesh.Trimesh, ProbingSession, list[Probe]]:
+    scales = {"cracker_box": 1.5, "clamp": 5.0}
+    of = CONFIGURATIONS[name].object
+    mesh = MODELS[of]().apply_scale(scales.get(of, 2.5))
+    session = open_kinematic(mesh, name, settings, seed)
+    return mesh, session, list(session.probes())
+
+
+@pytest.fixture(scope="module")
+def drill() -> tuple[trimesh.Trimesh, ProbingSession, list[Probe]]:
+    return _run("drill_slanted")
+
+
+def test_the_hand_has_the_outer_size_of_a_franka_hand() -> None:
+    bounds = np.array([solid.bounds for solid in hand.solids()])
+    lower, upper = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    np.testing.assert_allclose(lower, [-0.026, -0.102, -0.0316], atol=1e-6)
+    np.testing.assert_allclose(upper, [TIP, 0.102, 0.0316], atol=1e-6)
+    assert all(solid.is_convex and solid.is_watertight for solid in hand.solids())
+
+
+def test_interior_points_are_as_deep_as_asked_for() -> None:
+    points = hand.interior_points(0.005, 0.010)
+    depth = -np.min([mesh_sdf(solid, points)[0] for solid in hand.solids()], axis=0)
+    assert depth.min() > 0.010
+    assert len(points) > 1000
+
+
+def test_a_wall_stops_the_finger_tip_to_a_micrometre_and_lets_it_go() -> None:
+    wall = trimesh.creation.box((0.1, 2.0, 2.0))
+    pose = np.eye(4)
+    pose[0, 3] = 0.15
+    engine = KinematicEngine(wall, pose, DEFAULT)
+    for step in range(60):
+        touch = engine.advance(np.array([X_REST + 0.002 * step, 0.0, 0.2]))
+    assert touch.position[0] == pytest.approx(0.1 - TIP, abs=2e-6)
+    assert touch.contact is not None
+    np.testing.assert_allclose(touch.contact, [0.1, 0.0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(touch.normal, [-1.0, 0.0, 0.0], atol=1e-9)
+    back = engine.advance(touch.position - [0.002, 0.0, 0.0])
+    assert back.contact is None
+    assert back.position[0] == pytest.approx(touch.position[0] - 0.002)
+
+
+def test_a_ball_is_met_where_two_round_bodies_touch() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
+    pose = np.eye(4)
+    pose[:3, 3] = [0.3, 0.0, 0.2]
+    engine = KinematicEngine(ball, pose, DEFAULT)
+    position = np.array(START)
+    while (touch := engine.advance(position)).contact is None:
+        position = position + np.array([0.002, 0.0, 0.0])
+    assert touch.position[0] == pytest.approx(0.3 - 0.1 - TIP, abs=1e-4)
+
+
+def test_contacts_lie_on_the_surface_with_normals_out_of_it(
+    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
+) -> None:
+    mesh, session, probes = drill
+    assert session.world_from_object is not None
+    contacts = np.concatenate([probe.contacts for probe in probes])
+    normals = np.concatenate([probe.contact_normals for probe in probes])
+    object_from_world = inverse(session.world_from_object)
+    assert len(contacts) >= 4
+    assert np.abs(mesh_sdf(mesh, apply(object_from_world, contacts))[0]).max() < 1e-5
+    outside = mesh_sdf(mesh, apply(object_from_world, contacts + 1e-4 * normals))[0]
+    assert outside.min() > 0.5e-4
+
+
+def test_the_hand_is_never_in_the_object(
+    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
+) -> None:
+    mesh, session, probes = drill
+    assert session.world_from_object is not None
+    surface = hand.surface_points(0.004)
+    for probe in probes[:8]:
+        ends = probe.gripper_path[:, :3, 3]
+        furthest = ends[np.argmax(ends[:, 0])]
+        points = apply(inverse(session.world_from_object), surface + furthest)
+        assert mesh_sdf(mesh, points)[0].min() > -1e-5
+
+
+def test_free_voxels_are_new_each_time_and_not_deep_in_the_object(
+    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
+) -> None:
+    mesh, session, probes = drill
+    assert session.world_from_object is not None
+    free = [session.initial_points.free, *(probe.new_points.free for probe in probes)]
+    points = np.concatenate(free)
+    assert len(np.unique(np.rint(points / 0.0125), axis=0)) == len(points)
+    # Half the diagonal of a voxel less the depth of the hand's interior points.
+    tolerance = 0.5 * np.sqrt(3.0) * 0.025 - 0.010
+    inside = mesh_sdf(mesh, apply(inverse(session.world_from_object), points))[0]
+    assert inside.min() > -tolerance
+    assert len(points) - len(free[0]) > 2000
+
+
+def test_each_probe_returns_before_the_object_at_its_place_in_the_grid(
+    drill: tuple[trimesh.Trimesh, ProbingSession, list[Probe]],
+) -> None:
+    _, session, probes = drill
+    assert [probe.step for probe in probes] == list(range(session.count))
+    for probe, (y, z) in zip(probes, session.configuration.grid, strict=True):
+        x_end, y_end, z_end = probe.gripper_path[-1, :3, 3]
+        assert x_end == pytest.approx(X_REST, abs=3e-4)
+        assert (y_end, z_end) == pytest.approx((y, z), abs=5e-3)
+        assert probe.outcome == ("contact" if len(probe.contacts) else "free")
+        np.testing.assert_array_equal(probe.new_points.contacts, probe.contacts)
+        np.testing.assert_array_equal(probe.gripper_path[0, :3, :3], hand.ROTATION)
+
+
+def test_a_seed_fixes_every_bit_and_another_one_does_not() -> None:
+    first, again, other = (_run("box", seed=seed)[2] for seed in (3, 3, 4))
+    for one, two in zip(first, again, strict=True):
+        assert one.new_points.digest == two.new_points.digest
+        np.testing.assert_array_equal(one.gripper_path, two.gripper_path)
+    assert first[0].new_points.digest != other[0].new_points.digest
+
+
+def test_without_noise_the_hand_pushes_along_a_line() -> None:
+    _, _, probes = _run("box", replace(DEFAULT, noise=0.0))
+    pushed = probes[0].gripper_path[:, :3, 3]
+    forward = pushed[pushed[:, 0] > X_REST + 1e-3]
+    assert np.ptp(forward[:, 1:], axis=0).max() == 0.0
+
+
+def test_sweeping_mini_steps_frees_all_that_control_steps_do_and_more() -> None:
+    fine = _run("can")[2]
+    coarse = _run("can", replace(DEFAULT, sweep="control_steps"))[2]
+    sets = []
+    for probes in (fine, coarse):
+        free = np.concatenate([probe.new_points.free for probe in probes])
+        sets.append(set(map(tuple, np.rint(free / 0.0125).astype(int).tolist())))
+    assert sets[1] < sets[0]
+
+
+def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace() -> None:
+    free = {}
+    for boundary in ("floor_slab", "box_shell", "both"):
+        mesh = MODELS["spam_can"]().apply_scale(2.5)
+        session = open_kinematic(mesh, "can", replace(DEFAULT, boundary=boundary), 0)
+        free[boundary] = session.initial_points.free
+    np.testing.assert_allclose(np.unique(free["floor_slab"][:, 2]), [-0.075, -0.05], atol=1e-12)
+    # The can is 0.14 m x 0.25 m wide; the slab reaches 0.15 m further on each side.
+    np.testing.assert_allclose(np.ptp(free["floor_slab"], axis=0)[:2], [0.44, 0.55], atol=0.026)
+    assert len(free["box_shell"]) == 25 * 25 * 29 - 23 * 23 * 27
+    assert len(free["both"]) < len(free["box_shell"]) + len(free["floor_slab"])
+
+
+def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_workspace() -> None:
+    mesh = MODELS["hammer"]().apply_scale(2.5)
+    shell = replace(DEFAULT, boundary="box_shell")
+    session = open_kinematic(mesh, "hammer_straight", shell, 0)
+    assert session.world_from_object is not None
+    assert apply(session.world_from_object, np.asarray(mesh.vertices))[:, 0].max() > 0.5
+    points = apply(inverse(session.world_from_object), session.initial_points.free)
+    assert mesh_sdf(mesh, points)[0].min() > 0.0
+
+
+def test_a_real_scan_can_be_probed(ycb_directory) -> None:  # type: ignore[no-untyped-def]
+    from chsel.mesh import load_mesh
+
+    file = ycb_directory / "010_potted_meat_can" / "google_16k" / "nontextured.ply"
+    session = open_kinematic(load_mesh(file, scale=2.5), "can", DEFAULT, 0)
+    contacts = [len(next(session.probes()).contacts)]
+    assert sum(contacts) >= 1

@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.errors import SessionError
+from chsel.pose import apply, inverse
+from chsel.sdf import mesh_sdf
+from replay.events import Probe
+from runners.objects.models import MODELS
+from runners.sessions import hand
+from runners.sessions.configurations import CONFIGURATIONS
+from runners.sessions.kinematic import open_kinematic
+from runners.sessions.placement import laid_down, lowest
+from runners.sessions.probing import ProbingSettings
+from runners.sessions.simulated import open_simulated
+
+pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+
+SCALES = {"cracker_box": 1.5, "clamp": 5.0}
+AGREEMENT = 0.003  # m
+PRESSED = 0.0005  # m: how far 30 N press the hand into the object before the engine resists
+
+DIGESTS = """
+from runners.objects.models import MODELS
+from runners.sessions.probing import ProbingSettings
+from runners.sessions.simulated import open_simulated
+session = open_simulated(MODELS["spam_can"]().apply_scale(2.5), "can", ProbingSettings(), 5)
+print(session.world_from_object.tobytes().hex(), session.initial_points.digest)
+for probe, _ in zip(session.probes(), range(4)):
+    print(probe.new_points.digest, probe.gripper_path.tobytes().hex()[-200:], probe.outcome)
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """One configuration, probed by both engines."""
+
+    mesh: trimesh.Trimesh
+    world_from_object: FloatArray
+    simulated: list[Probe]
+    kinematic: list[Probe]
+
+
+def _mesh(configuration_name: str) -> trimesh.Trimesh:
+    name = CONFIGURATIONS[configuration_name].object
+    return MODELS[name]().apply_scale(SCALES.get(name, 2.5))
+
+
+@pytest.fixture(scope="module", params=list(CONFIGURATIONS))
+def pair(request: pytest.FixtureRequest) -> _Pair:
+    mesh = _mesh(request.param)
+    simulated = open_simulated(mesh, request.param, ProbingSettings(), 0)
+    kinematic = open_kinematic(mesh, request.param, ProbingSettings(), 0)
+    assert simulated.world_from_object is not None
+    both = list(simulated.probes()), list(kinematic.probes())
+    simulated.close()
+    return _Pair(mesh, simulated.world_from_object, *both)
+
+
+def test_contacts_agree_with_plain_geometry_to_3_mm(pair: _Pair) -> None:
+    distances = []
+    for simulated, kinematic in zip(pair.simulated, pair.kinematic, strict=True):
+        assert simulated.outcome == kinematic.outcome
+        for contact in simulated.contacts:
+            patch = np.concatenate([kinematic.contacts, _touching(pair, kinematic, contact)])
+            assert _distances(contact, patch).min() < AGREEMENT
+            distances.append(_distances(contact, kinematic.contacts).min())
+    # Where faces lie nearly flat on one another, one engine's point can be anywhere in the patch
+    # that touches, so single points are only held to agree for the most part.
+    assert np.median(distances) < AGREEMENT
+    assert max(distances) < 0.010
+
+
+def _touching(pair: _Pair, probe: Probe, near: FloatArray) -> FloatArray:
+    """Where on the object (N, 3) the hand of a probe, at its furthest, all but touches it."""
+    ends = probe.gripper_path[:, :3, 3]
+    surface = hand.surface_points(0.001) + ends[np.argmax(ends[:, 0])]
+    surface = surface[_distances(near, surface) < 0.02]
+    points = apply(inverse(pair.world_from_object), surface)
+    distance, normal = mesh_sdf(pair.mesh, points)
+    onto = points - distance[:, None] * normal
+    return apply(pair.world_from_object, onto[distance < PRESSED])
+
+
+def _distances(point: FloatArray, points: FloatArray) -> FloatArray:
+    return np.sqrt(((points - point) ** 2).sum(axis=1))
+
+
+def test_each_configuration_has_four_contacts_all_of_them_on_the_surface(pair: _Pair) -> None:
+    contacts = np.concatenate([probe.contacts for probe in pair.simulated])
+    assert len(contacts) >= 4
+    points = apply(inverse(pair.world_from_object), contacts)
+    assert np.abs(mesh_sdf(pair.mesh, points)[0]).max() < 0.001
+
+
+def test_free_space_is_nearly_that_of_plain_geometry(pair: _Pair) -> None:
+    counts = [
+        sum(len(probe.new_points.free) for probe in probes)
+        for probes in (pair.simulated, pair.kinematic)
+    ]
+    assert counts[0] == pytest.approx(counts[1], rel=0.01)
+    assert counts[0] > 2000
+
+
+def test_free_voxels_are_not_deep_in_the_object(pair: _Pair) -> None:
+    free = np.concatenate([probe.new_points.free for probe in pair.simulated])
+    points = apply(inverse(pair.world_from_object), free)
+    tolerance = 0.5 * np.sqrt(3.0) * 0.025 - 0.010
+    assert mesh_sdf(pair.mesh, points)[0].min() > -tolerance
+
+
+def test_the_settled_object_lies_on_the_floor_where_geometry_has_laid_it(
+    pair: _Pair, request: pytest.FixtureRequest
+) -> None:
+    assert lowest(pair.mesh, pair.world_from_object) == pytest.approx(0.0, abs=1e-9)
+    laid = laid_down(pair.mesh, CONFIGURATIONS[request.node.callspec.params["pair"]])
+    vertices = np.asarray(pair.mesh.vertices)
+    moved = apply(pair.world_from_object, vertices) - apply(laid, vertices)
+    assert np.sqrt((moved**2).sum(axis=1)).max() < 0.001
+
+
+def test_a_seed_gives_the_same_bytes_in_every_process() -> None:
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", DIGESTS], capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    ]
+    assert outputs[0] == outputs[1]
+    assert outputs[0].count("\n") == 5
+    assert "contact" in outputs[0]
+
+
+def test_contacts_can_be_with_the_convex_parts(capfd: pytest.CaptureFixture[str]) -> None:
+    settings = replace(ProbingSettings(), collision_mesh="vhacd")
+    session = open_simulated(_mesh("can"), "can", settings, 0)
+    probe = next(session.probes())
+    session.close()
+    assert len(probe.contacts) >= 1
+    assert capfd.readouterr().out == ""  # the decomposition is talkative
+
+
+def test_without_pybullet_the_error_names_the_other_session(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(SessionError, match="session=kinematic"):
+        open_simulated(_mesh("can"), "can", ProbingSettings(), 0)
