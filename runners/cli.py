@@ -71,6 +71,9 @@ def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bo
         run()
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # whoever read the output has had enough of it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except _USER_ERRORS as error:
         if show_traceback:
             raise
@@ -122,16 +125,12 @@ def _groups() -> list[str]:
 
 
 def _register_resolvers() -> None:
-    """Resolvers that the files in conf/ use."""
-    OmegaConf.register_new_resolver(
-        "options",
-        lambda: "\n".join(f"  {g}={'|'.join(choices(g))}" for g in _groups()),
-        replace=True,
-    )
-    OmegaConf.register_new_resolver("slug", lambda name: name.replace("/", "-"), replace=True)
-    OmegaConf.register_new_resolver(
-        "run_id", lambda: os.urandom(2).hex(), replace=True, use_cache=True
-    )
+    """What the help texts in conf/ use: ${options:object,session} lists the options of groups."""
+
+    def options(*groups: str) -> str:
+        return "\n".join(f"  {group}={'|'.join(choices(group))}" for group in groups)
+
+    OmegaConf.register_new_resolver("options", options, replace=True)
 
 
 def _print_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.filesize import decimal
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -64,7 +65,7 @@ class Display:
         truth = "best_position_error" in rows[-1]
         title = "registrations"
         if truth:
-            title += "; error to the true pose of the best hypothesis, and of the closest"
+            title += "; errors to the true pose: best hypothesis, closest one"
         table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
         names = ["probe", "contacts", "best cost", "distinct"]
         errors = ["mm", "°", "mm", "°"] if truth else []
@@ -81,7 +82,7 @@ class Display:
     def written(self, folder: Path, files: Mapping[str, int]) -> None:
         """What lies in the run's folder, and how to look at it."""
         for name, size in files.items():
-            self._console.print(f"{folder / name}  {size / 1e6:.2f} MB", soft_wrap=True)
+            self._console.print(f"{folder / name}  {decimal(size)}", soft_wrap=True)
         if "recording.rrd" in files:
             self._console.print(
                 f"look at it: rerun --bind 127.0.0.1 {folder / 'recording.rrd'}", soft_wrap=True

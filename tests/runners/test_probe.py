@@ -88,7 +88,7 @@ def test_a_run_leaves_recordings_config_and_summary(
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["method"]["descent"]["iterations"] == 20
     assert done.stdout.count("\nprobe ") == 3
-    assert "error to the true pose of the best hypothesis" in done.stdout
+    assert "errors to the true pose: best hypothesis, closest one" in done.stdout
     assert f"{folder / 'recording.mcap'}" in done.stdout
     assert done.stderr == ""
 
