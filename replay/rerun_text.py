@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
+
+import yaml
 
 from replay.events import SessionStarted
 
@@ -23,7 +25,8 @@ def session_markdown(started: SessionStarted) -> str:
     parts = ["\n".join(table)]
     for title, mapping in (("Configuration", started.config), ("Environment", started.environment)):
         if mapping:
-            parts.append(f"**{title}**\n```\n" + "\n".join(_indented(mapping)) + "\n```")
+            text = yaml.safe_dump(dict(mapping), sort_keys=False)
+            parts.append(f"**{title}**\n```\n{text}```")
     return "\n\n".join(parts) + "\n"
 
 
@@ -32,21 +35,3 @@ def _find(config: Mapping[str, Any], name: str) -> Any:
     method = config.get("method")
     found = config.get(name) or (method.get(name) if isinstance(method, Mapping) else None)
     return found.get("name") if isinstance(found, Mapping) else found
-
-
-def _indented(value: Any, depth: int = 0) -> list[str]:
-    """Nested mappings as indented lines of `key: value`."""
-    lines: list[str] = []
-    for key, inner in value.items():
-        start = "  " * depth + f"{key}:"
-        if isinstance(inner, Mapping) and inner:
-            lines += [start, *_indented(inner, depth + 1)]
-        else:
-            lines.append(f"{start} {_plain(inner)}")
-    return lines
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return "[" + ", ".join(_plain(item) for item in value) + "]"
-    return "-" if value is None else str(value)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shutil
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -84,13 +86,20 @@ class Display:
         for name, size in files.items():
             self._console.print(f"{folder / name}  {decimal(size)}", soft_wrap=True)
         if "recording.rrd" in files:
-            self._console.print(
-                f"look at it: rerun --bind 127.0.0.1 {folder / 'recording.rrd'}", soft_wrap=True
-            )
+            viewer = f"{_viewer()} --bind 127.0.0.1"
+            self._console.print(f"look at it: {viewer} {folder / 'recording.rrd'}", soft_wrap=True)
 
     def close(self) -> None:
         """Give the terminal back."""
         self._bar.stop()
+
+
+def _viewer() -> str:
+    """How to start Rerun's viewer from here."""
+    beside = Path(sys.executable).with_name("rerun")
+    if shutil.which("rerun") or not beside.is_file():
+        return "rerun"
+    return str(beside.relative_to(Path.cwd()) if beside.is_relative_to(Path.cwd()) else beside)
 
 
 def _errors(row: Mapping[str, Any], which: str) -> tuple[str, str]:

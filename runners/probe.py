@@ -77,7 +77,7 @@ class Scene:
 @command("probe")
 def main(config: DictConfig) -> None:
     """Run one session."""
-    values = plain(config)
+    values = _with_configuration(plain(config))
     checked = build_settings(ProbeConfig, values, "probe")
     torch.set_num_threads(checked.threads)
     method_config = dict(checked.method)
@@ -94,6 +94,15 @@ def main(config: DictConfig) -> None:
         scene.session.close()
     if interrupted:
         sys.exit(130)
+
+
+def _with_configuration(values: dict[str, Any]) -> dict[str, Any]:
+    """The values with the object's own configuration where none was chosen."""
+    session, object_values = values.get("session"), values.get("object")
+    if isinstance(session, dict) and isinstance(object_values, dict) and "configuration" in session:
+        chosen = session["configuration"] or object_values.get("configuration")
+        values["configuration"] = session["configuration"] = chosen
+    return values
 
 
 def open_scene(config: ProbeConfig) -> Scene:
