@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+import yaml
 from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
@@ -367,7 +368,8 @@ def test_the_text_tells_the_session_and_its_whole_configuration(rows: dict[str, 
     ((_, values),) = rows["/session"]
     (text,) = values["TextDocument:text"]
     assert "| method | **chsel, preset paper** |" in text
-    assert "method:\n  qd:\n    bins: [40, 40]" in text
+    shown = yaml.safe_load(text.split("```")[1])
+    assert shown == {"preset": {"name": "paper"}, "method": {"qd": {"bins": [40, 40]}}}
 
 
 def test_the_log_has_every_line_with_its_level(rows: dict[str, list[Row]]) -> None:
