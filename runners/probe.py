@@ -110,16 +110,16 @@ def open_scene(config: ProbeConfig) -> Scene:
     session_config = dict(config.session)
     kind = str(session_config.pop("kind", None))
     settings = session_settings(kind, session_config)
-    start = (settings.start_contacts, settings.start_probe)
     if kind == "recorded":
         recorded = RecordedSession(settings)
         of = recorded.recorded
-        return Scene(recorded, of.object, of.mesh, of.sdf, start)
+        return Scene(recorded, of.object, of.mesh, of.sdf, recorded.start)
     object_model = load_object(config.object, config.assets.folder)
     session = open_session(kind, settings, object_model, config.seed)
     sdf = SdfGrid.from_mesh(
         object_model.mesh, settings.object_resolution, padding=settings.object_padding
     )
+    start = (settings.start_contacts, settings.start_probe)
     return Scene(session, object_model.name, object_model.mesh, sdf, start)
 
 

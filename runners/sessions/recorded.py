@@ -14,12 +14,13 @@ from replay.mcap_reader import read_recording
 class RecordedSettings:
     """path: the recording.mcap; it brings its own object, workspace and resolutions.
 
-    start_contacts, start_probe: a registration needs so many contacts and this probe index.
+    start_contacts, start_probe: a registration needs so many contacts and this probe index; None:
+    as in the recording.
     """
 
     path: str | None = None
-    start_contacts: int = 0
-    start_probe: int = 0
+    start_contacts: int | None = None
+    start_probe: int | None = None
 
     def __post_init__(self) -> None:
         if not self.path:
@@ -39,10 +40,21 @@ class RecordedSession:
         self.initial_points = self.recorded.initial_points
         self._probes = recording.probes
         self.count = len(self._probes)
+        self.start = (
+            self._rule("start_contacts", settings.start_contacts),
+            self._rule("start_probe", settings.start_probe),
+        )
 
     def probes(self) -> Iterator[Probe]:
         """The recorded probes in their order."""
         yield from self._probes
+
+    def _rule(self, name: str, chosen: int | None) -> int:
+        """What was chosen, or else what the recording says; 0 if it says nothing sensible."""
+        session = self.recorded.config.get("session")
+        recorded = session.get(name) if isinstance(session, dict) else None
+        value = recorded if chosen is None else chosen
+        return value if isinstance(value, int) else 0
 
     def close(self) -> None:
         """Nothing is held open."""

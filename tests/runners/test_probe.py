@@ -150,6 +150,7 @@ def test_a_recorded_session_repeats_the_probes_with_another_method(
     assert again.problem(2).points.digest == before.problem(2).points.digest
     assert again.start.sdf.digest == before.start.sdf.digest
     assert again.start.object == "mesh"
+    assert again.steps == before.steps
     assert again.hypotheses(2).archive is None
 
 
