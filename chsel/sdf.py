@@ -25,19 +25,16 @@ _NORMAL_RANGE = 1e-3  # nearer than this to the surface, the face normal is the 
 def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Exact signed distance (N,) in metres and its unit gradient (N, 3) at points (N, 3).
 
-    Negative inside. The sign comes from pseudonormals, or from the winding number where the mesh
-    is open. Within 1 mm of the surface the gradient is the normal of the closest face
-    (CHSEL, Sec. IV-A; there by ray casting, which is not reproducible).
+    Negative inside. The sign comes from the winding number, which also holds for open meshes and
+    for scans with folds, where pseudonormals fail. Within 1 mm of the surface the gradient is the
+    normal of the closest face (CHSEL, Sec. IV-A; there by ray casting, which is not reproducible).
     """
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
     queries = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
     if len(queries) == 0:
         return np.zeros(0), np.zeros((0, 3))
-    watertight = bool(mesh.is_watertight)
-    kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    if not watertight:
-        kind = igl.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
+    kind = igl.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
     signed, face, closest = igl.signed_distance(queries, vertices, faces, sign_type=kind)[:3]
     away = np.where(signed[:, None] < 0.0, closest - queries, queries - closest)
     length = np.sqrt((away**2).sum(axis=1))
