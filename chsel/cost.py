@@ -1,4 +1,4 @@
-"""The relaxed cost of a pose (CHSEL, Eq. 6), differentiable with the gradient that it defines."""
+"""The relaxed cost of a pose (CHSEL, Eqs. 6 to 10), with the gradient that the paper defines."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class CostSettings:
 
     penetration_tolerance: alpha, the level (metres, negative) that free points may reach.
     free_scale, occupied_scale: lambda. known_scale: weight of known-SDF points.
-    free_term: "direct" sums over free points as Eq. 6 does; "interior" sums over points inside
+    free_term: "direct" sums over free points as Eq. 8 does; "interior" sums over points inside
     the object that fall into free voxels, as the authors' experiments did.
     interior_spacing: of those points, metres; by default |alpha|. volume_normalise: weigh them by
     the volume they stand for in free voxels. known_tolerance: dead band of known-SDF points,
     metres. lookup, outside: how the SDF grid is read, see SdfGrid.query. gradient: "defined"
-    is violation times normal (Eq. 7); "exact" is the derivative of the value.
+    is violation times normal (Eqs. 8 to 10); "exact" is the derivative of the value.
     """
 
     penetration_tolerance: float = -0.01
@@ -87,11 +87,11 @@ class Part:
 
 
 class RelaxedCost:
-    """C^(X) = lambda sum_free c_f + lambda sum_occupied c_o + sum_known c_k (CHSEL, Eq. 6).
+    """C^(X) = lambda sum_free c_f + lambda sum_occupied c_o + sum_known c_k (CHSEL, Eq. 7).
 
     A function of rotations (B, 3, 3) and translations (B, 3) of object_from_world; B may differ
     from call to call, and no pose's cost depends on the others. Built from numpy arrays and
-    differentiable by torch: the gradient is the one that Eq. 7 defines, pushed through
+    differentiable by torch: the gradient is the one that Eqs. 8 to 10 define, pushed through
     x~ = R x + t.
     """
 

@@ -125,7 +125,7 @@ class Lattice:
 
 
 class FreeVoxels:
-    """Free space met so far, one point a voxel (the density cap of CHSEL, Sec. IV-A)."""
+    """Free space met so far, one point a voxel (the density cap of CHSEL, Sec. IV-B)."""
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice

@@ -27,7 +27,7 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
 
     Negative inside. The sign comes from the winding number, which also holds for open meshes and
     for scans with folds, where pseudonormals fail. Within 1 mm of the surface the gradient is the
-    normal of the closest face (CHSEL, Sec. IV-A; there by ray casting, which is not reproducible).
+    normal of the closest face (CHSEL, Sec. IV-B; there by ray casting, which is not reproducible).
     """
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
@@ -152,7 +152,7 @@ class SdfGrid:
     ) -> tuple[Tensor, Tensor]:
         """Signed distance (P,) and gradient (P, 3) at object-frame points (P, 3).
 
-        lookup "nearest" takes the nearest node, ties to even (CHSEL, Sec. IV-A); "trilinear"
+        lookup "nearest" takes the nearest node, ties to even (CHSEL, Sec. IV-B); "trilinear"
         interpolates values and gradients. Outside of the grid, "surface_point" returns the
         distance to the surface point closest to the nearest point of the grid, an upper bound;
         "bounding_box" returns the distance to the grid's box.

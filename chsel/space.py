@@ -28,7 +28,7 @@ class SearchSpace(Protocol):
 
 
 class SE3Space:
-    """x = [first row of R, second row of R, t] (CHSEL, Sec. IV-B)."""
+    """x = [first row of R, second row of R, t] (CHSEL, Sec. IV-C)."""
 
     dimension = 9
 

@@ -12,7 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -91,6 +96,9 @@ def _message(error: Exception, config_name: str) -> str:
     if unknown and isinstance(error, ConfigCompositionException):
         return _unknown_key(unknown.group(1), config_name)
     text = str(error)
+    if isinstance(error, OverrideParseException):
+        text = f"{error.override!r} is no setting ({text}"
+        text = text.split("\n")[0] + "); accepted: KEY=VALUE"
     if isinstance(error, HydraException) and error.__cause__ is not None:
         text = f"{text}: {error.__cause__}"
     text = re.split(r"\nConfig search path:|\nSee https?://|\n\s*full_key:", text)[0]

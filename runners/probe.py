@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import trimesh
 import yaml
 from omegaconf import DictConfig
 
-from chsel.errors import require_positive
+from chsel.errors import RecordingError, require_positive
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.sdf import SdfGrid
@@ -77,7 +78,7 @@ class Scene:
 @command("probe")
 def main(config: DictConfig) -> None:
     """Run one session."""
-    values = _with_configuration(plain(config))
+    values = plain(config)
     checked = build_settings(ProbeConfig, values, "probe")
     torch.set_num_threads(checked.threads)
     method_config = dict(checked.method)
@@ -94,15 +95,6 @@ def main(config: DictConfig) -> None:
         scene.session.close()
     if interrupted:
         sys.exit(130)
-
-
-def _with_configuration(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with the object's own configuration where none was chosen."""
-    session, object_values = values.get("session"), values.get("object")
-    if isinstance(session, dict) and isinstance(object_values, dict) and "configuration" in session:
-        chosen = session["configuration"] or object_values.get("configuration")
-        values["configuration"] = session["configuration"] = chosen
-    return values
 
 
 def open_scene(config: ProbeConfig) -> Scene:
@@ -175,7 +167,6 @@ def run(
         show=show,
     )
     rows: list[Row] = []
-    outcome = "failed"
     try:
         recorder.record(started)
         recorder.flush()
@@ -187,12 +178,12 @@ def run(
     except KeyboardInterrupt:
         outcome = "interrupted"
     except Exception as error:
-        outcome = f"failed: {error}"
+        with suppress(OSError):  # the first error is the one to tell
+            _finish(folder, recorder, session_run.step, started, rows, f"failed: {error}")
         raise
     finally:
-        _end(recorder, session_run.step, outcome)
         display.close()
-        _summarise(folder, started, rows, outcome)
+    _finish(folder, recorder, session_run.step, started, rows, outcome)
     display.table(rows)
     if outcome == "interrupted":
         display.say("interrupted: the recording holds everything up to here")
@@ -200,11 +191,29 @@ def run(
     return outcome == "interrupted"
 
 
-def _end(recorder: Recorder, step: int, outcome: str) -> None:
-    level = "info" if outcome == "finished" else "warning"
-    recorder.record(Logged(step, level, f"session {outcome}"))
-    recorder.record(SessionEnded(step, outcome))
-    recorder.close()
+def _finish(
+    folder: Path,
+    recorder: Recorder,
+    step: int,
+    started: SessionStarted,
+    rows: list[Row],
+    outcome: str,
+) -> None:
+    """End the recording, and write the summary even if the recording is what has failed."""
+    finished = outcome == "finished"
+    try:
+        with nullcontext() if finished else suppress(RecordingError):
+            _end(recorder, step, "info" if finished else "warning", outcome)
+    finally:
+        _summarise(folder, started, rows, outcome)
+
+
+def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:
+    try:
+        recorder.record(Logged(step, level, f"session {outcome}"))
+        recorder.record(SessionEnded(step, outcome))
+    finally:
+        recorder.close()
 
 
 def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -198,6 +199,27 @@ def test_a_killed_run_leaves_every_probe_that_it_reported(
     assert recording.hypotheses(1).object_from_world.shape == (30, 4, 4)
 
 
+def test_a_full_disk_is_told_and_loses_nothing_that_was_written(
+    points: tuple[str, ...], tmp_path: Path
+) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    size = 2_000_000
+    command = [sys.executable, "-m", "runners.probe", *points, f"logs={tmp_path}", *QUICK]
+    many = ["recording=mcap", "method.archive.bins=400", "method.emitter.iterations=200"]
+    done = subprocess.run([*command, *many], capture_output=True, text=True, preexec_fn=limit)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "recording.mcap cannot be written: File too large" in done.stderr
+    folder = run_folder(tmp_path)
+    recording = read_recording(folder / "recording.mcap", partial=True)
+    assert recording.start.object == "mesh"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["outcome"].startswith("failed: ")
+    assert len(recording.steps) >= len(summary["steps"])
+
+
 def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> None:
     overrides = ["-m", *points, *QUICK[:2], "method=gradient_descent", "seed=1,2", "recording=none"]
     done = run(tmp_path, *overrides)
@@ -227,6 +249,7 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
         ("session.path=nothing.npz", "point file nothing.npz does not exist"),
         ("logs=/dev/null", "run folder /dev/null/probe"),
         ("session.path=null", "session.path=FILE"),
+        ("seed=1=2{", "'seed=1=2{' is no setting"),
         (
             "session=kinematic object=clamp configuration=drill",
             "accepted for object clamp: clamp, ",
