@@ -68,7 +68,7 @@ class Display:
         title = "registrations"
         if truth:
             title += "; errors to the true pose: best hypothesis, closest one"
-        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
         names = ["probe", "contacts", "best cost", "distinct"]
         errors = ["mm", "°", "mm", "°"] if truth else []
         for name in [*names, *errors, "time"]:
