@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,9 +39,12 @@ class RecordingConfig:
 
 
 def make_run_folder(logs: Path, *names: str) -> Path:
-    """A new folder TIME_NAME_NAME_ID in `logs`; the random id keeps two runs of a second apart."""
+    """A new folder TIME_NAME_NAME_ID in `logs`; the random id keeps two runs of a second apart.
+
+    Of names, which may come from a file, only letters, digits and a few signs are taken.
+    """
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    parts = [stamp, *(name.replace("/", "-") for name in names), os.urandom(2).hex()]
+    parts = [stamp, *(re.sub(r"[^\w.-]", "-", name)[:60] for name in names), os.urandom(2).hex()]
     folder = logs / "_".join(parts)
     try:
         folder.mkdir(parents=True)
