@@ -5,7 +5,8 @@ Free Space Data", Robotics: Science and Systems, 2023.
 """
 
 from chsel.api import register
-from chsel.cost import CostSettings, RelaxedCost
+from chsel.cost import RelaxedCost
+from chsel.cost_settings import CostSettings
 from chsel.errors import ChselError
 from chsel.mesh import load_mesh
 from chsel.points import KnownPoints, Workspace

@@ -11,63 +11,17 @@ import torch
 from torch import Tensor
 
 from chsel.arrays import FloatArray
-from chsel.errors import SettingError, require_choice, require_positive
-from chsel.points import KnownPoints, Lattice
-from chsel.pose import as_tensor
+from chsel.cost_settings import CostSettings
+from chsel.device import device_named
+from chsel.errors import EngineError, require_positive
+from chsel.free_blocks import FreeBlocks
+from chsel.interior import VoxelGrid, interior_points, interior_spacing
+from chsel.points import KnownPoints
+from chsel.pose import as_tensor, moved_columns
 from chsel.problem import RegistrationProblem
-from chsel.sdf import LOOKUPS, OUTSIDE, SdfGrid
+from chsel.sdf import SdfGrid
 
-FREE_TERMS = ("direct", "interior")
-GRADIENTS = ("defined", "exact")
-FEW_INTERIOR_POINTS = 25
-_PAIRS_AT_ONCE = 2_000_000
-_MAX_VOXELS = 100_000_000
-
-
-@dataclass(frozen=True)
-class CostSettings:
-    """Settings of the relaxed cost, with the paper's symbols.
-
-    penetration_tolerance: alpha, the level (metres, negative) that free points may reach.
-    free_scale, occupied_scale: lambda. known_scale: weight of known-SDF points.
-    free_term: "direct" sums over free points as Eq. 8 does; "interior" sums over points inside
-    the object that fall into free voxels, as the authors' experiments did.
-    interior_spacing: of those points, metres; by default |alpha|. volume_normalise: weigh them by
-    the volume they stand for in free voxels. known_tolerance: dead band of known-SDF points,
-    metres. lookup, outside: how the SDF grid is read, see SdfGrid.query. gradient: "defined"
-    is violation times normal (Eqs. 8 to 10); "exact" is the derivative of the value.
-    """
-
-    penetration_tolerance: float = -0.01
-    free_scale: float = 20.0
-    occupied_scale: float = 20.0
-    known_scale: float = 1.0
-    free_term: str = "direct"
-    interior_spacing: float | None = None
-    volume_normalise: bool = False
-    known_tolerance: float = 0.0
-    lookup: str = "trilinear"
-    outside: str = "surface_point"
-    gradient: str = "defined"
-
-    def __post_init__(self) -> None:
-        if not -10.0 < self.penetration_tolerance <= 0.0:
-            raise SettingError(
-                f"penetration_tolerance is {self.penetration_tolerance}; accepted: at most 0 (m)"
-            )
-        for name in ("free_scale", "occupied_scale", "known_scale", "known_tolerance"):
-            require_positive(name, getattr(self, name), zero=True)
-        if self.interior_spacing is not None:
-            require_positive("interior_spacing", self.interior_spacing)
-        require_choice("free_term", self.free_term, FREE_TERMS)
-        require_choice("lookup", self.lookup, LOOKUPS)
-        require_choice("outside", self.outside, OUTSIDE)
-        require_choice("gradient", self.gradient, GRADIENTS)
-        if self.free_term == "interior" and self.gradient == "exact":
-            raise SettingError(
-                "gradient is exact with free_term interior, whose value is piecewise constant; "
-                "accepted: gradient defined, or free_term direct"
-            )
+_PAIRS_AT_ONCE = {"cpu": 500_000, "cuda": 10_000_000}
 
 
 @dataclass(frozen=True)
@@ -93,6 +47,15 @@ class RelaxedCost:
     from call to call, and no pose's cost depends on the others. Built from numpy arrays and
     differentiable by torch: the gradient is the one that Eqs. 8 to 10 define, pushed through
     x~ = R x + t.
+
+    Take it for gradients by torch, and with device "cuda" for the costs of 10^5 poses and more.
+    CompiledCost is what the methods take: on a processor it is many times as fast, and its bits
+    are the same on every machine. Here they are the same in every run on one device, by sums in a
+    fixed order and no atomic additions; between devices, costs agree to 1e-9 of their size.
+
+    pairs_at_once: pairs of pose and point that are worked on together, at about PAIR_BYTES bytes
+    each; null stands for 500 000 on a processor and 10 million on a GPU.
+    Raises EngineError for a device that is not here.
     """
 
     def __init__(
@@ -102,46 +65,73 @@ class RelaxedCost:
         settings: CostSettings | None = None,
         *,
         free_resolution: float = 0.01,
+        device: str = "cpu",
+        pairs_at_once: int | None = None,
     ) -> None:
-        self.settings = settings or CostSettings()
+        self.settings = settings = settings or CostSettings()
         self.sdf = sdf
         self.points = points
-        self._free = as_tensor(points.free)
-        self._free_columns = as_tensor(points.free.T.copy())
-        self._occupied = as_tensor(points.occupied)
-        self._known = as_tensor(points.known)
-        self._known_sdf = as_tensor(points.sdf)
-        self._active = sdf.active_cells(self.settings.penetration_tolerance, self.settings.lookup)
-        if len(points.free) and not bool(self._active.any()):
-            warnings.warn(
-                f"no node of the SDF is deeper than {-self.settings.penetration_tolerance} m: free "
-                "points cannot be violated; use a smaller penetration_tolerance",
-                stacklevel=2,
-            )
+        self.device = device_named(device)
+        self.pairs_at_once = pairs_at_once or _PAIRS_AT_ONCE[device.partition(":")[0]]
+        require_positive("pairs_at_once", self.pairs_at_once)
+        self._occupied = as_tensor(points.occupied, self.device)
+        self._known = as_tensor(points.known, self.device)
+        self._known_sdf = as_tensor(points.sdf, self.device)
+        self._blocks: FreeBlocks | None = None
         self._interior: _InteriorPoints | None = None
-        if self.settings.free_term == "interior" and len(points.free):
-            self._interior = _InteriorPoints(sdf, points.free, free_resolution, self.settings)
+        if len(points.free):
+            self._look_at_free(points.free, free_resolution)
+
+    def _look_at_free(self, free: FloatArray, free_resolution: float) -> None:
+        sdf, settings = self.sdf, self.settings
+        alpha, lookup = settings.penetration_tolerance, settings.lookup
+        if not bool(sdf.active_cells(alpha, lookup).any()):
+            warnings.warn(
+                f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
+                "use a smaller penetration_tolerance",
+                stacklevel=3,
+            )
+        if settings.free_term == "interior":
+            self._interior = _InteriorPoints(sdf, free, free_resolution, settings, self.device)
+        else:
+            self._blocks = FreeBlocks(sdf, free, free_resolution, alpha, lookup, self.device)
 
     @classmethod
-    def of(cls, problem: RegistrationProblem, settings: CostSettings | None = None) -> RelaxedCost:
+    def of(
+        cls,
+        problem: RegistrationProblem,
+        settings: CostSettings | None = None,
+        *,
+        device: str = "cpu",
+    ) -> RelaxedCost:
         """The cost that a problem's points define."""
-        free_resolution = problem.free_resolution
-        return cls(problem.sdf, problem.points, settings, free_resolution=free_resolution)
+        resolution = problem.free_resolution
+        return cls(problem.sdf, problem.points, settings, free_resolution=resolution, device=device)
 
     def __call__(self, rotation: Tensor, translation: Tensor) -> Tensor:
         """Costs (B,) of object_from_world rotations (B, 3, 3) and translations (B, 3)."""
+        for tensor in (rotation, translation):
+            if tensor.device != self.device:
+                raise EngineError(
+                    f"poses are on {tensor.device}, the cost is on {self.device}; accepted: equal"
+                )
         cost: Tensor = _DefinedGradient.apply(rotation, translation, self)
         return cost
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
-        """Costs (B,) of transforms (B, 4, 4)."""
-        transforms = torch.tensor(np.asarray(object_from_world), dtype=torch.float64)
-        with torch.no_grad():
-            return self(transforms[:, :3, :3], transforms[:, :3, 3]).numpy()
+        """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
+        transforms = np.asarray(object_from_world, dtype=np.float64)
+        costs, size = np.empty(len(transforms)), self._poses_at_once
+        for first in range(0, len(transforms), size):
+            some = as_tensor(transforms[first : first + size], self.device)
+            with torch.no_grad():
+                costs[first : first + size] = self(some[:, :3, :3], some[:, :3, 3]).cpu().numpy()
+        costs[~np.isfinite(transforms[:, :3]).all(axis=(1, 2))] = np.inf
+        return costs
 
     def terms(self, rotation: Tensor, translation: Tensor) -> dict[str, Part]:
         """The weighted terms "free", "occupied" and "known" for B poses."""
-        size = max(1, _PAIRS_AT_ONCE // max(1, self._points_per_pose))
+        size = self._poses_at_once
         chunks = zip(rotation.split(size), translation.split(size), strict=True)
         parts = [
             (self._free_part(r, t), self._occupied_part(r, t), self._known_part(r, t))
@@ -151,84 +141,59 @@ class RelaxedCost:
         return {name: _joined([part[i] for part in parts]) for i, name in enumerate(names)}
 
     @property
-    def _points_per_pose(self) -> int:
-        interior = 0 if self._interior is None else len(self._interior.points)
-        return max(len(self._free), len(self._occupied), len(self._known), interior)
+    def _poses_at_once(self) -> int:
+        groups = (self._blocks, self._interior, self._occupied, self._known)
+        most = max(0 if group is None else len(group) for group in groups)
+        return max(1, self.pairs_at_once // max(1, most))
 
     def _free_part(self, rotation: Tensor, translation: Tensor) -> Part:
         """lambda sum max(0, alpha - s), with gradient -lambda max(0, alpha - s) n."""
         if self._interior is not None:
             return self._interior.part(rotation, translation)
-        if len(self._free) == 0:
-            return _zero(len(rotation))
-        moved, point, counts = self._free_in_active_cells(rotation, translation)
+        if self._blocks is None:
+            return _zero(rotation)
+        pose, block = self._blocks.near(rotation, translation)
+        if len(pose) * self._blocks.size > self.pairs_at_once and len(rotation) > 1:
+            half = -(-len(rotation) // 2)
+            halves = zip(rotation.split(half), translation.split(half), strict=True)
+            return _joined([self._free_part(r, t) for r, t in halves])
+        pose, world, moved = self._blocks.violated(rotation, translation, pose, block)
         s, n = self._query(moved)
         violation = (self.settings.penetration_tolerance - s).clamp_min(0.0)
         size = violation if self.settings.gradient == "defined" else (violation > 0.0).double()
         scale = self.settings.free_scale
         gradient = -scale * size[:, None] * n
-        columns = [(scale * violation)[:, None], gradient]
-        columns += [gradient[:, i : i + 1] * self._free[point] for i in range(3)]
-        sums = _sum_by_pose(torch.cat(columns, dim=1), counts)
-        return Part(sums[:, 0], sums[:, 4:].reshape(-1, 3, 3), sums[:, 1:4])
-
-    def _free_in_active_cells(
-        self, rotation: Tensor, translation: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The pairs of pose and free point that can be violated, pose by pose.
-
-        Moved points (P, 3), indices of their free points (P,), and pairs per pose (B,). Exact:
-        every point left out reads only SDF nodes at or above alpha.
-        """
-        x, y, z = self._free_columns
-        moved = [  # three times (B, N): a third of the time that (B, N, 3) takes
-            rotation[:, i, 0:1] * x
-            + rotation[:, i, 1:2] * y
-            + rotation[:, i, 2:3] * z
-            + translation[:, i : i + 1]
-            for i in range(3)
-        ]
-        first, last = self.sdf.bounds
-        near = torch.ones_like(moved[0], dtype=torch.bool)
-        for i in range(3):
-            near &= (moved[i] >= first[i]) & (moved[i] <= last[i])
-        pairs = near.reshape(-1).nonzero()[:, 0]
-        points = torch.stack([column.reshape(-1)[pairs] for column in moved], dim=1)
-        active = self._active[self.sdf.cells(points, self.settings.lookup)]
-        pairs = pairs[active]
-        counts = torch.bincount(pairs // len(x), minlength=len(rotation))
-        return points[active], pairs % len(x), counts
+        return _sum_by_pose(rotation, pose, scale * violation, gradient, gradient, world)
 
     def _occupied_part(self, rotation: Tensor, translation: Tensor) -> Part:
         """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n."""
         if len(self._occupied) == 0:
-            return _zero(len(rotation))
-        s, n = self._query_all(_move(rotation, translation, self._occupied))
+            return _zero(rotation)
+        pose, world, moved = _all_pairs(rotation, translation, self._occupied)
+        s, n = self._query(moved)
         violation = (self.settings.penetration_tolerance + s).clamp_min(0.0)
         size = violation if self.settings.gradient == "defined" else (violation > 0.0).double()
         scale = self.settings.occupied_scale
-        return _dense_part(scale * violation, scale * size[..., None] * n, self._occupied)
+        gradient = scale * size[:, None] * n
+        return _sum_by_pose(rotation, pose, scale * violation, gradient, gradient, world)
 
     def _known_part(self, rotation: Tensor, translation: Tensor) -> Part:
         """sum |s - v|, with gradient (s - v) n."""
         if len(self._known) == 0:
-            return _zero(len(rotation))
-        s, n = self._query_all(_move(rotation, translation, self._known))
-        difference = s - self._known_sdf
+            return _zero(rotation)
+        pose, world, moved = _all_pairs(rotation, translation, self._known)
+        s, n = self._query(moved)
+        difference = s - self._known_sdf.repeat(len(rotation))
         excess = (difference.abs() - self.settings.known_tolerance).clamp_min(0.0)
         signed = excess * torch.sign(difference)
         size = signed if self.settings.gradient == "defined" else torch.sign(signed)
         scale = self.settings.known_scale
-        return _dense_part(scale * excess, scale * size[..., None] * n, self._known)
+        gradient = scale * size[:, None] * n
+        return _sum_by_pose(rotation, pose, scale * excess, gradient, gradient, world)
 
     def _query(self, points: Tensor) -> tuple[Tensor, Tensor]:
         lookup, outside = self.settings.lookup, self.settings.outside
         return self.sdf.query(points, lookup=lookup, outside=outside)
-
-    def _query_all(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """SDF (B, N) and gradients (B, N, 3) at points (B, N, 3)."""
-        s, n = self._query(points.reshape(-1, 3))
-        return s.reshape(points.shape[:2]), n.reshape(points.shape)
 
 
 class _InteriorPoints:
@@ -239,66 +204,43 @@ class _InteriorPoints:
     """
 
     def __init__(
-        self, sdf: SdfGrid, free: FloatArray, free_resolution: float, settings: CostSettings
+        self,
+        sdf: SdfGrid,
+        free: FloatArray,
+        free_resolution: float,
+        settings: CostSettings,
+        device: torch.device,
     ) -> None:
-        alpha = settings.penetration_tolerance
-        spacing = settings.interior_spacing or max(-alpha, sdf.resolution / 4)
-        lower, upper = sdf.bounds
-        counts = np.floor((upper - lower) / spacing).astype(int) + 1
-        nodes = lower + np.indices(counts).reshape(3, -1).T * spacing
-        s, n = sdf.query(nodes, lookup=settings.lookup, outside=settings.outside)
-        inside = s < alpha
-        if not bool(inside.any()):
-            raise SettingError(
-                f"free_term interior finds no point deeper than {-alpha} m; accepted: "
-                "a penetration_tolerance nearer to 0, or free_term direct"
-            )
-        if int(inside.sum()) < FEW_INTERIOR_POINTS:
-            warnings.warn(
-                f"free_term interior uses {int(inside.sum())} points; a finer interior_spacing "
-                f"than {spacing} m describes the object better",
-                stacklevel=3,
-            )
+        interior = interior_points(sdf, settings)
+        voxels = VoxelGrid.around(free, free_resolution)
         scale = settings.free_scale
         if settings.volume_normalise:
-            scale *= (spacing / free_resolution) ** 3
-        self.points = as_tensor(nodes)[inside]
-        self._weight = -scale * s[inside]
-        self._normal = n[inside]
-        self._build_voxels(free, free_resolution)
+            scale *= (interior_spacing(sdf, settings) / free_resolution) ** 3
+        self.points = as_tensor(interior.points, device)  # (M, 3)
+        self._weight = as_tensor(scale * interior.depth, device)
+        self._normal = as_tensor(interior.normals, device)
+        self._is_free = torch.from_numpy(voxels.flags.reshape(-1)).to(device)
+        self._counts = voxels.flags.shape
+        self._origin = voxels.origin.tolist()
+        self._inverse = 1.0 / voxels.resolution
 
-    def _build_voxels(self, free: FloatArray, resolution: float) -> None:
-        lattice = Lattice(tuple(free.min(axis=0).tolist()), resolution)
-        voxels = lattice.voxels(free)
-        shape = voxels.max(axis=0) + 1
-        if np.prod(shape, dtype=float) > _MAX_VOXELS:
-            raise SettingError(
-                f"free points span {np.prod(shape, dtype=float):.1e} voxels of {resolution} m; "
-                f"accepted: at most {_MAX_VOXELS:.0e}, so a coarser free_resolution"
-            )
-        # One layer of unknown voxels around, onto which everything outside is clamped.
-        grid = np.zeros(shape + 2, dtype=bool)
-        grid[tuple((voxels + 1).T)] = True
-        self._is_free = torch.from_numpy(grid.reshape(-1))
-        self._shape = torch.tensor(grid.shape)
-        self._origin = as_tensor(lattice.origin)
-        self._resolution = resolution
+    def __len__(self) -> int:
+        return len(self.points)
 
     def part(self, rotation: Tensor, translation: Tensor) -> Part:
         """The term for B poses."""
-        back = rotation.transpose(1, 2)
-        local = self.points - translation[:, None]  # (B, M, 3): y = R^T (m - t)
-        world = _move(back, torch.zeros_like(translation), local)
-        index = torch.round((world - self._origin) / self._resolution).to(torch.int64) + 1
-        index = torch.minimum(index.clamp_min(0), self._shape - 1)
-        flat = (index[..., 0] * self._shape[1] + index[..., 1]) * self._shape[2] + index[..., 2]
-        weight = torch.where(self._is_free[flat], self._weight, 0.0)  # (B, M)
-        pull = weight[..., None] * self._normal  # R dC/dy
-        by_world = _move(back, torch.zeros_like(translation), pull)
-        by_rotation = torch.stack(
-            [(local[..., i : i + 1] * by_world).sum(dim=1) for i in range(3)], dim=1
-        )
-        return Part(weight.sum(dim=1), by_rotation, -pull.sum(dim=1))
+        start = -_turned_back(rotation, translation)
+        world = moved_columns(rotation.transpose(1, 2), start, self.points.T)  # R^T m - R^T t
+        flat = torch.zeros_like(world[0], dtype=torch.int64)
+        for y, origin, count in zip(world, self._origin, self._counts, strict=True):
+            index = torch.round((y - origin) * self._inverse).to(torch.int64)
+            flat = flat * count + index.clamp(0, count - 1)
+        pose, point = self._is_free[flat].nonzero(as_tuple=True)
+        weight = self._weight[point]
+        pull = weight[:, None] * self._normal[point]  # R dC/dy
+        local = self.points[point] - translation[pose]
+        by_world = _turned_back(rotation[pose], pull)
+        return _sum_by_pose(rotation, pose, weight, -pull, local, by_world)
 
 
 class _DefinedGradient(torch.autograd.Function):
@@ -317,37 +259,51 @@ class _DefinedGradient(torch.autograd.Function):
         return by_value[:, None, None] * by_rotation, by_value[:, None] * by_translation, None
 
 
-def _move(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
-    """R x + t: points (N, 3) or (B, N, 3) under B poses, (B, N, 3).
+def _all_pairs(
+    rotation: Tensor, translation: Tensor, points: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """All pairs of B poses and points (N, 3): the pose (B N,), the points, and them moved."""
+    count = len(rotation)
+    moved = torch.stack(moved_columns(rotation, translation, points.T), dim=-1)
+    pose = torch.arange(count, device=points.device).repeat_interleave(len(points))
+    return pose, points.repeat(count, 1), moved.reshape(-1, 3)
 
-    Written out, as a matrix product adds in an order that depends on the machine.
+
+def _turned_back(rotation: Tensor, vectors: Tensor) -> Tensor:
+    """R^T v of vectors (P, 3), by rotations (P, 3, 3)."""
+    rows = [rotation[:, i] * vectors[:, i : i + 1] for i in range(3)]
+    return rows[0] + rows[1] + rows[2]
+
+
+def _sum_by_pose(
+    rotation: Tensor,
+    pose: Tensor,
+    value: Tensor,
+    by_translation: Tensor,
+    left: Tensor,
+    right: Tensor,
+) -> Part:
+    """Sum what pairs add to their poses: values (P,) and gradients; that by R is left right^T.
+
+    pose (P,): ascending. Each sum runs in the order of its pairs: the same bits in any batch.
     """
-    points = points if points.dim() == 3 else points[None]
-    columns = [rotation[:, None, :, i] * points[..., i : i + 1] for i in range(3)]
-    return columns[0] + columns[1] + columns[2] + translation[:, None]
+    count = len(rotation)
+    if len(pose) == 0:
+        return _zero(rotation)
+    columns = [value[:, None], by_translation, *(left[:, i : i + 1] * right for i in range(3))]
+    ends = torch.searchsorted(pose, torch.arange(count + 1, device=pose.device))
+    # Not one column alone: for two and more, torch adds rows one after another on a GPU, too.
+    sums = torch.segment_reduce(torch.cat(columns, dim=1), "sum", lengths=ends.diff(), axis=0)
+    return Part(sums[:, 0], sums[:, 4:].reshape(-1, 3, 3), sums[:, 1:4])
 
 
-def _dense_part(value: Tensor, gradient: Tensor, points: Tensor) -> Part:
-    """Sum values (B, N) and object-frame gradients (B, N, 3) at world points (N, 3)."""
-    rows = [(gradient[..., i : i + 1] * points).sum(dim=1) for i in range(3)]
-    return Part(value.sum(dim=1), torch.stack(rows, dim=1), gradient.sum(dim=1))
-
-
-def _sum_by_pose(rows: Tensor, counts: Tensor) -> Tensor:
-    """Sums (B, C) of consecutive rows (P, C), counts (B,) of them per pose, in order."""
-    if len(rows) == 0:
-        return torch.zeros((len(counts), rows.shape[1]), dtype=torch.float64)
-    return torch.segment_reduce(rows, "sum", lengths=counts, axis=0)
-
-
-def _zero(count: int) -> Part:
-    zeros = torch.zeros(count, dtype=torch.float64)
-    return Part(zeros, zeros.new_zeros((count, 3, 3)), zeros.new_zeros((count, 3)))
+def _zero(rotation: Tensor) -> Part:
+    """Nothing, for each of the rotations (B, 3, 3)."""
+    zeros = torch.zeros_like(rotation)
+    return Part(zeros[:, 0, 0], zeros, zeros[:, 0])
 
 
 def _joined(parts: list[Part]) -> Part:
-    if not parts:
-        return _zero(0)
     return Part(
         torch.cat([part.value for part in parts]),
         torch.cat([part.by_rotation for part in parts]),

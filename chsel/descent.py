@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.adam import Adam
 from chsel.arrays import FloatArray
 from chsel.errors import SettingError, require_positive
 from chsel.objective import Objective
@@ -51,10 +50,7 @@ def descend(
     count = len(estimates)
     for restart in range(settings.restarts):
         vectors = objective.space.encode(estimates)
-        adam = Adam(settings.rate)
-        for _ in range(settings.iterations):
-            _, gradient = objective.costs_and_gradients(vectors)
-            vectors = vectors - adam.step(gradient / count)
+        vectors = objective.descended(vectors, count, settings.rate, settings.iterations)
         estimates = transforms_of(objective.space, vectors)
         vectors = objective.space.encode(estimates)
         costs = objective.costs(vectors)

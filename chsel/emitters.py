@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
-
-from chsel.adam import Adam
 from chsel.archive import GridArchive
 from chsel.arrays import FloatArray, IntArray
 from chsel.errors import require_choice, require_positive
-from chsel.evolution import EvolutionStrategy, rank_by_improvement, recombination_weights
+from chsel.kernels import emitters as kernels
+from chsel.kernels.emitters import me_search, mega_search
 from chsel.objective import Objective
 from chsel.observer import Observer
-from chsel.streams import Purpose, StreamKey
-
-_EPSILON = 1e-8  # keeps the normalisation of a zero gradient finite
+from chsel.streams import Purpose, StreamKey, normals
 
 
 @dataclass(frozen=True)
@@ -26,7 +23,7 @@ class EmitterSettings:
     iterations: n_o. sigma0: first step size, of the gradient coefficients for CMA-MEGA, of the
     search vector for CMA-ME. rate: of the Adam ascent of CMA-MEGA. start: the first solution,
     "best" of E' and E_l, or "initial", the first element of E_0. ribs_parity: see
-    EvolutionStrategy.
+    chsel.kernels.evolution.Strategy.
     """
 
     iterations: int = 100
@@ -52,7 +49,7 @@ class Draws:
     def normals(self, iterations: int, batch: int, dimension: int) -> FloatArray:
         """Standard normal draws (iterations, batch, dimension) for the evolution strategy."""
         stream = self.key.stream(Purpose.EMITTER, self.refinement)
-        return stream.standard_normal((iterations, batch, dimension))
+        return normals(stream, (iterations, batch, dimension))
 
     def elites(self, iterations: int) -> FloatArray:
         """Uniform draws (iterations,) that choose an elite for a restart."""
@@ -73,15 +70,6 @@ def update_cells(
     return archive.add(vectors, -costs, objective.measures(archive.measure, vectors))
 
 
-def _rank(
-    archive: GridArchive, objective: Objective, vectors: FloatArray
-) -> tuple[IntArray, FloatArray, int]:
-    """Offer vectors (B, d): order (B,), best first; ranking values (B, 2); how many improved."""
-    status, value = update_cells(archive, objective, vectors)
-    order = rank_by_improvement(status, value)
-    return order, np.stack([status, value], axis=1)[order], int((status > 0).sum())
-
-
 def cma_mega(
     objective: Objective,
     archive: GridArchive,
@@ -96,30 +84,20 @@ def cma_mega(
     start (d,): the first theta. An iteration evaluates theta with its gradients, and count - 1
     branches around it.
     """
-    batch, coefficients = max(count - 1, 1), archive.measure.count + 1
-    normals = draws.normals(settings.iterations, batch, coefficients)
-    elites = draws.elites(settings.iterations)
-    strategy = EvolutionStrategy(
-        coefficients, batch, settings.sigma0, ribs_parity=settings.ribs_parity
+    batch, measures, total = max(count - 1, 1), archive.measure.count, settings.iterations
+    problem = _problem(objective, archive)
+    normals, elites = draws.normals(total, batch, measures + 1), draws.elites(total)
+    search = mega_search(
+        start,
+        measures,
+        batch,
+        sigma0=settings.sigma0,
+        rate=settings.rate,
+        ribs_parity=settings.ribs_parity,
     )
-    theta, ascent = start, Adam(settings.rate)
-    for iteration in range(settings.iterations):
-        cost, gradient = objective.costs_and_gradients(theta[None])
-        update_cells(archive, objective, theta[None], cost)
-        rows = np.vstack([-gradient, objective.measure_gradients(archive.measure, theta)])
-        directions = rows / (np.sqrt((rows**2).sum(axis=1, keepdims=True)) + _EPSILON)
-        chosen = strategy.ask(normals[iteration])
-        branches = theta + (chosen[:, :, None] * directions).sum(axis=1)
-        order, ranking, parents = _rank(archive, objective, branches)
-        strategy.tell(chosen[order], parents)
-        if parents == 0 or strategy.stopped(ranking):
-            theta, ascent = archive.sample_elite(elites[iteration]), Adam(settings.rate)
-            strategy.reset(np.zeros(coefficients))
-        else:
-            weights = recombination_weights(parents)[:, None]
-            towards = (weights * branches[order[:parents]]).sum(axis=0) - theta
-            theta = theta - ascent.step(-towards)
-        watch.after("cma_mega", iteration + 1, settings.iterations, archive)
+    for first, last in watch.segments(total):
+        kernels.cma_mega(*problem, archive.cells, search, normals, elites, first, last)
+        watch.after("cma_mega", last, total, archive)
 
 
 def cma_me(
@@ -135,20 +113,25 @@ def cma_me(
 
     start (d,): the first mean. An iteration evaluates count samples.
     """
-    dimension = len(start)
-    normals = draws.normals(settings.iterations, count, dimension)
-    elites = draws.elites(settings.iterations)
-    strategy = EvolutionStrategy(
-        dimension, count, settings.sigma0, ribs_parity=settings.ribs_parity
+    total = settings.iterations
+    problem = _problem(objective, archive)
+    normals, elites = draws.normals(total, count, len(start)), draws.elites(total)
+    search = me_search(
+        start,
+        archive.measure.count,
+        count,
+        sigma0=settings.sigma0,
+        ribs_parity=settings.ribs_parity,
     )
-    strategy.reset(start)
-    for iteration in range(settings.iterations):
-        samples = strategy.ask(normals[iteration])
-        order, ranking, parents = _rank(archive, objective, samples)
-        strategy.tell(samples[order], parents)
-        if parents == 0 or strategy.stopped(ranking):
-            strategy.reset(archive.sample_elite(elites[iteration]))
-        watch.after("cma_me", iteration + 1, settings.iterations, archive)
+    for first, last in watch.segments(total):
+        kernels.cma_me(*problem, archive.cells, search, normals, elites, first, last)
+        watch.after("cma_me", last, total, archive)
+
+
+def _problem(objective: Objective, archive: GridArchive) -> tuple[Any, Any, Any, Any]:
+    """What the kernels evaluate: the cost's model, the space, the measure, and scratch."""
+    measure = objective.measure_code(archive.measure)
+    return objective.model, objective.space_arrays, measure, objective.work()
 
 
 class ArchiveWatch:
@@ -163,6 +146,21 @@ class ArchiveWatch:
     def start(self, archive: GridArchive) -> None:
         """The archive is seeded."""
         self._observer.snapshot(archive.snapshot(0, self._refinement))
+
+    def segments(self, total: int) -> Iterator[tuple[int, int]]:
+        """The iterations (first, last) to be run before each word to the observer, of `total`."""
+        first = 0
+        while first < total:
+            last = min(self._next(first, self.trace_interval), total)
+            if self._observer.snapshot_interval:
+                last = min(last, self._next(first, self._observer.snapshot_interval))
+            yield first, last
+            first = last
+
+    @staticmethod
+    def _next(iteration: int, interval: int) -> int:
+        """The first multiple of the interval after an iteration."""
+        return (iteration // interval + 1) * interval
 
     def after(self, stage: str, iteration: int, total: int, archive: GridArchive) -> None:
         """An iteration has ended."""

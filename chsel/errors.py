@@ -29,6 +29,10 @@ class PoseError(ChselError):
     """A pose is not a rigid transform."""
 
 
+class EngineError(ChselError):
+    """The compiled kernels cannot run here, or a device does not exist."""
+
+
 class SessionError(ChselError):
     """A probe session cannot be opened or continued."""
 

@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from chsel.arrays import FloatArray
 from chsel.errors import SettingError, require_choice
-
-MeasureFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
+from chsel.kernels.elementary import arctangents, logs, sines_cosines
+from chsel.kernels.measures import (
+    OBJECT_POSITION,
+    OBJECT_YAW,
+    TRANSLATION,
+    VECTOR,
+    MeasureCode,
+)
 
 
 @dataclass(frozen=True)
 class Measure:
     """A map from search vectors to k numbers: axes names them with units.
 
-    Called with vectors (B, d), rotations (B, 3, 3) and translations (B, 3) of object_from_world;
-    returns (B, k). A circular measure is an angle in radians.
+    code: how it is computed. A circular measure is an angle in radians.
     """
 
     axes: tuple[str, ...]
-    function: MeasureFunction
+    code: MeasureCode
     circular: bool = False
 
     @property
@@ -40,10 +42,10 @@ class Measure:
         """
         if not self.circular:
             return values.mean(axis=0), values.std(axis=0)
-        sine, cosine = np.sin(values).mean(axis=0), np.cos(values).mean(axis=0)
+        sine, cosine = (part.mean(axis=0) for part in sines_cosines(values))
         length = np.sqrt(sine**2 + cosine**2)
-        spread = np.sqrt(-2.0 * np.log(np.clip(length, 1e-300, 1.0)))
-        return np.arctan2(sine, cosine), np.where(length > 1.0 - 1e-6, 0.0, spread)
+        spread = np.sqrt(-2.0 * logs(np.clip(length, 1e-300, 1.0)))
+        return arctangents(sine, cosine), np.where(length > 1.0 - 1e-6, 0.0, spread)
 
     def unwrapped(self, values: FloatArray, centre: FloatArray) -> FloatArray:
         """Values (B, k) moved by whole turns to within half a turn of the centre (k,)."""
@@ -53,36 +55,21 @@ class Measure:
         return values - turn * np.round((values - centre) / turn)
 
 
-def _translation(count: int) -> MeasureFunction:
-    return lambda vectors, rotation, translation: translation[:, :count]
-
-
-def _object_position(vectors: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """x and y of p = -R^T t."""
-    return -(rotation[:, :, :2] * translation[:, :, None]).sum(dim=1)
-
-
-def _object_yaw(vectors: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """Yaw of R^T about the world's z."""
-    return torch.atan2(rotation[:, 0, 1], rotation[:, 0, 0])[:, None]
-
-
-def _rotation(count: int) -> Measure:
-    """The first entries of the 6-D rotation."""
-    axes = tuple(f"6-D rotation {i}" for i in range(count))
-    return Measure(axes, lambda vectors, rotation, translation: vectors[:, :count])
-
-
-_SE3_ONLY = {f"rotation_{count}": _rotation(count) for count in range(1, 7)}
+_SE3_ONLY = {
+    f"rotation_{count}": Measure(
+        tuple(f"6-D rotation {i}" for i in range(count)), MeasureCode(VECTOR, count)
+    )
+    for count in range(1, 7)
+}
 _SE2_ONLY = {
-    "plane_position": Measure(("u (m)", "v (m)"), lambda x, r, t: x[:, 1:3]),
-    "plane_angle": Measure(("theta (rad)",), lambda x, r, t: x[:, 0:1], circular=True),
+    "plane_position": Measure(("u (m)", "v (m)"), MeasureCode(VECTOR, 2, first=1)),
+    "plane_angle": Measure(("theta (rad)",), MeasureCode(VECTOR, 1), circular=True),
 }
 _ANY = {
-    "position_2": Measure(("t_x (m)", "t_y (m)"), _translation(2)),
-    "position_3": Measure(("t_x (m)", "t_y (m)", "t_z (m)"), _translation(3)),
-    "object_xy": Measure(("object x (m)", "object y (m)"), _object_position),
-    "object_yaw": Measure(("object yaw (rad)",), _object_yaw, circular=True),
+    "position_2": Measure(("t_x (m)", "t_y (m)"), MeasureCode(TRANSLATION, 2)),
+    "position_3": Measure(("t_x (m)", "t_y (m)", "t_z (m)"), MeasureCode(TRANSLATION, 3)),
+    "object_xy": Measure(("object x (m)", "object y (m)"), MeasureCode(OBJECT_POSITION, 2)),
+    "object_yaw": Measure(("object yaw (rad)",), MeasureCode(OBJECT_YAW, 1), circular=True),
 }
 MEASURES = {**_ANY, **_SE3_ONLY, **_SE2_ONLY}
 

@@ -2,43 +2,77 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-import torch
 
 from chsel.arrays import FloatArray
-from chsel.cost import RelaxedCost
+from chsel.engine import CompiledCost
+from chsel.kernels.descent import descend
+from chsel.kernels.measures import MeasureCode, all_measures, measure_gradients
+from chsel.kernels.objective import Work, costs_and_gradients, work_for
+from chsel.kernels.pose import decode_all
 from chsel.measures import Measure
 from chsel.space import SearchSpace
+from chsel.threads import spread
 
 
 class Objective:
     """The relaxed cost, and its gradients, over the vectors of a search space."""
 
-    def __init__(self, cost: RelaxedCost, space: SearchSpace) -> None:
+    def __init__(self, cost: CompiledCost, space: SearchSpace) -> None:
         self._cost = cost
         self.space = space
+        self.model = cost.model
+        self.space_arrays = space.arrays
+
+    def work(self) -> Work:
+        """Scratch for one thread."""
+        return work_for(self.model)
+
+    @staticmethod
+    def measure_code(measure: Measure) -> MeasureCode:
+        """The measure as the kernels know it."""
+        return measure.code
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d)."""
-        with torch.no_grad():
-            return self._cost(*self.space.decode(torch.tensor(vectors))).numpy()
+        poses = np.empty((len(vectors), 12))
+        decode_all(self.space_arrays, vectors, poses)
+        return self._cost.costs(poses)
 
     def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Costs (B,) and the defined gradients (B, d) at vectors (B, d)."""
-        x = torch.tensor(vectors, requires_grad=True)
-        cost = self._cost(*self.space.decode(x))
-        (gradient,) = torch.autograd.grad(cost.sum(), x)
-        return cost.detach().numpy(), gradient.numpy()
+        costs, gradients = np.empty(len(vectors)), np.empty(vectors.shape)
+
+        def run(first: int, last: int, work: Any) -> None:
+            space = self.space_arrays
+            costs_and_gradients(self.model, space, vectors, costs, gradients, first, last, work)
+
+        spread(run, len(vectors), self.work)
+        return costs, gradients
+
+    def descended(
+        self, vectors: FloatArray, divisor: float, rate: float, iterations: int
+    ) -> FloatArray:
+        """Vectors (B, d) after some iterations of Adam; gradients are divided by `divisor`."""
+        moved = np.array(vectors)
+
+        def run(first: int, last: int, work: Any) -> None:
+            space = self.space_arrays
+            descend(self.model, space, moved, rate, divisor, iterations, first, last, work)
+
+        spread(run, len(moved), self.work)
+        return moved
 
     def measures(self, measure: Measure, vectors: FloatArray) -> FloatArray:
         """Measures (B, k) of vectors (B, d)."""
-        with torch.no_grad():
-            x = torch.tensor(vectors)
-            return np.ascontiguousarray(measure.function(x, *self.space.decode(x)).numpy())
+        values = np.empty((len(vectors), measure.count))
+        all_measures(self.space_arrays, measure.code, vectors, values)
+        return values
 
     def measure_gradients(self, measure: Measure, vector: FloatArray) -> FloatArray:
         """Gradients (k, d) of the measures at one vector (d,)."""
-        x = torch.tensor(vector[None], requires_grad=True)
-        values = measure.function(x, *self.space.decode(x))[0]
-        rows = [torch.autograd.grad(value, x, retain_graph=True)[0][0] for value in values]
-        return torch.stack(rows).numpy()
+        gradients = np.empty((measure.count, len(vector)))
+        measure_gradients(self.space_arrays, measure.code, vector, gradients)
+        return gradients

@@ -9,10 +9,10 @@ import numpy as np
 from chsel.arrays import FloatArray
 from chsel.errors import require_choice, require_positive
 from chsel.points import KnownPoints, Workspace
-from chsel.pose import axis_angle, compose, inverse, random_rotations, rotation_vector
+from chsel.pose import axis_angle, compose, inverse, product, random_rotations, rotation_vector
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
-from chsel.streams import Purpose, StreamKey
+from chsel.streams import Purpose, StreamKey, normals, uniforms
 
 _CENTROID_SPREAD = 0.05
 
@@ -75,16 +75,16 @@ def first_initial_set(
     """E_0 before any registration: object_from_world (B, 4, 4)."""
     stream = key.stream(Purpose.INITIAL_POSES)
     count = settings.hypotheses
-    position = stream.uniform(workspace.lower, workspace.upper, (count, 3))
+    position = uniforms(stream, workspace.lower, workspace.upper, (count, 3))
     if settings.initial == "so3":
         rotation = random_rotations(stream, count)
     else:
-        yaw = stream.uniform(0.0, 2.0 * np.pi, count)
+        yaw = uniforms(stream, 0.0, 2.0 * np.pi, count)
         rotation = axis_angle(np.broadcast_to([0.0, 0.0, 1.0], (count, 3)), yaw)
     if settings.initial == "origin":
         position = np.zeros((count, 3))
     elif settings.initial == "contact_centroid" and len(points.contacts):
-        spread = stream.uniform(-_CENTROID_SPREAD, _CENTROID_SPREAD, (count, 3))
+        spread = uniforms(stream, -_CENTROID_SPREAD, _CENTROID_SPREAD, (count, 3))
         position = points.contacts.mean(axis=0) + spread
     return inverse(compose(rotation, position))
 
@@ -101,9 +101,9 @@ def updated_initial_set(
     world_from_best = inverse(best)
     stream = key.stream(Purpose.UPDATE_NOISE)
     count = settings.hypotheses
-    shift = settings.translation_noise * stream.standard_normal((count, 3))
+    shift = settings.translation_noise * normals(stream, (count, 3))
     turn = _rotation_noise(stream, count, settings)
-    rotation = np.einsum("bij,jk->bik", turn, world_from_best[:3, :3])
+    rotation = product(turn, world_from_best[:3, :3])
     initial_set = inverse(compose(rotation, world_from_best[:3, 3] + shift))
     if settings.keep_best:
         initial_set[0] = best
@@ -113,11 +113,11 @@ def updated_initial_set(
 def _rotation_noise(
     stream: np.random.Generator, count: int, settings: OnlineSettings
 ) -> FloatArray:
-    direction = stream.standard_normal((count, 3))
+    direction = normals(stream, (count, 3))
     if settings.rotation_law == "rotvec_gauss":
         return rotation_vector(settings.rotation_noise * direction)
     axis = direction / np.sqrt((direction**2).sum(axis=1, keepdims=True))
-    return axis_angle(axis, settings.rotation_noise * stream.standard_normal(count))
+    return axis_angle(axis, settings.rotation_noise * normals(stream, count))
 
 
 def _low_cost_set(previous: Hypotheses, settings: OnlineSettings) -> FloatArray:

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from chsel.arrays import FloatArray
 from chsel.errors import PoseError
+from chsel.kernels.elementary import arctangents, sines_cosines
+from chsel.streams import normals
 
 RIGID_TOLERANCE = 1e-6
 
@@ -48,10 +50,24 @@ def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     return transforms
 
 
+def product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Matrix products (..., 3, 3) of (..., 3, 3), each sum in the order of its index."""
+    total = left[..., :, 0, None] * right[..., None, 0, :]
+    total = total + left[..., :, 1, None] * right[..., None, 1, :]
+    return total + left[..., :, 2, None] * right[..., None, 2, :]
+
+
+def rotated(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 3) turned by rotations (..., 3, 3), each sum in the order of its index."""
+    total = rotation[..., 0] * vectors[..., 0, None]
+    total = total + rotation[..., 1] * vectors[..., 1, None]
+    return total + rotation[..., 2] * vectors[..., 2, None]
+
+
 def inverse(transforms: FloatArray) -> FloatArray:
     """The inverse of rigid transforms (..., 4, 4)."""
     rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
-    return compose(rotation, -np.einsum("...ij,...j->...i", rotation, transforms[..., :3, 3]))
+    return compose(rotation, -rotated(rotation, transforms[..., :3, 3]))
 
 
 def apply(transforms: FloatArray, points: FloatArray) -> FloatArray:
@@ -62,7 +78,7 @@ def apply(transforms: FloatArray, points: FloatArray) -> FloatArray:
 
 def axis_angle(axis: FloatArray, angle: FloatArray | float) -> FloatArray:
     """Rotations (..., 3, 3) about unit axes (..., 3) by angles (...) in radians (Rodrigues)."""
-    sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    sine, cosine = (values[..., None, None] for values in sines_cosines(angle))
     hat = np.zeros((*axis.shape[:-1], 3, 3))
     hat[..., 0, 1], hat[..., 0, 2] = -axis[..., 2], axis[..., 1]
     hat[..., 1, 0], hat[..., 1, 2] = axis[..., 2], -axis[..., 0]
@@ -81,7 +97,7 @@ def rotation_vector(vectors: FloatArray) -> FloatArray:
 
 def random_rotations(stream: np.random.Generator, count: int) -> FloatArray:
     """Rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
-    quaternion = stream.standard_normal((count, 4))
+    quaternion = normals(stream, (count, 4))
     w, x, y, z = (quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -102,7 +118,7 @@ def rotation_angle(rotation: FloatArray) -> FloatArray:
         axis=-1,
     )
     trace = np.trace(rotation, axis1=-2, axis2=-1)
-    return np.arctan2(np.sqrt((skew**2).sum(axis=-1)), trace - 1.0)
+    return arctangents(np.sqrt((skew**2).sum(axis=-1)), trace - 1.0)
 
 
 def encode_9d(object_from_world: FloatArray) -> FloatArray:
@@ -115,7 +131,7 @@ def decode_6d(rows: Tensor) -> Tensor:
     """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
     first, second = rows[:, 0:3], rows[:, 3:6]
     b1 = first / _length(first)
-    b2 = second - (b1 * second).sum(dim=1, keepdim=True) * b1
+    b2 = second - _dot(b1, second) * b1
     b2 = b2 / _length(b2)
     b3 = torch.stack(
         [
@@ -130,9 +146,31 @@ def decode_6d(rows: Tensor) -> Tensor:
 
 def _length(vectors: Tensor) -> Tensor:
     # Kept away from 0, so that a degenerate 6-D vector decodes to finite numbers.
-    return torch.sqrt((vectors * vectors).sum(dim=1, keepdim=True)).clamp_min(1e-12)
+    return torch.sqrt(_dot(vectors, vectors)).clamp_min(1e-12)
 
 
-def as_tensor(value: Any) -> Tensor:
+def _dot(left: Tensor, right: Tensor) -> Tensor:
+    """Products (B, 1) of vectors (B, 3), each sum in the order of its index."""
+    products = left * right
+    return products[:, 0:1] + products[:, 1:2] + products[:, 2:3]
+
+
+def moved_columns(rotation: Tensor, translation: Tensor, columns: Tensor) -> list[Tensor]:
+    """R x + t, as three times (B, N), of points (3, N) or (3, B, N) under B poses.
+
+    Written out, as a matrix product adds in an order that depends on the machine; by columns, as
+    (B, N, 3) takes three times as long.
+    """
+    x, y, z = columns
+    return [
+        rotation[:, i, 0:1] * x
+        + rotation[:, i, 1:2] * y
+        + rotation[:, i, 2:3] * z
+        + translation[:, i : i + 1]
+        for i in range(3)
+    ]
+
+
+def as_tensor(value: Any, device: torch.device | str = "cpu") -> Tensor:
     """A float64 tensor that shares no memory with a read-only array."""
-    return torch.tensor(np.asarray(value), dtype=torch.float64)
+    return torch.tensor(np.asarray(value), dtype=torch.float64).to(device)

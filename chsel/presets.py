@@ -7,7 +7,7 @@ determines its result.
 
 from __future__ import annotations
 
-from chsel.cost import CostSettings
+from chsel.cost_settings import CostSettings
 from chsel.descent import DescentSettings
 from chsel.emitters import EmitterSettings
 from chsel.online import OnlineSettings

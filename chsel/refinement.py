@@ -6,6 +6,7 @@ import numpy as np
 
 from chsel.arrays import FloatArray
 from chsel.space import SearchSpace, transforms_of
+from chsel.streams import normals
 
 _BEST = 0.2
 
@@ -22,6 +23,6 @@ def resampled_around_best(
     best = np.argsort(costs, kind="stable")[: max(1, int(_BEST * count))]
     vectors = space.encode(estimates[best])
     deviation = vectors.std(axis=0, ddof=1) if len(best) > 1 else np.zeros(space.dimension)
-    drawn = vectors.mean(axis=0) + deviation * stream.standard_normal((count, space.dimension))
+    drawn = vectors.mean(axis=0) + deviation * normals(stream, (count, space.dimension))
     drawn[: len(best)] = vectors
     return transforms_of(space, drawn)

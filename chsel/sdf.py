@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import igl
 import numpy as np
@@ -19,6 +20,7 @@ from chsel.pose import as_tensor
 LOOKUPS = ("nearest", "trilinear")
 OUTSIDE = ("surface_point", "bounding_box")
 MAX_NODES = 50_000_000
+Derived = TypeVar("Derived")
 _NORMAL_RANGE = 1e-3  # nearer than this to the surface, the face normal is the better gradient
 
 
@@ -42,6 +44,19 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     gradient = away / np.where(near, 1.0, length)[:, None]
     gradient[near] = _face_normals(vertices, faces[face[near]])
     return np.asarray(signed, dtype=np.float64), gradient
+
+
+class _Tensors(NamedTuple):
+    """A grid on a device: corners (3,), the last lowest node of eight (3,), values and gradients.
+
+    values (nodes,), gradients (nodes, 3).
+    """
+
+    first: Tensor
+    last: Tensor
+    top: Tensor
+    values: Tensor
+    gradients: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +133,22 @@ class SdfGrid:
         """Digest of the grid."""
         return digest(self.origin, np.array(self.resolution), self.values, self.gradients)
 
+    @cached_property
+    def table(self) -> FloatArray:
+        """Value and gradient (nodes, 4) of all nodes."""
+        return np.concatenate([self.values[..., None], self.gradients], axis=-1).reshape(-1, 4)
+
+    def derived(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
+        """What `make` makes of this grid, kept under a key for as long as the grid lives."""
+        if key not in self._derived:
+            self._derived[key] = make()
+        made: Derived = self._derived[key]
+        return made
+
+    @cached_property
+    def _derived(self) -> dict[Hashable, Any]:
+        return {}
+
     def active_cells(self, level: float, lookup: str) -> Tensor:
         """Flags of the cells, as `cells` counts them, that read any value below `level`."""
         below = self.values < level
@@ -135,17 +166,26 @@ class SdfGrid:
 
         The nearest node for lookup "nearest", the lowest of eight nodes for "trilinear".
         """
-        cell = (points - as_tensor(self.origin)) / self.resolution
+        cell = (points - self._on(points.device).first) * (1.0 / self.resolution)
         return self._flat(torch.round(cell) if lookup == "nearest" else self._base(cell))
+
+    def clamped(self, points: Tensor) -> Tensor:
+        """The points of the grid's box (P, 3) nearest to points (P, 3); no nan stays one."""
+        grid = self._on(points.device)
+        return torch.fmin(torch.fmax(points, grid.first), grid.last)
 
     def _base(self, cell: Tensor) -> Tensor:
         """The lowest of the eight nodes around grid coordinates (P, 3)."""
-        return torch.minimum(torch.floor(cell), torch.tensor(self.shape) - 2.0)
+        return torch.minimum(torch.floor(cell), self._on(cell.device).top)
 
-    @cached_property
-    def _tables(self) -> tuple[Tensor, Tensor]:
-        """Values and gradients as flat tensors."""
-        return as_tensor(self.values.reshape(-1)), as_tensor(self.gradients.reshape(-1, 3))
+    def _on(self, device: torch.device) -> _Tensors:
+        """The grid on a device, where it stays."""
+        return self.derived(("tensors", device), lambda: self._made_on(device))
+
+    def _made_on(self, device: torch.device) -> _Tensors:
+        tables = self.values.reshape(-1), self.gradients.reshape(-1, 3)
+        parts = (*self.bounds, np.array(self.shape) - 2.0, *tables)
+        return _Tensors(*(as_tensor(part, device) for part in parts))
 
     def query(
         self, points: Any, *, lookup: str = "nearest", outside: str = "surface_point"
@@ -160,10 +200,10 @@ class SdfGrid:
         require_choice("lookup", lookup, LOOKUPS)
         require_choice("outside", outside, OUTSIDE)
         points = torch.as_tensor(points, dtype=torch.float64)
-        first, last = as_tensor(self.bounds)
-        clamped = torch.minimum(torch.maximum(points, first), last)
+        clamped = self.clamped(points)
         read = self._nearest if lookup == "nearest" else self._trilinear
-        value, gradient = read((clamped - first) / self.resolution)
+        first = self._on(points.device).first
+        value, gradient = read((clamped - first) * (1.0 / self.resolution))
         beyond = (clamped != points).any(dim=1)
         if not bool(beyond.any()):
             return value, gradient
@@ -179,23 +219,22 @@ class SdfGrid:
     def _nearest(self, cell: Tensor) -> tuple[Tensor, Tensor]:
         """Value and gradient at grid coordinates (P, 3) by the nearest node."""
         index = self._flat(torch.round(cell))
-        values, gradients = self._tables
-        return values[index], gradients[index]
+        grid = self._on(cell.device)
+        return grid.values[index], grid.gradients[index]
 
     def _trilinear(self, cell: Tensor) -> tuple[Tensor, Tensor]:
         """Value and gradient at grid coordinates (P, 3) by interpolation between 8 nodes."""
         base = self._base(cell)
         fraction = cell - base
-        values, gradients = self._tables
-        value = torch.zeros(len(cell), dtype=torch.float64)
-        gradient = torch.zeros((len(cell), 3), dtype=torch.float64)
-        for corner in np.ndindex(2, 2, 2):
-            step = torch.tensor(corner)
-            sides = torch.where(step == 1, fraction, 1.0 - fraction)
-            weight = sides[:, 0] * sides[:, 1] * sides[:, 2]
-            index = self._flat(base + step)
-            value = value + weight * values[index]
-            gradient = gradient + weight[:, None] * gradients[index]
+        sides = (1.0 - fraction, fraction)
+        first = self._flat(base)
+        grid, (_, ny, nz) = self._on(cell.device), self.shape
+        value, gradient = torch.zeros_like(cell[:, 0]), torch.zeros_like(cell)
+        for i, j, k in np.ndindex(2, 2, 2):
+            weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
+            index = first + (i * ny + j) * nz + k
+            value = value + weight * grid.values[index]
+            gradient = gradient + weight[:, None] * grid.gradients[index]
         return value, gradient
 
     def _flat(self, index: Tensor) -> Tensor:
@@ -219,5 +258,11 @@ def _border(values: FloatArray) -> list[FloatArray]:
     return [np.take(values, end, axis=axis) for axis in range(3) for end in (0, -1)]
 
 
+def squared_length(vectors: Tensor) -> Tensor:
+    """Squared lengths (P, 1) of vectors (P, 3), each sum in the order of its index."""
+    squares = vectors * vectors
+    return squares[:, 0:1] + squares[:, 1:2] + squares[:, 2:3]
+
+
 def _length(vectors: Tensor) -> Tensor:
-    return torch.sqrt((vectors * vectors).sum(dim=1, keepdim=True)).clamp_min(1e-12)
+    return torch.sqrt(squared_length(vectors)).clamp_min(1e-12)

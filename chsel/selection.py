@@ -107,7 +107,7 @@ def select_elites(
     if len(good) >= count or settings.shortage == "fewer":
         return good[:count]
     if settings.shortage == "resample":
-        return good[np.sort(stream.integers(0, len(good), count))]
+        return good[np.sort((stream.random(count) * len(good)).astype(np.int64))]
     return order[np.sort(np.resize(np.arange(len(order)), count))]
 
 

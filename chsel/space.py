@@ -11,7 +11,9 @@ from torch import Tensor
 
 from chsel.arrays import FloatArray, frozen
 from chsel.errors import SettingError
-from chsel.pose import as_tensor, compose, decode_6d, encode_9d, rotation_vector
+from chsel.kernels.elementary import arctangents
+from chsel.kernels.pose import Space, decode_all
+from chsel.pose import as_tensor, compose, decode_6d, encode_9d, product, rotated, rotation_vector
 from chsel.sdf import SdfGrid
 
 
@@ -19,6 +21,8 @@ class SearchSpace(Protocol):
     """Vectors x (B, d) that stand for transforms object_from_world."""
 
     dimension: int
+    arrays: Space
+    """The space as the kernels know it."""
 
     def encode(self, object_from_world: FloatArray) -> FloatArray:
         """Vectors (B, d) of transforms (B, 4, 4); the nearest ones if the space is smaller."""
@@ -31,6 +35,7 @@ class SE3Space:
     """x = [first row of R, second row of R, t] (CHSEL, Sec. IV-C)."""
 
     dimension = 9
+    arrays = Space()
 
     def encode(self, object_from_world: FloatArray) -> FloatArray:
         """The 9-D vectors of transforms."""
@@ -87,10 +92,16 @@ class SE2Space:
         x, y, z = axis
         self._hat = as_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         self._hat_squared = as_tensor(np.outer(axis, axis) - np.eye(3))
+        turning = product(self._hat.numpy(), self.resting_rotation)
+        turning_squared = product(self._hat_squared.numpy(), self.resting_rotation)
+        matrices = (self.resting_rotation, turning, turning_squared)
+        vectors = (tuple(vector.tolist()) for vector in (axis, e_u, self.e_v))
+        flat = (tuple(matrix.reshape(-1).tolist()) for matrix in matrices)
+        self.arrays = Space(True, *vectors, *flat, offset=float(offset))
 
     def encode(self, object_from_world: FloatArray) -> FloatArray:
         """The plane poses nearest to transforms, by the Frobenius norm of the rotations."""
-        turned = object_from_world[:, :3, :3] @ self.resting_rotation.T
+        turned = product(object_from_world[:, :3, :3], self.resting_rotation.T)
         skew = np.stack(
             [
                 turned[:, 2, 1] - turned[:, 1, 2],
@@ -99,19 +110,26 @@ class SE2Space:
             ],
             axis=1,
         )
-        along = np.einsum("i,bij,j->b", self.axis, turned, self.axis)
-        theta = np.arctan2(skew @ self.axis, np.trace(turned, axis1=1, axis2=2) - along)
+        along = (rotated(turned, self.axis) * self.axis).sum(axis=1)
+        theta = arctangents(
+            (skew * self.axis).sum(axis=1), np.trace(turned, axis1=1, axis2=2) - along
+        )
         translation = object_from_world[:, :3, 3]
-        return np.stack([theta, translation @ self.e_u, translation @ self.e_v], axis=1)
+        u, v = (translation * self.e_u).sum(axis=1), (translation * self.e_v).sum(axis=1)
+        return np.stack([theta, u, v], axis=1)
 
     def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Rodrigues' formula about the axis, and a point of the plane."""
+        device = vectors.device
+        hat, hat_squared, rest = (
+            part.to(device) for part in (self._hat, self._hat_squared, self._rest)
+        )
+        e_u, e_v, axis = (part.to(device) for part in (self._e_u, self._e_v, self._axis))
         sine, cosine = torch.sin(vectors[:, 0]), torch.cos(vectors[:, 0])
-        turn = torch.eye(3, dtype=torch.float64) + sine[:, None, None] * self._hat
-        turn = turn + (1.0 - cosine)[:, None, None] * self._hat_squared
-        rotation = (turn[:, :, :, None] * self._rest[None, None]).sum(dim=2)
-        in_plane = vectors[:, 1:2] * self._e_u + vectors[:, 2:3] * self._e_v
-        return rotation, in_plane + self.offset * self._axis
+        turn = torch.eye(3, dtype=torch.float64, device=device) + sine[:, None, None] * hat
+        turn = turn + (1.0 - cosine)[:, None, None] * hat_squared
+        rotation = (turn[:, :, :, None] * rest[None, None]).sum(dim=2)
+        return rotation, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + self.offset * axis
 
 
 def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:
@@ -121,9 +139,10 @@ def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:
 
 def transforms_of(space: SearchSpace, vectors: FloatArray) -> FloatArray:
     """The transforms object_from_world (B, 4, 4) of vectors (B, d)."""
-    with torch.no_grad():
-        rotation, translation = space.decode(torch.tensor(vectors, dtype=torch.float64))
-    return compose(rotation.numpy(), translation.numpy())
+    vectors = np.array(vectors, dtype=np.float64)
+    poses = np.empty((len(vectors), 12))
+    decode_all(space.arrays, vectors, poses)
+    return compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
 
 
 def _lowest_point(sdf: SdfGrid, axis: FloatArray) -> float:
@@ -131,4 +150,4 @@ def _lowest_point(sdf: SdfGrid, axis: FloatArray) -> float:
     near = np.abs(sdf.values) < 2.0 * sdf.resolution
     nodes = sdf.origin + np.argwhere(near) * sdf.resolution
     surface = nodes - sdf.values[near][:, None] * sdf.gradients[near]
-    return float((surface @ axis).min())
+    return float((surface * axis).sum(axis=1).min())

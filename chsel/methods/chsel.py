@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from chsel.arrays import FloatArray
-from chsel.cost import CostSettings, RelaxedCost
+from chsel.cost_settings import CostSettings
 from chsel.descent import DescentSettings, descend
 from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
+from chsel.engine import CompiledCost
 from chsel.errors import require_choice, require_positive
 from chsel.measures import measure_named
 from chsel.objective import Objective
@@ -70,7 +71,7 @@ class Chsel:
         """Hypotheses for the known points of a problem, best first."""
         observer = observer or NullObserver()
         space = search_space(self.settings.plane, problem.sdf)
-        objective = Objective(RelaxedCost.of(problem, self.settings.cost), space)
+        objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
         estimates = self._algorithm_1(
             problem, objective, problem.initial_set, problem.low_cost_set, 0, observer
         )

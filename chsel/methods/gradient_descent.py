@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from chsel.cost import CostSettings, RelaxedCost
+from chsel.cost_settings import CostSettings
 from chsel.descent import DescentSettings, descend
+from chsel.engine import CompiledCost
 from chsel.objective import Objective
 from chsel.observer import NullObserver, Observer
 from chsel.online import OnlineSettings
@@ -43,7 +44,7 @@ class GradientDescent:
         """Hypotheses for the known points of a problem, best first."""
         observer = observer or NullObserver()
         space = search_space(self.settings.plane, problem.sdf)
-        objective = Objective(RelaxedCost.of(problem, self.settings.cost), space)
+        objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
         estimates, _ = descend(objective, problem.initial_set, self.settings.descent, observer)
         no_cells = np.full(len(estimates), -1, dtype=np.int64)
         return ranked_hypotheses(objective, estimates, no_cells, estimates, None)

@@ -1,12 +1,21 @@
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
 from chsel.archive import GridArchive
+from chsel.errors import ChselError
+from chsel.kernels.archive import sampled_cell
+from chsel.kernels.measures import VECTOR, MeasureCode
 from chsel.measures import MEASURES, Measure
 
-XY = Measure(("x", "y"), lambda vectors, rotation, translation: vectors[:, :2])
+XY = Measure(("x", "y"), MeasureCode(VECTOR, 2))
+
+
+@numba.njit
+def sampled(objectives, uniform):  # type: ignore[no-untyped-def]
+    return sampled_cell(objectives, uniform)
 
 
 @pytest.fixture
@@ -54,10 +63,33 @@ def test_of_equals_in_a_batch_the_first_stays(archive: GridArchive) -> None:
 def test_elites_are_sampled_from_occupied_cells_alone(archive: GridArchive) -> None:
     add(archive, [[0.1, -0.9], [0.9, 0.9], [0.3, 0.1]], [-1.0, -2.0, -3.0])
     uniform = np.linspace(0.0, 1.0, 300, endpoint=False)
-    drawn = np.array([archive.sample_elite(u) for u in uniform])
-    found, counts = np.unique(drawn, axis=0, return_counts=True)
-    np.testing.assert_array_equal(found, [[0.1, -0.9], [0.3, 0.1], [0.9, 0.9]])
+    drawn = np.array([sampled(archive.cells.objectives, u) for u in uniform])
+    found, counts = np.unique(drawn, return_counts=True)
+    np.testing.assert_array_equal(found, [0, 6, 15])
     np.testing.assert_array_equal(counts, [100, 100, 100])
+
+
+def test_an_empty_archive_has_no_elite_to_sample(archive: GridArchive) -> None:
+    assert sampled(archive.cells.objectives, 0.5) == -1
+    with pytest.raises(ChselError, match="no pose"):
+        _ = archive.best_solution
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("where", ["solution", "objective", "measure"])
+def test_numbers_that_are_not_finite_never_enter(
+    archive: GridArchive, where: str, bad: float
+) -> None:
+    solutions = np.array([[0.1, -0.9], [0.9, 0.9]])
+    measures, objectives = solutions.copy(), np.array([-1.0, -2.0])
+    target = {"solution": solutions, "objective": objectives, "measure": measures}[where]
+    target.reshape(2, -1)[1, -1] = bad
+    status, value = archive.add(solutions, objectives, measures)
+    np.testing.assert_array_equal(status, [2, 0])
+    np.testing.assert_array_equal(value, [-1.0, -np.inf])
+    np.testing.assert_array_equal(archive.occupied, [0])
+    if where == "measure":
+        np.testing.assert_array_equal(archive.cells_of(measures), [0, -1])
 
 
 def test_snapshot_is_a_copy_with_its_statistics(archive: GridArchive) -> None:

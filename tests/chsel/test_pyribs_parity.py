@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import pytest
 
 import chsel.emitters
-from chsel.adam import Adam
 from chsel.archive import GridArchive
 from chsel.arrays import FloatArray
 from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.kernels import emitters as kernels
+from chsel.kernels.emitters import mega_search
+from chsel.kernels.measures import VECTOR, MeasureCode
 from chsel.measures import Measure
 from chsel.observer import NullObserver
 from chsel.streams import StreamKey
@@ -27,27 +31,72 @@ SEEDS = 20
 ITERATIONS = 100
 
 
+class Parameters(NamedTuple):
+    """Of the quadratic, as the compiled searches take them."""
+
+    centre: FloatArray
+    weights: FloatArray
+
+
 class Quadratic:
     """Cost |A (x - c)|^2 over 9 dimensions; the measures are the last coordinates but one."""
 
     def __init__(self) -> None:
-        self.centre = np.linspace(-0.3, 0.3, 9)
-        self.weights = np.linspace(1.0, 3.0, 9)
+        self.model = Parameters(np.linspace(-0.3, 0.3, 9), np.linspace(1.0, 3.0, 9))
+        self.space_arrays = 0
+
+    def measure_code(self, measure: Measure) -> MeasureCode:
+        return measure.code
+
+    def work(self) -> int:
+        return 0
 
     def costs(self, vectors: FloatArray) -> FloatArray:
-        return ((self.weights * (vectors - self.centre)) ** 2).sum(axis=1)
+        return ((self.model.weights * (vectors - self.model.centre)) ** 2).sum(axis=1)
 
     def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return self.costs(vectors), 2.0 * self.weights**2 * (vectors - self.centre)
-
-    def measures(self, measure: Measure, vectors: FloatArray) -> FloatArray:
-        return vectors[:, 6:8]
-
-    def measure_gradients(self, measure: Measure, vector: FloatArray) -> FloatArray:
-        return np.eye(9)[6:8]
+        return self.costs(vectors), 2.0 * self.model.weights**2 * (vectors - self.model.centre)
 
 
-MEASURE = Measure(("x", "y"), lambda vectors, rotation, translation: vectors[:, 6:8])
+@numba.njit
+def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for j in range(9):
+        total += (model.weights[j] * (vector[j] - model.centre[j])) ** 2
+    return total
+
+
+@numba.njit
+def cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[no-untyped-def]
+    for j in range(9):
+        gradient[j] = 2.0 * model.weights[j] ** 2 * (vector[j] - model.centre[j])
+    return cost_of(model, space, vector, work)
+
+
+@numba.njit
+def measures_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+    out[0], out[1] = vector[6], vector[7]
+
+
+@numba.njit
+def measure_gradients_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+    out[:] = 0.0
+    out[0, 6] = out[1, 7] = 1.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def searches_of_the_quadratic() -> Iterator[None]:
+    """Compiles the searches, as they are, around the quadratic instead of around poses."""
+    with pytest.MonkeyPatch.context() as patch:
+        for function in (cost_of, cost_and_gradient_of, measures_of, measure_gradients_of):
+            patch.setattr(kernels, function.__name__, function)
+        for name in SEARCHES:
+            loop: Any = getattr(kernels, name)
+            patch.setattr(kernels, name, numba.njit(error_model="numpy")(loop.py_func))
+        yield
+
+
+MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2, 6))
 START = np.linspace(0.4, -0.2, 9)
 
 
@@ -65,15 +114,23 @@ def search(name: str, seed: int, **settings: Any) -> GridArchive:
 
 
 class SharedNormals:
-    """Stands in for the generator of a pyribs strategy: our draws, in our order."""
+    """Stands in for the generator of a pyribs strategy: our draws, in our order.
 
-    def __init__(self, normals: FloatArray) -> None:
+    Draws are coordinates along eigenvectors, whose signs are anybody's choice; so each gets the
+    sign that turns pyribs' eigenvector into ours, of which the largest entry is positive.
+    """
+
+    def __init__(self, strategy: Any, normals: FloatArray) -> None:
+        self._strategy = strategy
         self._rows = iter(normals)
 
     def normal(self, mean: float, sigma: float, shape: tuple[int, int]) -> FloatArray:
         rows = next(self._rows)
         assert rows.shape == shape
-        return mean + sigma * rows
+        basis = self._strategy.cov.eigenbasis
+        largest = np.abs(basis).argmax(axis=0)
+        signs = np.sign(np.take_along_axis(basis, largest[None], axis=0))
+        return mean + sigma * rows * signs
 
 
 def ribs_archive() -> Any:
@@ -109,7 +166,7 @@ def ribs_search(name: str, seed: int, *, sigma0: float = 1.0, shared: bool = Fal
     draws = Draws(StreamKey(seed, 0))
     iteration = 0
     if shared:
-        emitter._opt._rng = SharedNormals(draws.normals(ITERATIONS, BATCH, dimension))
+        emitter._opt._rng = SharedNormals(emitter._opt, draws.normals(ITERATIONS, BATCH, dimension))
         elites = draws.elites(ITERATIONS)
 
         def our_elite(count: int, **_: Any) -> dict[str, FloatArray]:
@@ -141,7 +198,7 @@ def test_with_its_formulas_and_shared_random_numbers_the_archive_is_that_of_pyri
     name: str, sigma0: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # pyribs adds Adam's epsilon before the bias correction; without it the two are one formula.
-    monkeypatch.setattr(chsel.emitters, "Adam", partial(Adam, epsilon=0.0))
+    monkeypatch.setattr(chsel.emitters, "mega_search", partial(mega_search, epsilon=0.0))
     ours = search(name, 3, sigma0=sigma0, ribs_parity=True)
     data = ribs_search(name, 3, sigma0=sigma0, shared=True).data(return_type="dict")
     order = np.argsort(data["index"])

@@ -1,0 +1,73 @@
+"""The signed distance grid, as the inner loops read it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.kernels.compiler import leaf
+from chsel.kernels.region import Box, box_of
+from chsel.sdf import SdfGrid
+
+
+class Field(NamedTuple):
+    """Signed distances and gradients at the nodes of a grid.
+
+    table (nodes, 4): value and gradient of each node. trilinear: interpolate, else read the
+    nearest node. box_distance: how distances continue outside, see SdfGrid.query.
+    """
+
+    box: Box
+    table: FloatArray
+    trilinear: bool
+    box_distance: bool
+
+
+def field_of(sdf: SdfGrid, lookup: str, outside: str) -> Field:
+    """The field of a signed distance grid."""
+    trilinear = lookup == "trilinear"
+    box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
+    return Field(box, sdf.table, trilinear, outside == "bounding_box")
+
+
+@leaf
+def sample(trilinear, box, table, places, n):  # type: ignore[no-untyped-def]
+    """Signed distance and its gradient (s, n_x, n_y, n_z) at a place in the box."""
+    if trilinear:
+        return _interpolated(box, table, places.cell[n], places.u[n], places.v[n], places.w[n])
+    at = places.cell[n]
+    return table[at, 0], table[at, 1], table[at, 2], table[at, 3]
+
+
+@leaf
+def _interpolated(box, table, base, u, v, w):  # type: ignore[no-untyped-def]
+    across, along = int(box.across), int(box.along)
+    s = nx = ny = nz = 0.0
+    for corner in range(8):
+        a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+        weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
+        at = base + a * across + b * along + c
+        s += weight * table[at, 0]
+        nx += weight * table[at, 1]
+        ny += weight * table[at, 2]
+        nz += weight * table[at, 3]
+    return s, nx, ny, nz
+
+
+@leaf
+def continued(box_distance, box, inside, x, y, z):  # type: ignore[no-untyped-def]
+    """The same at a point beyond the box, from that at the point of the box nearest to it."""
+    s, nx, ny, nz = inside
+    first, last = box.first, box.last
+    ax = x - min(max(x, first[0]), last[0])
+    ay = y - min(max(y, first[1]), last[1])
+    az = z - min(max(z, first[2]), last[2])
+    if not box_distance:
+        length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
+        ax += s * (nx / length)
+        ay += s * (ny / length)
+        az += s * (nz / length)
+    length = max(np.sqrt(ax * ax + ay * ay + az * az), 1e-12)
+    return length, ax / length, ay / length, az / length

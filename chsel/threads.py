@@ -1,0 +1,47 @@
+"""Work spread over threads; results do not depend on how many there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import torch
+
+from chsel.kernels.arithmetic import require_ieee_arithmetic
+
+_SHARES = 4  # pieces per thread, so that none waits long for another
+
+
+def spread(run: Callable[[int, int, Any], None], count: int, scratch: Callable[[], Any]) -> None:
+    """Call run(first, last, scratch) on pieces of range(count), on as many threads as torch uses.
+
+    scratch: makes what one thread works in. The pieces must not depend on each other.
+    """
+    threads = min(torch.get_num_threads(), count)
+    if threads <= 1:
+        if count:
+            run(0, count, scratch())
+        return
+    size = -(-count // (threads * _SHARES))
+    pieces = iter(range(0, count, size))
+
+    def work() -> None:
+        require_ieee_arithmetic()
+        own = scratch()
+        for first in pieces:
+            run(first, min(first + size, count), own)
+
+    for future in [_pool(threads).submit(work) for _ in range(threads)]:
+        future.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="chsel")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork

@@ -1,0 +1,150 @@
+"""`python -m runners.benchmark`: time registrations, beside those of the published package."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from omegaconf import DictConfig
+from rich.console import Console
+
+from chsel.errors import require_choice, require_positive
+from chsel.settings import build_settings
+from chsel.streams import StreamKey
+from runners.benchmarks import report
+from runners.benchmarks.alone import MEASURES, Scope
+from runners.benchmarks.comparison import WHAT, compare
+from runners.benchmarks.machine import load, machine
+from runners.benchmarks.ours import Steps
+from runners.benchmarks.plot import draw
+from runners.benchmarks.problems import PROBLEMS
+from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
+from runners.cli import command, plain
+from runners.recording import make_run_folder
+
+
+@dataclass(frozen=True)
+class BenchmarkConfig:
+    """conf/benchmark.yaml, checked.
+
+    problems: which to register. alone: what else to measure of this library. free_points,
+    hypotheses: the sizes that show how the time grows.
+    """
+
+    problems: tuple[str, ...]
+    alone: tuple[str, ...]
+    free_points: tuple[int, ...]
+    hypotheses: tuple[int, ...]
+    package: PackageConfig
+    steps: Steps
+    logs: str
+    repeats: int = 5
+    seed: int = 0
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        StreamKey(self.seed, 0)
+        require_positive("repeats", self.repeats)
+        for name in ("free_points", "hypotheses"):
+            for value in getattr(self, name):
+                require_positive(name, value)
+        for problem in (*self.problems, *self.package.equation):
+            require_choice("problem", problem, PROBLEMS)
+        for measure in self.alone:
+            require_choice("alone", measure, MEASURES)
+
+    def shortened(self) -> BenchmarkConfig:
+        """As much as takes under a minute; its times are no ones to quote."""
+        return replace(
+            self,
+            problems=("real_20",),
+            alone=tuple(name for name in self.alone if name != "start"),
+            free_points=(5000, 20_000),
+            hypotheses=(10, 30),
+            repeats=2,
+            package=replace(self.package, equation=()),
+            steps=Steps(restarts=1, adam=50, search=10, long_search=20),
+        )
+
+
+@command("benchmark")
+def main(config: DictConfig) -> None:
+    """Run the benchmark."""
+    values = plain(config)
+    checked = build_settings(BenchmarkConfig, values, "benchmark")
+    if checked.quick:
+        checked = checked.shortened()
+    torch.set_num_threads(1)
+    console = Console(highlight=False)
+    say = partial(console.print, soft_wrap=True)
+    with ExitStack() as stack:
+        python = None if checked.package.skip else interpreter(checked.package, say)
+        package = None if python is None else stack.enter_context(PublishedPackage(python))
+        folder = make_run_folder(Path(checked.logs) / "benchmark", "drill")
+        (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+        found = _run(checked, package, folder, console)
+    report.show(console, found)
+    draw(found, folder / "benchmark.png")
+    say(f"written: {folder}")
+
+
+def _run(
+    config: BenchmarkConfig, package: PublishedPackage | None, folder: Path, console: Console
+) -> dict[str, Any]:
+    """Measure everything; what is measured so far is always in the file."""
+    found: dict[str, Any] = {
+        "runner": "benchmark",
+        "what": WHAT,
+        "settings": asdict(config),
+        "machine": {**machine(), "load_before": load(), "load_after": None},
+        "problems": {},
+        "comparison": [],
+        "alone": [],
+    }
+    if package is not None:
+        found["machine"]["published"] = package.versions
+
+    def write() -> None:
+        found["machine"]["load_after"] = load()
+        report.write(folder / "benchmark.json", found)
+
+    with console.status("") as status:
+        for name in config.problems:
+            status.update(f"registering {name}")
+            rows, problem = compare(
+                name,
+                config.steps,
+                config.repeats,
+                config.seed,
+                package,
+                folder,
+                equation=name in config.package.equation,
+            )
+            found["problems"][name] = problem
+            added = [row.mapping() for row in rows]
+            found["comparison"] += [
+                row
+                | {"times_ours": report.ratios(added, row)}
+                | {"lowest_cost": problem["did"][row["who"]]["lowest_cost"]}
+                for row in added
+            ]
+            write()
+        scope = Scope(
+            config.steps, config.repeats, config.seed, config.free_points, config.hypotheses
+        )
+        for name in config.alone:
+            status.update(f"measuring {name}")
+            for row in MEASURES[name](scope):
+                found["alone"].append(row.mapping())
+                write()
+    write()
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What `python -m runners.benchmark` measures, and how it reports it."""

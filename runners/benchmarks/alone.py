@@ -1,0 +1,190 @@
+"""What is measured of this library alone: how a registration's time is spent, and how it grows."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from chsel.arrays import FloatArray
+from chsel.cost import RelaxedCost
+from chsel.engine import CompiledCost
+from chsel.online import OnlineSettings, first_initial_set
+from chsel.presets import COST
+from chsel.streams import StreamKey
+from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
+from runners.benchmarks.ours import PRESETS, StageTimer, Steps, register
+from runners.benchmarks.problems import PROBLEMS, PosedProblem, Problem, pose
+from runners.benchmarks.recorded import recorded_registrations
+from runners.benchmarks.timing import Row, in_turn
+
+_PROBLEM = "real_20"
+_THREADS = (1, 2)
+_POSES = 100_000
+_POSES_AT_ONCE = 1000
+_LONGEST = 3.0  # seconds
+
+
+@dataclass(frozen=True)
+class Scope:
+    """How much is measured."""
+
+    steps: Steps
+    repeats: int
+    seed: int
+    free_points: tuple[int, ...]
+    hypotheses: tuple[int, ...]
+
+    def timed(self, problem: Problem, preset: str) -> tuple[float, ...]:
+        """Milliseconds of repeated registrations of a problem, after one that is not counted."""
+        posed = pose(problem, self.seed)
+        self.seconds(posed, preset)
+        return tuple(1000.0 * self.seconds(posed, preset) for _ in range(self.repeats))
+
+    def seconds(self, posed: PosedProblem, preset: str) -> float:
+        """Seconds of one registration."""
+        return register(posed, preset, self.steps, self.steps.search)[0]
+
+
+def stages(scope: Scope) -> Iterator[Row]:
+    """Adam, search, and all else of a registration."""
+    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
+    for preset in PRESETS:
+        parts: dict[str, list[float]] = {}
+        for _ in range(scope.repeats + 1):
+            timer = StageTimer()
+            seconds, _ = register(posed, preset, scope.steps, scope.steps.search, timer)
+            taken = {**timer.seconds, "other": seconds - sum(timer.seconds.values())}
+            for stage, value in taken.items():
+                parts.setdefault(stage, []).append(1000.0 * value)
+        for stage, samples in parts.items():
+            yield Row("stage", stage, preset, "ms", tuple(samples[1:]))
+
+
+def threads(scope: Scope) -> Iterator[Row]:
+    """One and two threads, in turn."""
+    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
+
+    def measured(preset: str, count: int) -> float:
+        with _threads(count):
+            return 1000.0 * scope.seconds(posed, preset)
+
+    for preset in PRESETS:
+        cases = {str(count): partial(measured, preset, count) for count in _THREADS}
+        for case in cases.values():
+            case()
+        for name, samples in in_turn(scope.repeats, cases).items():
+            yield Row("threads", name, preset, "ms", samples, float(name))
+
+
+def free_points(scope: Scope) -> Iterator[Row]:
+    """Growth with the free points: in a larger box at the same spacing, and more densely."""
+    for spread, measure in ((True, "free, more space"), (False, "free, denser")):
+        for count in scope.free_points:
+            problem = Problem(free_points=count, spread=spread)
+            actual = len(pose(problem, scope.seed).free)
+            for preset in PRESETS:
+                samples = scope.timed(problem, preset)
+                yield Row(measure, f"{actual}", preset, "ms", samples, float(actual))
+
+
+def hypotheses(scope: Scope) -> Iterator[Row]:
+    """Growth with B."""
+    for count in scope.hypotheses:
+        for preset in PRESETS:
+            samples = scope.timed(Problem(hypotheses=count), preset)
+            yield Row("hypotheses", str(count), preset, "ms", samples, float(count))
+
+
+def evaluation(scope: Scope) -> Iterator[Row]:
+    """Poses evaluated in a second, without gradients: as the methods do, and as torch does."""
+    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
+    problem = posed.registration_problem()
+    settings = OnlineSettings(hypotheses=_POSES)
+    poses = first_initial_set(posed.workspace, problem.points, StreamKey(scope.seed, 1), settings)
+    for preset in PRESETS:
+        costs = {
+            "compiled": CompiledCost.of(problem, COST[preset]).evaluate,
+            "torch": RelaxedCost.of(problem, COST[preset]).evaluate,
+        }
+        for case, evaluate in costs.items():
+            evaluate(poses[:_POSES_AT_ONCE])
+            rates = tuple(_rate(evaluate, poses, scope.repeats) for _ in range(scope.repeats))
+            yield Row("evaluation", case, preset, "poses/s", rates)
+
+
+def _rate(evaluate: Callable[[FloatArray], FloatArray], poses: FloatArray, repeats: int) -> float:
+    """Poses a second; fewer than all if they take long."""
+    done, seconds, begun = 0, 0.0, time.perf_counter()
+    while done < len(poses) and seconds < _LONGEST / repeats:
+        evaluate(poses[done : done + _POSES_AT_ONCE])
+        done += _POSES_AT_ONCE
+        seconds = time.perf_counter() - begun
+    return done / seconds
+
+
+def recording(scope: Scope) -> Iterator[Row]:
+    """What writing both recordings adds to a registration."""
+    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
+    for preset in PRESETS:
+        samples = recorded_registrations(posed, preset, scope.steps, scope.repeats)
+        for case, values in samples.items():
+            yield Row("recording", case, preset, "ms", values)
+
+
+def memory(scope: Scope) -> Iterator[Row]:
+    """Peak memory of a process that registers once, and of one that only imports."""
+    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
+    with _saved(posed) as path:
+        memory_of_one(path, PRESETS[0], scope.steps)  # compiles what is not yet on disk
+        for preset in (None, *PRESETS):
+            case = "imports alone" if preset is None else "one registration"
+            peak = memory_of_one(path, preset, scope.steps) / 2**20
+            yield Row("peak memory", case, preset or "", "MiB", (peak,))
+
+
+def start(scope: Scope) -> Iterator[Row]:
+    """Seconds of a whole process: imports alone; one registration, kernels not yet compiled."""
+    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
+    imports = tuple(time_of_imports() for _ in range(scope.repeats))
+    yield Row("start", "imports alone", "", "s", imports)
+    with _saved(posed) as path:
+        first, later = first_and_later_start(path, "default", scope.steps, scope.repeats)
+    yield Row("start", "first, compiling", "default", "s", (first,))
+    yield Row("start", "later", "default", "s", later)
+
+
+MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
+    "stages": stages,
+    "threads": threads,
+    "free_points": free_points,
+    "hypotheses": hypotheses,
+    "evaluation": evaluation,
+    "recording": recording,
+    "memory": memory,
+    "start": start,
+}
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _saved(posed: PosedProblem) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "problem.npz"
+        posed.save(path)
+        yield path

@@ -1,0 +1,78 @@
+"""Measurements that need a process of their own: memory, and the time to start.
+
+As a program: `python -m runners.benchmarks.fresh JSON` imports the library, registers once if JSON
+names a preset, and prints its peak memory.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from runners.benchmarks.machine import peak_memory
+from runners.benchmarks.ours import Steps, register
+from runners.benchmarks.problems import PosedProblem
+
+_CACHE = "CHSEL_CACHE_DIR"
+
+
+def memory_of_one(problem: Path, preset: str | None, steps: Steps) -> int:
+    """Peak bytes of a process that registers a saved problem, or only imports the library."""
+    return int(_run(_task(problem, preset, steps))[1]["bytes"])
+
+
+def time_of_imports() -> float:
+    """Seconds of a process that only imports the library."""
+    return _run({})[0]
+
+
+def first_and_later_start(
+    problem: Path, preset: str, steps: Steps, repeats: int
+) -> tuple[float, tuple[float, ...]]:
+    """Seconds of processes that register once: with no compiled kernel on disk, and with all."""
+    task = _task(problem, preset, steps)
+    with tempfile.TemporaryDirectory() as folder:
+        first = _run(task, cache=folder)[0]
+        return first, tuple(_run(task, cache=folder)[0] for _ in range(repeats))
+
+
+def _task(problem: Path, preset: str | None, steps: Steps) -> dict[str, Any]:
+    if preset is None:
+        return {}
+    return {"problem": str(problem), "preset": preset, "steps": dataclasses.asdict(steps)}
+
+
+def _run(task: dict[str, Any], cache: str | None = None) -> tuple[float, dict[str, Any]]:
+    """Seconds that the process took, and its answer."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    if cache is not None:
+        environment[_CACHE] = cache
+    command = [sys.executable, "-m", "runners.benchmarks.fresh", json.dumps(task)]
+    begun = time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    seconds = time.perf_counter() - begun
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return seconds, answer
+
+
+def main(task: dict[str, Any]) -> None:
+    """Do the task of one such process."""
+    if task:
+        import torch
+
+        torch.set_num_threads(1)
+        steps = Steps(**task["steps"])
+        posed = PosedProblem.load(Path(task["problem"]))
+        register(posed, task["preset"], steps, steps.search)
+    print(json.dumps({"bytes": peak_memory()}))
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))

@@ -1,0 +1,49 @@
+"""What a time depends on: the machine, how busy it is, and the versions of what runs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from runners.environment import environment
+
+_PACKAGES = ("numba", "llvmlite", "scipy")
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores, Python and versions."""
+    values: dict[str, Any] = {**environment(), "cores": os.cpu_count(), "cores_usable": cores()}
+    for name in _PACKAGES:
+        try:
+            values[f"package {name}"] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            values[f"package {name}"] = "not installed"
+    return values
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def load() -> float | None:
+    """Processes that ran or waited in the mean over the last minute, where the system tells."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+def peak_memory() -> int:
+    """Peak memory of this process in bytes."""
+    # Not getrusage where there is another way: a new process inherits its parent's peak there.
+    try:
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(status.split("VmHWM:")[1].split()[0])
+    except (OSError, IndexError):
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else 1024 * peak

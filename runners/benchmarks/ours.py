@@ -1,0 +1,94 @@
+"""Registrations by this library, with the number of steps that the comparison prescribes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from chsel.arrays import FloatArray
+from chsel.cost import RelaxedCost
+from chsel.errors import require_positive
+from chsel.methods import build_method, preset_settings
+from chsel.methods.method import Method
+from chsel.observer import Observer
+from chsel.presets import COST
+from chsel.problem import ArchiveSnapshot, Hypotheses
+from runners.benchmarks.problems import PosedProblem
+
+PRESETS = ("paper", "default")
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How much every registration does, by either package; none stops early.
+
+    restarts x adam: Adam steps. search: CMA-MEGA iterations; long_search: in the longer row.
+    """
+
+    restarts: int = 10
+    adam: int = 50
+    search: int = 100
+    long_search: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("restarts", "adam", "search", "long_search"):
+            require_positive(name, getattr(self, name))
+
+    def searching(self, *, long: bool) -> int:
+        """Iterations of the search of one registration."""
+        return self.long_search if long else self.search
+
+
+def method(preset: str, steps: Steps, search: int) -> Method:
+    """CHSEL in a preset, with all steps done."""
+    settings = preset_settings("chsel", preset)
+    descent = replace(
+        settings.descent, restarts=steps.restarts, iterations=steps.adam, stop_below=None
+    )
+    emitter = replace(settings.emitter, iterations=search)
+    return build_method("chsel", replace(settings, descent=descent, emitter=emitter))
+
+
+def register(
+    posed: PosedProblem,
+    preset: str,
+    steps: Steps,
+    search: int,
+    observer: Observer | None = None,
+) -> tuple[float, Hypotheses]:
+    """Seconds from arrays to hypotheses, and these; only the SDF grid is there already."""
+    begun = time.perf_counter()
+    problem = posed.registration_problem()
+    hypotheses = method(preset, steps, search).register(problem, observer)
+    return time.perf_counter() - begun, hypotheses
+
+
+def common_costs(posed: PosedProblem, poses: FloatArray) -> FloatArray:
+    """Costs (B,) of poses (B, 4, 4) under the paper's equation: the same measure for everyone."""
+    return RelaxedCost.of(posed.registration_problem(), COST["paper"]).evaluate(poses)
+
+
+class StageTimer:
+    """An observer that takes the time of the stages, and counts their iterations."""
+
+    snapshot_interval = 0
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.seconds: dict[str, float] = {}
+        self.iterations: dict[str, int] = {}
+        self._clock = clock
+        self._mark = clock()
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        """The time since the last report is the stage's."""
+        now = self._clock()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
+        self.iterations[stage] = iteration
+        self._mark = now
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        """Ignore it."""
+
+    def snapshot(self, archive: ArchiveSnapshot) -> None:
+        """Ignore it."""

@@ -1,0 +1,180 @@
+"""Registers with the published package `chsel`, in the interpreter that has it, on request.
+
+A program of its own that imports nothing of this project, whose package has the same name. It
+reads requests and writes answers, one JSON object a line; see runners/benchmarks/published.py.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+_PACKAGES = ("chsel", "pytorch-volumetric", "pytorch-kinematics", "ribs", "numpy", "torch")
+_COSTS = {"default": "VolumetricDirectSDFCost", "equation": "VolumetricDoubleDirectCost"}
+
+
+class GridSdf:
+    """Stands where the package has the mesh: answers every query by the nearest node of our grid.
+
+    So both packages read the same signed distances, and the query of the whole mesh that the
+    package's constructor makes costs it next to nothing.
+    """
+
+    def __init__(self, data: dict[str, Any]) -> None:
+        self._origin = torch.tensor(data["sdf_origin"])
+        self._resolution = float(data["sdf_resolution"])
+        self._values = torch.tensor(data["sdf_values"], dtype=torch.float32)
+        self._gradients = torch.tensor(data["sdf_gradients"], dtype=torch.float32)
+        self._bounds = torch.tensor(data["object_bounds"], dtype=torch.float32).T  # (3, 2)
+
+    def __call__(self, points: Any, compute_grad: bool = True) -> tuple[Any, Any]:
+        """Values (...) and gradients (..., 3) at points (..., 3)."""
+        index = ((points.double() - self._origin) / self._resolution).round().long()
+        last = torch.tensor(self._values.shape) - 1
+        i, j, k = torch.minimum(index.clamp_min(0), last).unbind(-1)
+        return self._values[i, j, k], self._gradients[i, j, k]
+
+    def surface_bounding_box(self, padding: float = 0.0, padding_ratio: float = 0.0) -> Any:
+        """Lowest and highest coordinates (3, 2) of the mesh."""
+        margin = padding + padding_ratio * (self._bounds[:, 1] - self._bounds[:, 0])
+        return self._bounds + torch.stack([-margin, margin], dim=-1)
+
+
+class Worker:
+    """The package, with the problem that it registers."""
+
+    def __init__(self) -> None:
+        torch.set_num_threads(1)
+        self._chsel = importlib.import_module("chsel")
+        self._volumetric = importlib.import_module("pytorch_volumetric")
+        self._descent = self._chsel.sgd.volumetric_registration_sgd
+        self._folder = tempfile.mkdtemp()
+
+    def describe(self) -> dict[str, Any]:
+        """Versions of what runs here."""
+        versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+        return {"python": platform.python_version(), **versions}
+
+    def load(self, problem: str) -> dict[str, Any]:
+        """Read a problem, and build the package's signed distance grid from it."""
+        with np.load(problem) as data:
+            self._data = dict(data)
+        origin, shape = self._data["sdf_origin"], self._data["sdf_values"].shape
+        self._resolution = float(self._data["sdf_resolution"])
+        last = origin + (np.array(shape) - 1) * self._resolution
+        self._sdf = self._volumetric.CachedSDF(
+            "object",
+            self._resolution,
+            list(zip(origin.tolist(), last.tolist(), strict=True)),
+            GridSdf(self._data),
+            cache_path=str(Path(tempfile.mkdtemp(dir=self._folder)) / "sdf.pkl"),
+        )
+        free, contacts = self._data["free"], self._data["contacts"]
+        classes = self._chsel.SemanticsClass
+        self._positions = torch.tensor(np.concatenate([free, contacts]), dtype=torch.float32)
+        self._semantics = torch.tensor(
+            [classes.FREE.value] * len(free) + [classes.SURFACE.value] * len(contacts)
+        )
+        self._initial_set = torch.tensor(self._data["initial_set"], dtype=torch.float32)
+        return {"loaded": problem}
+
+    def register(
+        self, cost: str, restarts: int, steps: int, search: int, seed: int
+    ) -> dict[str, Any]:
+        """Construct and register once: seconds, poses (B, 4, 4) of object_from_world, and counts.
+
+        Runs all `restarts` x `steps` steps: the package's own test for convergence is false for
+        every cost when its threshold is not a number.
+        """
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002  (what the package draws from)
+        block = functools.partial(
+            self._descent, max_iterations=restarts, relative_rmse_thr=float("nan"), iterations=steps
+        )
+        self._chsel.sgd.volumetric_registration_sgd = block
+        counted = _counting(getattr(self._chsel, _COSTS[cost]))
+        begun = time.perf_counter()
+        registration = self._chsel.CHSEL(
+            self._sdf,
+            self._positions,
+            self._semantics,
+            resolution=self._resolution,
+            free_voxels_resolution=float(self._data["free_spacing"]),
+            qd_iterations=search,
+            cost=counted,
+            savedir=self._folder,
+        )
+        result, _ = registration.register(
+            iterations=1, initial_tsf=self._initial_set, batch=len(self._initial_set)
+        )
+        seconds = time.perf_counter() - begun
+        poses = torch.eye(4, dtype=torch.float64).repeat(len(result.RTs.R), 1, 1)
+        poses[:, :3, :3], poses[:, :3, 3] = result.RTs.R, result.RTs.T
+        return {
+            "seconds": seconds,
+            "poses": poses.tolist(),
+            "cost_calls": counted.calls,
+            "cost_calls_with_gradient": counted.calls_with_gradient,
+            "poses_evaluated": counted.poses,
+            "free_points": _free_points(registration.volumetric_cost.free_voxels),
+        }
+
+
+def _counting(cost: Any) -> Any:
+    """The cost class, counting how often it is called and with how many poses."""
+
+    class Counting(cost):
+        calls = 0
+        calls_with_gradient = 0
+        poses = 0
+
+        def __call__(self, R: Any, T: Any, s: Any, other_info: Any = None) -> Any:
+            Counting.calls += 1
+            Counting.calls_with_gradient += bool(R.requires_grad)
+            Counting.poses += len(R)
+            return super().__call__(R, T, s, other_info)
+
+    return Counting
+
+
+def _free_points(voxels: Any) -> int:
+    return len(voxels.get_known_pos_and_values()[0])
+
+
+def main() -> None:
+    """Answer requests until stdin ends."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what the package prints is no answer
+
+    def answer(values: dict[str, Any]) -> None:
+        answers.write(json.dumps(values) + "\n")
+        answers.flush()
+
+    try:
+        worker = Worker()
+    except Exception as error:
+        answer({"error": f"{type(error).__name__}: {error}"})
+        return
+    answer({"ready": True})
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer(getattr(worker, request.pop("task"))(**request))
+        except Exception as error:
+            answer({"error": f"{type(error).__name__}: {error}"})
+
+
+if __name__ == "__main__":
+    main()

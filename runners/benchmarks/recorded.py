@@ -1,0 +1,89 @@
+"""Registrations as a session does them, with and without its recordings."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from chsel.points import KnownPoints
+from replay.events import HypothesesFound, Probe, ProblemPosed, Recorder, SessionStarted
+from runners.benchmarks.ours import Steps, method
+from runners.benchmarks.problems import PosedProblem, drill
+from runners.benchmarks.timing import in_turn
+from runners.environment import environment
+from runners.recording import RecordingConfig, StepObserver, open_recorder
+
+_FILES = {
+    "none": RecordingConfig(mcap=False, rerun=False),
+    "mcap": RecordingConfig(rerun=False),
+    "both": RecordingConfig(),
+}
+
+
+def recorded_registrations(
+    posed: PosedProblem, preset: str, steps: Steps, repeats: int
+) -> dict[str, tuple[float, ...]]:
+    """Milliseconds of registrations by what is recorded, in turn: "none", "mcap", "both"."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        sessions: dict[str, Callable[[], float]] = {}
+        for name, files in _FILES.items():
+            (folder / name).mkdir()
+            recorder = open_recorder(folder / name, files)
+            stack.callback(recorder.close)
+            sessions[name] = _session(recorder, posed, preset, steps, files.snapshot_interval)
+        for register_once in sessions.values():
+            register_once()
+        return in_turn(repeats, sessions)
+
+
+def _session(
+    recorder: Recorder, posed: PosedProblem, preset: str, steps: Steps, snapshot_interval: int
+) -> Callable[[], float]:
+    """Opens a recording, and returns what registers its next step in milliseconds."""
+    problem = posed.registration_problem()
+    recorder.record(_started(posed, preset))
+    step = 0
+
+    def register_once() -> float:
+        nonlocal step
+        points = problem.points if step == 0 else KnownPoints()
+        recorder.record(Probe(step, "points", points))
+        recorder.flush()
+        begun = time.perf_counter()
+        posed_again = posed.registration_problem()
+        recorder.record(ProblemPosed(step, posed_again))
+        observer = StepObserver(recorder, step, snapshot_interval, _show)
+        hypotheses = method(preset, steps, steps.search).register(posed_again, observer)
+        recorder.record(HypothesesFound(step, hypotheses))
+        recorder.flush()
+        step += 1
+        return 1000.0 * (time.perf_counter() - begun)
+
+    return register_once
+
+
+def _show(stage: str, iteration: int, total: int) -> None:
+    """Nothing."""
+
+
+def _started(posed: PosedProblem, preset: str) -> SessionStarted:
+    mesh, _ = drill(1.0)
+    return SessionStarted(
+        runner="benchmark",
+        object="drill",
+        session="points",
+        method="chsel",
+        seed=0,
+        config={},
+        mesh=mesh,
+        sdf=posed.sdf,
+        workspace=posed.workspace,
+        free_resolution=posed.free_spacing,
+        initial_points=KnownPoints(),
+        world_from_object=posed.world_from_object,
+        environment=environment(),
+    )

@@ -1,0 +1,113 @@
+"""What a benchmark found: tables on the terminal, and the same numbers as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+Values = Mapping[str, Any]
+
+
+def write(path: Path, report: Values) -> None:
+    """The report as JSON."""
+    path.write_text(json.dumps(report, indent=2) + "\n")
+
+
+def show(console: Console, report: Values) -> None:
+    """The report as tables."""
+    for line in _machine(report["machine"]):
+        console.print(line, soft_wrap=True)
+    if report["comparison"]:
+        console.print(f"\n{report['what']}\n")
+        _show_comparison(console, report["comparison"])
+        _show_calls(console, report["problems"])
+    if report["alone"]:
+        _show_alone(console, report["alone"])
+
+
+def number(value: float) -> str:
+    """Three digits that count, without an exponent."""
+    for digits, limit in ((3, 1.0), (2, 10.0), (1, 100.0)):
+        if abs(value) < limit:
+            return f"{value:.{digits}f}"
+    return f"{value:.0f}"
+
+
+def ratios(rows: Sequence[Values], row: Values) -> dict[str, float]:
+    """How many times as long as ours, in each preset, the median of a package's row is."""
+    if not row["who"].startswith("package"):
+        return {}
+    ours = {r["who"]: r["median"] for r in rows if r["case"] == row["case"]}
+    names = [who for who in ours if who.startswith("ours")]
+    return {who.removeprefix("ours, "): row["median"] / ours[who] for who in names}
+
+
+def _machine(machine: Values) -> list[str]:
+    packages = ("numpy", "torch", "numba")
+    versions = ", ".join(f"{name} {machine[f'package {name}']}" for name in packages)
+    lines = [
+        f"{machine['processor']}, {machine['cores_usable']} of {machine['cores']} cores usable, "
+        f"load {machine['load_before']} before, {machine['load_after']} after",
+        f"Python {machine['python']}, {versions}",
+    ]
+    if "published" in machine:
+        published = ", ".join(f"{name} {value}" for name, value in machine["published"].items())
+        lines.append(f"package: {published}")
+    return lines
+
+
+def _show_comparison(console: Console, rows: Sequence[Values]) -> None:
+    compared = any(row["times_ours"] for row in rows)
+    title = "one registration in ms" + ("; x: times ours, median by median" if compared else "")
+    title += "\ncost: of the best pose, by Eq. 7 with nearest lookup for all"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
+    for name in ("problem", "registration"):
+        table.add_column(name, no_wrap=True)
+    ratio_names = ["x paper", "x default"] if compared else []
+    for name in ("median", "quartiles", *ratio_names, "cost"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        times = [number(value) for value in row["times_ours"].values()] or [""] * len(ratio_names)
+        cells = [row["case"], row["who"], number(row["median"]), _quartiles(row)]
+        table.add_row(*cells, *times, number(row["lowest_cost"]))
+    console.print(table)
+
+
+def _show_calls(console: Console, problems: Mapping[str, Values]) -> None:
+    """How often the package asked for its cost: twice an iteration of the search, once a step."""
+    calls = {
+        name: problem["did"]["package"]["cost_calls"]
+        for name, problem in problems.items()
+        if "package" in problem["did"]
+    }
+    if calls:
+        counts = ", ".join(f"{name} {count}" for name, count in calls.items())
+        console.print(f"cost calls of the package, counted: {counts}\n")
+
+
+def _show_alone(console: Console, rows: Sequence[Values]) -> None:
+    title = "this library alone: median and quartiles"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
+    for name in ("measure", "case", "preset"):
+        table.add_column(name)
+    for name in ("median", "quartiles", ""):
+        table.add_column(name, justify="right")
+    previous = ""
+    for row in rows:
+        measure = "" if row["measure"] == previous else row["measure"]
+        previous = row["measure"]
+        cells = [measure, row["case"], row["who"], number(row["median"])]
+        table.add_row(*cells, _quartiles(row), row["unit"])
+    console.print(table)
+
+
+def _quartiles(row: Values) -> str:
+    if len(row["samples"]) == 1:
+        return ""
+    return f"{number(row['lower_quartile'])}-{number(row['upper_quartile'])}"

@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+
+from chsel.arrays import FloatArray, digest
+from chsel.kernels.elementary import (
+    arctangent,
+    arctangents,
+    exp,
+    log,
+    logs,
+    sine_cosine,
+    sines_cosines,
+)
+from chsel.streams import normals
+
+LIMIT = 0.9  # ulp
+COUNT = 2000
+DIGEST = "c92dc86719aee4727a5d05c3d4e28b05"
+
+
+@pytest.fixture(autouse=True)
+def _many_digits():  # type: ignore[no-untyped-def]
+    with mpmath.workprec(250):
+        yield
+
+
+def error(found: float, exact: mpmath.mpf) -> float:
+    """In units of the last place of the exact value, whose sign counts where it is 0."""
+    return float(abs((mpmath.mpf(float(found)) - exact) / math.ulp(float(exact))))
+
+
+def scattered(low: float, high: float, seed: int) -> FloatArray:
+    """Numbers of both signs, their sizes spread evenly over the powers of two in between."""
+    stream = np.random.Generator(np.random.Philox(seed))
+    sizes = np.ldexp(
+        1.0 + stream.random(COUNT), np.floor(stream.uniform(low, high, COUNT)).astype(int)
+    )
+    return sizes * np.where(stream.random(COUNT) < 0.5, -1.0, 1.0)
+
+
+def even(low: float, high: float, seed: int) -> FloatArray:
+    return np.random.Generator(np.random.Philox(seed)).uniform(low, high, COUNT)
+
+
+def near_quarter_turns() -> FloatArray:
+    """The doubles around multiples of pi/2, where the reduced argument is all cancellation."""
+    turns = np.unique(np.floor(np.abs(scattered(0, 19, 1))))
+    nearest = np.array([float(n * mpmath.pi / 2) for n in turns.astype(int).tolist()])
+    return np.concatenate([nearest, np.nextafter(nearest, 0), -np.nextafter(nearest, np.inf)])
+
+
+@pytest.mark.parametrize(
+    "x",
+    [even(-745, 709.7, 1), scattered(-60, 3, 2), even(-745.13, -708, 3)],
+    ids=["all", "around 0", "to subnormals"],
+)
+def test_exp_is_within_an_ulp(x: FloatArray) -> None:
+    assert max(error(exp(v), mpmath.exp(v)) for v in x.tolist()) < LIMIT
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        np.abs(scattered(-1022, 1023, 1)),
+        1.0 + scattered(-52, -2, 2),
+        even(0.3, 3.0, 3),
+        np.abs(scattered(-1074, -1023, 4)),
+    ],
+    ids=["all", "around 1", "middle", "subnormals"],
+)
+def test_log_is_within_an_ulp(x: FloatArray) -> None:
+    assert max(error(log(v), mpmath.log(v)) for v in x.tolist()) < LIMIT
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        scattered(-80, 2, 1),
+        even(-7, 7, 2),
+        even(-1e5, 1e5, 3),
+        even(-(2.0**20), 2.0**20, 4),
+        near_quarter_turns(),
+    ],
+    ids=["around 0", "a turn", "1e5", "2^20", "quarter turns"],
+)
+def test_sine_and_cosine_are_within_an_ulp(x: FloatArray) -> None:
+    for v in x.tolist():
+        sine, cosine = sine_cosine(v)
+        assert error(sine, mpmath.sin(v)) < LIMIT, v
+        assert error(cosine, mpmath.cos(v)) < LIMIT, v
+
+
+@pytest.mark.parametrize(
+    ("y", "x"),
+    [
+        (scattered(-3, 3, 1), scattered(-3, 3, 2)),
+        (scattered(-1022, 1023, 3), scattered(-1022, 1023, 4)),
+        (scattered(-1e3, -990, 5), scattered(-1e3, -990, 6)),
+        (scattered(1010, 1023, 7), scattered(1010, 1023, 8)),
+        (scattered(-36, -20, 9), scattered(0, 1, 10)),
+        (np.tile([0.25, 0.5, 0.75, 1.0], COUNT // 4), 1.0 + scattered(-52, -8, 11)),
+        (np.abs(scattered(-1074, -1023, 12)), np.abs(scattered(0, 3, 13))),
+    ],
+    ids=["around 1", "all", "tiny", "huge", "flat", "seams of the table", "subnormals"],
+)
+def test_arctangent_is_within_an_ulp(y: FloatArray, x: FloatArray) -> None:
+    for v, w in zip(y.tolist(), x.tolist(), strict=True):
+        assert error(arctangent(v, w), mpmath.atan2(v, w)) < LIMIT, (v, w)
+
+
+@pytest.mark.parametrize(
+    ("x", "value"),
+    [
+        (0.0, 1.0),
+        (-0.0, 1.0),
+        (math.inf, math.inf),
+        (-math.inf, 0.0),
+        (709.782712893384, 1.7976931348622732e308),
+        (709.782712893385, math.inf),
+        (1e300, math.inf),
+        (-745.1332191019411, 5e-324),
+        (-745.1332191019412, 0.0),
+        (-1e300, 0.0),
+    ],
+)
+def test_exp_over_and_underflows_where_it_must(x: float, value: float) -> None:
+    assert exp(x) == value
+
+
+@pytest.mark.parametrize(
+    ("x", "value"),
+    [(0.0, -math.inf), (-0.0, -math.inf), (1.0, 0.0), (math.inf, math.inf)],
+)
+def test_log_at_its_ends(x: float, value: float) -> None:
+    assert log(x) == value
+
+
+def test_what_has_no_value_is_nan() -> None:
+    assert math.isnan(exp(math.nan))
+    assert all(math.isnan(log(x)) for x in (math.nan, -1.0, -5e-324, -math.inf))
+    assert all(math.isnan(v) for x in (math.nan, math.inf, -math.inf) for v in sine_cosine(x))
+    assert math.isnan(arctangent(math.nan, 1.0))
+    assert math.isnan(arctangent(0.0, math.nan))
+
+
+def test_sine_keeps_the_sign_of_zero_and_the_smallest_numbers() -> None:
+    for x in (0.0, -0.0, 5e-324, -5e-324, 1e-300, -1e-9):
+        sine, cosine = sine_cosine(x)
+        assert (sine, math.copysign(1.0, sine), cosine) == (x, math.copysign(1.0, x), 1.0)
+
+
+@pytest.mark.parametrize("x", [2.0**20, -1234567.8, 1e9, -3e15, 1e100, 1.7976931348623157e308])
+def test_beyond_2_to_the_20_an_angle_is_taken_modulo_the_double_next_to_a_turn(x: float) -> None:
+    left = math.fmod(x, 2.0 * math.pi)
+    sine, cosine = sine_cosine(x)
+    assert abs(sine - mpmath.sin(left)) < 1.2e-16
+    assert abs(cosine - mpmath.cos(left)) < 1.2e-16
+    if abs(x) < 1e12:
+        assert abs(sine - mpmath.sin(x)) < 4e-17 * abs(x) + 1.2e-16
+
+
+def test_zeros_and_infinities_of_the_arctangent_are_those_of_c() -> None:
+    values = [0.0, 5e-324, 1.0, 1e308, math.inf]
+    values += [-v for v in values]
+    for y in values:
+        for x in values:
+            found, expected = arctangent(y, x), math.atan2(y, x)
+            assert found == pytest.approx(expected, rel=3e-16, abs=0.0), (y, x)
+            assert math.copysign(1.0, found) == math.copysign(1.0, expected), (y, x)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "scalar"),
+    [
+        (logs, log),
+        (lambda x: sines_cosines(x)[0], lambda x: sine_cosine(x)[0]),
+        (lambda x: sines_cosines(x)[1], lambda x: sine_cosine(x)[1]),
+        (lambda x: arctangents(x, 0.3), lambda x: arctangent(x, 0.3)),
+    ],
+    ids=["logs", "sines", "cosines", "arctangents"],
+)
+def test_arrays_keep_their_shape_and_hold_the_scalars(
+    arrays: Callable[[FloatArray | float], FloatArray], scalar: Callable[[float], float]
+) -> None:
+    values = np.abs(scattered(-3, 3, 1))[:24].reshape(2, 3, 4)
+    for x in (values, values.transpose(2, 0, 1), values[:, ::2, 1:], values[:0], values[0, 0, 0]):
+        expected = [scalar(v) for v in np.ravel(x).tolist()]
+        np.testing.assert_array_equal(arrays(x), np.reshape(expected, np.shape(x)))
+    values.setflags(write=False)
+    assert arrays(values).shape == (2, 3, 4)
+    assert arrays(2) == scalar(2.0)
+
+
+def test_arctangents_of_different_shapes_are_broadcast() -> None:
+    found = arctangents(np.array([[1.0], [-1.0]]), np.array([1.0, -1.0, 0.0]))
+    np.testing.assert_allclose(found, np.pi / 4 * np.array([[1, 3, 2], [-1, -3, -2]]), rtol=1e-15)
+
+
+def sample() -> str:
+    """Digest of all functions at arguments that no rounding hangs on."""
+    u = np.random.Generator(np.random.Philox(7)).random((4, 5000)) - 0.5
+    return digest(
+        np.array([exp(v) for v in (1400.0 * u[0]).tolist()]),
+        logs(np.abs(u[1]) / (u[2] * u[2])),
+        *sines_cosines(4e6 * u[3]),
+        arctangents(u[0], u[1] * u[2]),
+        normals(np.random.Generator(np.random.Philox(8)), (333, 7)),
+    )
+
+
+def test_the_bits_are_those_of_every_other_machine() -> None:
+    assert sample() == DIGEST
+
+
+def test_code_for_the_oldest_cpu_gives_the_same_bits(tmp_path: Path) -> None:
+    code = (
+        "import runpy, sys; import chsel.kernels.elementary;"
+        "print(runpy.run_path(sys.argv[1])['sample']())"
+    )
+    plain = {
+        "NUMBA_CPU_NAME": "generic",
+        "NUMBA_CPU_FEATURES": "",
+        "CHSEL_CACHE_DIR": str(tmp_path),
+    }
+    plain |= {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX2,-FMA"}
+    root = Path(__file__).parents[3]
+    run = [sys.executable, "-c", code, __file__]
+    found = subprocess.run(
+        run, env=os.environ | plain, cwd=root, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.strip() == DIGEST

@@ -1,0 +1,298 @@
+"""The compiled searches around landscapes that bring them to every turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import pytest
+
+from chsel.archive import GridArchive
+from chsel.arrays import FloatArray, digest
+from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.kernels import emitters as kernels
+from chsel.kernels.emitters import MegaSearch, MeSearch, me_search, mega_search
+from chsel.kernels.evolution import EVALUATIONS, SIGMA
+from chsel.kernels.measures import VECTOR, MeasureCode
+from chsel.measures import Measure
+from chsel.observer import NullObserver
+from chsel.problem import ArchiveSnapshot
+from chsel.streams import StreamKey
+
+QUADRATIC, FLAT, NAN, INFINITE, NAN_BEYOND, NAN_GRADIENT = range(6)
+MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2))
+START = np.array([0.3, -0.2, 0.1, 0.2])
+ITERATIONS, COUNT = 60, 12
+
+
+class Landscape(NamedTuple):
+    """A cost of 4-D vectors, of which the first two entries are the measures."""
+
+    kind: int
+
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        return np.array([cost_of(self, 0, vector, 0) for vector in vectors])
+
+
+class LandscapeObjective:
+    """What the searches ask for in place of chsel.objective.Objective."""
+
+    def __init__(self, kind: int) -> None:
+        self.model, self.space_arrays = Landscape(kind), 0
+
+    def measure_code(self, measure: Measure) -> MeasureCode:
+        return measure.code
+
+    def work(self) -> int:
+        return 0
+
+
+@numba.njit
+def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for j in range(4):
+        if not np.isfinite(vector[j]):
+            raise ValueError("a vector that is not finite was evaluated")
+        total += (j + 1.0) * vector[j] * vector[j]
+    if model.kind == FLAT:
+        return 1.0
+    if model.kind == NAN or (model.kind == NAN_BEYOND and abs(vector[3]) > 0.25):
+        return np.nan
+    return -np.inf if model.kind == INFINITE else total
+
+
+@numba.njit
+def cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[no-untyped-def]
+    for j in range(4):
+        gradient[j] = 0.0 if model.kind == FLAT else 2.0 * (j + 1.0) * vector[j]
+    if model.kind == NAN_GRADIENT:
+        gradient[2] = np.nan
+    return cost_of(model, space, vector, work)
+
+
+@numba.njit
+def measures_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+    out[0], out[1] = vector[0], vector[1]
+
+
+@numba.njit
+def measure_gradients_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
+    out[:] = 0.0
+    out[0, 0] = out[1, 1] = 1.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def searches_of_a_landscape() -> Iterator[None]:
+    """Compiles the searches, as they are, around a landscape instead of around poses."""
+    with pytest.MonkeyPatch.context() as patch:
+        for function in (cost_of, cost_and_gradient_of, measures_of, measure_gradients_of):
+            patch.setattr(kernels, function.__name__, function)
+        for name in SEARCHES:
+            loop: Any = getattr(kernels, name)
+            patch.setattr(kernels, name, numba.njit(error_model="numpy")(loop.py_func))
+        yield
+
+
+class Watcher(NullObserver):
+    """Wants snapshots at an interval."""
+
+    def __init__(self, interval: int) -> None:
+        self.snapshot_interval = interval
+        self.heard: list[tuple[str, int]] = []
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        self.heard.append(("trace", iteration))
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        self.heard.append((stage, iteration))
+
+    def snapshot(self, archive: ArchiveSnapshot) -> None:
+        self.heard.append(("snapshot", archive.iteration))
+
+
+def empty_archive() -> GridArchive:
+    return GridArchive(MEASURE, np.full(2, -0.5), np.full(2, 0.5), bins=8, dimension=4)
+
+
+def found(name: str, kind: int, interval: int = 0, count: int = COUNT) -> GridArchive:
+    """The archive after a search."""
+    archive = empty_archive()
+    draws, watch = Draws(StreamKey(4, 0)), ArchiveWatch(Watcher(interval), 0)
+    settings = EmitterSettings(iterations=ITERATIONS, sigma0=0.2)
+    SEARCHES[name](LandscapeObjective(kind), archive, START, count, settings, draws, watch)  # type: ignore[arg-type]
+    return archive
+
+
+class Stepper:
+    """One search, iteration by iteration, on one landscape after another."""
+
+    def __init__(self, name: str) -> None:
+        self.archive, self.iteration = empty_archive(), 0
+        self.search: Any = (
+            mega_search(START, 2, COUNT, sigma0=0.2, rate=0.05)
+            if name == "cma_mega"
+            else me_search(START, 2, COUNT, sigma0=0.2)
+        )
+        self._loop = getattr(kernels, name)
+        random, n = np.random.default_rng(0), len(self.search.strategy.mean)
+        self._normals = random.standard_normal((ITERATIONS, COUNT, n))
+        self.elites = random.random(ITERATIONS)
+
+    def step(self, kind: int) -> None:
+        problem = Landscape(kind), 0, MEASURE.code, 0
+        draws = self._normals, self.elites, self.iteration, self.iteration + 1
+        self._loop(*problem, self.archive.cells, self.search, *draws)
+        self.iteration += 1
+
+
+def bytes_of(archive: GridArchive) -> str:
+    return digest(archive.cells.objectives, archive.cells.solutions, archive.cells.measures)
+
+
+def center(search: MegaSearch | MeSearch) -> FloatArray:
+    """What a restart puts on an elite."""
+    return search.theta if isinstance(search, MegaSearch) else search.strategy.mean
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_search_fills_the_archive_and_finds_the_optimum(name: str) -> None:
+    archive = found(name, QUADRATIC)
+    assert len(archive.occupied) > 40
+    assert archive.costs.min() < 0.02
+    np.testing.assert_array_equal(archive.costs, Landscape(QUADRATIC).costs(archive.solutions))
+    measures = archive.cells.measures[archive.occupied]
+    np.testing.assert_array_equal(measures, archive.solutions[:, :2])
+    np.testing.assert_array_equal(archive.cells_of(measures), archive.occupied)
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_segments_of_any_length_give_the_same_bytes(name: str) -> None:
+    assert len({bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}) == 1
+
+
+def test_an_observer_hears_every_ten_iterations_and_at_its_interval() -> None:
+    watcher = Watcher(7)
+    watch = ArchiveWatch(watcher, 0)
+    assert list(watch.segments(16)) == [(0, 7), (7, 10), (10, 14), (14, 16)]
+    assert list(watch.segments(0)) == []
+    for _, last in watch.segments(16):
+        watch.after("cma_me", last, 16, empty_archive())
+    expected = [("snapshot", 7), ("trace", 10), ("cma_me", 10), ("snapshot", 14)]
+    assert watcher.heard == [*expected, ("trace", 16), ("cma_me", 16), ("snapshot", 16)]
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+@pytest.mark.parametrize("kind", [NAN, INFINITE])
+def test_costs_that_are_not_finite_leave_the_archive_empty(name: str, kind: int) -> None:
+    assert len(found(name, kind).occupied) == 0
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_search_lives_with_costs_of_which_some_are_nan(name: str) -> None:
+    archive = found(name, NAN_BEYOND)
+    assert len(archive.occupied) > 20
+    assert np.isfinite(archive.costs).all()
+    assert (np.abs(archive.solutions[:, 3]) <= 0.25).all()
+
+
+def test_a_gradient_of_nan_is_no_direction() -> None:
+    archive = found("cma_mega", NAN_GRADIENT)
+    assert np.isfinite(archive.solutions).all()
+    assert len(archive.occupied) > 20
+    # Branches leave theta along the measures alone.
+    assert (archive.solutions[:, 2:] == START[2:]).all()
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_one_pose_is_enough(name: str) -> None:
+    assert len(found(name, QUADRATIC, count=1).occupied) > 3
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_without_improvement_it_restarts_from_the_chosen_elite(name: str) -> None:
+    stepper = Stepper(name)
+    for _ in range(8):
+        stepper.step(QUADRATIC)
+    strategy = stepper.search.strategy
+    assert strategy.numbers[SIGMA] != 0.2
+    elite = int(stepper.elites[stepper.iteration] * len(stepper.archive.occupied))
+    before = bytes_of(stepper.archive)
+    stepper.step(NAN)
+    assert bytes_of(stepper.archive) == before
+    np.testing.assert_array_equal(center(stepper.search), stepper.archive.solutions[elite])
+    assert strategy.numbers[SIGMA] == 0.2
+    assert strategy.numbers[EVALUATIONS] == 0
+    np.testing.assert_array_equal(strategy.covariance, np.eye(len(strategy.mean)))
+    if name == "cma_mega":
+        np.testing.assert_array_equal(strategy.mean, np.zeros(3))
+        np.testing.assert_array_equal(stepper.search.adam.moments, np.zeros((2, 4)))
+        np.testing.assert_array_equal(stepper.search.adam.powers, np.ones(2))
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+@pytest.mark.parametrize("degenerate", ["covariance", "step"])
+def test_a_degenerate_strategy_restarts_although_it_improved(name: str, degenerate: str) -> None:
+    stepper = Stepper(name)
+    strategy = stepper.search.strategy
+    if degenerate == "covariance":
+        strategy.eigenvalues[0] = 1e-20
+    else:
+        strategy.numbers[SIGMA] = 1e-13
+    stepper.step(QUADRATIC)
+    assert len(stepper.archive.occupied) > 0
+    assert strategy.numbers[EVALUATIONS] == 0
+    assert strategy.numbers[SIGMA] == 0.2
+    assert (stepper.archive.solutions == center(stepper.search)).all(axis=1).any()
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_vectors_that_are_not_finite_are_not_evaluated(name: str) -> None:
+    stepper = Stepper(name)
+    stepper.step(QUADRATIC)
+    stepper.search.strategy.numbers[SIGMA] = np.inf
+    stepper.step(QUADRATIC)  # a landscape raises where it is asked for such a vector
+    assert stepper.search.strategy.numbers[SIGMA] == 0.2
+    assert np.isfinite(center(stepper.search)).all()
+    assert np.isfinite(stepper.archive.solutions).all()
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name: str) -> None:
+    stepper = Stepper(name)
+    restarts = 0
+    for _ in range(30):
+        stepper.step(FLAT)
+        restarts += int(stepper.search.strategy.numbers[EVALUATIONS] == 0)
+    assert restarts > 5
+    np.testing.assert_array_equal(stepper.archive.costs, 1.0)
+
+
+def test_theta_moves_by_adam_towards_the_weighted_mean_of_the_parents() -> None:
+    stepper = Stepper("cma_mega")
+    theta, first, second = START, np.zeros(4), np.zeros(4)
+    for t in range(1, 4):
+        stepper.step(QUADRATIC)
+        branches = stepper.search.branches
+        parents = int((branches.status > 0).sum())
+        assert parents > 1
+        raw = np.log(parents + 0.5) - np.log(np.arange(parents) + 1.0)
+        best = branches.vectors[branches.order[:parents]]
+        towards = (raw / raw.sum()) @ best - theta
+        first = 0.9 * first + 0.1 * towards
+        second = 0.999 * second + 0.001 * towards**2
+        corrected = np.sqrt(second / (1.0 - 0.999**t)) + 1e-8
+        theta = theta + 0.05 * first / (1.0 - 0.9**t) / corrected
+        np.testing.assert_allclose(stepper.search.theta, theta, rtol=1e-12, atol=1e-15)
+
+
+def test_branches_leave_theta_along_normalised_gradients() -> None:
+    stepper = Stepper("cma_mega")
+    stepper.step(QUADRATIC)
+    search = stepper.search
+    downhill = -2.0 * (np.arange(4) + 1.0) * START
+    rows = [downhill / np.sqrt(downhill @ downhill), [1, 0, 0, 0], [0, 1, 0, 0]]
+    np.testing.assert_allclose(search.directions, rows, atol=1e-7)
+    expected = START + search.coefficients @ search.directions
+    np.testing.assert_allclose(search.branches.vectors, expected, rtol=1e-14)

@@ -1,0 +1,548 @@
+"""The compiled cost against the torch cost, and its own bits against themselves."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
+from chsel.arrays import FloatArray
+from chsel.engine import CompiledCost, poses_of
+from chsel.errors import EngineError, PointsError, SettingError
+from chsel.kernels.descent import BETA1, BETA2, EPSILON
+from chsel.objective import Objective
+from chsel.pose import compose, random_rotations
+from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+
+pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
+BOX_SIDES = (0.12, 0.08, 0.06)
+
+
+def sphere(radius: float, resolution: float, half: int) -> SdfGrid:
+    """The exact signed distance of a sphere, whose values need all of 64 bits."""
+    nodes = np.moveaxis(np.indices((2 * half + 1,) * 3), 0, -1) * resolution - half * resolution
+    distance = np.sqrt((nodes**2).sum(axis=-1))
+    safe = np.where(distance > 0.0, distance, 1.0)[..., None]
+    gradient = np.where(distance[..., None] > 0.0, nodes / safe, [1.0, 0.0, 0.0])
+    return SdfGrid(np.full(3, -half * resolution), resolution, distance - radius, gradient)
+
+
+@cache
+def grid_of(name: str) -> SdfGrid:
+    if name == "sphere":
+        return sphere(0.05, 0.01, 9)
+    if name == "box":
+        return SdfGrid.from_mesh(trimesh.creation.box(BOX_SIDES), 0.006, padding=0.03)
+    if name == "dyadic":  # a grid whose nodes and borders are exact numbers
+        return sphere(0.07, 2.0**-6, 8)
+    legs = [trimesh.creation.box(sides) for sides in ((0.16, 0.07, 0.06), (0.07, 0.14, 0.06))]
+    legs[0].apply_translation([0.05, -0.04, 0.0])
+    resolution = 0.004 if name == "fine l_shape" else 0.012
+    return SdfGrid.from_mesh(trimesh.boolean.union(legs), resolution, padding=0.04)
+
+
+@dataclass(frozen=True)
+class Case:
+    shape: str
+    points: KnownPoints
+    settings: CostSettings
+    free_resolution: float
+    vectors: FloatArray
+    space: SearchSpace
+
+    @property
+    def sdf(self) -> SdfGrid:
+        return grid_of(self.shape)
+
+    def objective(self, way: str = "fastest") -> Objective:
+        cost = CompiledCost(
+            self.sdf, self.points, self.settings, free_resolution=self.free_resolution, way=way
+        )
+        return Objective(cost, self.space)
+
+    def other_ways(self) -> list[Objective]:
+        """Every way to find free points that these points allow."""
+        found = [self.objective("direct"), self.objective("tree")]
+        with suppress(SettingError):
+            found.append(self.objective("lattice"))
+        return found
+
+
+@st.composite
+def cases(draw: st.DrawFn, free_terms: tuple[str, ...] = ("direct", "interior")) -> Case:
+    stream = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    shape = draw(st.sampled_from(["sphere", "box", "l_shape"]))
+    resolution = draw(st.sampled_from([0.01, 0.022, 0.03]))
+    count = draw(st.sampled_from([0, 1, 2, 9, 100, 3000]))
+    free = stream.uniform(-0.15, 0.15, (count, 3))
+    if draw(st.booleans()):
+        free = np.unique(np.rint(free / resolution), axis=0) * resolution
+    known = stream.uniform(-0.15, 0.15, (draw(st.integers(0, 12)), 3))
+    free_term = draw(st.sampled_from(free_terms))
+    gradients = ("defined", "exact") if free_term == "direct" else ("defined",)
+    changes = CostSettings(
+        penetration_tolerance=draw(st.sampled_from([0.0, -0.004, -0.01, -0.015])),
+        free_term=free_term,
+        lookup=draw(st.sampled_from(["nearest", "trilinear"])),
+        outside=draw(st.sampled_from(["surface_point", "bounding_box"])),
+        gradient=draw(st.sampled_from(gradients)),
+        volume_normalise=draw(st.booleans()),
+        known_tolerance=draw(st.sampled_from([0.0, 0.015])),
+    )
+    occupied = stream.uniform(-0.15, 0.15, (draw(st.integers(0, 6)), 3))
+    points = KnownPoints(free, occupied, known, stream.uniform(-0.03, 0.03, len(known)))
+    count, reach = draw(st.integers(1, 9)), draw(st.sampled_from([0.03, 0.1, 0.4]))
+    translations = stream.uniform(-reach, reach, (count, 3))
+    space: SearchSpace = SE3Space()
+    if draw(st.integers(0, 3)) == 0:
+        axis = tuple(stream.standard_normal(3).tolist())
+        space = SE2Space(PlaneSettings(axis=axis, offset=0.01), grid_of(shape))
+    vectors = space.encode(compose(random_rotations(stream, count), translations))
+    if space.dimension == 9:  # raw vectors are not orthonormal
+        vectors[:, :6] += stream.uniform(-0.2, 0.2, (count, 6))
+    return Case(shape, points, changes, resolution, vectors, space)
+
+
+def oracle(cost: RelaxedCost, space: SearchSpace, vectors: FloatArray) -> list[FloatArray]:
+    """Costs (B,) and gradients (B, d) by torch."""
+    leaves = torch.tensor(vectors, requires_grad=True)
+    values = cost(*space.decode(leaves))
+    values.sum().backward()
+    assert leaves.grad is not None
+    return [values.detach().numpy(), leaves.grad.numpy()]
+
+
+def assert_equals_torch(case: Case) -> None:
+    cost = RelaxedCost(case.sdf, case.points, case.settings, free_resolution=case.free_resolution)
+    values, gradients = oracle(cost, case.space, case.vectors)
+    found, slopes = case.objective().costs_and_gradients(case.vectors)
+    np.testing.assert_allclose(found, values, rtol=1e-12, atol=1e-14)
+    size = 1.0 + np.abs(gradients).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(slopes / size, gradients / size, rtol=0.0, atol=1e-12)
+
+
+def assert_same_bits(first: object, second: object) -> None:
+    for one, other in zip(np.atleast_1d(first), np.atleast_1d(second), strict=True):
+        one, other = np.asarray(one), np.asarray(other)
+        assert one.shape == other.shape
+        np.testing.assert_array_equal(one.view(np.int64), other.view(np.int64))
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@settings(max_examples=150, deadline=None)
+@given(case=cases())
+def test_costs_and_gradients_are_those_of_the_torch_cost(case: Case) -> None:
+    assert_equals_torch(case)
+
+
+@settings(max_examples=100, deadline=None)
+@given(case=cases())
+def test_ways_to_find_points_batches_threads_and_gradients_change_no_bit(case: Case) -> None:
+    objective, vectors = case.objective(), case.vectors
+    costs, gradients = objective.costs_and_gradients(vectors)
+    for other in case.other_ways():
+        other_costs, other_gradients = other.costs_and_gradients(vectors)
+        assert_same_bits(costs, other_costs)
+        assert_same_bits(gradients, other_gradients)
+    assert_same_bits(costs, objective.costs(vectors))
+    for n in range(len(vectors)):
+        cost, gradient = objective.costs_and_gradients(vectors[n : n + 1].copy())
+        assert_same_bits(cost[0], costs[n])
+        assert_same_bits(gradient[0], gradients[n])
+    for count in (2, 3):
+        with threads(count):
+            again, slopes = objective.costs_and_gradients(vectors)
+            assert_same_bits(objective.costs(vectors), costs)
+        assert_same_bits(again, costs)
+        assert_same_bits(slopes, gradients)
+
+
+def descended_plainly(
+    objective: Objective, vectors: FloatArray, divisor: float, rate: float, iterations: int
+) -> FloatArray:
+    """Adam, asking all points at every step; the operations are those of the kernel."""
+    mean, square = np.zeros_like(vectors), np.zeros_like(vectors)
+    power1 = power2 = 1.0
+    for _ in range(iterations):
+        _, gradients = objective.costs_and_gradients(vectors)
+        power1 *= BETA1
+        power2 *= BETA2
+        slope = gradients / divisor
+        mean = BETA1 * mean + (1.0 - BETA1) * slope
+        square = BETA2 * square + (1.0 - BETA2) * slope * slope
+        step = rate * (mean / (1.0 - power1))
+        vectors = vectors - step / (np.sqrt(square / (1.0 - power2)) + EPSILON)
+    return vectors
+
+
+@settings(max_examples=100, deadline=None)
+@given(case=cases(), rate=st.sampled_from([1e-4, 1e-3, 0.01, 0.1, 1.0]))
+def test_descent_with_neighbour_lists_is_to_the_bit_descent_over_all_points(
+    case: Case, rate: float
+) -> None:
+    plain = descended_plainly(case.objective("direct"), case.vectors, 3.0, rate, 40)
+    for other in case.other_ways():
+        assert_same_bits(other.descended(case.vectors, 3.0, rate, 40), plain)
+    objective = case.objective()
+    with threads(2):
+        assert_same_bits(objective.descended(case.vectors, 3.0, rate, 40), plain)
+    assert_same_bits(objective.descended(case.vectors[:1].copy(), 3.0, rate, 40), plain[:1])
+
+
+class Turntable(SE2Space):
+    """A plane on which the object can only turn."""
+
+    def __init__(self, sdf: SdfGrid) -> None:
+        super().__init__(PlaneSettings(offset=0.0), sdf)
+        self.arrays = self.arrays._replace(e_u=(0.0, 0.0, 0.0), e_v=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("turn", [0.004, 0.02, 0.1])
+@pytest.mark.parametrize("free_term", ["direct", "interior"])
+def test_an_object_that_turns_misses_none_of_the_points_that_it_sweeps(
+    free_term: str, turn: float
+) -> None:
+    """Contacts far away turn it by about `turn` radians a step, at first."""
+    free = np.random.default_rng(14).uniform(-0.2, 0.2, (100_000, 3)) * [1.0, 1.0, 0.2]
+    points = KnownPoints(free, known=[[0.0, 3.0, 0.0], [0.1, -3.0, 0.0]])
+    changes = CostSettings(free_term=free_term, known_scale=1e6)
+    vectors = np.zeros((8, 3))
+    vectors[:, 0] = np.arange(8) * 0.7
+    case = Case("fine l_shape", points, changes, 0.005, vectors, Turntable(grid_of("l_shape")))
+    plain = descended_plainly(case.objective("direct"), vectors, 1.0, turn, 50)
+    assert (np.abs(plain[:, 0] - vectors[:, 0]) > 5.0 * turn).any()
+    assert_same_bits(case.objective().descended(vectors, 1.0, turn, 50), plain)
+
+
+@settings(max_examples=25, deadline=None)
+@given(case=cases(), seed=st.integers(0, 2**32 - 1))
+def test_free_points_in_any_order_cost_the_same_bits_if_no_two_share_a_finest_cell(
+    case: Case, seed: int
+) -> None:
+    """Points in one cell of the finest level, a sixteenth of their spacing, keep their order."""
+    stream, spacing = np.random.default_rng(seed), case.free_resolution
+    free = np.unique(np.rint(case.points.free / spacing), axis=0) * spacing
+    free += stream.uniform(-0.3, 0.3, free.shape) * spacing
+    shuffled = free[stream.permutation(len(free))]
+    points = case.points
+    found = [
+        replace(
+            case, points=KnownPoints(some, points.occupied, points.known, points.sdf)
+        ).objective()
+        for some in (free, shuffled)
+    ]
+    for one, other in zip(
+        *(objective.costs_and_gradients(case.vectors) for objective in found), strict=True
+    ):
+        assert_same_bits(one, other)
+
+
+def summed_over_all(cost: CompiledCost, sdf: SdfGrid, free: FloatArray, pose: FloatArray) -> float:
+    """Eq. 8 over every free point, one after the other in the order of the tree."""
+    x, y, z = free[cost.model.free.tree.order].T
+    moved = [
+        pose[3 * i] * x + pose[3 * i + 1] * y + pose[3 * i + 2] * z + pose[9 + i] for i in range(3)
+    ]
+    changes = cost.settings
+    s, _ = sdf.query(np.stack(moved, axis=1), lookup=changes.lookup, outside=changes.outside)
+    violation = np.maximum(changes.penetration_tolerance - s.numpy(), 0.0)
+    return float(np.add.accumulate(changes.free_scale * violation)[-1])
+
+
+def lattice_points() -> FloatArray:
+    axis = (np.arange(59) - 29) * 0.005
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)[:200_000]
+
+
+def scattered_points() -> FloatArray:
+    return np.random.default_rng(3).uniform(-0.2, 0.2, (200_000, 3))
+
+
+@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
+@pytest.mark.parametrize("make", [lattice_points, scattered_points])
+def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(
+    make: Callable[[], FloatArray], lookup: str
+) -> None:
+    sdf, free, stream = grid_of("l_shape"), make(), np.random.default_rng(4)
+    changes = CostSettings(lookup=lookup)
+    transforms = compose(random_rotations(stream, 5), stream.uniform(-0.2, 0.2, (5, 3)))
+    transforms[0] = np.eye(4)
+    poses = poses_of(transforms)
+    culled, direct = (
+        CompiledCost(sdf, KnownPoints(free), changes, free_resolution=0.005, way=way)
+        for way in ("tree", "direct")
+    )
+    costs = culled.costs(poses)
+    assert costs[0] > 1.0
+    assert_same_bits(costs, direct.costs(poses))
+    assert_same_bits(costs, [summed_over_all(culled, sdf, free, pose) for pose in poses])
+
+
+def border_points(sdf: SdfGrid) -> FloatArray:
+    """Nodes, middles between them, corners of the grid, and the numbers next to all of these."""
+    stream, (first, last) = np.random.default_rng(5), sdf.bounds
+    nodes = stream.integers(0, np.array(sdf.shape), (300, 3))
+    halves = nodes - 0.5 * stream.integers(0, 2, (300, 3))
+    points = [first + halves * sdf.resolution]
+    corners = np.where(np.indices((2, 2, 2)).reshape(3, -1).T == 0, first, last)
+    faces = np.where(stream.integers(0, 2, (60, 3)) == 0, corners[stream.integers(0, 8, 60)], 0.01)
+    points += [corners, faces]
+    exact = np.concatenate(points)
+    return np.concatenate([exact, np.nextafter(exact, -np.inf), np.nextafter(exact, np.inf)])
+
+
+@pytest.mark.parametrize("gradient", ["defined", "exact"])
+@pytest.mark.parametrize("outside", ["surface_point", "bounding_box"])
+@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
+def test_points_on_borders_of_voxels_and_of_the_grid_read_what_the_torch_cost_reads(
+    lookup: str, outside: str, gradient: str
+) -> None:
+    sdf = grid_of("dyadic")
+    changes = CostSettings(lookup=lookup, outside=outside, gradient=gradient)
+    at = border_points(sdf)
+    turns = np.array(
+        [np.eye(3), [[0, 1, 0], [0, 0, 1], [1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]]
+    )
+    shifts = np.array([[0, 0, 0], [0.5, -1.0, 2.0], [2.0**-7, 0, 2.0**-6]])
+    vectors = SE3Space().encode(compose(turns, shifts))
+    for n in range(len(shifts)):
+        world = (at - shifts[n]) @ turns[n]  # exact but for the numbers next to others
+        for points in (KnownPoints(world), KnownPoints(occupied=world), KnownPoints(known=world)):
+            one = vectors[n : n + 1].copy()
+            assert_equals_torch(Case("dyadic", points, changes, sdf.resolution, one, SE3Space()))
+
+
+def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them() -> None:
+    step = 2.0**-6
+    free = np.array([[0.0, 0.0, 0.0], [step, 0.0, 0.0], [0.0, 2 * step, step], [3 * step, 0, 0]])
+    changes = CostSettings(free_term="interior", interior_spacing=0.5 * step)
+    vectors = SE3Space().encode(
+        compose(
+            np.tile(np.eye(3), (3, 1, 1)),
+            np.array(
+                [[0.0, 0.0, 0.0], [0.5 * step, 0.0, 0.25 * step], [1.5 * step, -step, 2.5 * step]]
+            ),
+        )
+    )
+    case = Case("dyadic", KnownPoints(free), changes, step, vectors, SE3Space())
+    assert case.objective().costs(vectors)[0] > 0.0
+    assert_equals_torch(case)
+
+
+def edge_points(name: str) -> KnownPoints:
+    stream = np.random.default_rng(6)
+    near, none = stream.uniform(-0.08, 0.08, (60, 3)), np.zeros((0, 3))
+    known_sdf = stream.uniform(-0.02, 0.02, 60)
+    flat = near * [1.0, 1.0, 0.0]
+    return {
+        "nothing at all": KnownPoints(),
+        "free alone": KnownPoints(near),
+        "occupied alone": KnownPoints(occupied=near),
+        "known alone": KnownPoints(known=near, known_sdf=known_sdf),
+        "no free": KnownPoints(none, near[:5], near, known_sdf),
+        "no occupied": KnownPoints(near, none, near, known_sdf),
+        "no known": KnownPoints(near, near[:5]),
+        "one free": KnownPoints(near[:1] * 0.1),
+        "one occupied": KnownPoints(occupied=near[:1]),
+        "one known": KnownPoints(known=near[:1], known_sdf=[-0.01]),
+        "one point a thousand times": KnownPoints(np.tile(near[:1] * 0.1, (1000, 1))),
+        "some points many times": KnownPoints(np.repeat(near, 30, axis=0)),
+        "in a plane": KnownPoints(np.repeat(flat, 3, axis=0)),
+        "on a line": KnownPoints(np.linspace(-0.2, 0.2, 500)[:, None] * [1.0, 0.0, 0.0]),
+        "10 m away": KnownPoints(near + 10.0, near, near - 10.0),
+        "in two clusters 1000 km apart": KnownPoints(np.concatenate([near, near + 1e6])),
+    }[name]
+
+
+EDGES = [
+    "nothing at all", "free alone", "occupied alone", "known alone", "no free", "no occupied",
+    "no known", "one free", "one occupied", "one known", "one point a thousand times",
+    "some points many times", "in a plane", "on a line", "10 m away",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("free_term", ["direct", "interior"])
+@pytest.mark.parametrize("name", [*EDGES, "in two clusters 1000 km apart"])
+def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term: str) -> None:
+    if free_term == "interior" and name == "in two clusters 1000 km apart":
+        pytest.skip("more voxels than are accepted")
+    stream = np.random.default_rng(7)
+    transforms = compose(random_rotations(stream, 4), stream.uniform(-0.02, 0.02, (4, 3)))
+    vectors = SE3Space().encode(transforms)
+    changes = CostSettings(free_term=free_term)
+    case = Case("box", edge_points(name), changes, 0.01, vectors, SE3Space())
+    assert_equals_torch(case)
+    culled, direct = case.objective(), case.objective("direct")
+    for one, other in zip(
+        culled.costs_and_gradients(vectors), direct.costs_and_gradients(vectors), strict=True
+    ):
+        assert_same_bits(one, other)
+    plain = descended_plainly(direct, vectors, 4.0, 0.01, 30)
+    assert_same_bits(culled.descended(vectors, 4.0, 0.01, 30), plain)
+
+
+@pytest.mark.parametrize("free_term", ["direct", "interior"])
+@pytest.mark.parametrize("far", [1e6, 1e9])
+def test_a_scene_far_from_the_origin_is_culled_without_loss(far: float, free_term: str) -> None:
+    """At 1e9 m, neighbouring doubles are 0.1 micrometres apart."""
+    stream = np.random.default_rng(8)
+    shift = np.array([far, -far, 0.5 * far])
+    free = np.rint(stream.uniform(-8.0, 8.0, (400, 3))) * 0.01 + shift
+    turns = random_rotations(stream, 6)
+    turns[0] = np.eye(3)
+    translations = -(turns @ shift) + stream.uniform(-0.03, 0.03, (6, 3))
+    vectors = SE3Space().encode(compose(turns, translations))
+    points = KnownPoints(free, known=free[:9] + 0.01)
+    changes = CostSettings(free_term=free_term)
+    case = Case("box", points, changes, 0.01, vectors, SE3Space())
+    culled, direct = case.objective(), case.objective("direct")
+    assert (culled.costs(vectors)[1:] > 0.0).any()
+    assert_same_bits(culled.costs(vectors), direct.costs(vectors))
+    plain = descended_plainly(direct, vectors, 1.0, 1e-3, 30)
+    assert_same_bits(culled.descended(vectors, 1.0, 1e-3, 30), plain)
+
+
+@pytest.mark.parametrize("free_term", ["direct", "interior"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1.7e308])
+def test_poses_beyond_all_numbers_cost_infinitely_much_and_harm_no_other(
+    bad: float, free_term: str
+) -> None:
+    stream = np.random.default_rng(9)
+    near = stream.uniform(-0.05, 0.05, (40, 3))
+    points = KnownPoints(near, near[:3], near[:9])
+    cost = CompiledCost(grid_of("box"), points, CostSettings(free_term=free_term))
+    transforms = np.tile(np.eye(4), (14, 1, 1))
+    for n in range(12):
+        transforms[n].reshape(-1)[n] = bad
+    transforms[12, :3, :3] = bad
+    costs = cost.evaluate(transforms)
+    assert_same_bits(costs[:13], np.full(13, np.inf))
+    assert_same_bits(costs[13:], cost.evaluate(np.eye(4)[None]))
+    assert 0.0 < costs[13] < np.inf
+    vectors = SE3Space().encode(transforms)
+    Objective(cost, SE3Space()).descended(vectors, 1.0, 0.01, 3)
+
+
+@pytest.mark.parametrize("free_term", ["direct", "interior"])
+def test_products_that_are_no_number_read_nothing_outside_of_the_grid(free_term: str) -> None:
+    """inf - inf in R x + t; an index made of it would be anywhere."""
+    points = np.full((5, 3), 1e200) + np.zeros((5, 1))
+    pose = np.eye(4)[None].copy()
+    pose[0, :3, :3] = [[1e150, -1e150, 0.0], [1e150, 0.0, -1e150], [0.0, 1e150, -1e150]]
+    for known in (KnownPoints(points), KnownPoints(occupied=points), KnownPoints(known=points)):
+        for lookup in ("nearest", "trilinear"):
+            changes = CostSettings(free_term=free_term, lookup=lookup)
+            cost = CompiledCost(grid_of("box"), known, changes).evaluate(pose)
+            assert not 0.0 < cost[0] < np.inf
+
+
+def test_rows_that_span_no_plane_descend_to_the_same_bits() -> None:
+    stream = np.random.default_rng(10)
+    near = stream.uniform(-0.1, 0.1, (300, 3))
+    vectors = np.zeros((4, 9))
+    vectors[1:, 0] = 1.0
+    vectors[2, 3] = 1.0
+    vectors[3, 3:5] = 1.0, 1e-11
+    case = Case(
+        "box", KnownPoints(near, near[:3], near[:9]), CostSettings(), 0.01, vectors,
+        SE3Space(),
+    )  # fmt: skip
+    plain = descended_plainly(case.objective("direct"), vectors, 4.0, 0.01, 30)
+    assert np.isfinite(plain).all()
+    assert_same_bits(case.objective().descended(vectors, 4.0, 0.01, 30), plain)
+
+
+def test_an_sdf_that_32_bits_cannot_hold_is_read_in_64_bits() -> None:
+    sdf = grid_of("sphere")
+    node = np.array([[0.03, 0.01, 0.02]])
+    cost = CompiledCost(sdf, KnownPoints(known=node), CostSettings(lookup="nearest"))
+    value = np.sqrt(0.0014) - 0.05
+    assert value != np.float32(value)
+    assert cost.evaluate(np.eye(4)[None])[0] == pytest.approx(abs(value), rel=1e-14)
+
+
+def test_tolerance_zero_charges_every_free_point_inside_of_the_object() -> None:
+    stream = np.random.default_rng(11)
+    sdf, free = grid_of("sphere"), stream.uniform(-0.08, 0.08, (500, 3))
+    changes = CostSettings(penetration_tolerance=0.0, lookup="nearest")
+    nodes = np.rint(free / 0.01) * 0.01
+    depth = np.maximum(0.05 - np.sqrt((nodes**2).sum(axis=1)), 0.0)
+    cost = CompiledCost(sdf, KnownPoints(free), changes).evaluate(np.eye(4)[None])
+    np.testing.assert_allclose(cost, 20.0 * depth.sum(), rtol=1e-12)
+
+
+def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_nothing() -> None:
+    changes = CostSettings(penetration_tolerance=-0.2)
+    free = np.random.default_rng(12).uniform(-0.05, 0.05, (100, 3))
+    with pytest.warns(UserWarning, match="cannot be violated"):
+        cost = CompiledCost(grid_of("box"), KnownPoints(free), changes)
+    assert cost.evaluate(np.eye(4)[None])[0] == 0.0
+    objective = Objective(cost, SE3Space())
+    vectors = SE3Space().encode(np.eye(4)[None])
+    assert_same_bits(objective.descended(vectors, 1.0, 0.01, 5), vectors)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        CompiledCost(grid_of("box"), KnownPoints(known=free), changes)
+
+
+def test_an_interior_term_without_interior_points_says_what_to_do() -> None:
+    changes = CostSettings(free_term="interior", penetration_tolerance=-0.2)
+    with pytest.raises(SettingError, match="penetration_tolerance nearer to 0"):
+        CompiledCost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0]]), changes)
+
+
+@pytest.mark.parametrize("far", [1e9, 1e19, 1e300])
+def test_free_voxels_that_span_too_much_are_an_error(far: float) -> None:
+    changes = CostSettings(free_term="interior")
+    with pytest.raises(SettingError, match="coarser free_resolution"):
+        CompiledCost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0], [far, far, far]]), changes)
+
+
+def test_free_points_whose_distance_is_no_number_are_an_error() -> None:
+    with pytest.raises(PointsError, match="accepted: a finite extent"):
+        CompiledCost(grid_of("box"), KnownPoints([[-1.7e308, 0.0, 0.0], [1.7e308, 0.0, 0.0]]))
+
+
+def test_points_and_poses_are_left_as_they_were() -> None:
+    stream = np.random.default_rng(13)
+    near = stream.uniform(-0.05, 0.05, (40, 3))
+    points = KnownPoints(near, near[:3], near[:9])
+    objective = Objective(CompiledCost(grid_of("box"), points), SE3Space())
+    vectors = SE3Space().encode(np.tile(np.eye(4), (3, 1, 1)))
+    before, digest = vectors.copy(), points.digest
+    assert (objective.descended(vectors, 3.0, 0.01, 5) != vectors).any()
+    objective.costs_and_gradients(vectors)
+    assert_same_bits(vectors, before)
+    fresh = KnownPoints(points.free, points.occupied, points.known, points.sdf)
+    assert fresh.digest == digest
+
+
+def test_a_thread_that_flushes_subnormals_is_refused() -> None:
+    points = KnownPoints(known=[[0.0, 0.0, 0.0]])
+    if not torch.set_flush_denormal(True):
+        pytest.skip("this processor cannot flush subnormal numbers")
+    try:
+        with pytest.raises(EngineError, match="flushes subnormal numbers to zero"):
+            CompiledCost(grid_of("box"), points)
+    finally:
+        torch.set_flush_denormal(False)
+    assert CompiledCost(grid_of("box"), points).evaluate(np.eye(4)[None])[0] > 0.0

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, norm
+
+from chsel.arrays import digest
+from chsel.errors import SettingError
+from chsel.streams import Purpose, StreamKey, normals, uniforms
+
+MANY = 1_000_000
+
+
+def stream(seed: int = 3) -> np.random.Generator:
+    return StreamKey(seed, 0).stream(Purpose.EMITTER)
+
+
+class Fixed:
+    """A stream whose every uniform number is the same."""
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+    def random(self, shape: tuple[int, ...]) -> np.ndarray:
+        return np.full(shape, self.value)
+
+
+@pytest.fixture(scope="module")
+def many() -> np.ndarray:
+    return normals(stream(), MANY)
+
+
+def test_normals_have_the_moments_of_the_standard_normal(many: np.ndarray) -> None:
+    moments = [(many**power).mean() for power in range(1, 7)]
+    deviations = np.sqrt(np.array([1, 2, 15, 96, 945, 10170]) / MANY)
+    np.testing.assert_allclose(moments, [0, 1, 0, 3, 0, 15], rtol=0, atol=4 * deviations.max())
+    assert (np.abs(np.array(moments) - [0, 1, 0, 3, 0, 15]) < 4 * deviations).all()
+
+
+def test_normals_follow_the_law_of_gauss(many: np.ndarray) -> None:
+    assert kstest(many, norm.cdf).pvalue > 0.01
+    assert kstest(many[0::2], norm.cdf).pvalue > 0.01
+    assert kstest(many[1::2], norm.cdf).pvalue > 0.01
+
+
+def test_tails_are_as_full_as_they_should_be(many: np.ndarray) -> None:
+    for limit in (2.0, 3.0, 4.0):
+        for found in ((many > limit).sum(), (many < -limit).sum()):
+            expected = MANY * norm.sf(limit)
+            assert abs(found - expected) < 4 * np.sqrt(expected)
+
+
+def test_the_two_of_a_pair_and_the_pairs_are_independent(many: np.ndarray) -> None:
+    cosine, sine = many[0::2], many[1::2]
+    pairs = [(cosine, sine), (cosine**2, sine**2), (cosine[1:], sine[:-1]), (many[2:], many[:-2])]
+    for a, b in pairs:
+        assert abs(np.corrcoef(a, b)[0, 1]) < 4 / np.sqrt(len(a))
+
+
+def test_normals_are_made_of_the_raw_output_two_by_two() -> None:
+    raw = np.random.Philox(key=(int(Purpose.EMITTER) << 84) | 3).random_raw(2000)
+    u, v = ((raw >> np.uint64(11)) * 2.0**-53).reshape(-1, 2).T
+    radius, angle = np.sqrt(-2.0 * np.log1p(-u)), 2.0 * np.pi * v
+    expected = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).reshape(-1)
+    np.testing.assert_allclose(normals(stream(), 2000), expected, rtol=1e-13, atol=1e-15)
+
+
+def test_the_bits_of_the_normals_never_change() -> None:
+    assert digest(normals(stream(), 10_000)) == "1fd879feb744c1f9ff257f5f1345cf26"
+
+
+def test_fewer_numbers_are_the_first_of_more() -> None:
+    all_of_them = normals(stream(), 12)
+    for count in (1, 2, 5, 7):
+        np.testing.assert_array_equal(normals(stream(), count), all_of_them[:count])
+    np.testing.assert_array_equal(normals(stream(), (2, 3, 2)).reshape(-1), all_of_them)
+
+
+def test_an_odd_count_takes_whole_pairs_from_the_stream() -> None:
+    taken = stream()
+    first, second = normals(taken, 3), normals(taken, 2)
+    np.testing.assert_array_equal(np.append(first, second), normals(stream(), 6)[[0, 1, 2, 4, 5]])
+
+
+@pytest.mark.parametrize("shape", [0, (0,), (0, 3), (4, 0, 2)])
+def test_no_numbers_take_nothing_from_the_stream(shape: int | tuple[int, ...]) -> None:
+    taken = stream()
+    assert normals(taken, shape).shape == np.zeros(shape).shape
+    assert taken.random() == stream().random()
+
+
+def test_the_least_and_the_largest_uniform_number_give_finite_ones() -> None:
+    np.testing.assert_array_equal(np.abs(normals(Fixed(0.0), 2)), [0.0, 0.0])  # type: ignore[arg-type]
+    largest = normals(Fixed(1.0 - 2.0**-53), 2)  # type: ignore[arg-type]
+    assert largest[0] == pytest.approx(np.sqrt(106.0 * np.log(2.0)), rel=1e-15)
+    assert 8.5 < largest[0] < 8.6
+
+
+def test_uniforms_fill_their_box() -> None:
+    lower, upper = np.array([-1.0, 0.0, 5.0]), np.array([1.0, 0.5, 5.5])
+    drawn = uniforms(stream(), lower, upper, (100_000, 3))
+    assert (drawn >= lower).all()
+    assert (drawn < upper).all()
+    for column, low, width in zip(drawn.T, lower, upper - lower, strict=True):
+        assert kstest((column - low) / width, "uniform").pvalue > 0.01
+
+
+def test_streams_of_other_purposes_steps_seeds_and_repetitions_are_others() -> None:
+    keys = [StreamKey(3, 0), StreamKey(4, 0), StreamKey(3, 1)]
+    drawn = [key.stream(purpose).random() for key in keys for purpose in Purpose]
+    drawn.append(StreamKey(3, 0).stream(Purpose.EMITTER, 1).random())
+    assert len(set(drawn)) == 3 * len(Purpose) + 1
+
+
+@pytest.mark.parametrize(("seed", "step"), [(-1, 0), (2**64, 0), (0, -1), (0, 2**32)])
+def test_keys_out_of_range_are_refused(seed: int, step: int) -> None:
+    with pytest.raises(SettingError, match=r"accepted: an integer from 0 to 2\*\*"):
+        StreamKey(seed, step)

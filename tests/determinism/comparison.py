@@ -1,0 +1,135 @@
+"""The first stage in which a record is not what it should be, and by how much."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import llvmlite
+import numba
+import numpy
+import numpy as np
+import torch
+
+from chsel.arrays import digest
+from tests.determinism.stages import Stages
+
+GOLDEN_FILE = Path(__file__).with_name("golden.json")
+_SAMPLES = 3
+
+Golden = dict[str, dict[str, list[str]]]
+"""By case and stage: a digest of all arrays, then a few of their numbers in hexadecimal."""
+
+
+def condensed(record: dict[str, Stages]) -> Golden:
+    """Digests and samples of a record."""
+    return {
+        case: {stage: [stage_digest(arrays), *_samples(arrays)] for stage, arrays in stages.items()}
+        for case, stages in record.items()
+    }
+
+
+def stage_digest(arrays: dict[str, np.ndarray]) -> str:
+    """Digest of the arrays of a stage, short enough to be read."""
+    return digest(*arrays.values())[:16]
+
+
+def _numbers(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    parts = [array.reshape(-1) for array in arrays.values() if array.dtype == np.float64]
+    return np.concatenate(parts)
+
+
+def _samples(arrays: dict[str, np.ndarray]) -> list[str]:
+    numbers = _numbers(arrays)
+    return [float(numbers[(i * len(numbers)) // _SAMPLES]).hex() for i in range(_SAMPLES)]
+
+
+def read_golden() -> Golden:
+    """The digests that every machine must give."""
+    golden: Golden = json.loads(GOLDEN_FILE.read_text())["cases"]
+    return golden
+
+
+def write_golden(golden: Golden) -> None:
+    """One line a stage, so that a change of one shows as one."""
+    lines = ["{", f' "versions": {json.dumps(versions())},', ' "cases": {']
+    for case, stages in golden.items():
+        rows = [f"   {json.dumps(stage)}: {json.dumps(row)}" for stage, row in stages.items()]
+        lines += [f"  {json.dumps(case)}: {{", ",\n".join(rows), "  },"]
+    lines[-1] = "  }"
+    GOLDEN_FILE.write_text("\n".join([*lines, " }", "}"]) + "\n")
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that could change a bit."""
+    return {module.__name__: module.__version__ for module in (numpy, torch, numba, llvmlite)}
+
+
+def other_versions() -> str:
+    """Which packages are not those with which golden.json was made; empty if all are."""
+    made, here = json.loads(GOLDEN_FILE.read_text())["versions"], versions()
+    return ", ".join(
+        f"{name} {here[name]} instead of {made[name]}" for name in here if here[name] != made[name]
+    )
+
+
+def ulps(left: np.ndarray, right: np.ndarray) -> list[int]:
+    """How many steps between neighbouring numbers lie between two arrays, entry by entry."""
+    return [abs(a - b) for a, b in zip(_ranks(left), _ranks(right), strict=True)]
+
+
+def _ranks(numbers: np.ndarray) -> list[int]:
+    """Where each number stands in the order of all doubles, -0.0 right below 0.0."""
+    bits = np.ascontiguousarray(numbers, dtype=np.float64).view(np.int64).reshape(-1)
+    return [int(b) if b >= 0 else -1 - (int(b) & (2**63 - 1)) for b in bits]
+
+
+def differences(
+    golden: Golden, record: dict[str, Stages], nearby: dict[str, Stages] | None = None
+) -> list[str]:
+    """A line for each case that is not as it should be, naming the first stage that differs.
+
+    nearby: the same cases in the default setting of this machine, for how far the numbers are
+    apart; without it, the samples in `golden` tell.
+    """
+    lines = [f"{case}: not recorded" for case in golden if case not in record]
+    lines += [f"{case}: not in golden.json" for case in record if case not in golden]
+    for case in golden:
+        if case in record:
+            lines += _first_difference(case, golden[case], record[case], nearby)
+    return lines
+
+
+def _first_difference(
+    case: str, expected: dict[str, list[str]], stages: Stages, nearby: dict[str, Stages] | None
+) -> list[str]:
+    for stage, arrays in stages.items():
+        if stage not in expected:
+            return [f"{case}: stage {stage!r} is new"]
+        if stage_digest(arrays) != expected[stage][0]:
+            usual = nearby[case].get(stage) if nearby else None
+            if usual is None or stage_digest(usual) != expected[stage][0]:
+                return [f"{case}: {stage!r} differs, {_by_samples(expected[stage][1:], arrays)}"]
+            return [f"{case}: {stage!r} differs, {_by_arrays(usual, arrays)}"]
+    missing = [stage for stage in expected if "hypotheses" in stage and stage not in stages]
+    return [f"{case}: stage {stage!r} is missing" for stage in missing]
+
+
+def _by_samples(expected: list[str], arrays: dict[str, np.ndarray]) -> str:
+    ours = np.array([float.fromhex(number) for number in _samples(arrays)])
+    theirs = np.array([float.fromhex(number) for number in expected])
+    apart = max(ulps(theirs, ours))
+    place = "in" if apart else "elsewhere than in"
+    return f"{f'by up to {apart} ulp ' if apart else ''}{place} the numbers that golden.json holds"
+
+
+def _by_arrays(usual: dict[str, np.ndarray], arrays: dict[str, np.ndarray]) -> str:
+    said = []
+    for name, array in arrays.items():
+        if array.shape != usual[name].shape:
+            said.append(f"{name} {array.shape} instead of {usual[name].shape}")
+        elif digest(array) != digest(usual[name]):
+            apart = ulps(usual[name], array)
+            unequal = sum(steps > 0 for steps in apart)
+            said.append(f"{unequal} of {array.size} {name} by up to {max(apart)} ulp")
+    return "; ".join(said)

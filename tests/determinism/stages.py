@@ -1,0 +1,144 @@
+"""What a case computes, stage by stage, so that the first stage that differs can be named."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Protocol
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.engine import CompiledCost
+from chsel.measures import MEASURES
+from chsel.methods.method import Method
+from chsel.objective import Objective
+from chsel.observer import NullObserver, Observer
+from chsel.online import pose_problem
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.space import search_space
+from chsel.streams import Purpose, StreamKey, normals
+from tests.determinism.cases import Case
+from tests.determinism.problems import scene
+
+Stages = dict[str, dict[str, np.ndarray]]
+"""Named arrays of named stages, in the order in which they came about."""
+
+
+class Watch(Protocol):
+    """Makes the observer of a step, which may add to its stages."""
+
+    def __call__(self, stages: Stages, case: Case, step: int) -> Observer:
+        """The observer of one registration."""
+
+
+class StageKeeper:
+    """Keeps the state after every block of iterations as a stage."""
+
+    def __init__(self, stages: Stages, case: Case, step: int) -> None:
+        self.snapshot_interval = 25 if case.long else 5
+        self._stages, self._step = stages, step
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        """Nothing to keep."""
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        """Vectors and costs of the descent; the search shows its archive besides."""
+        if stage == "descent":
+            self._keep(f"descent {iteration}", {"vectors": vectors.copy(), "costs": cost.copy()})
+
+    def snapshot(self, archive: ArchiveSnapshot) -> None:
+        """The archive's range and cells."""
+        self._keep(f"archive {archive.iteration}", archive_arrays(archive))
+
+    def _keep(self, name: str, arrays: dict[str, np.ndarray]) -> None:
+        keep(self._stages, f"step {self._step}: {name}", arrays)
+
+
+class Scribbler(NullObserver):
+    """Watches every iteration, logs all it sees, and writes over what it is shown."""
+
+    snapshot_interval = 1
+
+    def __init__(self, stages: Stages, case: Case, step: int) -> None:
+        self._log = logging.getLogger(__name__)
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        """Log it."""
+        self._log.debug("%s %d of %d", stage, iteration, total)
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        """Log it and spoil it."""
+        self._log.debug("%s %d: lowest cost %r", stage, iteration, cost.min(initial=np.inf))
+        vectors[:], cost[:] = np.nan, np.nan
+
+    def snapshot(self, archive: ArchiveSnapshot) -> None:
+        """Log it and spoil it."""
+        self._log.debug("archive %d: %r", archive.iteration, archive.coverage)
+        for array in (archive.lower, archive.upper, archive.solutions, archive.measures):
+            array[:] = np.nan
+
+
+def nobody(stages: Stages, case: Case, step: int) -> None:
+    """No observer."""
+
+
+def run(case: Case, sdf: SdfGrid, watch: Any = StageKeeper) -> Stages:
+    """All stages of a case; those within a registration as far as the observer keeps them."""
+    method, stages, found = case.build(), {}, None
+    where = scene(sdf, case.place, case.classes)
+    for step in range(case.steps):
+        key, resolution = StreamKey(11, step), where.free_resolution
+        problem = pose_problem(
+            sdf, where.points, where.workspace, resolution, key, method.online, found
+        )
+        if watch is StageKeeper:
+            _keep_start(stages, method, problem, step)
+        found = method.register(problem, watch(stages, case, step))
+        _keep_result(stages, found, step)
+    return stages
+
+
+def _keep_start(stages: Stages, method: Method, problem: RegistrationProblem, step: int) -> None:
+    """E_0 and E_l, and what the kernels say about E_0."""
+    sets = {"E_0": problem.initial_set, "E_l": problem.low_cost_set}
+    keep(stages, f"step {step}: initial sets", sets)
+    draws = normals(problem.key.stream(Purpose.EMITTER), 3000)
+    keep(stages, f"step {step}: normal draws", {"draws": draws})
+    settings = method.settings
+    space = search_space(settings.plane, problem.sdf)
+    objective = Objective(CompiledCost.of(problem, settings.cost), space)
+    vectors = space.encode(problem.initial_set)
+    keep(stages, f"step {step}: search vectors of E_0", {"vectors": vectors})
+    keep(stages, f"step {step}: costs of E_0", {"costs": objective.costs(vectors)})
+    _, gradients = objective.costs_and_gradients(vectors)
+    keep(stages, f"step {step}: gradients at E_0", {"gradients": gradients})
+    if not hasattr(settings, "archive"):
+        return
+    measure = MEASURES[settings.archive.measure]
+    mean, deviation = measure.moments(objective.measures(measure, vectors))
+    slopes = np.array([objective.measure_gradients(measure, vector) for vector in vectors])
+    measures = {"mean": mean, "deviation": deviation, "gradients": slopes}
+    keep(stages, f"step {step}: measures of E_0", measures)
+
+
+def _keep_result(stages: Stages, found: Hypotheses, step: int) -> None:
+    if found.archive is not None:
+        keep(stages, f"step {step}: last archive", archive_arrays(found.archive))
+    names = ("object_from_world", "cost", "duplicate", "cell", "elites")
+    keep(stages, f"step {step}: hypotheses", {name: getattr(found, name) for name in names})
+
+
+def archive_arrays(archive: ArchiveSnapshot) -> dict[str, np.ndarray]:
+    """The numbers of a snapshot."""
+    names = ("lower", "upper", "cells", "solutions", "objectives", "measures")
+    return {name: getattr(archive, name).copy() for name in names}
+
+
+def keep(stages: Stages, name: str, arrays: dict[str, np.ndarray]) -> None:
+    """Add a stage; one that comes again, in a later pass, is numbered."""
+    unique, number = name, 1
+    while unique in stages:
+        number += 1
+        unique = f"{name} (pass {number})"
+    stages[unique] = arrays

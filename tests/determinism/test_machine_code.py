@@ -1,0 +1,143 @@
+"""No CPU fuses a product and a sum, as that would round once where another rounds twice."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import pkgutil
+import platform
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+import pytest
+from numba.core.registry import CPUDispatcher
+
+import chsel.kernels
+from chsel.archive import GridArchive
+from chsel.arrays import FloatArray
+from chsel.kernels.compiler import compiled
+from chsel.measures import MEASURES
+from tests.determinism.cases import CASES
+from tests.determinism.libraries import fused as contracted
+from tests.determinism.machine_code import assembly, called, fused, host, loose, optimised, target
+from tests.determinism.problems import grid
+from tests.determinism.stages import run
+
+ENOUGH = ("chsel default", "contacts alone", "interior, trilinear, by volume", "plane_angle")
+EXACT = {"sqrt", "floor", "rint", "memset", "memcpy", "memmove"}  # by IEEE 754, or not of numbers
+OTHERS = {
+    "Haswell": ("x86_64-unknown-linux-gnu", "haswell", "+avx2,+fma"),
+    "ARM": ("aarch64-unknown-linux-gnu", "generic", ""),
+    "Apple": ("arm64-apple-macosx", "apple-m1", ""),
+}
+
+
+def planted(x: float, y: float) -> float:
+    """What compilers like to fuse."""
+    return x * y + 1.0
+
+
+@pytest.fixture(scope="module")
+def code() -> dict[str, str]:
+    """Optimised code of every kernel that Python calls."""
+    for name in ENOUGH:
+        run(CASES[name], grid(CASES[name].body))
+    archive = GridArchive(MEASURES["position_2"], np.zeros(2), np.ones(2), bins=2, dimension=9)
+    archive.cells_of(np.zeros((1, 2)))
+    return {
+        f"{name} {i}": text
+        for name, kernel in _kernels().items()
+        for i, text in enumerate(optimised(kernel))
+    }
+
+
+def _kernels() -> dict[str, Any]:
+    """All compiled functions by their full names."""
+    found = {}
+    for module in pkgutil.iter_modules(chsel.kernels.__path__, "chsel.kernels."):
+        for name, kernel in vars(importlib.import_module(module.name)).items():
+            if isinstance(kernel, CPUDispatcher) and kernel.__module__ == module.name:
+                found[f"{module.name}.{name}"] = kernel
+    return found
+
+
+def _on(name: str) -> llvm.TargetMachine:
+    if name != "host" and platform.machine().lower() not in ("x86_64", "amd64"):
+        pytest.skip(f"code of this {platform.machine()} cannot be made anew for another CPU")
+    return host() if name == "host" else target(*OTHERS[name])
+
+
+def test_every_kernel_that_python_calls_is_looked_at(code: dict[str, str]) -> None:
+    from_python = {
+        name
+        for name, kernel in _kernels().items()
+        if not kernel.targetoptions.get("no_cpython_wrapper")
+        if "elementary" not in name or "_fill_" in name  # others stand in the code of their callers
+    }
+    assert {"chsel.kernels.descent.descend", "chsel.kernels.emitters.cma_me"} < from_python
+    assert from_python <= {name.split()[0] for name in code}
+
+
+@pytest.mark.parametrize("cpu", ["host", *OTHERS])
+def test_no_product_is_fused_with_a_sum(cpu: str, code: dict[str, str]) -> None:
+    machine = _on(cpu)
+    assert {name: fused(assembly(text, machine)) for name, text in code.items()} == {
+        name: [] for name in code
+    }
+
+
+def test_no_code_may_be_reordered(code: dict[str, str]) -> None:
+    assert {name: loose(text) for name, text in code.items()} == {name: [] for name in code}
+
+
+def test_no_kernel_calls_the_c_library_for_what_it_rounds_its_own_way(
+    code: dict[str, str],
+) -> None:
+    assert set().union(*map(called, code.values())) <= EXACT
+
+
+@pytest.mark.parametrize("cpu", OTHERS)
+def test_a_fused_product_would_be_found(cpu: str) -> None:
+    loosely = numba.njit("float64(float64, float64)", fastmath={"contract"})(planted)
+    strictly = numba.njit("float64(float64, float64)")(planted)
+    contracted(np.ones(3))
+    machine = _on(cpu)
+    for function in (loosely, contracted):
+        (text,) = optimised(function)
+        assert loose(text)
+        assert fused(assembly(text, machine))
+    (text,) = optimised(strictly)
+    assert not loose(text)
+    assert not fused(assembly(text, machine))
+
+
+def test_a_call_of_the_c_library_would_be_found() -> None:
+    @numba.njit("float64(float64)")
+    def inexact(x: float) -> float:
+        return math.exp(x) + math.sin(x)
+
+    (text,) = optimised(inexact)
+    names = called(text)
+    assert any("exp" in name for name in names)
+    assert any("sin" in name for name in names)
+
+
+def test_code_from_the_cache_is_seen_as_freshly_compiled_code_is() -> None:
+    values = np.array([1.0, 2.0, 3.0])
+    fresh = numba.njit(nogil=True, error_model="numpy")(_cube_sum)
+    compiled(_cube_sum)(values)
+    cached = compiled(_cube_sum)
+    assert fresh(values) == cached(values) == 36.0
+    assert cached.stats.cache_hits
+    assert not fresh.stats.cache_hits
+    products = [assembly(*optimised(made), host()).count("mul") for made in (fresh, cached)]
+    assert products[0] == products[1] > 0
+
+
+def _cube_sum(values: FloatArray) -> float:
+    total = 0.0
+    for value in values:
+        total += value * value * value
+    return total
