@@ -7,6 +7,7 @@ Free Space Data", Robotics: Science and Systems, 2023.
 from chsel.api import register
 from chsel.cost import RelaxedCost
 from chsel.cost_settings import CostSettings
+from chsel.engine import CompiledCost
 from chsel.errors import ChselError
 from chsel.mesh import load_mesh
 from chsel.points import KnownPoints, Workspace
@@ -16,6 +17,7 @@ from chsel.sdf import SdfGrid
 __all__ = [
     "ArchiveSnapshot",
     "ChselError",
+    "CompiledCost",
     "CostSettings",
     "Hypotheses",
     "KnownPoints",

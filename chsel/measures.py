@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +45,6 @@ class Measure:
         length = np.sqrt(sine**2 + cosine**2)
         spread = np.sqrt(-2.0 * logs(np.clip(length, 1e-300, 1.0)))
         return arctangents(sine, cosine), np.where(length > 1.0 - 1e-6, 0.0, spread)
-
-    def unwrapped(self, values: FloatArray, centre: FloatArray) -> FloatArray:
-        """Values (B, k) moved by whole turns to within half a turn of the centre (k,)."""
-        if not self.circular:
-            return values
-        turn = 2.0 * math.pi
-        return values - turn * np.round((values - centre) / turn)
 
 
 _SE3_ONLY = {

@@ -155,20 +155,13 @@ def _dot(left: Tensor, right: Tensor) -> Tensor:
     return products[:, 0:1] + products[:, 1:2] + products[:, 2:3]
 
 
-def moved_columns(rotation: Tensor, translation: Tensor, columns: Tensor) -> list[Tensor]:
-    """R x + t, as three times (B, N), of points (3, N) or (3, B, N) under B poses.
+def moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
+    """R x + t (..., 3) of rotations (..., 3, 3), translations (..., 3) and points (..., 3).
 
-    Written out, as a matrix product adds in an order that depends on the machine; by columns, as
-    (B, N, 3) takes three times as long.
+    Written out, as a matrix product adds in an order that depends on the machine.
     """
-    x, y, z = columns
-    return [
-        rotation[:, i, 0:1] * x
-        + rotation[:, i, 1:2] * y
-        + rotation[:, i, 2:3] * z
-        + translation[:, i : i + 1]
-        for i in range(3)
-    ]
+    columns = [rotation[..., i] * points[..., i, None] for i in range(3)]
+    return columns[0] + columns[1] + columns[2] + translation
 
 
 def as_tensor(value: Any, device: torch.device | str = "cpu") -> Tensor:

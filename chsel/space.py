@@ -12,7 +12,8 @@ from torch import Tensor
 from chsel.arrays import FloatArray, frozen
 from chsel.errors import SettingError
 from chsel.kernels.elementary import arctangents
-from chsel.kernels.pose import Space, decode_all
+from chsel.kernels.pose import Space, decode_all, matrix_of
+from chsel.kernels.region import triple
 from chsel.pose import as_tensor, compose, decode_6d, encode_9d, product, rotated, rotation_vector
 from chsel.sdf import SdfGrid
 
@@ -94,10 +95,16 @@ class SE2Space:
         self._hat_squared = as_tensor(np.outer(axis, axis) - np.eye(3))
         turning = product(self._hat.numpy(), self.resting_rotation)
         turning_squared = product(self._hat_squared.numpy(), self.resting_rotation)
-        matrices = (self.resting_rotation, turning, turning_squared)
-        vectors = (tuple(vector.tolist()) for vector in (axis, e_u, self.e_v))
-        flat = (tuple(matrix.reshape(-1).tolist()) for matrix in matrices)
-        self.arrays = Space(True, *vectors, *flat, offset=float(offset))
+        self.arrays = Space(
+            planar=True,
+            axis=triple(axis),
+            e_u=triple(e_u),
+            e_v=triple(self.e_v),
+            resting=matrix_of(self.resting_rotation),
+            turning=matrix_of(turning),
+            turning_squared=matrix_of(turning_squared),
+            offset=float(offset),
+        )
 
     def encode(self, object_from_world: FloatArray) -> FloatArray:
         """The plane poses nearest to transforms, by the Frobenius norm of the rotations."""

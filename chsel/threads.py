@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -13,6 +14,7 @@ import torch
 from chsel.kernels.arithmetic import require_ieee_arithmetic
 
 _SHARES = 4  # pieces per thread, so that none waits long for another
+_here = threading.local()
 
 
 def spread(run: Callable[[int, int, Any], None], count: int, scratch: Callable[[], Any]) -> None:
@@ -21,7 +23,7 @@ def spread(run: Callable[[int, int, Any], None], count: int, scratch: Callable[[
     scratch: makes what one thread works in. The pieces must not depend on each other.
     """
     threads = min(torch.get_num_threads(), count)
-    if threads <= 1:
+    if threads <= 1 or hasattr(_here, "works"):  # a worker must not wait for workers
         if count:
             run(0, count, scratch())
         return
@@ -40,7 +42,11 @@ def spread(run: Callable[[int, int, Any], None], count: int, scratch: Callable[[
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="chsel")
+    return ThreadPoolExecutor(threads, thread_name_prefix="chsel", initializer=_become_worker)
+
+
+def _become_worker() -> None:
+    _here.works = True
 
 
 if hasattr(os, "register_at_fork"):

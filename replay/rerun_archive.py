@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+from functools import cache
+from typing import NamedTuple
+
 import numpy as np
 import rerun as rr
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.problem import ArchiveSnapshot, Hypotheses
+from replay.rerun_clock import ITERATION, PROBE
 from replay.rerun_colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
 from replay.rerun_hypotheses import shown_hypotheses
-from replay.rerun_plane import Frame, Label, lines, on_screen, texts, ticks
+from replay.rerun_plane import Frame, Label, color_array, lines, on_screen, texts, ticks
 
 _FLATTEST = 4  # a map wider or higher than this has its shorter side stretched
+_MARK = (255, 255, 255)
+_AT_ONCE = 8  # snapshots that are sent together
 _BAR = (0.06, 0.11)  # left and right edge of the colour bar, beyond the map, in map widths
+
+
+class _Moment(NamedTuple):
+    """A snapshot as it is drawn; costs, colors: the bytes of the two pictures."""
+
+    step: int
+    moment: int
+    costs: bytes
+    colors: bytes
+    labels: list[Label]
 
 
 class ArchiveMap:
@@ -23,28 +39,65 @@ class ArchiveMap:
         self._root = root
         self._scale: CostScale | None = None
         self._last: ArchiveSnapshot | None = None
+        self._framed: Frame | None = None
+        self._waiting: list[_Moment] = []
 
     def start(self) -> None:
         """A registration starts, with a new archive: the marks on the last one are gone."""
+        self.send()
         self._scale = self._last = None
         self._mark(np.zeros((0, 2)), [])
 
-    def draw(self, step: int, archive: ArchiveSnapshot) -> None:
-        """The lowest cost in each cell, empty cells in grey; axes, colour bar and a caption."""
+    def draw(self, step: int, moment: int, archive: ArchiveSnapshot) -> None:
+        """The lowest cost in each cell, empty cells in grey; axes, colour bar and a caption.
+
+        moment: on the timeline of iterations. What is drawn is sent in blocks.
+        """
         scale = CostScale.of(-archive.objectives)
         scale = scale if self._scale is None else self._scale.including(scale)
         self._scale, self._last = scale, archive
         costs, frame = lowest_costs(archive), map_frame(archive)
-        # The costs lie under the colours, so that the viewer tells them where the mouse points.
-        self._log("cost", rr.Image(costs, color_model="L", draw_order=-30.0))
-        self._log("colors", rr.Image(heat_map(costs, scale), opacity=1.0, draw_order=-20.0))
-        self._log("frame", lines(frame.outline()))
-        self._log("axes", texts(_labels(archive, frame, scale, step)))
+        colors = heat_map(costs, scale)
+        if frame != self._framed:
+            self.send()
+            self._framed = frame
+            self._lay_out(frame, costs.shape, colors.shape[:2])
+        labels = _labels(archive, frame, scale, step)
+        self._waiting.append(_Moment(step, moment, costs.tobytes(), colors.tobytes(), labels))
+        if len(self._waiting) == _AT_ONCE:
+            self.send()
 
-    def mark(self, step: int, hypotheses: Hypotheses) -> None:
+    def send(self) -> None:
+        """Send what is drawn and not sent yet."""
+        drawn, self._waiting = self._waiting, []
+        if not drawn:
+            return
+        times = [
+            rr.TimeColumn(PROBE, sequence=[one.step for one in drawn]),
+            rr.TimeColumn(ITERATION, sequence=[one.moment for one in drawn]),
+        ]
+        costs = rr.Image.columns(buffer=[one.costs for one in drawn])
+        colors = rr.Image.columns(buffer=[one.colors for one in drawn])
+        labels = [label for one in drawn for label in one.labels]
+        axes = rr.Points2D.columns(
+            positions=np.array([label[:2] for label in labels], dtype=np.float32),
+            labels=[label[2] for label in labels],
+        ).partition([len(one.labels) for one in drawn])
+        for name, columns in (("cost", costs), ("colors", colors), ("axes", axes)):
+            self._stream.send_columns(f"{self._root}/{name}", times, columns)
+
+    def _lay_out(self, frame: Frame, costs: tuple[int, int], colors: tuple[int, int]) -> None:
+        """What stays from one snapshot to the next."""
+        # The costs lie under the colours, so that the viewer tells them where the mouse points.
+        self._log("cost", _layer(costs, "L", rr.ChannelDatatype.F32, -30.0))
+        self._log("colors", _layer(colors, "RGBA", rr.ChannelDatatype.U8, -20.0))
+        self._log("axes", texts([]))
+        self._log("frame", lines(frame.outline()))
+
+    def mark(self, step: int, moment: int, hypotheses: Hypotheses) -> None:
         """Mark the cells that the hypotheses come from, each with its cost."""
         if self._last is None and hypotheses.archive is not None:
-            self.draw(step, hypotheses.archive)
+            self.draw(step, moment, hypotheses.archive)
         if self._last is None:
             return
         shown = shown_hypotheses(hypotheses)
@@ -61,7 +114,7 @@ class ArchiveMap:
             places.astype(np.float32),
             labels=labels,
             show_labels=False,
-            colors=[(255, 255, 255)],
+            colors=color_array(_MARK),
             radii=on_screen(2.5),
         )
         self._log("hypotheses", points)
@@ -91,17 +144,33 @@ def lowest_costs(archive: ArchiveSnapshot) -> np.ndarray:
 
 def heat_map(costs: np.ndarray, scale: CostScale) -> ColorArray:
     """The picture (height, width', 4) of costs (height, width), with the colour bar beside it."""
-    height, width = costs.shape
-    empty = np.isnan(costs)
-    colors = cost_colors(scale.fraction(np.where(empty, scale.high, costs)))
-    colors[empty] = EMPTY_CELL
+    picture = _empty_map(*costs.shape).copy()
+    filled = ~np.isnan(costs)
+    picture[:, : costs.shape[1], :3][filled] = cost_colors(scale.fraction(costs[filled]))
+    return picture
+
+
+@cache
+def _empty_map(height: int, width: int) -> ColorArray:
+    """The picture of an archive without a solution."""
     left, right = _bar_edges(width)
     picture = np.zeros((height, right, 4), dtype=np.uint8)
-    picture[:, :width, :3] = colors
-    picture[:, :width, 3] = 255
+    picture[:, :width] = (*EMPTY_CELL, 255)
     picture[:, left:, :3] = cost_colors((np.arange(height) + 0.5) / height)[:, None]
     picture[:, left:, 3] = 255
     return picture
+
+
+def _layer(
+    shape: tuple[int, int], color_model: str, kind: rr.ChannelDatatype, draw_order: float
+) -> rr.Image:
+    """All of a picture but its pixels."""
+    height, width = shape
+    layout = rr.encodings.ImageFormat(
+        width, height, color_model=rr.ColorModel.auto(color_model), channel_datatype=kind
+    )
+    opacity = None if color_model == "L" else 1.0
+    return rr.Image.from_fields(format=layout, opacity=opacity, draw_order=draw_order)
 
 
 def _bar_edges(width: int) -> tuple[int, int]:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import rerun as rr
 
 PROBE = "probe"
@@ -32,6 +29,11 @@ class Clock:
         """Iterations of this registration so far, of all stages."""
         return self._now - self._first
 
+    @property
+    def moment(self) -> int:
+        """The present one on the timeline of iterations."""
+        return self._now
+
     def set_probe(self, step: int) -> None:
         """All that is logged from here on belongs to probe `step`."""
         self._step = step
@@ -48,13 +50,6 @@ class Clock:
         """A stage of this registration has done `iteration` iterations; stages come in turn."""
         start = self._stages.setdefault(stage, self._now)
         self._now = max(self._now, start + iteration)
-        self._set()
-
-    @contextmanager
-    def iterations_alone(self) -> Iterator[None]:
-        """What is logged within has no place on the timeline of probes."""
-        self._stream.disable_timeline(PROBE)
-        yield
         self._set()
 
     def _set(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +60,7 @@ _VIRIDIS = np.array(
     ],
     dtype=np.float64,
 )
+_PLACES = 1024  # of the map, of which no two neighbours differ by more than one level of a colour
 _FLOOR = 1e-4  # costs below this fraction of the highest one have the colour of the lowest
 
 
@@ -99,7 +101,15 @@ class CostScale:
 
 def cost_colors(fraction: ArrayLike) -> ColorArray:
     """Colours (..., 3) of places on a cost scale (...): bright where the cost is low."""
-    place = (1.0 - np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0)) * (len(_VIRIDIS) - 1)
+    place = np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0) * (_PLACES - 1)
+    colors: ColorArray = _color_map()[np.rint(place).astype(np.int64)]
+    return colors
+
+
+@cache
+def _color_map() -> ColorArray:
+    """The colours (_PLACES, 3) of a cost scale, from its lowest cost to its highest."""
+    place = np.linspace(len(_VIRIDIS) - 1, 0.0, _PLACES)
     steps = np.arange(len(_VIRIDIS))
     channels = [np.interp(place, steps, _VIRIDIS[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)

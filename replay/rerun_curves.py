@@ -7,11 +7,13 @@ import rerun as rr
 
 from chsel.problem import Hypotheses
 from replay.events import Traced
-from replay.rerun_colors import CURVES, FRAME, SERIES, CostScale, Rgb, number
+from replay.rerun_clock import ITERATION
+from replay.rerun_colors import CURVES, SERIES, CostScale, Rgb, number
 from replay.rerun_plane import Frame, Label, lines, texts, ticks
 
 SEARCH_FRAME = Frame(1.5, 1.0)
 _CURVE_NAMES = ("lowest", "median", "highest")
+_AT_ONCE = 64  # blocks of iterations that are sent together
 
 
 class Curves:
@@ -20,6 +22,7 @@ class Curves:
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._named: set[str] = set()
+        self._traced: list[tuple[int, tuple[float, float, float]]] = []
 
     def set_up(self) -> None:
         """The curves that every session has."""
@@ -51,10 +54,24 @@ class Curves:
         """Wall-clock time of a stage."""
         self._scalar(f"seconds/{stage.replace(' ', '_')}", stage.replace("_", " "), seconds)
 
-    def add_trace(self, traced: Traced) -> None:
-        """Costs of the search at this iteration."""
-        for name, value in zip(_CURVE_NAMES, traced.costs, strict=True):
-            self._scalar(f"search/{name}", name, float(value))
+    def add_trace(self, iteration: int, traced: Traced) -> None:
+        """Costs of the search at this moment of the timeline of iterations; sent in blocks."""
+        self._traced.append((iteration, traced.costs))
+        if len(self._traced) == _AT_ONCE:
+            self.send_traces()
+
+    def send_traces(self) -> None:
+        """Send what has not been sent yet. It has no place on the timeline of probes."""
+        iterations = np.array([iteration for iteration, _ in self._traced], dtype=np.int64)
+        costs = np.array([costs for _, costs in self._traced]).reshape(-1, len(_CURVE_NAMES))
+        self._traced = []
+        for column, name in enumerate(_CURVE_NAMES):
+            finite = np.isfinite(costs[:, column])
+            if finite.any():
+                self._style(f"search/{name}", name)
+                moments = rr.TimeColumn(ITERATION, sequence=iterations[finite])
+                values = rr.Scalars.columns(scalars=costs[finite, column])
+                self._stream.send_columns(f"search/{name}", [moments], values)
 
     def _scalar(self, entity: str, name: str, value: float) -> None:
         if not np.isfinite(value):
@@ -87,6 +104,7 @@ class SearchPlot:
         self._root = root
         self._points: list[tuple[int, tuple[float, float, float]]] = []
         self._stages: list[tuple[int, str]] = []
+        self._walls: list[list[tuple[float, float]]] = []  # between stages, as they were drawn last
 
     def start(self) -> None:
         """A registration starts."""
@@ -108,12 +126,14 @@ class SearchPlot:
         last = max(float(iterations[-1]), 1.0)
         x = SEARCH_FRAME.width * iterations / last
         y = (1.0 - scale.fraction(costs)) * SEARCH_FRAME.height
-        for column, name in enumerate(_CURVE_NAMES):
-            curve = lines([np.stack([x, y[:, column]], axis=1)], CURVES[name], width=2.0)
-            self._stream.log(f"{self._root}/{name}", curve)
+        strips = [np.stack([x, y[:, column]], axis=1) for column in range(len(_CURVE_NAMES))]
+        colors = [CURVES[name] for name in _CURVE_NAMES]
+        self._stream.log(f"{self._root}/curves", lines(strips, *colors, width=2.0))
         starts = [SEARCH_FRAME.width * first / last for first, _ in self._stages]
         walls = [[(start, 0.0), (start, SEARCH_FRAME.height)] for start in starts]
-        self._stream.log(f"{self._root}/frame", lines([*SEARCH_FRAME.outline(), *walls], FRAME))
+        if walls != self._walls:
+            self._walls = walls
+            self._stream.log(f"{self._root}/frame", lines([*SEARCH_FRAME.outline(), *walls]))
         labels = self._labels(step, scale, last)
         self._stream.log(f"{self._root}/axes", texts(labels))
 

@@ -32,6 +32,7 @@ class HypothesisMeshes:
     def __init__(self, stream: rr.RecordingStream, root: str = "scene/hypotheses") -> None:
         self._stream = stream
         self._root = root
+        self._hidden: set[str] = set()  # entities that show nothing, by what was logged last
 
     def set_up(self, mesh: trimesh.Trimesh) -> None:
         """Store the object's mesh once for each colour, and show none."""
@@ -63,7 +64,12 @@ class HypothesisMeshes:
 
     def _poses(self, entity: str, world_from_object: FloatArray, cost: FloatArray) -> None:
         if len(world_from_object) == 0:
+            if entity in self._hidden:
+                return
+            self._hidden.add(entity)
             world_from_object, cost = _HIDDEN, _NO_COST
+        else:
+            self._hidden.discard(entity)
         poses = rr.InstancePoses3D(
             translations=world_from_object[:, :3, 3].astype(np.float32),
             mat3x3=world_from_object[:, :3, :3].astype(np.float32),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -50,9 +52,17 @@ def ticks(lower: float, upper: float, *, most: int = 5) -> list[float]:
     return [lower, upper]
 
 
-def on_screen(radius: float) -> float:
-    """A radius in points of the screen, however far away, as the viewer takes it."""
-    return float(np.asarray(rr.Radius.ui_points(radius), dtype=np.float64))
+@cache
+def on_screen(radius: float) -> Any:
+    """One radius in points of the screen, however far away: an array that Rerun takes as it is."""
+    points = np.asarray(rr.Radius.ui_points(radius), dtype=np.float32).reshape(1)
+    return rr.components.RadiusBatch(points).as_arrow_array()
+
+
+@cache
+def color_array(*colors: Rgb) -> Any:
+    """Colours, the last of them for all further things: an array that Rerun takes as it is."""
+    return rr.components.ColorBatch(colors).as_arrow_array()
 
 
 def texts(labels: Sequence[Label], color: Rgb = TEXT) -> rr.Points2D:
@@ -60,15 +70,17 @@ def texts(labels: Sequence[Label], color: Rgb = TEXT) -> rr.Points2D:
     return rr.Points2D(
         np.array([label[:2] for label in labels], dtype=np.float32).reshape(-1, 2),
         labels=[label[2] for label in labels],
-        colors=[color] * len(labels),
-        radii=[on_screen(0.0)] * len(labels),
+        colors=color_array(color),
+        radii=on_screen(0.0),
         show_labels=True,
     )
 
 
-def lines(strips: Sequence[object], color: Rgb = FRAME, *, width: float = 1.0) -> rr.LineStrips2D:
-    """Line strips, each a sequence of (x, y), of a width in points of the screen."""
+def lines(strips: Sequence[object], *colors: Rgb, width: float = 1.0) -> rr.LineStrips2D:
+    """Line strips, each a sequence of (x, y), of a width in points of the screen.
+
+    colors: of each strip, the last for all further ones; FRAME if there is none.
+    """
     arrays = [np.asarray(strip, dtype=np.float32).reshape(-1, 2) for strip in strips]
-    return rr.LineStrips2D(
-        arrays, colors=[color] * len(arrays), radii=[on_screen(width / 2)] * len(arrays)
-    )
+    drawn = color_array(*(colors or (FRAME,)))
+    return rr.LineStrips2D(arrays, colors=drawn, radii=on_screen(width / 2))

@@ -60,6 +60,8 @@ class RerunRecorder(Recorder):
 
     def flush(self) -> None:
         """Hand all events so far to the operating system, and to the viewer if there is one."""
+        self._curves.send_traces()
+        self._archive.send()
         try:
             self._stream.flush(timeout_sec=_FLUSH_SECONDS)
         except RuntimeError as error:
@@ -124,21 +126,20 @@ class RerunRecorder(Recorder):
     @_draw.register
     def _(self, event: events.SnapshotTaken) -> None:
         self._clock.advance(f"archive {event.archive.refinement}", event.archive.iteration)
-        self._archive.draw(event.step, event.archive)
+        self._archive.draw(event.step, self._clock.moment, event.archive)
         self._fit_layout(event.archive)
 
     @_draw.register
     def _(self, event: events.Traced) -> None:
         self._clock.advance(event.stage, event.iteration)
         self._search.add(self._clock.iteration, event)
-        with self._clock.iterations_alone():
-            self._curves.add_trace(event)
+        self._curves.add_trace(self._clock.moment, event)
 
     @_draw.register
     def _(self, event: events.HypothesesFound) -> None:
         self._meshes.draw(event.hypotheses)
         self._legend.draw(event.hypotheses)
-        self._archive.mark(event.step, event.hypotheses)
+        self._archive.mark(event.step, self._clock.moment, event.hypotheses)
         self._fit_layout(event.hypotheses.archive)
         self._curves.add_hypotheses(event.hypotheses)
         self._search.draw(event.step)

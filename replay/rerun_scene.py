@@ -21,7 +21,7 @@ from replay.rerun_colors import (
     PAST,
     Rgb,
 )
-from replay.rerun_plane import on_screen
+from replay.rerun_plane import color_array, on_screen
 
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
@@ -35,6 +35,7 @@ class Scene:
         self._stream = stream
         self._root = root
         self._normal_length = 0.0
+        self._empty: set[str] = set()  # entities that show nothing, by what was logged last
 
     def set_up(
         self, mesh: trimesh.Trimesh, workspace: Workspace, world_from_object: FloatArray | None
@@ -46,8 +47,8 @@ class Scene:
         box = rr.Boxes3D(
             mins=[lower],
             sizes=[upper - lower],
-            colors=[FRAME],
-            radii=[on_screen(0.6)],
+            colors=color_array(FRAME),
+            radii=on_screen(0.6),
             fill_mode="MajorWireframe",
         )
         self._log("workspace", box, static=True)
@@ -74,24 +75,33 @@ class Scene:
         path = probe.gripper_path[:, :3, 3].astype(np.float32)
         self._log("gripper/past", _path(path, PAST, 0.8))
         self._log("gripper/path", _path(path, GRIPPER, 1.6))
-        end = path[-1:]
-        self._log("gripper/end", rr.Points3D(end, colors=[GRIPPER], radii=on_screen(4.0)))
+        self._points("gripper/end", probe.gripper_path[-1:, :3, 3], GRIPPER, size=4.0)
         self._normals(probe)
         self._points("contacts/new", probe.contacts, CONTACT, size=6.5)
 
     def _normals(self, probe: Probe) -> None:
         known = np.abs(probe.contact_normals).sum(axis=1) > 0.0
+        if self._stays_empty("contacts/normals", not known.any()):
+            return
         arrows = rr.Arrows3D(
             origins=probe.contacts[known].astype(np.float32),
             vectors=(self._normal_length * probe.contact_normals[known]).astype(np.float32),
-            colors=[CONTACT],
+            colors=color_array(CONTACT),
             radii=on_screen(1.2),
         )
         self._log("contacts/normals", arrows)
 
     def _points(self, name: str, points: FloatArray, color: Rgb, *, size: float) -> None:
+        if self._stays_empty(name, len(points) == 0):
+            return
         positions = np.ascontiguousarray(points, dtype=np.float32)
-        self._log(name, rr.Points3D(positions, colors=[color], radii=on_screen(size)))
+        self._log(name, rr.Points3D(positions, colors=color_array(color), radii=on_screen(size)))
+
+    def _stays_empty(self, name: str, empty: bool) -> bool:
+        """Whether there is nothing to log about an entity, which was empty and is so now."""
+        before = name in self._empty
+        (self._empty.add if empty else self._empty.discard)(name)
+        return empty and before
 
     def _log(
         self, name: str, what: rr.AsComponents, *more: rr.AsComponents, static: bool = False
@@ -111,4 +121,4 @@ def display_mesh(mesh: trimesh.Trimesh, color: tuple[int, int, int, int]) -> rr.
 
 def _path(path: np.ndarray, color: Rgb, width: float) -> rr.LineStrips3D:
     strips = [path] if len(path) > 1 else []
-    return rr.LineStrips3D(strips, colors=[color], radii=on_screen(width / 2))
+    return rr.LineStrips3D(strips, colors=color_array(color), radii=on_screen(width / 2))

@@ -13,6 +13,7 @@ import yaml
 from omegaconf import DictConfig
 from rich.console import Console
 
+from chsel.device import device_named, gpus
 from chsel.errors import require_choice, require_positive
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
@@ -33,7 +34,8 @@ class BenchmarkConfig:
     """conf/benchmark.yaml, checked.
 
     problems: which to register. alone: what else to measure of this library. free_points,
-    hypotheses: the sizes that show how the time grows.
+    hypotheses: the sizes that show how the time grows. device: where evaluation takes many poses,
+    besides the processor.
     """
 
     problems: tuple[str, ...]
@@ -43,6 +45,7 @@ class BenchmarkConfig:
     package: PackageConfig
     steps: Steps
     logs: str
+    device: str = "auto"
     repeats: int = 5
     seed: int = 0
     quick: bool = False
@@ -57,6 +60,14 @@ class BenchmarkConfig:
             require_choice("problem", problem, PROBLEMS)
         for measure in self.alone:
             require_choice("alone", measure, MEASURES)
+        require_choice("device", self.device, ("auto", "cpu", "cuda"))
+        if self.device == "cuda":
+            device_named("cuda")
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether a GPU is measured, too."""
+        return self.device == "cuda" or (self.device == "auto" and gpus() > 0)
 
     def shortened(self) -> BenchmarkConfig:
         """As much as takes under a minute; its times are no ones to quote."""
@@ -135,7 +146,12 @@ def _run(
             ]
             write()
         scope = Scope(
-            config.steps, config.repeats, config.seed, config.free_points, config.hypotheses
+            config.steps,
+            config.repeats,
+            config.seed,
+            config.free_points,
+            config.hypotheses,
+            config.on_gpu,
         )
         for name in config.alone:
             status.update(f"measuring {name}")

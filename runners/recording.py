@@ -15,9 +15,10 @@ import numpy as np
 from chsel.arrays import FloatArray, digest
 from chsel.errors import RecordingError, require_positive
 from chsel.problem import ArchiveSnapshot
+from replay.background_recorder import BackgroundRecorder
 from replay.events import Recorder, SnapshotTaken, Traced
 from replay.mcap_writer import McapRecorder
-from replay.recorder import TeeRecorder
+from replay.recorder import NullRecorder, TeeRecorder
 from replay.rerun_recorder import RerunRecorder
 
 
@@ -56,14 +57,14 @@ def make_run_folder(logs: Path, *names: str) -> Path:
 
 
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
-    """A recorder to all files that `config` asks for, none of them included."""
+    """A recorder, working beside the run, to all files that `config` asks for."""
     recorders: list[Recorder] = []
     if config.mcap:
         recorders.append(McapRecorder(folder / "recording.mcap"))
     if config.rerun or config.live:
         path = folder / "recording.rrd" if config.rerun else None
         recorders.append(RerunRecorder(path, live=config.live))
-    return TeeRecorder(recorders)
+    return BackgroundRecorder(TeeRecorder(recorders)) if recorders else NullRecorder()
 
 
 class StepObserver:

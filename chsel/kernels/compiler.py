@@ -16,13 +16,15 @@ from typing import Any, TypeVar
 import llvmlite
 import llvmlite.binding
 import numba
-from numba.core import config, event
+from numba.core import event
 
 from chsel.errors import EngineError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 CACHE_VARIABLE = "CHSEL_CACHE_DIR"
+config: Any = numba.core.config
+_njit: Any = numba.njit  # its types leave out some options
 _log = logging.getLogger(__name__)
 
 
@@ -34,7 +36,7 @@ def compiled(function: Function) -> Function:
     previous = config.CACHE_DIR
     config.CACHE_DIR = str(cache_directory())
     try:
-        made: Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        made: Function = _njit(cache=True, nogil=True, error_model="numpy")(function)
         return made
     finally:
         config.CACHE_DIR = previous
@@ -45,13 +47,13 @@ def inner(function: Function) -> Function:
 
     It cannot make arrays, so that nothing is counted when arrays change hands.
     """
-    made: Function = numba.njit(**_INNER)(function)
+    made: Function = _njit(**_INNER)(function)
     return made
 
 
 def leaf(function: Function) -> Function:
     """Like `inner`, and always made part of its caller."""
-    made: Function = numba.njit(**_INNER, forceinline=True)(function)
+    made: Function = _njit(**_INNER, forceinline=True)(function)
     return made
 
 
@@ -80,12 +82,17 @@ def cache_directory() -> Path:
                 "compiled kernels, or nothing"
             )
         return directory
-    temporary = Path(tempfile.gettempdir()) / f"chsel-{getpass.getuser()}"
+    temporary = Path(tempfile.gettempdir()) / f"chsel-{_user()}"
     for place in (_user_cache() / "chsel" / "kernels", temporary):
         directory = place / _fingerprint()
         if _writable(directory) and _private(place):
             return directory
     return Path(tempfile.mkdtemp(prefix="chsel-"))
+
+
+def _user() -> str:
+    """A name for who runs this; a number where the user may have no name, as in a container."""
+    return getpass.getuser() if sys.platform == "win32" else str(os.getuid())
 
 
 def _user_cache() -> Path:

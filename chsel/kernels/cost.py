@@ -83,20 +83,12 @@ def neighbours_of(model: Model) -> Neighbours:
 
 
 @leaf
-def evaluate(model, pose, near):  # type: ignore[no-untyped-def]
-    """The cost of a pose and its gradient, 13 sums; an infinite cost if it is not finite."""
-    near.memory[0] = -1.0
-    return _evaluate(model, pose, near, 0.0)
+def evaluate(model, pose, near, most_slack):  # type: ignore[no-untyped-def]
+    """The cost of a pose and its gradient, 13 sums; an infinite cost if it is not finite.
 
-
-@leaf
-def evaluate_nearby(model, pose, near):  # type: ignore[no-untyped-def]
-    """The same as `evaluate`, to the bit; faster for a sequence of poses close to each other."""
-    return _evaluate(model, pose, near, MOST_SLACK)
-
-
-@leaf
-def _evaluate(model, pose, near, most_slack):  # type: ignore[no-untyped-def]
+    most_slack: MOST_SLACK in a sequence of poses close to each other, which is faster then; 0.0
+    otherwise. The result is the same to the bit.
+    """
     free, found, memory = model.free, near.found, near.memory
     if not finite(pose):
         memory[0] = -1.0

@@ -6,7 +6,8 @@ import numpy as np
 
 from chsel.kernels.adam import BETA1, BETA2, EPSILON, adam_step
 from chsel.kernels.compiler import compiled
-from chsel.kernels.objective import nearby_cost_and_gradient_of
+from chsel.kernels.cost import MOST_SLACK, evaluate
+from chsel.kernels.pose import decode, pull_back
 
 
 @compiled
@@ -16,14 +17,16 @@ def descend(model, space, vectors, rate, divisor, iterations, first, last, work)
     divisor: what gradients are divided by.
     """
     dimension = vectors.shape[1]
+    near = work.near
     gradient, moments = np.empty(dimension), np.empty((2, dimension))
     for n in range(first, last):
         vector = vectors[n]
         moments[:] = 0.0
         power1 = power2 = 1.0
-        work.near.memory[0] = -1.0
+        near.memory[0] = -1.0
         for _ in range(iterations):
-            nearby_cost_and_gradient_of(model, space, vector, gradient, work)
+            sums = evaluate(model, decode(space, vector), near, MOST_SLACK)
+            pull_back(space, vector, sums[4:13] + sums[1:4], gradient)
             power1 *= BETA1
             power2 *= BETA2
             for j in range(dimension):

@@ -49,9 +49,10 @@ def lattice_of(tree: Tree, spacing: float, region: Region) -> Lattice | None:
         return None
     origin = points.min(axis=1) - spacing
     shape = np.rint((points.max(axis=1) - origin) / spacing) + 2.0
-    if not np.prod(shape) <= _MOST_NODES_PER_POINT * points.shape[1] + 1e6:
+    nodes_of_lattice = float(shape[0] * shape[1] * shape[2])
+    if not nodes_of_lattice <= _MOST_NODES_PER_POINT * points.shape[1] + 1e6:
         return None
-    point_at = np.full(int(np.prod(shape)), -1, dtype=np.int32)
+    point_at = np.full(int(nodes_of_lattice), -1, dtype=np.int32)
     if not _fill(points, origin, spacing, triple(shape), _TOLERANCE, point_at):
         return None
     box = box_of(origin, spacing, shape)

@@ -15,7 +15,7 @@ class MeasureCode(NamedTuple):
     """Which measure: its kind, its numbers k, and for kind VECTOR the first entry it takes."""
 
     kind: int
-    count: int
+    size: int
     first: int = 0
 
 
@@ -24,10 +24,10 @@ def measures_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
     """Fill out (k,) with the measures of a search vector (d,)."""
     pose = decode(space, vector)
     if measure.kind == VECTOR:
-        for i in range(measure.count):
+        for i in range(measure.size):
             out[i] = vector[measure.first + i]
     elif measure.kind == TRANSLATION:
-        for i in range(measure.count):
+        for i in range(measure.size):
             out[i] = pose[9 + i]
     elif measure.kind == OBJECT_POSITION:  # p = -R^T t
         for i in range(2):
@@ -40,13 +40,13 @@ def measures_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
 def measure_gradients_of(space, measure, vector, out):  # type: ignore[no-untyped-def]
     """Fill out (k, d) with the gradients of the measures by a search vector (d,)."""
     if measure.kind == VECTOR:
-        for i in range(measure.count):
+        for i in range(measure.size):
             for j in range(len(vector)):
                 out[i, j] = 1.0 if j == measure.first + i else 0.0
         return
     r = decode(space, vector)
     none = 0.0
-    for i in range(measure.count):
+    for i in range(measure.size):
         first, second, third = _is(i, 0), _is(i, 1), _is(i, 2)
         if measure.kind == TRANSLATION:
             by_rotation = (none, none, none, none, none, none, none, none, none)

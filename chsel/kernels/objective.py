@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from chsel.kernels.compiler import compiled, leaf
-from chsel.kernels.cost import Model, Neighbours, evaluate, evaluate_nearby, neighbours_of
+from chsel.kernels.cost import Model, Neighbours, evaluate, neighbours_of
 from chsel.kernels.measures import measure_gradients_of, measures_of
 from chsel.kernels.pose import decode, pose_at, pull_back
 
@@ -26,21 +26,13 @@ def work_for(model: Model) -> Work:
 @leaf
 def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
     """The cost of a search vector (d,)."""
-    return evaluate(model, decode(space, vector), work.near)[0]
+    return evaluate(model, decode(space, vector), work.near, 0.0)[0]
 
 
 @leaf
 def cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[no-untyped-def]
     """The cost of a search vector (d,); fills its gradient (d,)."""
-    sums = evaluate(model, decode(space, vector), work.near)
-    pull_back(space, vector, sums[4:13] + sums[1:4], gradient)
-    return sums[0]
-
-
-@leaf
-def nearby_cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[no-untyped-def]
-    """The same to the bit; faster for a sequence of vectors close to each other."""
-    sums = evaluate_nearby(model, decode(space, vector), work.near)
+    sums = evaluate(model, decode(space, vector), work.near, 0.0)
     pull_back(space, vector, sums[4:13] + sums[1:4], gradient)
     return sums[0]
 
@@ -49,7 +41,7 @@ def nearby_cost_and_gradient_of(model, space, vector, gradient, work):  # type: 
 def costs_of_poses(model, poses, out, first, last, work):  # type: ignore[no-untyped-def]
     """Fill out (B,) with the costs of poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
-        out[n] = evaluate(model, pose_at(poses, n), work.near)[0]
+        out[n] = evaluate(model, pose_at(poses, n), work.near, 0.0)[0]
 
 
 @compiled

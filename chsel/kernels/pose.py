@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from chsel.arrays import FloatArray
 from chsel.kernels.compiler import compiled, leaf
 from chsel.kernels.elementary import sine_cosine
 
@@ -17,7 +18,7 @@ _SHORTEST = 1e-12  # vectors are divided by at least this
 
 Triple = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
-_NO_MATRIX: Matrix = (0.0,) * 9  # type: ignore[assignment]
+_NO_MATRIX: Matrix = (0.0,) * 9
 
 
 class Space(NamedTuple):
@@ -35,6 +36,12 @@ class Space(NamedTuple):
     turning: Matrix = _NO_MATRIX
     turning_squared: Matrix = _NO_MATRIX
     offset: float = 0.0
+
+
+def matrix_of(rotation: FloatArray) -> Matrix:
+    """A matrix (3, 3) as nine numbers."""
+    a, b, c, d, e, f, g, h, i = (float(value) for value in rotation.reshape(-1))
+    return a, b, c, d, e, f, g, h, i
 
 
 @leaf

@@ -100,9 +100,9 @@ def locate(move, box, x, y, z, places, count):  # type: ignore[no-untyped-def]
         a = move[0] * x[n] + move[1] * y[n] + move[2] * z[n] + move[9]
         b = move[3] * x[n] + move[4] * y[n] + move[5] * z[n] + move[10]
         c = move[6] * x[n] + move[7] * y[n] + move[8] * z[n] + move[11]
-        d = min(max(a, first[0]), last[0])
-        e = min(max(b, first[1]), last[1])
-        f = min(max(c, first[2]), last[2])
+        d = min(max(first[0], a), last[0])  # in this order, nan ends up in the box
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
         beyond[n] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
         a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
         d = _node(a, box.between, most[0])

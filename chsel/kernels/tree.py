@@ -17,7 +17,7 @@ from chsel.kernels.region import Places, locate, places_for
 
 _LEAF_SIZE = 4  # points in a leaf at least, in the mean
 _TOP_SIZE = 64  # nodes of the uppermost level at most
-_SUBDIVISION = 16  # cells of the finest level per spacing of the points, and a power of two
+_SUBDIVISION = 4  # cells of the finest level per spacing of the points, and a power of two
 _RADIX_BITS = 11
 
 
@@ -53,9 +53,9 @@ class Found(NamedTuple):
 
 def found_for(size: int) -> Found:
     """Scratch for so many points and nodes."""
-    numbers = (np.empty(size) for _ in range(4))
-    integers = (np.empty(size, dtype=np.int32) for _ in range(2))
-    return Found(*numbers, places_for(size), *integers)
+    x, y, z, radius = (np.empty(size) for _ in range(4))
+    nodes, kept = (np.empty(size, dtype=np.int32) for _ in range(2))
+    return Found(x, y, z, radius, places_for(size), nodes, kept)
 
 
 def octree(points: FloatArray, spacing: float) -> Tree:
@@ -74,7 +74,7 @@ def octree(points: FloatArray, spacing: float) -> Tree:
     if not extent < np.inf:
         raise PointsError(f"points span {extent} m; accepted: a finite extent")
     index_bits = count.bit_length()
-    most = 2.0 ** ((63 - index_bits) // 3) - 1.0
+    most = float((1 << (63 - index_bits) // 3) - 1)
     quantum = spacing / _SUBDIVISION
     while extent / quantum >= most:
         quantum *= 2.0

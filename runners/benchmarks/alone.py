@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from chsel.arrays import FloatArray
@@ -28,18 +29,20 @@ _PROBLEM = "real_20"
 _THREADS = (1, 2)
 _POSES = 100_000
 _POSES_AT_ONCE = 1000
+_POSES_ON_GPU = (100_000, 1_000_000, 10_000_000)
 _LONGEST = 3.0  # seconds
 
 
 @dataclass(frozen=True)
 class Scope:
-    """How much is measured."""
+    """How much is measured, and where evaluation is."""
 
     steps: Steps
     repeats: int
     seed: int
     free_points: tuple[int, ...]
     hypotheses: tuple[int, ...]
+    gpu: bool = False
 
     def timed(self, problem: Problem, preset: str) -> tuple[float, ...]:
         """Milliseconds of repeated registrations of a problem, after one that is not counted."""
@@ -103,7 +106,10 @@ def hypotheses(scope: Scope) -> Iterator[Row]:
 
 
 def evaluation(scope: Scope) -> Iterator[Row]:
-    """Poses evaluated in a second, without gradients: as the methods do, and as torch does."""
+    """Poses evaluated in a second, without gradients: as the methods do, and as torch does.
+
+    On a GPU, many poses in one call, which takes them there and the costs back.
+    """
     posed = pose(PROBLEMS[_PROBLEM], scope.seed)
     problem = posed.registration_problem()
     settings = OnlineSettings(hypotheses=_POSES)
@@ -117,6 +123,19 @@ def evaluation(scope: Scope) -> Iterator[Row]:
             evaluate(poses[:_POSES_AT_ONCE])
             rates = tuple(_rate(evaluate, poses, scope.repeats) for _ in range(scope.repeats))
             yield Row("evaluation", case, preset, "poses/s", rates)
+        for count in _POSES_ON_GPU if scope.gpu else ():
+            many = np.resize(poses, (count, 4, 4))
+            on_gpu = RelaxedCost.of(problem, COST[preset], device="cuda").evaluate
+            on_gpu(many[:_POSES])
+            rates = tuple(count / _seconds(on_gpu, many) for _ in range(scope.repeats))
+            case = f"torch, GPU, {count} poses"
+            yield Row("evaluation", case, preset, "poses/s", rates, float(count))
+
+
+def _seconds(evaluate: Callable[[FloatArray], FloatArray], poses: FloatArray) -> float:
+    begun = time.perf_counter()
+    evaluate(poses)
+    return time.perf_counter() - begun
 
 
 def _rate(evaluate: Callable[[FloatArray], FloatArray], poses: FloatArray, repeats: int) -> float:

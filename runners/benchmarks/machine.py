@@ -8,14 +8,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from chsel.device import gpus
 from runners.environment import environment
 
 _PACKAGES = ("numba", "llvmlite", "scipy")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, Python and versions."""
+    """Processor, cores, GPU, Python and versions."""
     values: dict[str, Any] = {**environment(), "cores": os.cpu_count(), "cores_usable": cores()}
+    values["gpu"] = torch.cuda.get_device_name() if gpus() else None
     for name in _PACKAGES:
         try:
             values[f"package {name}"] = importlib.metadata.version(name)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
+from chsel.engine import CompiledCost
 from chsel.errors import SettingError
 from chsel.objective import Objective
 from chsel.pose import compose, random_rotations
@@ -61,6 +62,10 @@ def test_terms_of_a_sphere_have_their_closed_form(
     found, slope = value_and_translation_gradient(sphere, points, lookup=lookup)
     assert found == pytest.approx(value, abs=1e-9)
     np.testing.assert_allclose(slope, gradient, atol=1e-9)
+    objective = Objective(CompiledCost(sphere, points, CostSettings(lookup=lookup)), SE3Space())
+    costs, gradients = objective.costs_and_gradients(SE3Space().encode(np.eye(4)[None]))
+    assert costs[0] == pytest.approx(value, abs=1e-9)
+    np.testing.assert_allclose(gradients[0, 6:], gradient, atol=1e-9)
 
 
 def test_dead_band_shrinks_the_difference_towards_zero(sphere: SdfGrid) -> None:
@@ -100,13 +105,13 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
         known=stream.uniform(-0.2, 0.2, (9, 3)),
         known_sdf=stream.uniform(-0.02, 0.02, 9),
     )
-    cost = RelaxedCost(
-        sphere, points, CostSettings(free_term=free_term, lookup="nearest"), free_resolution=0.02
-    )
+    changes = CostSettings(free_term=free_term, lookup="nearest")
+    cost = RelaxedCost(sphere, points, changes, free_resolution=0.02)
+    compiled = CompiledCost(sphere, points, changes, free_resolution=0.02)
     space = SE3Space()
     vector = space.encode(compose(random_rotations(stream, 1), stream.uniform(-0.02, 0.02, (1, 3))))
     vector[:, :6] *= 1.3  # raw vectors are not orthonormal
-    _, gradient = Objective(cost, space).costs_and_gradients(vector)
+    _, gradient = Objective(compiled, space).costs_and_gradients(vector)
     expected = np.zeros(9)
     moved, point_gradients = point_gradients_by_hand(cost, sphere, points, vector, free_term)
     for i in range(9):
@@ -116,6 +121,10 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
         slope = (moved(ahead) - moved(behind)) / 2e-6
         expected[i] = (slope * point_gradients).sum()
     np.testing.assert_allclose(gradient[0], expected, rtol=1e-6, atol=1e-8)
+    leaf = torch.tensor(vector, requires_grad=True)
+    cost(*space.decode(leaf)).backward()
+    assert leaf.grad is not None
+    np.testing.assert_allclose(leaf.grad[0], expected, rtol=1e-6, atol=1e-8)
 
 
 def point_gradients_by_hand(cost, sphere, points, vector, free_term):  # type: ignore[no-untyped-def]

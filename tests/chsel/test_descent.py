@@ -1,95 +1,172 @@
 from __future__ import annotations
 
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
+import trimesh
+from torch import Tensor
 
-from chsel.adam import Adam
+from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
+from chsel.arrays import FloatArray
 from chsel.descent import DescentSettings, descend
+from chsel.engine import CompiledCost
 from chsel.errors import SettingError
+from chsel.objective import Objective
 from chsel.observer import NullObserver
 from chsel.pose import compose, random_rotations
-from chsel.space import SE3Space
+from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+
+SIDES = np.array([0.12, 0.08, 0.06])
+BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)
 
 
-class Bowl:
-    """Cost |t - (1, 2, 3)|^2, whatever the rotation."""
+def starts(count: int, seed: int = 0, reach: float = 0.02) -> FloatArray:
+    stream = np.random.default_rng(seed)
+    return compose(random_rotations(stream, count), stream.uniform(-reach, reach, (count, 3)))
 
-    space = SE3Space()
-    centre = np.array([1.0, 2.0, 3.0])
 
-    def costs(self, vectors: np.ndarray) -> np.ndarray:
-        return ((vectors[:, 6:] - self.centre) ** 2).sum(axis=1)
+def scene(seed: int = 0) -> KnownPoints:
+    stream = np.random.default_rng(seed)
+    near = stream.uniform(-0.08, 0.08, (200, 3))
+    return KnownPoints(near[:150], near[150:160], near[160:], stream.uniform(-0.01, 0.01, 40))
 
-    def costs_and_gradients(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        gradient = np.zeros_like(vectors)
-        gradient[:, 6:] = 2.0 * (vectors[:, 6:] - self.centre)
-        return self.costs(vectors), gradient
+
+def contacts() -> Objective:
+    """One contact, so that many poses cost nothing."""
+    return Objective(CompiledCost(BOX, KnownPoints(known=[[0.02, 0.0, 0.01]])), SE3Space())
 
 
 class Blocks(NullObserver):
     def __init__(self) -> None:
         self.iterations: list[int] = []
+        self.traced: list[tuple[FloatArray, FloatArray]] = []
+        self.total = 0
 
-    def trace(self, stage: str, iteration: int, vectors: np.ndarray, cost: np.ndarray) -> None:
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
         self.iterations.append(iteration)
+        self.traced.append((vectors, cost))
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        assert stage == "descent"
+        assert done == self.iterations[-1]
+        self.total = total
 
 
-def starts(count: int) -> np.ndarray:
-    stream = np.random.default_rng(0)
-    return compose(random_rotations(stream, count), stream.uniform(-0.1, 0.1, (count, 3)))
-
-
-def test_adam_takes_the_steps_of_torch() -> None:
-    stream = np.random.default_rng(0)
-    ours = stream.standard_normal((4, 3))
-    theirs = torch.tensor(ours, requires_grad=True)
-    optimizer = torch.optim.Adam([theirs], lr=0.03)
-    adam = Adam(0.03)
-    for _ in range(50):
-        gradient = stream.standard_normal((4, 3))
-        ours = ours - adam.step(gradient)
-        theirs.grad = torch.tensor(gradient)
+def descended_by_torch(
+    cost: RelaxedCost, space: SearchSpace, vectors: FloatArray, rate: float, iterations: int
+) -> FloatArray:
+    """torch.optim.Adam on the mean of the costs."""
+    leaves: Tensor = torch.tensor(vectors, requires_grad=True)
+    optimizer = torch.optim.Adam([leaves], lr=rate)
+    for _ in range(iterations):
+        optimizer.zero_grad()
+        cost(*space.decode(leaves)).mean().backward()
         optimizer.step()
-    np.testing.assert_allclose(ours, theirs.detach().numpy(), rtol=1e-12)
+    return leaves.detach().numpy()
 
 
-def test_descent_finds_the_bottom_from_every_start() -> None:
-    bowl: Any = Bowl()
-    settings = DescentSettings(restarts=30, iterations=50, rate=0.03)
-    poses, costs = descend(bowl, starts(5), settings, NullObserver())
-    np.testing.assert_allclose(poses[:, :3, 3], np.tile(Bowl.centre, (5, 1)), atol=0.02)
-    np.testing.assert_allclose(costs, bowl.costs(SE3Space().encode(poses)), rtol=1e-12)
+@pytest.mark.parametrize("plane", [False, True])
+@pytest.mark.parametrize(("free_term", "lookup"), [
+    ("direct", "trilinear"), ("direct", "nearest"), ("interior", "trilinear"),
+])  # fmt: skip
+def test_descent_takes_the_steps_of_torch(free_term: str, lookup: str, plane: bool) -> None:
+    space: SearchSpace = SE3Space()
+    if plane:
+        space = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.0), BOX)
+    changes = CostSettings(free_term=free_term, lookup=lookup)
+    points, vectors = scene(), space.encode(starts(6))
+    expected = descended_by_torch(RelaxedCost(BOX, points, changes), space, vectors, 0.001, 30)
+    assert np.abs(expected - vectors).max() > 0.01
+    objective = Objective(CompiledCost(BOX, points, changes), space)
+    found = objective.descended(vectors, len(vectors), 0.001, 30)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+
+
+def test_no_iteration_moves_nothing_and_one_moves_each_number_by_the_rate() -> None:
+    objective, vectors = contacts(), SE3Space().encode(starts(4))
+    np.testing.assert_array_equal(objective.descended(vectors, 4.0, 0.01, 0), vectors)
+    _, gradients = objective.costs_and_gradients(vectors)
+    step = vectors - objective.descended(vectors, 1.0, 0.01, 1)
+    expected = 0.01 * gradients / (np.abs(gradients) + 1e-8)  # Adam's first step
+    np.testing.assert_allclose(step, expected, rtol=1e-9, atol=1e-14)
+
+
+def test_descent_moves_the_surface_onto_the_contacts() -> None:
+    """Poses at rest: |s| = 0 for contacts in the middles of all six faces."""
+    middles = np.concatenate([np.diag(SIDES / 2.0), -np.diag(SIDES / 2.0)])
+    objective = Objective(CompiledCost(BOX, KnownPoints(known=middles)), SE3Space())
+    turned = starts(5)
+    turned[:, :3, :3] = rotations_near_identity(5)
+    before = objective.costs(SE3Space().encode(turned))
+    settings = DescentSettings(restarts=20, iterations=50, rate=0.002)
+    poses, costs = descend(objective, turned, settings, NullObserver())
+    assert (costs < 0.1 * before).all()
+    np.testing.assert_allclose(poses[:, :3, 3], 0.0, atol=0.006)
+    np.testing.assert_array_equal(costs, objective.costs(SE3Space().encode(poses)))
+
+
+def rotations_near_identity(count: int) -> FloatArray:
+    rows = np.eye(3)[None] + np.random.default_rng(1).uniform(-0.1, 0.1, (count, 3, 3))
+    vectors = torch.tensor(np.concatenate([rows[:, :2].reshape(-1, 6), rows[:, 2]], axis=1))
+    return SE3Space().decode(vectors)[0].numpy()
+
+
+def test_descent_reports_every_block_as_it_stands() -> None:
+    objective, blocks = contacts(), Blocks()
+    settings = DescentSettings(restarts=4, iterations=5, rate=0.001, stop_below=None)
+    poses, costs = descend(objective, starts(3), settings, blocks)
+    assert blocks.iterations == [5, 10, 15, 20]
+    assert blocks.total == 20
+    for vectors, cost in blocks.traced:
+        np.testing.assert_array_equal(cost, objective.costs(vectors))
+        rows = vectors[:, :6].reshape(-1, 2, 3)
+        products = rows @ rows.transpose(0, 2, 1)
+        np.testing.assert_allclose(products, np.tile(np.eye(2), (3, 1, 1)), atol=1e-14)
+    np.testing.assert_allclose(SE3Space().encode(poses), blocks.traced[-1][0], atol=1e-15)
+    np.testing.assert_array_equal(costs, blocks.traced[-1][1])
 
 
 def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to() -> None:
-    bowl: Any = Bowl()
-    at_the_bottom = compose(
-        random_rotations(np.random.default_rng(0), 3), np.tile(Bowl.centre, (3, 1))
-    )
+    free = KnownPoints(free=[[1.0, 1.0, 1.0]])  # costs nothing anywhere near
+    objective = Objective(CompiledCost(BOX, free), SE3Space())
     stopping, going = Blocks(), Blocks()
-    descend(bowl, at_the_bottom, DescentSettings(), stopping)
-    descend(bowl, at_the_bottom, DescentSettings(stop_below=None), going)
+    descend(objective, starts(3), DescentSettings(), stopping)
+    descend(objective, starts(3), DescentSettings(stop_below=None), going)
     assert stopping.iterations == [50]
     assert going.iterations == list(range(50, 501, 50))
 
 
+def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> None:
+    objective = contacts()
+    blocks = Blocks()
+    settings = DescentSettings(restarts=12, iterations=10, rate=0.001, stop_below=0.05)
+    initial = starts(4)
+    descend(objective, initial, settings, blocks)
+    costs = [objective.costs(SE3Space().encode(initial)), *(cost for _, cost in blocks.traced)]
+    gains = [
+        np.where(a > 0.0, (a - b) / np.maximum(a, 1e-300), 0.0).mean() for a, b in pairwise(costs)
+    ]
+    assert len(gains) > 1
+    assert all(gain > 0.05 for gain in gains[:-1])
+    assert gains[-1] <= 0.05 or len(gains) == 12
+
+
 def test_no_restart_returns_the_starts() -> None:
-    bowl: Any = Bowl()
-    poses, costs = descend(bowl, starts(3), DescentSettings(restarts=0), NullObserver())
+    objective = contacts()
+    poses, costs = descend(objective, starts(3), DescentSettings(restarts=0), NullObserver())
     np.testing.assert_allclose(poses, starts(3), atol=1e-15)
-    assert (costs > 10.0).all()
+    np.testing.assert_array_equal(costs, objective.costs(SE3Space().encode(poses)))
+    assert (costs > 0.0).all()
 
 
 def test_each_start_descends_as_if_it_were_alone() -> None:
-    """Adam's step does not depend on the scale of a gradient, but for its epsilon."""
-    bowl: Any = Bowl()
-    settings = DescentSettings(restarts=2, iterations=20)
-    together, _ = descend(bowl, starts(4), settings, NullObserver())
-    alone, _ = descend(bowl, starts(4)[2:3], settings, NullObserver())
-    np.testing.assert_allclose(together[2:3], alone, atol=1e-6)
+    objective = Objective(CompiledCost(BOX, scene()), SE3Space())
+    vectors = SE3Space().encode(starts(4))
+    together = objective.descended(vectors, 4.0, 0.01, 20)
+    alone = objective.descended(vectors[2:3], 4.0, 0.01, 20)
+    np.testing.assert_array_equal(together[2:3], alone)
 
 
 def test_settings_that_are_no_numbers_are_refused() -> None:

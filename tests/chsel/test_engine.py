@@ -19,7 +19,7 @@ from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.arrays import FloatArray
 from chsel.engine import CompiledCost, poses_of
 from chsel.errors import EngineError, PointsError, SettingError
-from chsel.kernels.descent import BETA1, BETA2, EPSILON
+from chsel.kernels.adam import BETA1, BETA2, EPSILON
 from chsel.objective import Objective
 from chsel.pose import compose, random_rotations
 from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace
@@ -442,17 +442,46 @@ def test_poses_beyond_all_numbers_cost_infinitely_much_and_harm_no_other(
     Objective(cost, SE3Space()).descended(vectors, 1.0, 0.01, 3)
 
 
+@pytest.mark.parametrize("name", ["free", "occupied", "known"])
+@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
+def test_products_that_are_no_number_read_nothing_outside_of_the_grid(
+    lookup: str, name: str
+) -> None:
+    """inf - inf in R x + t: an index made of it would be anywhere, and the process would die."""
+    points = np.array([[1e200, 1e200, 1e200], [0.01, 0.0, 0.02], [0.0, 0.2, 0.0]])
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, :3, :3] = [[1e150, -1e150, 0.0], [1e150, 0.0, -1e150], [0.0, 1e150, -1e150]]
+    for free_resolution in (0.01, 1e200):
+        cost = CompiledCost(
+            grid_of("box"),
+            KnownPoints(**{name: points}),
+            CostSettings(lookup=lookup),
+            free_resolution=free_resolution,
+        )
+        expected = cost.evaluate(poses[:1])[0]
+        assert_same_bits(cost.evaluate(poses)[[0, 2]], [expected, expected])
+
+
+@pytest.mark.parametrize("free_resolution", [0.01, 0.022])
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
-def test_products_that_are_no_number_read_nothing_outside_of_the_grid(free_term: str) -> None:
-    """inf - inf in R x + t; an index made of it would be anywhere."""
-    points = np.full((5, 3), 1e200) + np.zeros((5, 1))
-    pose = np.eye(4)[None].copy()
-    pose[0, :3, :3] = [[1e150, -1e150, 0.0], [1e150, 0.0, -1e150], [0.0, 1e150, -1e150]]
-    for known in (KnownPoints(points), KnownPoints(occupied=points), KnownPoints(known=points)):
-        for lookup in ("nearest", "trilinear"):
-            changes = CostSettings(free_term=free_term, lookup=lookup)
-            cost = CompiledCost(grid_of("box"), known, changes).evaluate(pose)
-            assert not 0.0 < cost[0] < np.inf
+def test_matrices_that_are_no_rotations_cost_the_same_bits_in_every_way(
+    free_term: str, free_resolution: float
+) -> None:
+    stream = np.random.default_rng(15)
+    free = np.unique(np.rint(stream.uniform(-9.0, 9.0, (3000, 3))), axis=0) * free_resolution
+    transforms = np.tile(np.eye(4), (40, 1, 1))
+    transforms[:, :3, :3] = stream.uniform(-3.0, 3.0, (40, 3, 3))
+    transforms[0, :3, :3] = 5.0 * np.eye(3)
+    transforms[1, :3, :3] = np.diag([0.1, 4.0, 0.0])
+    sdf, points, changes = grid_of("box"), KnownPoints(free), CostSettings(free_term=free_term)
+    fastest, tree, direct = (
+        CompiledCost(sdf, points, changes, free_resolution=free_resolution, way=way)
+        for way in ("fastest", "tree", "direct")
+    )
+    costs = direct.evaluate(transforms)
+    assert (costs > 0.0).sum() > 20
+    assert_same_bits(fastest.evaluate(transforms), costs)
+    assert_same_bits(tree.evaluate(transforms), costs)
 
 
 def test_rows_that_span_no_plane_descend_to_the_same_bits() -> None:

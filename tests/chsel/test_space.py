@@ -6,11 +6,13 @@ import torch
 import trimesh
 from scipy.optimize import minimize_scalar
 
-from chsel import SdfGrid
+from chsel import KnownPoints, SdfGrid
+from chsel.engine import CompiledCost
 from chsel.errors import SettingError
-from chsel.measures import MEASURES, measure_named
+from chsel.measures import MEASURES, Measure, measure_named
+from chsel.objective import Objective
 from chsel.pose import apply, axis_angle, compose, inverse, random_rotations, rotation_vector
-from chsel.space import PlaneSettings, SE2Space, SE3Space, transforms_of
+from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace, transforms_of
 
 BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
 STREAM = np.random.default_rng(0)
@@ -88,29 +90,88 @@ def test_plane_height_puts_the_object_onto_the_plane(
     np.testing.assert_allclose(np.abs(axis), normal, atol=1e-12)
 
 
+def objective_in(space: SearchSpace) -> Objective:
+    return Objective(CompiledCost(BOX, KnownPoints(known=[[0.0, 0.0, 0.0]])), space)
+
+
 @pytest.mark.parametrize("name", sorted(MEASURES))
 def test_measures_have_the_gradients_of_their_values(name: str) -> None:
     planar = name.startswith("plane")
-    space = SE2Space(PlaneSettings(offset=0.0), BOX) if planar else SE3Space()
-    measure = measure_named(name, planar=planar)
-    x = torch.tensor(STREAM.uniform(-1.0, 1.0, (1, space.dimension)), requires_grad=True)
+    axis = (0.0, 0.6, 0.8)
+    space = SE2Space(PlaneSettings(axis=axis, offset=0.1), BOX) if planar else SE3Space()
+    assert_gradients_of_values(space, measure_named(name, planar=planar))
 
-    def values(vectors: torch.Tensor) -> torch.Tensor:
-        return measure.function(vectors, *space.decode(vectors))
 
-    assert values(x).shape == (1, measure.count)
-    assert torch.autograd.gradcheck(values, (x,), eps=1e-6, atol=1e-6)
+@pytest.mark.parametrize("name", ["position_3", "object_xy", "object_yaw"])
+def test_measures_of_plane_poses_have_the_gradients_of_their_values(name: str) -> None:
+    space = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), BOX)
+    assert_gradients_of_values(space, measure_named(name, planar=True))
+
+
+def assert_gradients_of_values(space: SearchSpace, measure: Measure) -> None:
+    """Central differences, at vectors that are not orthonormal."""
+    objective, step = objective_in(space), 1e-6
+    for vector in np.random.default_rng(1).uniform(-1.0, 1.0, (5, space.dimension)):
+        steps = step * np.eye(space.dimension)
+        ahead = objective.measures(measure, vector + steps)
+        behind = objective.measures(measure, vector - steps)
+        gradients = objective.measure_gradients(measure, vector)
+        assert gradients.shape == (measure.count, space.dimension)
+        expected = (ahead - behind).T / (2.0 * step)
+        np.testing.assert_allclose(gradients, expected, rtol=1e-6, atol=1e-7)
+        assert (np.abs(gradients).max(axis=1) > 0.01).all()
+
+
+def test_measures_of_vectors_and_translations_are_their_entries() -> None:
+    vectors = STREAM.uniform(-1.0, 1.0, (10, 9))
+    objective = objective_in(SE3Space())
+    for count in range(1, 7):
+        found = objective.measures(MEASURES[f"rotation_{count}"], vectors)
+        np.testing.assert_array_equal(found, vectors[:, :count])
+    for count in (2, 3):
+        found = objective.measures(MEASURES[f"position_{count}"], vectors)
+        np.testing.assert_array_equal(found, vectors[:, 6 : 6 + count])
+    plane = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), BOX)
+    poses = STREAM.uniform(-1.0, 1.0, (10, 3))
+    on_plane = objective_in(plane)
+    np.testing.assert_array_equal(
+        on_plane.measures(MEASURES["plane_position"], poses), poses[:, 1:]
+    )
+    np.testing.assert_array_equal(on_plane.measures(MEASURES["plane_angle"], poses), poses[:, :1])
+    np.testing.assert_array_equal(
+        on_plane.measures(MEASURES["position_3"], poses), transforms_of(plane, poses)[:, :3, 3]
+    )
 
 
 def test_object_measures_are_of_world_from_object() -> None:
     transforms = random_transforms(10)
-    vectors = torch.tensor(SE3Space().encode(transforms))
-    decoded = SE3Space().decode(vectors)
-    world = inverse(transforms)
-    xy = MEASURES["object_xy"].function(vectors, *decoded).numpy()
+    vectors = SE3Space().encode(transforms)
+    world, objective = inverse(transforms), objective_in(SE3Space())
+    xy = objective.measures(MEASURES["object_xy"], vectors)
     np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
-    yaw = MEASURES["object_yaw"].function(vectors, *decoded).numpy()[:, 0]
+    yaw = objective.measures(MEASURES["object_yaw"], vectors)[:, 0]
     np.testing.assert_allclose(yaw, np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
+
+
+def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it() -> None:
+    """The object's x axis along the world's z: the heading is not defined."""
+    rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    vector = SE3Space().encode(compose(rotation[None], np.zeros((1, 3))))
+    objective, yaw = objective_in(SE3Space()), MEASURES["object_yaw"]
+    assert np.isfinite(objective.measures(yaw, vector)).all()
+    np.testing.assert_array_equal(objective.measure_gradients(yaw, vector[0]), np.zeros((1, 9)))
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_compiled_decoding_is_that_of_torch(planar: bool) -> None:
+    space: SearchSpace = SE3Space()
+    if planar:
+        settings = PlaneSettings(axis=(0.3, 0.6, 0.8), offset=0.1, resting_rotation=(0.4, 1.0, 0.2))
+        space = SE2Space(settings, BOX)
+    vectors = STREAM.uniform(-3.0, 3.0, (50, space.dimension))
+    rotation, translation = space.decode(torch.tensor(vectors))
+    expected = compose(rotation.numpy(), translation.numpy())
+    np.testing.assert_allclose(transforms_of(space, vectors), expected, rtol=0.0, atol=3e-15)
 
 
 def test_a_measure_of_the_other_space_names_those_that_fit() -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 import warnings
@@ -16,7 +17,7 @@ from chsel.engine import CompiledCost
 from chsel.errors import EngineError
 from chsel.threads import spread
 
-PATIENCE = 60.0  # seconds until what should have ended long ago counts as stuck
+PATIENCE = 20.0  # seconds until what should have ended long ago counts as stuck
 
 
 @pytest.fixture(params=[1, 2, 3])
@@ -89,10 +90,11 @@ def test_work_may_spread_work(threads: int) -> None:
     np.testing.assert_array_equal(sums, [20 * n + 190 for n in range(12)])
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="threads inherit their rounding on Linux")
 def test_a_worker_that_flushes_subnormals_is_refused() -> None:
     """A thread starts with the rounding of the thread that starts it."""
     before = torch.get_num_threads()
-    torch.set_num_threads(5)  # a pool that no other test has started
+    torch.set_num_threads(5)  # a pool that no other test uses, before or after
     if not torch.set_flush_denormal(True):
         pytest.skip("this processor cannot flush subnormal numbers")
     try:

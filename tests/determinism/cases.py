@@ -76,7 +76,11 @@ _COSTS = {
         changes={"cost": {"gradient": "exact", "lookup": "nearest", "outside": "bounding_box"}},
         classes=ALL_CLASSES,
     ),
-    "other alpha": Case(changes={"cost": {"penetration_tolerance": -0.004}}, classes=ALL_CLASSES),
+    "near alpha": Case(changes={"cost": {"penetration_tolerance": -0.004}}, classes=ALL_CLASSES),
+    "deep alpha": Case(changes={"cost": {"penetration_tolerance": -0.02}}, classes=ALL_CLASSES),
+    "deep alpha, nearest": Case(
+        "gradient_descent", "paper", changes={"cost": {"penetration_tolerance": -0.018}}
+    ),
     "interior, trilinear, by volume": Case(
         changes={
             "cost": {"free_term": "interior", "volume_normalise": True, "interior_spacing": 0.007}

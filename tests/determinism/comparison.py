@@ -103,24 +103,27 @@ def differences(
 def _first_difference(
     case: str, expected: dict[str, list[str]], stages: Stages, nearby: dict[str, Stages] | None
 ) -> list[str]:
+    lines = []
     for stage, arrays in stages.items():
         if stage not in expected:
-            return [f"{case}: stage {stage!r} is new"]
-        if stage_digest(arrays) != expected[stage][0]:
+            lines.append(f"{case}: stage {stage!r} is new")
+        elif stage_digest(arrays) != expected[stage][0]:
             usual = nearby[case].get(stage) if nearby else None
             if usual is None or stage_digest(usual) != expected[stage][0]:
-                return [f"{case}: {stage!r} differs, {_by_samples(expected[stage][1:], arrays)}"]
-            return [f"{case}: {stage!r} differs, {_by_arrays(usual, arrays)}"]
+                apart = _by_samples(expected[stage][1:], arrays)
+            else:
+                apart = _by_arrays(usual, arrays)
+            return [*lines, f"{case}: {stage!r} differs, {apart}"]
     missing = [stage for stage in expected if "hypotheses" in stage and stage not in stages]
-    return [f"{case}: stage {stage!r} is missing" for stage in missing]
+    return lines + [f"{case}: stage {stage!r} is missing" for stage in missing]
 
 
 def _by_samples(expected: list[str], arrays: dict[str, np.ndarray]) -> str:
     ours = np.array([float.fromhex(number) for number in _samples(arrays)])
     theirs = np.array([float.fromhex(number) for number in expected])
     apart = max(ulps(theirs, ours))
-    place = "in" if apart else "elsewhere than in"
-    return f"{f'by up to {apart} ulp ' if apart else ''}{place} the numbers that golden.json holds"
+    place = "in" if apart else "but not in"
+    return f"{f'by up to {apart} ulp ' if apart else ''}{place} the numbers in golden.json"
 
 
 def _by_arrays(usual: dict[str, np.ndarray], arrays: dict[str, np.ndarray]) -> str:

@@ -107,7 +107,7 @@ def test_one_wrong_bit_is_found_and_said_where() -> None:
         "second: 'step 0: costs of E_0' differs, 1 of 3 costs by up to 1 ulp"
     ]
     assert differences(golden, wrong, wrong) == [
-        "second: 'step 0: costs of E_0' differs, by up to 1 ulp in the numbers that golden.json holds"
+        "second: 'step 0: costs of E_0' differs, by up to 1 ulp in the numbers in golden.json"
     ]
     unfinished = {
         "first": stages,

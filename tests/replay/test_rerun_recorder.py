@@ -177,6 +177,11 @@ def at_probe(rows: list[Row], step: int) -> list[dict[str, Any]]:
     return [values for times, values in rows if times.get("probe") == step]
 
 
+def until_probe(rows: list[Row], step: int) -> list[dict[str, Any]]:
+    """What a view at a probe draws from: the last value counts."""
+    return [values for times, values in rows if times.get("probe", step + 1) <= step]
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("rerun") / "recording.rrd", session())
@@ -250,7 +255,7 @@ def shown_hypotheses(rows: dict[str, list[Row]], step: int) -> dict[float, tuple
     """Pose and entity of each hypothesis drawn at a probe, by cost."""
     found: dict[float, tuple[np.ndarray, str]] = {}
     for entity in MESH_ENTITIES:
-        row = at_probe(rows[entity], step)[-1]
+        row = until_probe(rows[entity], step)[-1]
         translations = row["InstancePoses3D:translations"]
         for cost, where, turn in zip(
             row["cost"], translations, row["InstancePoses3D:mat3x3"], strict=True

@@ -1,0 +1,115 @@
+"""Where machine code is kept: in processes of their own, as that is settled once in each."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+COMPUTE = """
+import numpy as np
+from chsel.kernels.elementary import sines_cosines
+print(np.stack(sines_cosines(np.linspace(-9.0, 9.0, 50))).tobytes().hex())
+"""
+
+
+def start(code: str, tmp_path: Path, **changes: str | None) -> subprocess.Popen[str]:
+    """A process with a home folder of its own; None takes a variable out of the environment."""
+    home = tmp_path / "home"
+    environment: dict[str, str | None] = {**os.environ, "HOME": str(home), "TMPDIR": str(tmp_path)}
+    for name in ("CHSEL_CACHE_DIR", "XDG_CACHE_HOME", "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES"):
+        environment[name] = None
+    environment |= {"OMP_NUM_THREADS": "1"} | changes
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env={name: value for name, value in environment.items() if value is not None},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def result_of(process: subprocess.Popen[str]) -> tuple[str, str]:
+    """What the process printed, and what it said on stderr."""
+    out, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said
+    assert len(out.strip()) == 2 * 2 * 50 * 8
+    return out, said
+
+
+def kernels_in(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.nbc"))
+
+
+def test_kernels_are_kept_in_the_named_folder_apart_for_every_cpu(tmp_path: Path) -> None:
+    named = tmp_path / "kept" / "here"
+    first, said = result_of(start(COMPUTE, tmp_path, CHSEL_CACHE_DIR=str(named)))
+    assert str(named) in said
+    assert said.count("compiling the kernels") == 1
+    made = kernels_in(named)
+    assert len(made) > 0
+    assert len({path.relative_to(named).parts[0] for path in made}) == 1
+    again, said = result_of(start(COMPUTE, tmp_path, CHSEL_CACHE_DIR=str(named)))
+    assert (again, said) == (first, "")
+    assert kernels_in(named) == made
+    other, said = result_of(
+        start(
+            COMPUTE,
+            tmp_path,
+            CHSEL_CACHE_DIR=str(named),
+            NUMBA_CPU_NAME="generic",
+            NUMBA_CPU_FEATURES="",
+        )
+    )
+    assert other == first  # to the bit, by code for another CPU
+    assert "compiling the kernels" in said
+    assert len({path.relative_to(named).parts[0] for path in kernels_in(named)}) == 2
+    assert not (tmp_path / "home").exists()
+
+
+def test_two_processes_that_start_on_an_empty_folder_both_succeed(tmp_path: Path) -> None:
+    processes = [start(COMPUTE, tmp_path, XDG_CACHE_HOME=str(tmp_path / "xdg")) for _ in range(2)]
+    (one, _), (other, _) = (result_of(process) for process in processes)
+    assert one == other
+    assert len(kernels_in(tmp_path / "xdg" / "chsel" / "kernels")) > 0
+    again, said = result_of(start(COMPUTE, tmp_path, XDG_CACHE_HOME=str(tmp_path / "xdg")))
+    assert (again, said) == (one, "")
+
+
+def test_a_named_folder_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("no folder")
+    process = start(COMPUTE, tmp_path, CHSEL_CACHE_DIR=str(file))
+    out, said = process.communicate(timeout=300)
+    assert process.returncode == 1
+    assert out == ""
+    assert said.splitlines()[-1] == (
+        f"chsel.errors.EngineError: CHSEL_CACHE_DIR is {file}, which cannot be written; accepted: "
+        "a folder for compiled kernels, or nothing"
+    )
+
+
+NAMELESS = """
+import pwd
+def nobody(user):
+    raise KeyError(user)
+pwd.getpwuid = nobody
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a file cannot stand in for the folder there")
+@pytest.mark.parametrize("code", [COMPUTE, NAMELESS + COMPUTE], ids=["named user", "nameless"])
+def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(
+    tmp_path: Path, code: str
+) -> None:
+    """A file in place of the home folder: as root, permissions would not hold anybody back."""
+    (tmp_path / "home").write_text("no folder")
+    names = dict.fromkeys(("LOGNAME", "USER", "LNAME", "USERNAME"))
+    _, said = result_of(start(code, tmp_path, **names))
+    assert len(kernels_in(tmp_path)) > 0
+    assert str(tmp_path) in said

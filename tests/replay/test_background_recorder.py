@@ -1,0 +1,199 @@
+"""Recording beside the run: the same files, errors that reach the caller, a bounded queue."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from chsel.errors import RecordingError
+from replay.background_recorder import BackgroundRecorder
+from replay.events import Measured, Probe
+from replay.mcap_reader import read_recording
+from replay.mcap_writer import McapRecorder
+
+
+class Gate:
+    """Notes what it gets once its gate is open; fails at the events that it is told of."""
+
+    def __init__(self, *fails_at: object, is_open: bool = True) -> None:
+        self.calls: list[object] = []
+        self.threads: set[str] = set()
+        self.gate = threading.Event()
+        self.entered = threading.Event()
+        self._fails_at = fails_at
+        if is_open:
+            self.gate.set()
+
+    def record(self, event: object) -> None:
+        self._note(event)
+
+    def flush(self) -> None:
+        self._note("flush")
+
+    def close(self) -> None:
+        self._note("close")
+
+    def _note(self, call: object) -> None:
+        self.entered.set()
+        assert self.gate.wait(60)
+        self.calls.append(call)
+        self.threads.add(threading.current_thread().name)
+        if call in self._fails_at:
+            raise RecordingError(f"no {call}")
+
+
+def record_often(recorder: BackgroundRecorder, event: object) -> None:
+    for _ in range(10_000):
+        recorder.record(event)
+
+
+def test_the_caller_goes_on_while_an_event_is_recorded():
+    gate = Gate(is_open=False)
+    recorder = BackgroundRecorder(gate)
+    recorder.record("first")
+    recorder.record("second")
+    assert gate.calls == []
+    gate.gate.set()
+    recorder.close()
+    assert gate.calls == ["first", "second", "close"]
+    assert "recorder" in gate.threads
+
+
+def test_flush_returns_when_all_before_it_is_recorded_and_flushed():
+    gate = Gate()
+    recorder = BackgroundRecorder(gate)
+    for event in range(100):
+        recorder.record(event)
+    recorder.flush()
+    assert gate.calls == [*range(100), "flush"]
+    recorder.close()
+
+
+def test_who_records_faster_than_the_recorder_has_to_wait():
+    gate = Gate(is_open=False)
+    recorder = BackgroundRecorder(gate, most=3)
+    recorder.record("in work")
+    assert gate.entered.wait(60)
+    for event in range(3):
+        recorder.record(event)
+    fifth = threading.Thread(target=recorder.record, args=("fifth",))
+    fifth.start()
+    fifth.join(0.2)
+    assert fifth.is_alive()
+    gate.gate.set()
+    fifth.join(60)
+    recorder.close()
+    assert gate.calls == ["in work", 0, 1, 2, "fifth", "close"]
+
+
+def test_equal_events_give_the_bytes_of_a_recorder_without_a_thread(tmp_path, events, write):
+    path = tmp_path / "background.mcap"
+    recorder = BackgroundRecorder(McapRecorder(path))
+    for event in events:
+        recorder.record(event)
+    recorder.close()
+    assert path.read_bytes() == write(events).read_bytes()
+
+
+def test_an_error_is_told_by_the_next_call_and_what_follows_it_is_dropped():
+    gate = Gate("bad", is_open=False)
+    recorder = BackgroundRecorder(gate)
+    for event in ("good", "bad", "dropped", "dropped"):
+        recorder.record(event)
+    gate.gate.set()
+    with pytest.raises(RecordingError, match="no bad"):
+        recorder.flush()
+    recorder.record("after")
+    recorder.close()
+    assert gate.calls == ["good", "bad", "after", "close"]
+
+
+def test_an_error_that_is_known_is_told_before_another_event_is_taken():
+    gate = Gate("bad")
+    recorder = BackgroundRecorder(gate)
+    with pytest.raises(RecordingError, match="no bad"):
+        record_often(recorder, "bad")  # the queue is bounded, so the error must come
+    recorder.close()
+    assert gate.calls == ["bad", "close"]
+
+
+def test_an_error_is_told_at_close_at_the_latest_and_all_is_closed():
+    gate = Gate("bad", is_open=False)
+    recorder = BackgroundRecorder(gate)
+    recorder.record("bad")
+    gate.gate.set()
+    with pytest.raises(RecordingError, match="no bad"):
+        recorder.close()
+    assert gate.calls == ["bad", "close"]
+    recorder.close()
+
+
+def test_of_two_errors_the_first_is_told():
+    gate = Gate("bad", "close", is_open=False)
+    recorder = BackgroundRecorder(gate)
+    recorder.record("bad")
+    gate.gate.set()
+    with pytest.raises(RecordingError, match="no bad"):
+        recorder.close()
+
+
+def test_closing_twice_is_closing_once_and_ends_the_thread(tmp_path, events):
+    path = tmp_path / "recording.mcap"
+    before = threading.active_count()
+    recorder = BackgroundRecorder(McapRecorder(path))
+    recorder.record(events[0])
+    recorder.close()
+    assert threading.active_count() == before
+    closed = path.read_bytes()
+    recorder.close()
+    recorder.flush()
+    assert path.read_bytes() == closed
+    with pytest.raises(RecordingError, match="closed"):
+        recorder.record(events[1])
+
+
+_SCRIPT = """
+import runpy, sys
+from replay.background_recorder import BackgroundRecorder
+from replay.mcap_writer import McapRecorder
+events = runpy.run_path(sys.argv[1])["example_events"]()
+recorder = BackgroundRecorder(McapRecorder(sys.argv[2]))
+for event in events:
+    recorder.record(event)
+    if type(event).__name__ == "Measured":
+        recorder.flush()
+        break
+"""
+
+
+def run_script(end: str, path: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", _SCRIPT + end, str(Path(__file__).with_name("conftest.py"))]
+    return subprocess.run(
+        [*command, str(path)], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL on Windows")
+def test_all_that_was_flushed_survives_sigkill(tmp_path, events, assert_same):
+    path = tmp_path / "killed.mcap"
+    done = run_script("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", path)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    last = next(i for i, event in enumerate(events) if isinstance(event, Measured))
+    assert_same(read_recording(path, partial=True).events(), events[: last + 1])
+
+
+def test_a_run_that_dies_ends_and_leaves_what_was_flushed(tmp_path, events):
+    path = tmp_path / "died.mcap"
+    done = run_script("raise ValueError('died')", path)
+    assert done.returncode == 1
+    assert "ValueError: died" in done.stderr
+    recording = read_recording(path, partial=True)
+    assert recording.steps == (1,)
+    probes = [event for event in events if isinstance(event, Probe)]
+    assert [probe.step for probe in recording.probes] == [probe.step for probe in probes[:2]]
