@@ -18,8 +18,6 @@ import llvmlite.binding
 import numba
 from numba.core import event
 
-from chsel.errors import EngineError
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 CACHE_VARIABLE = "CHSEL_CACHE_DIR"
@@ -71,17 +69,19 @@ def cache_directory() -> Path:
     """Where machine code is kept: apart for every version of the kernels, of numba, every CPU.
 
     In the folder that CHSEL_CACHE_DIR names, else in the user's cache folder, else in a temporary
-    one of the user's own. Raises EngineError if the named folder cannot be written.
+    one of the user's own: the first that can be written.
     """
     named = os.environ.get(CACHE_VARIABLE)
     if named:
         directory = Path(named).expanduser() / _fingerprint()
-        if not _writable(directory):
-            raise EngineError(
-                f"{CACHE_VARIABLE} is {named}, which cannot be written; accepted: a folder for "
-                "compiled kernels, or nothing"
-            )
-        return directory
+        if _writable(directory):
+            return directory
+        _log.warning(
+            "%s is %s, which cannot be written; accepted: a folder for compiled kernels. They go "
+            "where they go without it",
+            CACHE_VARIABLE,
+            named,
+        )
     temporary = Path(tempfile.gettempdir()) / f"chsel-{_user()}"
     for place in (_user_cache() / "chsel" / "kernels", temporary):
         directory = place / _fingerprint()

@@ -293,24 +293,30 @@ def test_no_mesh_is_drawn_before_the_first_hypotheses(rows: dict[str, list[Row]]
         assert not np.any(first["InstancePoses3D:mat3x3"])
 
 
-def image(row: dict[str, Any], dtype: type, channels: int) -> np.ndarray:
-    (layout,) = row["Image:format"]
-    (pixels,) = row["Image:buffer"]
-    array: np.ndarray = np.array(pixels, dtype=np.uint8).view(dtype)
-    return array.reshape(layout["height"], layout["width"], channels)
+def images(rows: list[Row], step: int, dtype: type, channels: int) -> list[np.ndarray]:
+    """The pictures of a probe, each in the format that was given last."""
+    found, shape = [], (0, 0)
+    for times, row in rows:
+        for layout in row.get("Image:format", ()):
+            shape = layout["height"], layout["width"]
+        for pixels in row.get("Image:buffer", ()):
+            if times["probe"] == step:
+                array: np.ndarray = np.array(pixels, dtype=np.uint8).view(dtype)
+                found.append(array.reshape(*shape, channels))
+    return found
 
 
 def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(
     rows: dict[str, list[Row]],
 ) -> None:
-    first, last = at_probe(rows["/archive/cost"], 1)
-    costs = image(first, np.float32, 1)[..., 0]  # cells 0 and 1 of 4 x 3: first column, from below
+    first, last = images(rows["/archive/cost"], 1, np.float32, 1)
+    costs = first[..., 0]  # cells 0 and 1 of 4 x 3: first column, from below
     expected = np.full((3, 4), np.nan)
     expected[2, 0], expected[1, 0] = 1.0, 2.0
     np.testing.assert_array_equal(costs, expected)
-    assert np.isfinite(image(last, np.float32, 1)).sum() == 7
-    colors = image(at_probe(rows["/archive/colors"], 1)[-1], np.uint8, 4)[:, :4, :3]
-    empty = np.isnan(image(last, np.float32, 1)[..., 0])
+    assert np.isfinite(last).sum() == 7
+    colors = images(rows["/archive/colors"], 1, np.uint8, 4)[-1][:, :4, :3]
+    empty = np.isnan(last[..., 0])
     assert len(np.unique(colors[empty], axis=0)) == 1
     assert len(np.unique(colors[~empty], axis=0)) == 7
 
@@ -330,7 +336,8 @@ def test_hypotheses_are_marked_in_their_cells(rows: dict[str, list[Row]]) -> Non
 
 
 def test_iterations_run_on_over_stages_and_registrations(rows: dict[str, list[Row]]) -> None:
-    times = [(times["probe"], times["iteration"]) for times, _ in rows["/archive/cost"]]
+    drawn = [times for times, values in rows["/archive/cost"] if "Image:buffer" in values]
+    times = [(times["probe"], times["iteration"]) for times in drawn]
     assert times == [(0, 51), (0, 56), (1, 107), (1, 112), (2, 163), (2, 168)]
 
 
@@ -410,7 +417,7 @@ def test_archives_of_other_shapes_are_maps_too(
 ) -> None:
     events = [started(), probe(0), *registration(0, shape=shape)]
     rows = read(write(tmp_path / "a.rrd", events))
-    costs = image(at_probe(rows["/archive/cost"], 0)[-1], np.float32, 1)[..., 0]
+    costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
     assert costs.shape == size
     assert np.isfinite(costs).sum() == filled
 
@@ -418,7 +425,7 @@ def test_archives_of_other_shapes_are_maps_too(
 def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path: Path) -> None:
     events = [started(), probe(0), *registration(0, shape=(4, 3, 2))]
     rows = read(write(tmp_path / "a.rrd", events))
-    costs = image(at_probe(rows["/archive/cost"], 0)[-1], np.float32, 1)[..., 0]
+    costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
     assert costs[2, 0] == 1.0  # cells 0 and 1, of costs 1 and 2
     assert costs[1, 0] == 3.0
 
