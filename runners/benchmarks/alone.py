@@ -26,6 +26,7 @@ from runners.benchmarks.recorded import recorded_registrations
 from runners.benchmarks.timing import Row, in_turn
 
 _PROBLEM = "real_20"
+_THREADED = ("real_20", "large_20")
 _THREADS = (1, 2)
 _POSES = 100_000
 _POSES_AT_ONCE = 1000
@@ -72,18 +73,19 @@ def stages(scope: Scope) -> Iterator[Row]:
 
 def threads(scope: Scope) -> Iterator[Row]:
     """One and two threads, in turn."""
-    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
 
-    def measured(preset: str, count: int) -> float:
+    def measured(posed: PosedProblem, preset: str, count: int) -> float:
         with _threads(count):
             return 1000.0 * scope.seconds(posed, preset)
 
-    for preset in PRESETS:
-        cases = {str(count): partial(measured, preset, count) for count in _THREADS}
-        for case in cases.values():
-            case()
-        for name, samples in in_turn(scope.repeats, cases).items():
-            yield Row("threads", name, preset, "ms", samples, float(name))
+    for problem in _THREADED:
+        posed = pose(PROBLEMS[problem], scope.seed)
+        for preset in PRESETS:
+            cases = {str(count): partial(measured, posed, preset, count) for count in _THREADS}
+            for case in cases.values():
+                case()
+            for name, samples in in_turn(scope.repeats, cases).items():
+                yield Row("threads", f"{problem}, {name}", preset, "ms", samples, float(name))
 
 
 def free_points(scope: Scope) -> Iterator[Row]:

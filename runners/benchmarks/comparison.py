@@ -55,8 +55,8 @@ def compare(
     posed = pose(PROBLEMS[name], seed)
     count = len(posed.free)
     search = steps.searching(long=PROBLEMS[name].long)
-    ours = {preset: _ours(posed, preset, steps, search) for preset in PRESETS}
-    often, seldom = {"ours, paper": ours["paper"]}, {}
+    often = {f"ours, {preset}": _ours(posed, preset, steps, search) for preset in PRESETS}
+    seldom = {}
     if package is not None:
         posed.save(folder / "problem.npz")
         package.ask("load", problem=str(folder / "problem.npz"))
@@ -64,7 +64,6 @@ def compare(
         often["package"] = _package(package, "default", steps, search, seed, count)
         if equation:
             seldom["package, Eq. 8"] = _package(package, "equation", steps, search, seed, count)
-    often["ours, default"] = ours["default"]
     for contestant in often.values():
         contestant()
     samples = in_turn(repeats, often) | in_turn(max(1, repeats // 3), seldom)

@@ -16,7 +16,7 @@ from chsel.presets import COST
 from chsel.problem import ArchiveSnapshot, Hypotheses
 from runners.benchmarks.problems import PosedProblem
 
-PRESETS = ("paper", "default")
+PRESETS = ("reference", "paper", "default")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from runners.benchmarks.ours import PRESETS
+
 Values = Mapping[str, Any]
 
 
@@ -70,7 +72,7 @@ def _show_comparison(console: Console, rows: Sequence[Values]) -> None:
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
     for name in ("problem", "registration"):
         table.add_column(name, no_wrap=True)
-    ratio_names = ["x paper", "x default"] if compared else []
+    ratio_names = [f"x {preset}" for preset in PRESETS] if compared else []
     for name in ("median", "quartiles", *ratio_names, "cost"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:

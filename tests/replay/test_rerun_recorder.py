@@ -24,6 +24,7 @@ from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
 from replay import rerun_live
+from replay.background_recorder import BackgroundRecorder
 from replay.events import (
     Event,
     HypothesesFound,
@@ -480,6 +481,31 @@ def test_without_a_viewer_the_live_view_is_a_warning(
     recorder.record(started())
     recorder.close()
     assert "/scene/workspace" in read(tmp_path / "a.rrd")
+
+
+def test_a_thread_in_the_background_draws_the_same(
+    tmp_path: Path, rows: dict[str, list[Row]]
+) -> None:
+    recorder = BackgroundRecorder(RerunRecorder(tmp_path / "a.rrd"))
+    for event in session():
+        recorder.record(event)
+    recorder.close()
+    np.testing.assert_equal(read(tmp_path / "a.rrd"), rows)
+
+
+def test_long_searches_are_drawn_to_the_last_iteration(tmp_path: Path) -> None:
+    events: list[Event] = [started(), probe(0), next(registration(0))]
+    for iteration in range(0, 1000, 10):
+        events.append(Traced(0, "cma_mega", iteration, "0", (1.0, 2.0, 3.0 + iteration)))
+        events.append(SnapshotTaken(0, snapshot(iteration % 10)))
+    rows = read(write(tmp_path / "a.rrd", events))
+    highest = [
+        values["Scalars:scalars"][0]
+        for _, values in rows["/search/highest"]
+        if "Scalars:scalars" in values
+    ]
+    assert highest == [3.0 + iteration for iteration in range(0, 1000, 10)]
+    assert len(images(rows["/archive/cost"], 0, np.float32, 1)) == 100
 
 
 _KILLED = """

@@ -17,6 +17,7 @@ import torch
 from chsel.pose import apply, inverse
 from chsel.sdf import mesh_sdf
 from runners.benchmarks.comparison import require_equal
+from runners.benchmarks.ours import PRESETS
 from runners.benchmarks.problems import PROBLEMS, WORKSPACE, PosedProblem, Problem, drill, pose
 from runners.benchmarks.published import BenchmarkError, PublishedPackage
 from runners.benchmarks.published_worker import GridSdf
@@ -232,7 +233,8 @@ def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> 
     names = {file.name for file in folder.iterdir()}
     assert names == {"benchmark.json", "benchmark.png", "config.yaml"}
     assert (folder / "benchmark.png").read_bytes().startswith(b"\x89PNG")
-    assert [row["who"] for row in report["comparison"]] == ["ours, paper", "ours, default"]
+    who = [row["who"] for row in report["comparison"]]
+    assert who == [f"ours, {preset}" for preset in PRESETS]
     measures = ["stage", "threads", "hypotheses", "recording", "peak memory"]
     assert list(dict.fromkeys(row["measure"] for row in report["alone"])) == measures
     lines = done.stdout.splitlines()
@@ -252,7 +254,7 @@ def test_with_the_package_it_is_measured_in_the_same_run(stand_in: Path, tmp_pat
     done = run(tmp_path, f"package.python={stand_in}", "alone=[]")
     assert done.returncode == 0, done.stderr
     _, report = found(tmp_path)
-    ours, package, default = report["comparison"]
+    _, ours, default, package = report["comparison"]
     assert (ours["who"], package["who"]) == ("ours, paper", "package")
     assert len(package["samples"]) == len(ours["samples"]) == 2
     times = package["times_ours"]

@@ -1,11 +1,22 @@
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
+from chsel.arrays import digest
 from chsel.errors import RecordingError
-from runners.recording import make_run_folder
+from chsel.methods import build_method
+from chsel.points import KnownPoints, Workspace
+from chsel.problem import ArchiveSnapshot, RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.events import Event, SnapshotTaken, Traced
+from replay.recorder import NullRecorder
+from runners.recording import RecordingConfig, StepObserver, make_run_folder, open_recorder
 
 
 def test_run_folders_of_one_second_differ_and_stay_in_the_log_folder(tmp_path: Path) -> None:
@@ -27,3 +38,51 @@ def test_a_folder_that_can_not_be_made_is_one_clear_error(tmp_path: Path) -> Non
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordingError, match=r"cannot be made .*; accepted: a writable logs=DIR"):
         make_run_folder(tmp_path / "file", "drill")
+
+
+class Keeping(NullRecorder):
+    """Keeps events, and the digests of their arrays at the moment they came."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self.digests: list[str] = []
+
+    def record(self, event: Event) -> None:
+        if isinstance(event, SnapshotTaken):
+            self.events.append(event)
+            self.digests.append(digest(*arrays(event.archive)))
+
+
+def arrays(archive: ArchiveSnapshot) -> list[np.ndarray]:
+    return [value for value in vars(archive).values() if isinstance(value, np.ndarray)]
+
+
+def test_what_is_handed_over_is_never_changed() -> None:
+    """A recorder may write a snapshot while the search goes on."""
+    box = trimesh.creation.box((0.1, 0.06, 0.2))
+    surface = np.asarray(trimesh.sample.sample_surface(box, 10, seed=0)[0])
+    problem = RegistrationProblem(
+        SdfGrid.from_mesh(box, 0.02),
+        KnownPoints(known=surface),
+        np.eye(4)[None].repeat(4, axis=0),
+        Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)),
+        0.02,
+        StreamKey(0, 0),
+    )
+    settings = {"descent": {"restarts": 1, "iterations": 5}, "emitter": {"iterations": 20}}
+    recorder = Keeping()
+    observer = StepObserver(recorder, 0, 5, lambda *_: None)
+    build_method("chsel", settings).register(problem, observer)
+    assert len(recorder.events) >= 5
+    assert len(set(recorder.digests)) > 1
+    kept = [digest(*arrays(event.archive)) for event in recorder.events]
+    assert kept == recorder.digests
+
+
+def test_without_files_nothing_runs_in_the_background(tmp_path: Path) -> None:
+    before = threading.active_count()
+    recorder = open_recorder(tmp_path, RecordingConfig(mcap=False, rerun=False))
+    assert threading.active_count() == before
+    recorder.record(Traced(0, "descent", 0, "0", (0.0, 0.0, 0.0)))
+    recorder.close()
+    assert list(tmp_path.iterdir()) == []
