@@ -18,7 +18,7 @@ from chsel.problem import ArchiveSnapshot
 from replay.background_recorder import BackgroundRecorder
 from replay.events import Recorder, SnapshotTaken, Traced
 from replay.mcap_writer import McapRecorder
-from replay.recorder import NullRecorder, TeeRecorder
+from replay.recorder import TeeRecorder
 from replay.rerun_recorder import RerunRecorder
 
 
@@ -57,14 +57,14 @@ def make_run_folder(logs: Path, *names: str) -> Path:
 
 
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
-    """A recorder, working beside the run, to all files that `config` asks for."""
+    """A recorder to all files that `config` asks for, each written by a thread of its own."""
     recorders: list[Recorder] = []
     if config.mcap:
-        recorders.append(McapRecorder(folder / "recording.mcap"))
+        recorders.append(BackgroundRecorder(McapRecorder(folder / "recording.mcap")))
     if config.rerun or config.live:
         path = folder / "recording.rrd" if config.rerun else None
-        recorders.append(RerunRecorder(path, live=config.live))
-    return BackgroundRecorder(TeeRecorder(recorders)) if recorders else NullRecorder()
+        recorders.append(BackgroundRecorder(RerunRecorder(path, live=config.live)))
+    return TeeRecorder(recorders)
 
 
 class StepObserver:

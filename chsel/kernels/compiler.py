@@ -55,6 +55,15 @@ def leaf(function: Function) -> Function:
     return made
 
 
+def spliced(function: Function) -> Function:
+    """Like `leaf`, for a few lines around a large function: put into its caller before it is typed.
+
+    It is no function of its own to the compiler, which saves it going over the large one again.
+    """
+    made: Function = _njit(**_INNER, inline="always")(function)
+    return made
+
+
 _INNER = {
     "nogil": True,
     "error_model": "numpy",

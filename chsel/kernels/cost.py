@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.arrays import FloatArray
-from chsel.kernels.compiler import leaf
+from chsel.kernels.compiler import inner, leaf, spliced
 from chsel.kernels.field import Field, continued, sample
 from chsel.kernels.lattice import Lattice, look_up
 from chsel.kernels.pose import finite, rigid
@@ -21,6 +21,7 @@ from chsel.kernels.tree import Found, Tree, found_for, walk
 MOST_SLACK = 0.03  # metres
 STEPS_AHEAD = 3.0  # that a list of neighbours should last
 _NOTHING = (0.0,) * 13
+_COUNT, _SLACK = 0, 1  # what the memory holds there
 _GATHERED, _LAST = 2, 14  # where the memory holds the object's places and rotations
 
 
@@ -66,9 +67,9 @@ class Model(NamedTuple):
 class Neighbours(NamedTuple):
     """The points that can matter while a pose moves little (after Verlet, 1967).
 
-    found: them. memory (32,): how many (-1: none gathered), the slack in metres that the object
-    may move before they must be gathered again, and the places and rotations of the object then
-    and at the last evaluation.
+    found: them. memory (32,): how many, the slack in metres that the object may move before they
+    must be gathered again (-1: at once), and the places and rotations of the object when they were
+    gathered and at the last evaluation.
     """
 
     found: Found
@@ -83,6 +84,12 @@ def neighbours_of(model: Model) -> Neighbours:
 
 
 @leaf
+def forget(near):  # type: ignore[no-untyped-def]
+    """Make the next evaluation gather its neighbours anew."""
+    near.memory[_SLACK] = -1.0
+
+
+@inner
 def evaluate(model, pose, near, most_slack):  # type: ignore[no-untyped-def]
     """The cost of a pose and its gradient, 13 sums; an infinite cost if it is not finite.
 
@@ -91,18 +98,16 @@ def evaluate(model, pose, near, most_slack):  # type: ignore[no-untyped-def]
     """
     free, found, memory = model.free, near.found, near.memory
     if not finite(pose):
-        memory[0] = -1.0
         return _added(_NOTHING, np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     move = _movement(free.interior, pose)
-    if not rigid(pose):
-        memory[0] = -1.0
-        count = walk(free.tree, free.region, move, np.inf, found)
-    elif len(free.lattice.cells) > 0:
-        count = look_up(free.lattice, free.tree, free.region, move, _movement(True, pose), found)
-    elif most_slack == 0.0:
-        count = walk(free.tree, free.region, move, free.slack, found)
+    if len(free.lattice.cells) > 0 and rigid(pose):
+        back = _movement(True, pose)
+        count = look_up(free.lattice, free.tree, free.region, move, back, found)
     else:
-        count = _refresh(free, pose, move, found, memory, most_slack)
+        slack = _slack_to_gather(free, pose, memory, most_slack)
+        if slack >= 0.0:
+            memory[_COUNT] = walk(free.tree, free.region, move, slack, found)
+        count = int(memory[_COUNT])
     locate(move, free.region.box, found.x, found.y, found.z, found.places, count)
     if free.interior:
         sums = _interior_sums(free, pose, found, count)
@@ -112,22 +117,28 @@ def evaluate(model, pose, near, most_slack):  # type: ignore[no-untyped-def]
     return _with_known(sums, model, pose, found.places)
 
 
-@leaf
-def _refresh(free, pose, move, found, memory, most_slack):  # type: ignore[no-untyped-def]
-    """How many points can matter; gathered anew where the object has left the slack they have."""
-    place = _place(free.centre, pose)
-    radius = free.radius
-    stride = np.inf if memory[0] < 0.0 else _travel(place, radius, pose, memory, _LAST)
-    if memory[0] < 0.0 or _travel(place, radius, pose, memory, _GATHERED) > memory[1]:
-        slack = min(STEPS_AHEAD * stride, most_slack) if stride < most_slack else 0.0
-        memory[1] = slack
-        memory[0] = walk(free.tree, free.region, move, max(slack + 1e-9, free.slack), found)
-        _remember(place, pose, memory, _GATHERED)
-    _remember(place, pose, memory, _LAST)
-    return int(memory[0])
+@spliced
+def _slack_to_gather(free, pose, memory, most_slack):  # type: ignore[no-untyped-def]
+    """The slack to gather points with; negative if those gathered last are all that matter."""
+    slack = free.slack
+    if not rigid(pose) or most_slack == 0.0:  # distances do not hold, or are not worth it
+        slack = slack if rigid(pose) else np.inf
+        memory[_SLACK] = -1.0
+    else:
+        place, radius = _place(free.centre, pose), free.radius
+        stride = _travel(place, radius, pose, memory, _LAST)
+        if memory[_SLACK] < 0.0 or _travel(place, radius, pose, memory, _GATHERED) > memory[_SLACK]:
+            stride = stride if memory[_SLACK] >= 0.0 else np.inf
+            memory[_SLACK] = min(STEPS_AHEAD * stride, most_slack) if stride < most_slack else 0.0
+            slack = max(memory[_SLACK] + 1e-9, free.slack)
+            _remember(place, pose, memory, _GATHERED)
+        else:
+            slack = -1.0
+        _remember(place, pose, memory, _LAST)
+    return slack
 
 
-@leaf
+@spliced
 def _free_sums(model, found, count):  # type: ignore[no-untyped-def]
     """lambda sum max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8)."""
     box, table, trilinear = model.field.box, model.field.table, model.field.trilinear
@@ -144,7 +155,7 @@ def _free_sums(model, found, count):  # type: ignore[no-untyped-def]
     return sums
 
 
-@leaf
+@spliced
 def _interior_sums(free, pose, found, count):  # type: ignore[no-untyped-def]
     """A weight w at y = R^T (m - t), with gradient w R^T n by y: inwards, out of the free voxel."""
     clearance, weights, normals = free.region.clearance, free.weights, free.normals
@@ -163,7 +174,7 @@ def _interior_sums(free, pose, found, count):  # type: ignore[no-untyped-def]
     return sums
 
 
-@leaf
+@spliced
 def _with_occupied(sums, model, pose, places):  # type: ignore[no-untyped-def]
     """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
     box, table, trilinear = model.field.box, model.field.table, model.field.trilinear
@@ -181,7 +192,7 @@ def _with_occupied(sums, model, pose, places):  # type: ignore[no-untyped-def]
     return sums
 
 
-@leaf
+@spliced
 def _with_known(sums, model, pose, places):  # type: ignore[no-untyped-def]
     """sum |s - v|, with gradient (s - v) n, over points of known signed distance (Eq. 10)."""
     box, table, trilinear = model.field.box, model.field.table, model.field.trilinear

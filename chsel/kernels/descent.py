@@ -6,7 +6,7 @@ import numpy as np
 
 from chsel.kernels.adam import BETA1, BETA2, EPSILON, adam_step
 from chsel.kernels.compiler import compiled
-from chsel.kernels.cost import MOST_SLACK, evaluate
+from chsel.kernels.cost import MOST_SLACK, evaluate, forget
 from chsel.kernels.pose import decode, pull_back
 
 
@@ -23,7 +23,7 @@ def descend(model, space, vectors, rate, divisor, iterations, first, last, work)
         vector = vectors[n]
         moments[:] = 0.0
         power1 = power2 = 1.0
-        near.memory[0] = -1.0
+        forget(near)
         for _ in range(iterations):
             sums = evaluate(model, decode(space, vector), near, MOST_SLACK)
             pull_back(space, vector, sums[4:13] + sums[1:4], gradient)

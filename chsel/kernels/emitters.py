@@ -19,7 +19,7 @@ from chsel.kernels.archive import (
     rank,
     sampled_cell,
 )
-from chsel.kernels.compiler import compiled, inner
+from chsel.kernels.compiler import compiled, inner, spliced
 from chsel.kernels.evolution import Strategy, ask, reset, stopped, strategy_around, tell
 from chsel.kernels.objective import (
     cost_and_gradient_of,
@@ -173,7 +173,7 @@ def cma_me(
             reset(strategy)
 
 
-@inner
+@spliced
 def _evaluate(model: Any, space: Any, measure: Any, batch: Batch, work: Any) -> None:
     """Fill objectives and measures; a vector that is not finite is not looked up anywhere."""
     vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from chsel.kernels.compiler import compiled, leaf
+from chsel.kernels.compiler import compiled, spliced
 from chsel.kernels.cost import Model, Neighbours, evaluate, neighbours_of
 from chsel.kernels.measures import measure_gradients_of, measures_of
 from chsel.kernels.pose import decode, pose_at, pull_back
@@ -23,13 +23,13 @@ def work_for(model: Model) -> Work:
     return Work(neighbours_of(model))
 
 
-@leaf
+@spliced
 def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
     """The cost of a search vector (d,)."""
     return evaluate(model, decode(space, vector), work.near, 0.0)[0]
 
 
-@leaf
+@spliced
 def cost_and_gradient_of(model, space, vector, gradient, work):  # type: ignore[no-untyped-def]
     """The cost of a search vector (d,); fills its gradient (d,)."""
     sums = evaluate(model, decode(space, vector), work.near, 0.0)

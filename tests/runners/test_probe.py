@@ -159,7 +159,7 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
     points: tuple[str, ...], tmp_path: Path
 ) -> None:
     command = [sys.executable, "-m", "runners.probe", *points, f"logs={tmp_path}"]
-    slow = ["method.emitter.iterations=2000", "recording=mcap"]
+    slow = ["method.emitter.iterations=50000", "recording=mcap"]
     process = subprocess.Popen(command + slow, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     recordings: list[Path] = []
