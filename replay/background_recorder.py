@@ -15,15 +15,17 @@ class BackgroundRecorder(Recorder):
 
     most: events that may wait; whoever records another one then waits for its place. Events are
     frozen values, and nobody may change their arrays. `flush` and `close` return when the other
-    recorder has done the same. An error of the other recorder is raised by the next call; what was
-    recorded in between is dropped, as if the caller had stopped at the event that failed.
+    recorder has done the same; patient: False lets `flush` only ask for it. An error of the other
+    recorder is raised by the next call; what was recorded in between is dropped, as if the caller
+    had stopped at the event that failed.
     """
 
-    def __init__(self, recorder: Recorder, *, most: int = 16) -> None:
+    def __init__(self, recorder: Recorder, *, most: int = 16, patient: bool = True) -> None:
         self._recorder = recorder
         self._jobs: Queue[Callable[[], None] | None] = Queue(most)
         self._error: BaseException | None = None
         self._closed = False
+        self._patient = patient
         # A daemon, so that a run that ends without closing its recorder does end.
         self._thread = Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -37,12 +39,13 @@ class BackgroundRecorder(Recorder):
             self._jobs.put(partial(self._recorder.record, event))
 
     def flush(self) -> None:
-        """Wait until all events so far are recorded and flushed."""
+        """Wait until all events so far are recorded and flushed, or only have it done soon."""
         if self._closed:
             self._recorder.flush()
         else:
             self._jobs.put(self._recorder.flush)
-            self._jobs.join()
+            if self._patient:
+                self._jobs.join()
             self._raise_error()
 
     def close(self) -> None:

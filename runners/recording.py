@@ -57,13 +57,17 @@ def make_run_folder(logs: Path, *names: str) -> Path:
 
 
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
-    """A recorder to all files that `config` asks for, each written by a thread of its own."""
+    """A recorder to all files that `config` asks for, each written by a thread of its own.
+
+    After every step the run waits for the MCAP file, the full record, and not for the pictures.
+    """
     recorders: list[Recorder] = []
     if config.mcap:
         recorders.append(BackgroundRecorder(McapRecorder(folder / "recording.mcap")))
     if config.rerun or config.live:
         path = folder / "recording.rrd" if config.rerun else None
-        recorders.append(BackgroundRecorder(RerunRecorder(path, live=config.live)))
+        pictures = RerunRecorder(path, live=config.live)
+        recorders.append(BackgroundRecorder(pictures, patient=False))
     return TeeRecorder(recorders)
 
 

@@ -177,39 +177,45 @@ def _interior_sums(free, pose, found, count):  # type: ignore[no-untyped-def]
 @spliced
 def _with_occupied(sums, model, pose, places):  # type: ignore[no-untyped-def]
     """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
-    box, table, trilinear = model.field.box, model.field.table, model.field.trilinear
+    field, table = model.field, model.field.table
     xs, ys, zs = model.occupied[0], model.occupied[1], model.occupied[2]
-    locate(pose, box, xs, ys, zs, places, len(xs))
+    locate(pose, field.box, xs, ys, zs, places, len(xs))
     for n in range(len(xs)):
-        s, nx, ny, nz = sample(trilinear, box, table, places, n)
-        if places.beyond[n] > 0.0:
-            a, b, c = _moved(pose, xs[n], ys[n], zs[n])
-            s, nx, ny, nz = continued(model.field.box_distance, box, (s, nx, ny, nz), a, b, c)
+        x, y, z = xs[n], ys[n], zs[n]
+        s, nx, ny, nz = _distance_at(field, table, places, n, pose, x, y, z)
         violation = max(model.alpha + s, 0.0)
         size = model.occupied_scale * _slope(model, violation)
         value = model.occupied_scale * violation
-        sums = _added(sums, value, size * nx, size * ny, size * nz, xs[n], ys[n], zs[n])
+        sums = _added(sums, value, size * nx, size * ny, size * nz, x, y, z)
     return sums
 
 
 @spliced
 def _with_known(sums, model, pose, places):  # type: ignore[no-untyped-def]
     """sum |s - v|, with gradient (s - v) n, over points of known signed distance (Eq. 10)."""
-    box, table, trilinear = model.field.box, model.field.table, model.field.trilinear
+    field, table = model.field, model.field.table
     xs, ys, zs = model.known[0], model.known[1], model.known[2]
-    locate(pose, box, xs, ys, zs, places, len(xs))
+    locate(pose, field.box, xs, ys, zs, places, len(xs))
     for n in range(len(xs)):
-        s, nx, ny, nz = sample(trilinear, box, table, places, n)
-        if places.beyond[n] > 0.0:
-            a, b, c = _moved(pose, xs[n], ys[n], zs[n])
-            s, nx, ny, nz = continued(model.field.box_distance, box, (s, nx, ny, nz), a, b, c)
+        x, y, z = xs[n], ys[n], zs[n]
+        s, nx, ny, nz = _distance_at(field, table, places, n, pose, x, y, z)
         difference = s - model.known_sdf[n]
         excess = max(abs(difference) - model.known_tolerance, 0.0)
         size = model.known_scale * _slope(model, excess)
         size = size if difference > 0.0 else -size
         value = model.known_scale * excess
-        sums = _added(sums, value, size * nx, size * ny, size * nz, xs[n], ys[n], zs[n])
+        sums = _added(sums, value, size * nx, size * ny, size * nz, x, y, z)
     return sums
+
+
+@leaf
+def _distance_at(field, table, places, n, pose, x, y, z):  # type: ignore[no-untyped-def]
+    """Signed distance and gradient at the n-th of the places, that of a world point x, y, z."""
+    inside = sample(field.trilinear, field.box, table, places, n)
+    if places.beyond[n] > 0.0:
+        a, b, c = _moved(pose, x, y, z)
+        return continued(field.box_distance, field.box, inside, a, b, c)
+    return inside
 
 
 @leaf

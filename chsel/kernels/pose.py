@@ -54,14 +54,19 @@ def decode(space, x):  # type: ignore[no-untyped-def]
 
 @leaf
 def _spatial(x):  # type: ignore[no-untyped-def]
-    """Gram-Schmidt on two rows (Zhou et al.; CHSEL, Sec. IV-B)."""
+    p, q, r, u, v, w, _, _, _ = _gram_schmidt(x)
+    return p, q, r, u, v, w, q * w - r * v, r * u - p * w, p * v - q * u, x[6], x[7], x[8]
+
+
+@leaf
+def _gram_schmidt(x):  # type: ignore[no-untyped-def]
+    """Two rows made orthonormal (Zhou et al.; CHSEL, Sec. IV-B): b1 and b2, |a1|, b1 . a2, |u|."""
     a = _length(x[0], x[1], x[2])
     p, q, r = x[0] / a, x[1] / a, x[2] / a
     along = p * x[3] + q * x[4] + r * x[5]
     u, v, w = x[3] - along * p, x[4] - along * q, x[5] - along * r
     b = _length(u, v, w)
-    u, v, w = u / b, v / b, w / b
-    return p, q, r, u, v, w, q * w - r * v, r * u - p * w, p * v - q * u, x[6], x[7], x[8]
+    return p, q, r, u / b, v / b, w / b, a, along, b
 
 
 @leaf
@@ -98,12 +103,7 @@ def pull_back(space, x, by_pose, gradient):  # type: ignore[no-untyped-def]
 @leaf
 def _pull_back_spatial(x, by_pose, gradient):  # type: ignore[no-untyped-def]
     """Back through b3 = b1 x b2, b2 = u / |u|, u = a2 - (b1 . a2) b1, b1 = a1 / |a1|."""
-    a = _length(x[0], x[1], x[2])
-    p, q, r = x[0] / a, x[1] / a, x[2] / a
-    along = p * x[3] + q * x[4] + r * x[5]
-    u, v, w = x[3] - along * p, x[4] - along * q, x[5] - along * r
-    b = _length(u, v, w)
-    u, v, w = u / b, v / b, w / b
+    p, q, r, u, v, w, a, along, b = _gram_schmidt(x)
     d, e, f = by_pose[6], by_pose[7], by_pose[8]
     p2 = by_pose[3] + (e * r - f * q)
     q2 = by_pose[4] + (f * p - d * r)

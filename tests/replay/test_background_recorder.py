@@ -65,6 +65,17 @@ def test_the_caller_goes_on_while_an_event_is_recorded():
     assert "recorder" in gate.threads
 
 
+def test_an_impatient_flush_comes_soon_and_keeps_nobody_waiting():
+    gate = Gate(is_open=False)
+    recorder = BackgroundRecorder(gate, patient=False)
+    recorder.record("first")
+    recorder.flush()
+    assert gate.calls == []
+    gate.gate.set()
+    recorder.close()
+    assert gate.calls == ["first", "flush", "close"]
+
+
 def test_flush_returns_when_all_before_it_is_recorded_and_flushed():
     gate = Gate()
     recorder = BackgroundRecorder(gate)
