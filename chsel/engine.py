@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray
+from chsel.arrays import FloatArray
 from chsel.cost_settings import CostSettings
 from chsel.errors import SettingError, require_choice
 from chsel.interior import InteriorPoints, VoxelGrid, interior_points, interior_spacing
@@ -23,6 +23,7 @@ from chsel.problem import RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.threads import spread
 
+_POSES_PER_THREAD = 200  # fewer are costed faster than a thread wakes up
 WAYS = ("fastest", "direct", "tree", "lattice")
 
 
@@ -78,7 +79,7 @@ class CompiledCost:
         def run(first: int, last: int, work: Any) -> None:
             costs_of_poses(self.model, poses, costs, first, last, work)
 
-        spread(run, len(poses), lambda: work_for(self.model))
+        spread(run, len(poses), lambda: work_for(self.model), least=_POSES_PER_THREAD)
         return costs
 
 
@@ -120,20 +121,9 @@ def _free_term(
 
 def _region_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
     """The cells of a grid that read any value below `level`."""
-    between = lookup == "trilinear"
-    box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=between)
-    below = sdf.values < level
-    if between:
-        below = _any_corner(below)
-    return Region(box, clearance_of(below, sdf.resolution))
-
-
-def _any_corner(flags: BoolArray) -> BoolArray:
-    """Whether any corner of the cell above each node (nx, ny, nz) is set."""
-    for axis in range(3):
-        above = np.roll(flags, -1, axis=axis)  # nothing is set on the border, so none comes around
-        flags = flags | above
-    return flags
+    box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
+    active = sdf.active_cells(level, lookup).numpy().reshape(sdf.shape)
+    return Region(box, clearance_of(active, sdf.resolution))
 
 
 def _sphere_of(region: Region) -> tuple[tuple[float, float, float], float]:

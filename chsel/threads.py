@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any
 
@@ -17,12 +17,19 @@ _SHARES = 4  # pieces per thread, so that none waits long for another
 _here = threading.local()
 
 
-def spread(run: Callable[[int, int, Any], None], count: int, scratch: Callable[[], Any]) -> None:
+def spread(
+    run: Callable[[int, int, Any], None],
+    count: int,
+    scratch: Callable[[], Any],
+    *,
+    least: int = 1,
+) -> None:
     """Call run(first, last, scratch) on pieces of range(count), on as many threads as torch uses.
 
-    scratch: makes what one thread works in. The pieces must not depend on each other.
+    scratch: makes what one thread works in. The pieces must not depend on each other. least: how
+    many at least are worth another thread.
     """
-    threads = min(torch.get_num_threads(), count)
+    threads = min(torch.get_num_threads(), count // least)
     if threads <= 1 or hasattr(_here, "works"):  # a worker must not wait for workers
         if count:
             run(0, count, scratch())
@@ -36,8 +43,13 @@ def spread(run: Callable[[int, int, Any], None], count: int, scratch: Callable[[
         for first in pieces:
             run(first, min(first + size, count), own)
 
-    for future in [_pool(threads).submit(work) for _ in range(threads)]:
-        future.result()
+    others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        wait(others)
+    for other in others:
+        other.result()
 
 
 @cache

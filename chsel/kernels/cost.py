@@ -208,7 +208,7 @@ def _with_known(sums, model, pose, places):  # type: ignore[no-untyped-def]
     return sums
 
 
-@leaf
+@spliced
 def _distance_at(field, table, places, n, pose, x, y, z):  # type: ignore[no-untyped-def]
     """Signed distance and gradient at the n-th of the places, that of a world point x, y, z."""
     inside = sample(field.trilinear, field.box, table, places, n)
@@ -252,7 +252,7 @@ def _added_outer(t, value, by_t, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@leaf
+@spliced
 def _movement(back, pose):  # type: ignore[no-untyped-def]
     """The numbers of x -> R x + t, or of the way back m -> R^T m - R^T t."""
     a, b, c = pose[0], pose[1], pose[2]
@@ -274,7 +274,7 @@ def _moved(move, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@leaf
+@spliced
 def _travel(place, radius, pose, memory, at):  # type: ignore[no-untyped-def]
     """How far in the world any point of the object's side moved since it was remembered.
 
@@ -288,14 +288,14 @@ def _travel(place, radius, pose, memory, at):  # type: ignore[no-untyped-def]
     return np.sqrt(dx * dx + dy * dy + dz * dz) + np.sqrt(0.5 * turn) * radius
 
 
-@leaf
+@spliced
 def _remember(place, pose, memory, at):  # type: ignore[no-untyped-def]
     memory[at], memory[at + 1], memory[at + 2] = place
     for i in range(9):
         memory[at + 3 + i] = pose[i]
 
 
-@leaf
+@spliced
 def _place(centre, pose):  # type: ignore[no-untyped-def]
     """Where in the world the centre of the object's side is: R^T (c - t)."""
     x, y, z = centre[0] - pose[9], centre[1] - pose[10], centre[2] - pose[11]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.arrays import FloatArray
-from chsel.kernels.compiler import compiled, leaf
+from chsel.kernels.compiler import compiled, spliced
 from chsel.kernels.region import Box, Region, box_of, locate, triple
 from chsel.kernels.tree import Tree
 
@@ -85,7 +85,7 @@ def _fill(points, origin, spacing, counts, tolerance, point_at):  # type: ignore
     return True
 
 
-@leaf
+@spliced
 def look_up(lattice, tree, region, move, back, found):  # type: ignore[no-untyped-def]
     """Find the points that lie in the region once moved; how many they are, ascending.
 
@@ -112,14 +112,14 @@ def look_up(lattice, tree, region, move, back, found):  # type: ignore[no-untype
     return count
 
 
-@leaf
+@spliced
 def _fetch(spheres, nodes, found, count):  # type: ignore[no-untyped-def]
     for n in range(count):
         node = nodes + found.kept[n]
         found.x[n], found.y[n], found.z[n] = spheres[0, node], spheres[1, node], spheres[2, node]
 
 
-@leaf
+@spliced
 def _sort(numbers, count):  # type: ignore[no-untyped-def]
     """Insertion sort: there are few, and mostly in order."""
     for n in range(1, count):

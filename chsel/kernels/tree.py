@@ -12,7 +12,7 @@ import numpy as np
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.errors import PointsError
-from chsel.kernels.compiler import compiled, leaf
+from chsel.kernels.compiler import compiled, leaf, spliced
 from chsel.kernels.region import Places, locate, places_for
 
 _LEAF_SIZE = 4  # points in a leaf at least, in the mean
@@ -211,7 +211,7 @@ def _build(points, keys, order, shift, size, spheres, starts, levels):  # type: 
         spheres[3, node] = np.sqrt(squared) * (1.0 + 1e-12) + size
 
 
-@leaf
+@spliced
 def _widen(low, high, node, child, is_first, nodes, spheres):  # type: ignore[no-untyped-def]
     """Make the box of a node hold a child's: another node's box, or a point."""
     for axis in range(3):
@@ -223,11 +223,11 @@ def _widen(low, high, node, child, is_first, nodes, spheres):  # type: ignore[no
         high[axis, node] = b if is_first else max(high[axis, node], b)
 
 
-@leaf
+@spliced
 def walk(tree, region, move, slack, found):  # type: ignore[no-untyped-def]
     """Find the points that are within `slack` metres of a region once moved; how many they are.
 
-    They are in found.x, y, z, nodes, in ascending order. A node is left out if no point of its
+    They are in found.x, y, z, kept, in ascending order. A node is left out if no point of its
     sphere can be so near; all points are found for an infinite slack.
     """
     levels = tree.levels
@@ -244,7 +244,7 @@ def walk(tree, region, move, slack, found):  # type: ignore[no-untyped-def]
     return count
 
 
-@leaf
+@spliced
 def _take(spheres, nodes, count, found):  # type: ignore[no-untyped-def]
     for n in range(count):
         node = nodes[n]
@@ -254,7 +254,7 @@ def _take(spheres, nodes, count, found):  # type: ignore[no-untyped-def]
     return count
 
 
-@leaf
+@spliced
 def _expand(spheres, starts, count, found):  # type: ignore[no-untyped-def]
     """The children of the nodes kept."""
     kept, nodes = found.kept, found.nodes
@@ -269,7 +269,7 @@ def _expand(spheres, starts, count, found):  # type: ignore[no-untyped-def]
     return total
 
 
-@leaf
+@spliced
 def _keep(clearance, slack, found, count):  # type: ignore[no-untyped-def]
     """Keep what is near enough, in its order; the counting is free of branches."""
     x, y, z, radius, nodes, kept = found.x, found.y, found.z, found.radius, found.nodes, found.kept

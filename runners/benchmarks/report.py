@@ -67,12 +67,14 @@ def _machine(machine: Values) -> list[str]:
 
 def _show_comparison(console: Console, rows: Sequence[Values]) -> None:
     compared = any(row["times_ours"] for row in rows)
-    title = "one registration in ms" + ("; x: times ours, median by median" if compared else "")
+    title = "one registration in ms"
+    if compared:
+        title += "; x ref, pap, def: times ours in preset reference, paper, default"
     title += "\ncost: of the best pose, by Eq. 7 with nearest lookup for all"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
     for name in ("problem", "registration"):
         table.add_column(name, no_wrap=True)
-    ratio_names = [f"x {preset}" for preset in PRESETS] if compared else []
+    ratio_names = [f"x {preset[:3]}" for preset in PRESETS] if compared else []
     for name in ("median", "quartiles", *ratio_names, "cost"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
