@@ -93,6 +93,10 @@ def poses_of(object_from_world: FloatArray) -> FloatArray:
 def _free_term(
     sdf: SdfGrid, free: FloatArray, settings: CostSettings, free_resolution: float, way: str
 ) -> FreeTerm:
+    if settings.free_term == "interior" and way == "lattice":
+        raise SettingError(
+            "way is lattice, which free_term interior has none of; accepted: fastest, tree, direct"
+        )
     if settings.free_term == "interior" and len(free):
         return _interior_term(sdf, free, settings, free_resolution, way)
     alpha, lookup = settings.penetration_tolerance, settings.lookup

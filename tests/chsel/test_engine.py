@@ -380,11 +380,26 @@ EDGES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("free_term", ["direct", "interior"])
-@pytest.mark.parametrize("name", [*EDGES, "in two clusters 1000 km apart"])
+@pytest.mark.parametrize(
+    ("free_term", "spacing", "named"),
+    [("interior", 0.05, "interior has none"), ("direct", 0.001, "no lattice coarser")],
+)
+def test_a_way_that_does_not_fit_is_refused(free_term: str, spacing: float, named: str) -> None:
+    sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.01)
+    points = KnownPoints(free=np.eye(3) * 0.2)
+    settings = CostSettings(free_term=free_term)
+    with pytest.raises(SettingError, match=f"way is lattice.*{named}.*accepted: fastest"):
+        CompiledCost(sdf, points, settings, free_resolution=spacing, way="lattice")
+    with pytest.raises(SettingError, match="way is 'quick'; accepted: fastest, direct"):
+        CompiledCost(sdf, points, settings, way="quick")
+
+
+@pytest.mark.parametrize(
+    ("name", "free_term"),
+    [(name, term) for name in EDGES for term in ("direct", "interior")]
+    + [("in two clusters 1000 km apart", "direct")],  # too many voxels for the other
+)
 def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term: str) -> None:
-    if free_term == "interior" and name == "in two clusters 1000 km apart":
-        pytest.skip("more voxels than are accepted")
     stream = np.random.default_rng(7)
     transforms = compose(random_rotations(stream, 4), stream.uniform(-0.02, 0.02, (4, 3)))
     vectors = SE3Space().encode(transforms)
