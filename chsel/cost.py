@@ -17,7 +17,7 @@ from chsel.errors import EngineError, require_positive
 from chsel.free_tree import FreeTree
 from chsel.interior import VoxelGrid, interior_points, interior_spacing
 from chsel.points import KnownPoints
-from chsel.pose import as_tensor, moved
+from chsel.pose import as_tensor, moved, stacked
 from chsel.problem import RegistrationProblem
 from chsel.sdf import SdfGrid
 
@@ -124,7 +124,7 @@ class RelaxedCost:
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
-        transforms = np.asarray(object_from_world, dtype=np.float64)
+        transforms = stacked(object_from_world)
         costs, size = np.empty(len(transforms)), self._poses_at_once
         for first in range(0, len(transforms), size):
             some = as_tensor(transforms[first : first + size], self.device)

@@ -130,8 +130,7 @@ def cma_me(
 
 def _problem(objective: Objective, archive: GridArchive) -> tuple[Any, Any, Any, Any]:
     """What the kernels evaluate: the cost's model, the space, the measure, and scratch."""
-    measure = objective.measure_code(archive.measure)
-    return objective.model, objective.space_arrays, measure, objective.work()
+    return objective.model, objective.space_arrays, archive.measure.code, objective.work()
 
 
 class ArchiveWatch:

@@ -17,8 +17,9 @@ from chsel.kernels.field import field_of
 from chsel.kernels.lattice import MOST_CELLS, NO_LATTICE, cell_centres, lattice_of
 from chsel.kernels.objective import costs_of_poses, work_for
 from chsel.kernels.region import Region, box_of, clearance_of, triple
-from chsel.kernels.tree import Tree, octree
+from chsel.kernels.tree import Tree, octree, rounding_margin
 from chsel.points import KnownPoints
+from chsel.pose import stacked
 from chsel.problem import RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.threads import spread
@@ -85,7 +86,7 @@ class CompiledCost:
 
 def poses_of(object_from_world: FloatArray) -> FloatArray:
     """Poses (B, 12) of transforms (B, 4, 4)."""
-    transforms = np.asarray(object_from_world, dtype=np.float64)
+    transforms = stacked(object_from_world)
     rotations = transforms[:, :3, :3].reshape(-1, 9)
     return np.concatenate([rotations, transforms[:, :3, 3]], axis=1)
 
@@ -119,8 +120,15 @@ def _free_term(
             "way is lattice, but free points are no lattice coarser than the diagonal of an SDF "
             "cell; accepted: fastest, tree, direct"
         )
-    slack = np.inf if way == "direct" else 0.0
-    return FreeTerm(False, tree, region, *none, centre, radius, slack, lattice or NO_LATTICE)
+    reach = np.inf if way == "direct" else 0.0, _margin(tree, region)
+    return FreeTerm(False, tree, region, *none, centre, radius, *reach, lattice or NO_LATTICE)
+
+
+def _margin(tree: Tree, region: Region) -> float:
+    """More metres than rounding moves a point of either frame."""
+    uppermost = tree.spheres[:, : tree.levels[min(1, len(tree.levels) - 1)]]
+    corners = np.array([region.box.first, region.box.last])
+    return rounding_margin(np.concatenate([2.0 * uppermost.reshape(-1), corners.reshape(-1)]))
 
 
 def _region_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
@@ -160,9 +168,9 @@ def _interior_term(
     region = Region(box, clearance_of(voxels.flags, free_resolution))
     centre, radius = _sphere(interior.points, 0.0)
     weights = scale * interior.depth
-    slack = np.inf if way == "direct" else 0.0
+    reach = np.inf if way == "direct" else 0.0, _margin(tree, region)
     normals = interior.normals
-    return FreeTerm(True, tree, region, weights, normals, centre, radius, slack, NO_LATTICE)
+    return FreeTerm(True, tree, region, weights, normals, centre, radius, *reach, NO_LATTICE)
 
 
 def _interior_tree(sdf: SdfGrid, settings: CostSettings) -> tuple[Tree, InteriorPoints]:

@@ -9,7 +9,7 @@ import numpy as np
 from chsel.arrays import FloatArray
 from chsel.engine import CompiledCost
 from chsel.kernels.descent import descend
-from chsel.kernels.measures import MeasureCode, all_measures, measure_gradients
+from chsel.kernels.measures import all_measures, measure_gradients
 from chsel.kernels.objective import Work, costs_and_gradients, work_for
 from chsel.kernels.pose import decode_all
 from chsel.measures import Measure
@@ -29,11 +29,6 @@ class Objective:
     def work(self) -> Work:
         """Scratch for one thread."""
         return work_for(self.model)
-
-    @staticmethod
-    def measure_code(measure: Measure) -> MeasureCode:
-        """The measure as the kernels know it."""
-        return measure.code
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d)."""

@@ -16,6 +16,16 @@ from chsel.streams import normals
 RIGID_TOLERANCE = 1e-6
 
 
+def stacked(object_from_world: Any) -> FloatArray:
+    """Transforms (B, 4, 4) as numbers, finite or not; PoseError for another shape."""
+    transforms = np.asarray(object_from_world, dtype=np.float64)
+    if transforms.ndim != 3 or transforms.shape[1:] != (4, 4):
+        raise PoseError(
+            f"object_from_world has shape {transforms.shape}; accepted: (any, 4, 4), several poses"
+        )
+    return transforms
+
+
 def check_rigid(name: str, transforms: FloatArray, tolerance: float = RIGID_TOLERANCE) -> None:
     """Raise PoseError unless every (4, 4) of transforms (B, 4, 4) is a rotation and translation."""
     rotations = transforms[:, :3, :3]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -29,12 +30,12 @@ def spread(
     scratch: makes what one thread works in. The pieces must not depend on each other. least: how
     many at least are worth another thread.
     """
-    threads = min(torch.get_num_threads(), count // least)
-    if threads <= 1 or hasattr(_here, "works"):  # a worker must not wait for workers
+    most = min(torch.get_num_threads(), count // least)
+    if most <= 1 or hasattr(_here, "works"):  # a worker must not wait for workers
         if count:
             run(0, count, scratch())
         return
-    size = -(-count // (threads * _SHARES))
+    size = -(-count // (most * _SHARES))
     pieces = iter(range(0, count, size))
 
     def work() -> None:
@@ -43,7 +44,7 @@ def spread(
         for first in pieces:
             run(first, min(first + size, count), own)
 
-    others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    others = [_pool(most - 1).submit(work) for _ in range(most - 1)]
     try:
         work()
     finally:
@@ -52,9 +53,20 @@ def spread(
         other.result()
 
 
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """As many threads for a while, of torch and of the kernels."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="chsel", initializer=_become_worker)
+def _pool(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="chsel", initializer=_become_worker)
 
 
 def _become_worker() -> None:

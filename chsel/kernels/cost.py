@@ -31,7 +31,8 @@ class FreeTerm(NamedTuple):
     interior False: free points of the world, and the cells of the object below alpha. interior
     True: points inside of the object, with weights (N,) and normals (N, 3), and free voxels of
     the world. centre, radius: a sphere in the object frame that holds the object's side. slack: 0,
-    or infinite to leave out no point. lattice: of the free points, if they are asked that way.
+    or infinite to leave out no point. margin: more metres than rounding moves a point. lattice: of
+    the free points, if they are asked that way.
     """
 
     interior: bool
@@ -42,6 +43,7 @@ class FreeTerm(NamedTuple):
     centre: tuple[float, float, float]
     radius: float
     slack: float
+    margin: float
     lattice: Lattice
 
 
@@ -130,7 +132,7 @@ def _slack_to_gather(free, pose, memory, most_slack):  # type: ignore[no-untyped
         if memory[_SLACK] < 0.0 or _travel(place, radius, pose, memory, _GATHERED) > memory[_SLACK]:
             stride = stride if memory[_SLACK] >= 0.0 else np.inf
             memory[_SLACK] = min(STEPS_AHEAD * stride, most_slack) if stride < most_slack else 0.0
-            slack = max(memory[_SLACK] + 1e-9, free.slack)
+            slack = max(memory[_SLACK] + free.margin, free.slack)
             _remember(place, pose, memory, _GATHERED)
         else:
             slack = -1.0

@@ -13,7 +13,7 @@ import numpy as np
 from chsel.arrays import FloatArray
 from chsel.kernels.compiler import compiled, spliced
 from chsel.kernels.region import Box, Region, box_of, locate, triple
-from chsel.kernels.tree import Tree
+from chsel.kernels.tree import Tree, rounding_margin
 
 MOST_CELLS = 300  # for which this is the faster way
 _TOLERANCE = 1e-6  # of the spacing, that points may be off the lattice
@@ -45,10 +45,14 @@ def lattice_of(tree: Tree, spacing: float, region: Region) -> Lattice | None:
     """The tree's points as a lattice; None if they form none that is coarse enough."""
     nodes = len(tree.starts) - 1
     points = tree.spheres[:3, nodes:]
-    if points.shape[1] == 0 or not spacing * region.box.inverse > np.sqrt(3.0) * (1.0 + 1e-5):
+    if points.shape[1] == 0:
         return None
-    origin = points.min(axis=1) - spacing
-    shape = np.rint((points.max(axis=1) - origin) / spacing) + 2.0
+    room = 0.5 * spacing - 0.5 * np.sqrt(3.0) / region.box.inverse
+    lowest, highest = points.min(axis=1), points.max(axis=1)
+    if not room > 2.0 * _TOLERANCE * spacing + rounding_margin(np.array([lowest, highest])):
+        return None
+    origin = lowest - spacing
+    shape = np.rint((highest - origin) / spacing) + 2.0
     nodes_of_lattice = float(shape[0] * shape[1] * shape[2])
     if not nodes_of_lattice <= _MOST_NODES_PER_POINT * points.shape[1] + 1e6:
         return None

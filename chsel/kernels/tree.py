@@ -88,9 +88,14 @@ def octree(points: FloatArray, spacing: float) -> Tree:
     levels = levels[: depth + 1]
     spheres = np.empty((4, levels[-1] + count))
     starts = np.empty(levels[-1] + 1, dtype=np.int64)
-    size = 1e-9 + 1e-12 * float(np.abs(box).max())  # more than rounding can move a point
+    size = rounding_margin(box)
     _build(points, keys, order, index_bits + 3 * finest, size, spheres, starts, levels)
     return Tree(spheres, starts, levels, order)
+
+
+def rounding_margin(coordinates: FloatArray) -> float:
+    """More metres than rounding moves a point of such coordinates that is turned and shifted."""
+    return 1e-9 + 1e-12 * float(np.abs(coordinates).max(initial=0.0))
 
 
 @compiled

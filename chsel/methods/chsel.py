@@ -111,7 +111,8 @@ class Chsel:
         update_cells(archive, objective, space.encode(low_cost_set))
         # 6: M <- CMA-MEGA(M, C^, n_o)
         first = space.encode(initial_set[:1])[0]
-        start = first if settings.emitter.start == "initial" else archive.best_solution
+        best = archive.best_solution
+        start = first if settings.emitter.start == "initial" else best
         draws, watch = Draws(problem.key, index), ArchiveWatch(observer, index)
         watch.start(archive)
         self._search(objective, archive, start, count, settings.emitter, draws, watch)

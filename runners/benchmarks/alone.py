@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from chsel.arrays import FloatArray
 from chsel.cost import RelaxedCost
@@ -19,6 +18,7 @@ from chsel.engine import CompiledCost
 from chsel.online import OnlineSettings, first_initial_set
 from chsel.presets import COST
 from chsel.streams import StreamKey
+from chsel.threads import threads as use_threads
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
 from runners.benchmarks.ours import PRESETS, StageTimer, Steps, register
 from runners.benchmarks.problems import PROBLEMS, PosedProblem, Problem, pose
@@ -75,7 +75,7 @@ def threads(scope: Scope) -> Iterator[Row]:
     """One and two threads, in turn."""
 
     def measured(posed: PosedProblem, preset: str, count: int) -> float:
-        with _threads(count):
+        with use_threads(count):
             return 1000.0 * scope.seconds(posed, preset)
 
     for problem in _THREADED:
@@ -191,16 +191,6 @@ MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
     "memory": memory,
     "start": start,
 }
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextmanager

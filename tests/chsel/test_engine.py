@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -18,11 +18,12 @@ from hypothesis import strategies as st
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.arrays import FloatArray
 from chsel.engine import CompiledCost, poses_of
-from chsel.errors import EngineError, PointsError, SettingError
+from chsel.errors import EngineError, PointsError, PoseError, SettingError
 from chsel.kernels.adam import BETA1, BETA2, EPSILON
 from chsel.objective import Objective
 from chsel.pose import compose, random_rotations
 from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+from chsel.threads import threads
 
 pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
 BOX_SIDES = (0.12, 0.08, 0.06)
@@ -136,16 +137,6 @@ def assert_same_bits(first: object, second: object) -> None:
         one, other = np.asarray(one), np.asarray(other)
         assert one.shape == other.shape
         np.testing.assert_array_equal(one.view(np.int64), other.view(np.int64))
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @settings(max_examples=150, deadline=None)
@@ -590,3 +581,33 @@ def test_a_thread_that_flushes_subnormals_is_refused() -> None:
     finally:
         torch.set_flush_denormal(False)
     assert CompiledCost(grid_of("box"), points).evaluate(np.eye(4)[None])[0] > 0.0
+
+
+@pytest.mark.parametrize("distance", [6.4e6, 1e9])
+def test_lists_of_neighbours_hold_far_from_the_origin_too(distance: float) -> None:
+    """As in coordinates of the Earth's centre, where rounding moves points by nanometres."""
+    stream = np.random.default_rng(3)
+    sdf = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.15, 0.1)), 0.01)
+    far = distance * np.array([0.6, -0.48, 0.64])
+    points = KnownPoints(free=far + stream.uniform(-0.15, 0.15, (3000, 3)), known=far[None])
+    rotations = random_rotations(stream, 6)
+    there = stream.uniform(-0.05, 0.05, (6, 3)) - np.einsum("bij,j->bi", rotations, far)
+    vectors = SE3Space().encode(compose(rotations, there))
+    settings = CostSettings(penetration_tolerance=-0.01)
+    moved = []
+    for way in ("tree", "direct"):
+        cost = CompiledCost(sdf, points, settings, free_resolution=0.02, way=way)
+        objective = Objective(cost, SE3Space())
+        costs, gradients = objective.costs_and_gradients(vectors)
+        moved.append([costs, gradients, objective.descended(vectors, 1e6 * distance, 1e-9, 30)])
+    assert moved[0][0].max() > 1.0
+    for culled, direct in zip(*moved, strict=True):
+        assert_same_bits(culled, direct)
+
+
+@pytest.mark.parametrize("cost", [CompiledCost, RelaxedCost])
+def test_transforms_of_another_shape_are_refused(cost: type[CompiledCost | RelaxedCost]) -> None:
+    sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.01)
+    made = cost(sdf, KnownPoints(known=np.zeros((1, 3))))
+    with pytest.raises(PoseError, match=r"has shape \(4, 4\); accepted: \(any, 4, 4\)"):
+        made.evaluate(np.eye(4))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,7 +14,6 @@ import chsel.emitters
 from chsel.archive import GridArchive
 from chsel.arrays import FloatArray
 from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
-from chsel.kernels import emitters as kernels
 from chsel.kernels.emitters import mega_search
 from chsel.kernels.measures import VECTOR, MeasureCode
 from chsel.measures import Measure
@@ -44,9 +43,6 @@ class Quadratic:
     def __init__(self) -> None:
         self.model = Parameters(np.linspace(-0.3, 0.3, 9), np.linspace(1.0, 3.0, 9))
         self.space_arrays = 0
-
-    def measure_code(self, measure: Measure) -> MeasureCode:
-        return measure.code
 
     def work(self) -> int:
         return 0
@@ -85,15 +81,8 @@ def measure_gradients_of(space, measure, vector, out):  # type: ignore[no-untype
 
 
 @pytest.fixture(scope="module", autouse=True)
-def searches_of_the_quadratic() -> Iterator[None]:
-    """Compiles the searches, as they are, around the quadratic instead of around poses."""
-    with pytest.MonkeyPatch.context() as patch:
-        for function in (cost_of, cost_and_gradient_of, measures_of, measure_gradients_of):
-            patch.setattr(kernels, function.__name__, function)
-        for name in SEARCHES:
-            loop: Any = getattr(kernels, name)
-            patch.setattr(kernels, name, numba.njit(error_model="numpy")(loop.py_func))
-        yield
+def searches_of_the_quadratic(searches_around: Callable[..., None]) -> None:
+    searches_around(cost_of, cost_and_gradient_of, measures_of, measure_gradients_of)
 
 
 MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2, 6))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from operator import attrgetter
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -26,7 +27,7 @@ def optimised(dispatcher: Any) -> list[str]:
 
     Unlike numba's own way to inspect code, it also has code that was read from the cache.
     """
-    libraries = [made.library for made in dispatcher.overloads.values()]
+    libraries = map(attrgetter("library"), dispatcher.overloads.values())
     return [str(library._get_module_for_linking()) for library in libraries]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
@@ -41,9 +41,6 @@ class LandscapeObjective:
 
     def __init__(self, kind: int) -> None:
         self.model, self.space_arrays = Landscape(kind), 0
-
-    def measure_code(self, measure: Measure) -> MeasureCode:
-        return measure.code
 
     def work(self) -> int:
         return 0
@@ -84,15 +81,8 @@ def measure_gradients_of(space, measure, vector, out):  # type: ignore[no-untype
 
 
 @pytest.fixture(scope="module", autouse=True)
-def searches_of_a_landscape() -> Iterator[None]:
-    """Compiles the searches, as they are, around a landscape instead of around poses."""
-    with pytest.MonkeyPatch.context() as patch:
-        for function in (cost_of, cost_and_gradient_of, measures_of, measure_gradients_of):
-            patch.setattr(kernels, function.__name__, function)
-        for name in SEARCHES:
-            loop: Any = getattr(kernels, name)
-            patch.setattr(kernels, name, numba.njit(error_model="numpy")(loop.py_func))
-        yield
+def searches_of_a_landscape(searches_around: Callable[..., None]) -> None:
+    searches_around(cost_of, cost_and_gradient_of, measures_of, measure_gradients_of)
 
 
 class Watcher(NullObserver):
