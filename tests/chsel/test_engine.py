@@ -407,7 +407,7 @@ def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term:
 
 
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
-@pytest.mark.parametrize("far", [1e6, 1e9])
+@pytest.mark.parametrize("far", [1e6, 6.4e6, 1e9])
 def test_a_scene_far_from_the_origin_is_culled_without_loss(far: float, free_term: str) -> None:
     """At 1e9 m, neighbouring doubles are 0.1 micrometres apart."""
     stream = np.random.default_rng(8)
@@ -581,28 +581,6 @@ def test_a_thread_that_flushes_subnormals_is_refused() -> None:
     finally:
         torch.set_flush_denormal(False)
     assert CompiledCost(grid_of("box"), points).evaluate(np.eye(4)[None])[0] > 0.0
-
-
-@pytest.mark.parametrize("distance", [6.4e6, 1e9])
-def test_lists_of_neighbours_hold_far_from_the_origin_too(distance: float) -> None:
-    """As in coordinates of the Earth's centre, where rounding moves points by nanometres."""
-    stream = np.random.default_rng(3)
-    sdf = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.15, 0.1)), 0.01)
-    far = distance * np.array([0.6, -0.48, 0.64])
-    points = KnownPoints(free=far + stream.uniform(-0.15, 0.15, (3000, 3)), known=far[None])
-    rotations = random_rotations(stream, 6)
-    there = stream.uniform(-0.05, 0.05, (6, 3)) - np.einsum("bij,j->bi", rotations, far)
-    vectors = SE3Space().encode(compose(rotations, there))
-    settings = CostSettings(penetration_tolerance=-0.01)
-    moved = []
-    for way in ("tree", "direct"):
-        cost = CompiledCost(sdf, points, settings, free_resolution=0.02, way=way)
-        objective = Objective(cost, SE3Space())
-        costs, gradients = objective.costs_and_gradients(vectors)
-        moved.append([costs, gradients, objective.descended(vectors, 1e6 * distance, 1e-9, 30)])
-    assert moved[0][0].max() > 1.0
-    for culled, direct in zip(*moved, strict=True):
-        assert_same_bits(culled, direct)
 
 
 @pytest.mark.parametrize("cost", [CompiledCost, RelaxedCost])
