@@ -85,7 +85,7 @@ class GridArchive:
         if len(self.occupied) == 0:
             raise ChselError(
                 "the archive is empty, as no pose that was offered to it has a finite cost; "
-                "accepted: known points and an SDF of which the cost of some pose is finite"
+                "accepted: points, SDF and scales by which the cost of some pose is finite"
             )
         return self.cells.solutions[int(np.argmax(self.cells.objectives))]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from chsel.archive import GridArchive
 from chsel.arrays import BoolArray, FloatArray, IntArray
-from chsel.errors import require_choice, require_positive
+from chsel.errors import ChselError, require_choice, require_positive
 from chsel.measures import Measure
 from chsel.objective import Objective
 from chsel.problem import ArchiveSnapshot, Hypotheses
@@ -138,6 +138,11 @@ def ranked_hypotheses(
 ) -> Hypotheses:
     """Poses (B, 4, 4) from archive cells (B,), costed as they are and put in order of cost."""
     cost = objective.costs(objective.space.encode(object_from_world))
+    if not np.isfinite(cost).any():
+        raise ChselError(
+            "no hypothesis has a finite cost; accepted: points, SDF and scales by which the cost "
+            "of some pose is finite"
+        )
     order = np.argsort(cost, kind="stable")
     poses = object_from_world[order]
     return Hypotheses(poses, cost[order], repeated(poses), cells[order], elites, archive)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import trimesh
 
 from chsel import Hypotheses, KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.cost import RelaxedCost
+from chsel.errors import ChselError
 from chsel.evaluation.pose_error import pose_errors
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
@@ -108,6 +110,17 @@ def test_hypotheses_are_sorted_by_the_cost_of_exactly_these_poses(name: str, pre
     cost = RelaxedCost.of(problem, method.settings.cost).evaluate(found.object_from_world)
     np.testing.assert_allclose(found.cost, cost, rtol=1e-9, atol=1e-12)
     assert found.duplicate.sum() == 30 - len(np.unique(found.object_from_world, axis=0))
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered")
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", METHODS)
+def test_costs_beyond_all_numbers_are_an_error_that_says_so(name: str, preset: str) -> None:
+    cost = settings_mapping(preset_settings(name, preset))["cost"] | {"known_scale": 1e308}
+    method = quick(name, preset, cost=cost)
+    problem = replace(posed(method), points=KnownPoints(known=50.0 + np.eye(40, 3)))
+    with pytest.raises(ChselError, match=r"has a finite cost; accepted: points, SDF and scales"):
+        method.register(problem)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
