@@ -46,7 +46,9 @@ def descend(
     Each start runs on its own; the costs are those of the returned transforms.
     """
     estimates = initial_set
-    costs = previous = objective.costs(objective.space.encode(estimates))
+    vectors = objective.space.encode(estimates)
+    costs = previous = objective.costs(vectors)
+    observer.trace("descent", 0, vectors.copy(), costs.copy())
     count = len(estimates)
     for restart in range(settings.restarts):
         vectors = objective.space.encode(estimates)

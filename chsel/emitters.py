@@ -97,7 +97,7 @@ def cma_mega(
     )
     for first, last in watch.segments(total):
         kernels.cma_mega(*problem, archive.cells, search, normals, elites, first, last)
-        watch.after("cma_mega", last, total, archive)
+        watch.after(last, total, archive)
 
 
 def cma_me(
@@ -125,7 +125,7 @@ def cma_me(
     )
     for first, last in watch.segments(total):
         kernels.cma_me(*problem, archive.cells, search, normals, elites, first, last)
-        watch.after("cma_me", last, total, archive)
+        watch.after(last, total, archive)
 
 
 def _problem(objective: Objective, archive: GridArchive) -> tuple[Any, Any, Any, Any]:
@@ -138,12 +138,14 @@ class ArchiveWatch:
 
     trace_interval = 10
 
-    def __init__(self, observer: Observer, refinement: int) -> None:
+    def __init__(self, observer: Observer, refinement: int, stage: str) -> None:
         self._observer = observer
         self._refinement = refinement
+        self._stage = stage
 
     def start(self, archive: GridArchive) -> None:
         """The archive is seeded."""
+        self._observer.trace(self._stage, 0, archive.solutions, archive.costs)
         self._observer.snapshot(archive.snapshot(0, self._refinement))
 
     def segments(self, total: int) -> Iterator[tuple[int, int]]:
@@ -161,12 +163,12 @@ class ArchiveWatch:
         """The first multiple of the interval after an iteration."""
         return (iteration // interval + 1) * interval
 
-    def after(self, stage: str, iteration: int, total: int, archive: GridArchive) -> None:
+    def after(self, iteration: int, total: int, archive: GridArchive) -> None:
         """An iteration has ended."""
         interval = self._observer.snapshot_interval
         if iteration % self.trace_interval == 0 or iteration == total:
-            self._observer.trace(stage, iteration, archive.solutions, archive.costs)
-            self._observer.progress(stage, iteration, total)
+            self._observer.trace(self._stage, iteration, archive.solutions, archive.costs)
+            self._observer.progress(self._stage, iteration, total)
         if iteration == total or (interval and iteration % interval == 0):
             self._observer.snapshot(archive.snapshot(iteration, self._refinement))
 

@@ -18,7 +18,10 @@ class Observer(Protocol):
         """A stage has finished `iteration` of `total` iterations."""
 
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """State of a stage after a block of iterations: search vectors (B, d) and costs (B,)."""
+        """State of a stage at its start and after blocks of iterations: vectors, costs (B,).
+
+        vectors (B, d): of the search; of a quality-diversity search, all that its archive holds.
+        """
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:
         """The archive at this moment."""

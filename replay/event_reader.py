@@ -16,6 +16,7 @@ from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
 from replay.attachments import MESH, SDF_GRID, mesh_from_ply, sdf_from_bytes
+from replay.contents import Contents
 from replay.encoding import decode
 from replay.events import (
     Event,
@@ -26,6 +27,7 @@ from replay.events import (
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
+    Timed,
     Traced,
 )
 from replay.foxglove_messages import cloud_points, log_level_and_text
@@ -69,6 +71,8 @@ class EventReader:
     def __init__(self, attachments: dict[str, bytes]) -> None:
         self.entries: list[Event | RecordedProblem] = []
         self.within: str | None = None
+        self.contents = Contents()
+        self.closed = False  # whether the contents, which come last, were there
         self._attachments = attachments
         self._opening: dict[str, Any] = {}
         self._clouds: dict[str, FloatArray] = {}
@@ -92,16 +96,35 @@ class EventReader:
             if topic == "/session":
                 _check_version(data)
             self.within, self._opening = topic, decode(RECORDS[topic], data)
+        elif topic == "/contents":
+            self._compare_contents(data)
         else:
-            self.entries.append(self._event(topic, decode(RECORDS[topic], data)))
+            self._append(self._event(topic, decode(RECORDS[topic], data)))
 
     def _fits(self, topic: str) -> bool:
         """Whether a message on this topic can follow the ones before it."""
+        if self.closed:
+            return False
         if self.within is not None:
             return topic == "/known_points" or (topic in _CLOUDS and topic not in self._clouds)
         if not self.entries:
             return topic == "/session"
         return topic not in (*_CLOUDS, "/known_points", "/session")
+
+    def _append(self, entry: Event | RecordedProblem) -> None:
+        self.entries.append(entry)
+        if isinstance(entry, RecordedProblem):
+            self.contents.pose(entry.step)
+        else:
+            self.contents.take(entry)
+
+    def _compare_contents(self, data: bytes) -> None:
+        """The last message says again what came before it."""
+        self.closed = True
+        recorded = decode(RECORDS["/contents"], data)
+        for name, column in self.contents.values().items():
+            if recorded[name].tobytes() != column.tobytes():
+                raise RecordingError(f"its contents, as read, have another {name} than recorded")
 
     def _event(self, topic: str, values: dict[str, Any]) -> Event | RecordedProblem:
         match topic:
@@ -121,6 +144,9 @@ class EventReader:
             case "/measured":
                 numbers = {item["name"]: item["value"] for item in values["values"]}
                 return Measured(values["step"], numbers)
+            case "/timed":
+                seconds = {item["name"]: item["value"] for item in values["seconds"]}
+                return Timed(values["step"], seconds)
             case _:
                 return SessionEnded(**values)
 
@@ -184,7 +210,7 @@ def _session(
     config = json.loads(values["config"])
     if not isinstance(config, dict):
         raise RecordingError("its configuration is no mapping")
-    named = ("runner", "object", "session", "method", "seed", "free_resolution")
+    named = ("runner", "object", "session", "method", "seed", "free_resolution", "source")
     return SessionStarted(
         **{name: values[name] for name in (*named, "world_from_object")},
         config=config,

@@ -22,6 +22,7 @@ class SessionStarted:
     config: the resolved configuration, plain values. mesh: of the object, in its frame, metres.
     world_from_object (4, 4): the true pose, where known. initial_points: known before any probe.
     environment: versions, platform, processor, state of the checkout; no clock, no paths.
+    source: digest of the recording whose problems these are, "" if the session made its own.
     """
 
     runner: str
@@ -37,6 +38,7 @@ class SessionStarted:
     initial_points: KnownPoints
     world_from_object: FloatArray | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
+    source: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,7 @@ class SnapshotTaken:
 
 @dataclass(frozen=True)
 class Traced:
-    """Where a stage of a registration stands after a block of iterations.
+    """Where a stage of a registration stands at its start or after a block of iterations.
 
     digest: of the search vectors and costs. costs: lowest, median and highest, over B.
     """
@@ -109,7 +111,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Timed:
-    """Wall-clock seconds by stage. Shown to people, never part of a byte-stable recording."""
+    """Wall-clock seconds by stage. With it no two recordings are equal to the byte."""
 
     step: int
     seconds: Mapping[str, float]

@@ -159,9 +159,6 @@ class McapFile:
         summary = file.read(size - self._footer.summary_start - len(MCAP0_MAGIC) - crc_size)
         if zlib.crc32(summary) != self._footer.summary_crc:
             return self._stop_at("damaged: the checksum of its summary is wrong")
-        missing = sorted(set(self._schemas) - set(self._topics.values()))
-        if missing and self._count > 0:
-            raise RecordingError(f"recording {self.path} lacks topics: {', '.join(missing)}")
         return None
 
     def _stop_at(self, damage: str) -> None:

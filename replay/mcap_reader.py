@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import reduce
 from pathlib import Path
@@ -70,6 +70,12 @@ class Recording:
         points = reduce(KnownPoints.merged, news, self.start.initial_points)
         return self._completed(entry, points)
 
+    def checked_steps(self, steps: Sequence[int] | None) -> tuple[int, ...]:
+        """Steps with a registration problem, in order; None means all. RecordingError if not."""
+        for step in steps or ():
+            self._check_step(step, self.steps, "registration problem")
+        return self.steps if steps is None else tuple(s for s in self.steps if s in set(steps))
+
     def hypotheses(self, step: int) -> Hypotheses:
         """What the registration of a step found."""
         found = {e.step: e.hypotheses for e in self._entries if isinstance(e, HypothesesFound)}
@@ -110,6 +116,8 @@ def read_recording(path: str | Path, *, partial: bool = False) -> Recording:
             events.take(message)
     if events.within is not None and file.damage is None:
         raise RecordingError(f"recording {path} ends within an event on {events.within}")
+    if not events.closed and events.entries and file.damage is None:
+        raise RecordingError(f"recording {path} ends without its contents")
     return Recording(path, events.entries, file.damage)
 
 

@@ -18,6 +18,7 @@ from chsel.points import KnownPoints
 from chsel.pose import inverse
 from chsel.problem import ArchiveSnapshot
 from replay.attachments import MEDIA_TYPES, MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
+from replay.contents import Contents
 from replay.encoding import encode
 from replay.events import (
     Event,
@@ -58,7 +59,7 @@ class McapRecorder(Recorder):
     """Writes one recording to a new file.
 
     Log time counts messages, in nanoseconds, from one second per step: step k lies between k + 1 s
-    and k + 2 s. No wall-clock time enters the file; `Timed` events are left out.
+    and k + 2 s. No wall-clock time enters the file, but for `Timed` events if there are any.
     Raises RecordingError if the file exists, cannot be written, or could not be read back to the
     same values.
     """
@@ -70,6 +71,8 @@ class McapRecorder(Recorder):
         self._channels: dict[str, int] = {}
         self._points: KnownPoints | None = None  # all that is known, once a session has started
         self._sdf_digest = ""
+        self._contents = Contents()
+        self._last_step = _BEFORE_ALL_STEPS
         self._last_snapshot = b""
         self._last_elites: FloatArray | None = None
         with self._writing():
@@ -92,6 +95,8 @@ class McapRecorder(Recorder):
             raise RecordingError(f"recording {self._path} needs one SessionStarted, as first event")
         with self._writing():
             self._write(event)
+        self._contents.take(event)
+        self._last_step = max(self._last_step, getattr(event, "step", _BEFORE_ALL_STEPS))
 
     def flush(self) -> None:
         """End the chunk in progress and hand it to the operating system."""
@@ -100,9 +105,11 @@ class McapRecorder(Recorder):
                 self._writer.flush()
 
     def close(self) -> None:
-        """Write summary and checksums. Until then, and after a failure, the file is unfinished."""
+        """Write contents and checksums. Until then, and after a failure, the file is unfinished."""
         if not self._closed:
             with self._writing():
+                if self._points is not None:
+                    self._record("/contents", self._last_step, self._contents.values())
                 self._writer.finish()
                 self._file.close()
             self._closed = True
@@ -137,15 +144,14 @@ class McapRecorder(Recorder):
             case HypothesesFound():
                 self._write_hypotheses(event)
             case Measured():
-                values = [{"name": name, "value": value} for name, value in event.values.items()]
-                self._record("/measured", event.step, {"values": values})
+                self._record("/measured", event.step, {"values": _numbers(event.values)})
+            case Timed():
+                self._record("/timed", event.step, {"seconds": _numbers(event.seconds)})
             case Logged():
                 time = self._time(event.step)
                 self._add("/log", time, log_line(event.level, event.text, time))
             case SessionEnded():
                 self._record("/session_ended", event.step, {"outcome": event.outcome})
-            case Timed():
-                pass  # the one event that tells two equal runs apart
             case _:
                 raise RecordingError(f"{type(event).__name__} is no event of a session")
 
@@ -161,6 +167,7 @@ class McapRecorder(Recorder):
         values["environment"] = [{"name": k, "value": v} for k, v in event.environment.items()]
         values["mesh_digest"] = mesh_digest(event.mesh)
         values["sdf_digest"] = event.sdf.digest
+        values["source"] = event.source
         self._record("/session", _BEFORE_ALL_STEPS, values)
         self._write_points(_BEFORE_ALL_STEPS, KnownPoints(), event.initial_points)
         if event.world_from_object is not None:
@@ -239,7 +246,8 @@ class McapRecorder(Recorder):
 
     def _record(self, topic: str, step: int, values: dict[str, Any]) -> bytes:
         """Write a message of the project's own; its bytes."""
-        data = encode(RECORDS[topic], {"step": step, **values})
+        values = values if topic == "/contents" else {"step": step, **values}
+        data = encode(RECORDS[topic], values)
         self._add(topic, self._time(step), data)
         return data
 
@@ -278,6 +286,10 @@ def _snapshot_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
     named = ("iteration", "refinement", "measure_names", "shape", "lower", "upper")
     arrays = ("cells", "solutions", "objectives", "measures", "digest")
     return {"step": step} | {name: getattr(archive, name) for name in (*named, *arrays)}
+
+
+def _numbers(values: Mapping[str, float]) -> list[dict[str, Any]]:
+    return [{"name": name, "value": value} for name, value in values.items()]
 
 
 def _same(a: FloatArray, b: FloatArray) -> bool:

@@ -21,6 +21,23 @@ class NullRecorder(Recorder):
         """Nothing to do."""
 
 
+class ListRecorder(Recorder):
+    """Keeps the events in `events`."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def record(self, event: Event) -> None:
+        """Keep it."""
+        self.events.append(event)
+
+    def flush(self) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
 class TeeRecorder(Recorder):
     """Hands every event to several recorders, in their order."""
 

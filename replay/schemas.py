@@ -44,6 +44,7 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
         "environment": "Text*",
         "mesh_digest": "string",
         "sdf_digest": "string",
+        "source": "string",
     },
     "Probe": {
         "step": "sint32",
@@ -111,7 +112,20 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
         "digest": "string",
     },
     "Measured": {"step": "sint32", "values": "Number*"},
+    "Timed": {"step": "sint32", "seconds": "Number*"},
     "SessionEnded": {"step": "sint32", "outcome": "string"},
+    # The last message: a row for each probe, so that a large file tells at once what is in it.
+    "Contents": {
+        "step": "i8[S]",
+        "free": "i8[S]",
+        "occupied": "i8[S]",
+        "known": "i8[S]",
+        "contacts": "i8[S]",
+        "posed": "b1[S]",
+        "hypotheses": "i8[S]",  # -1 where there is no result
+        "distinct": "i8[S]",
+        "best_cost": "f8[S]",  # NaN where there is no result
+    },
     # No topic: this is the attachment "sdf_grid".
     "SdfGrid": {
         "origin": "f8[3]",
@@ -130,7 +144,9 @@ RECORDS: Mapping[str, str] = {
     "/trace": "Trace",
     "/hypotheses": "Hypotheses",
     "/measured": "Measured",
+    "/timed": "Timed",
     "/session_ended": "SessionEnded",
+    "/contents": "Contents",
 }
 """Topics that carry messages of the table."""
 

@@ -21,10 +21,10 @@ from chsel.methods.method import Method
 from chsel.sdf import SdfGrid
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
+from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from runners.cli import command, plain
 from runners.display import Display
-from runners.environment import environment
 from runners.interrupt import Interrupt
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
@@ -163,7 +163,7 @@ def run(
         recorder,
         seed=config.seed,
         start=scene.start,
-        snapshot_interval=config.recording.snapshot_interval,
+        recording=config.recording,
         show=show,
     )
     rows: list[Row] = []

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-import numpy as np
-
-from chsel.arrays import FloatArray, digest
 from chsel.errors import RecordingError, require_positive
-from chsel.problem import ArchiveSnapshot
 from replay.background_recorder import BackgroundRecorder
-from replay.events import Recorder, SnapshotTaken, Traced
+from replay.events import Recorder
 from replay.mcap_writer import McapRecorder
 from replay.recorder import TeeRecorder
 from replay.rerun_recorder import RerunRecorder
@@ -27,13 +21,15 @@ class RecordingConfig:
     """mcap, rerun: which files to write. live: show the session in the viewer while it runs.
 
     snapshot_interval: quality-diversity iterations between archive snapshots; 0 for the first and
-    last alone.
+    last alone. timings: also wall-clock seconds by stage, with which no two recordings are equal
+    to the byte.
     """
 
     mcap: bool = True
     rerun: bool = True
     live: bool = False
     snapshot_interval: int = 25
+    timings: bool = False
 
     def __post_init__(self) -> None:
         require_positive("snapshot_interval", self.snapshot_interval, zero=True)
@@ -69,37 +65,3 @@ def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
         pictures = RerunRecorder(path, live=config.live)
         recorders.append(BackgroundRecorder(pictures, patient=False))
     return TeeRecorder(recorders)
-
-
-class StepObserver:
-    """Hands what happens within one registration to the recorder, and takes the time by stage."""
-
-    def __init__(
-        self,
-        recorder: Recorder,
-        step: int,
-        snapshot_interval: int,
-        show: Callable[[str, int, int], None],
-    ) -> None:
-        self.snapshot_interval = snapshot_interval
-        self.seconds: dict[str, float] = {}
-        self._recorder = recorder
-        self._step = step
-        self._show = show
-        self._mark = time.perf_counter()
-
-    def progress(self, stage: str, iteration: int, total: int) -> None:
-        """Show it, and count the time since the last report to the stage."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
-        self._mark = now
-        self._show(stage, iteration, total)
-
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """Record where the stage stands."""
-        costs = (float(cost.min()), float(np.median(cost)), float(cost.max()))
-        self._recorder.record(Traced(self._step, stage, iteration, digest(vectors, cost), costs))
-
-    def snapshot(self, archive: ArchiveSnapshot) -> None:
-        """Record the archive."""
-        self._recorder.record(SnapshotTaken(self._step, archive))

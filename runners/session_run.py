@@ -6,12 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
-
-from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.result_numbers import result_numbers
 from chsel.methods.method import Method
 from chsel.online import pose_problem
-from chsel.points import KnownPoints
 from chsel.problem import Hypotheses
 from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
@@ -24,7 +21,8 @@ from replay.events import (
     Recorder,
     Timed,
 )
-from runners.recording import StepObserver
+from replay.step_observer import StepObserver
+from runners.recording import RecordingConfig
 from runners.sessions.session import Session
 
 Row = dict[str, Any]
@@ -42,14 +40,15 @@ class SessionRun:
         *,
         seed: int,
         start: tuple[int, int],
-        snapshot_interval: int,
+        recording: RecordingConfig,
         show: Callable[[str, int, int], None],
     ) -> None:
         """start: a registration needs so many contacts, and this probe index."""
         self._session, self._method, self._sdf, self._recorder = session, method, sdf, recorder
         self._seed = seed
         self._start = start
-        self._snapshot_interval = snapshot_interval
+        self._snapshot_interval = recording.snapshot_interval
+        self._timings = recording.timings
         self._show = show
         self.points = session.initial_points
         self.contact_count = len(session.initial_points.contacts)
@@ -72,7 +71,8 @@ class SessionRun:
             if self._enough(probe):
                 row |= self._register(probe.step, seconds)
             self._recorder.record(Logged(probe.step, "info", _line(row)))
-            self._recorder.record(Timed(probe.step, seconds))
+            if self._timings:
+                self._recorder.record(Timed(probe.step, seconds))
             self._recorder.flush()
             row |= {"seconds": sum(seconds.values()), "seconds_by_stage": seconds}
             yield probe, row
@@ -105,7 +105,7 @@ class SessionRun:
         seconds |= observer.seconds
         seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
         self._recorder.record(HypothesesFound(step, hypotheses))
-        measured = measure(hypotheses, self.points, self._session)
+        measured = result_numbers(hypotheses, problem, self._session.world_from_object)
         self._recorder.record(Measured(step, measured))
         self.previous = hypotheses
         row = {"best_cost": float(hypotheses.cost[0]), "distinct": hypotheses.distinct}
@@ -118,21 +118,3 @@ def _line(row: Row) -> str:
     if "best_cost" not in row:
         return f"{text}, too little for a registration"
     return f"{text}, best cost {row['best_cost']:.4g}, {row['distinct']} distinct hypotheses"
-
-
-def measure(hypotheses: Hypotheses, points: KnownPoints, session: Session) -> dict[str, float]:
-    """Numbers about a result, among them the error to the true pose where it is known."""
-    values = {
-        "distinct_hypotheses": float(hypotheses.distinct),
-        "known_points": float(points.count),
-    }
-    if hypotheses.archive is not None:
-        values["archive_coverage"] = hypotheses.archive.coverage
-        values["archive_qd_score"] = hypotheses.archive.qd_score
-    if session.world_from_object is not None:
-        position, rotation = pose_errors(hypotheses.object_from_world, session.world_from_object)
-        closest = int(np.argmin(position))
-        for name, index in (("best", 0), ("closest", closest)):
-            values[f"{name}_position_error"] = float(position[index])
-            values[f"{name}_rotation_error"] = float(rotation[index])
-    return values

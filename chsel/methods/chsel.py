@@ -113,7 +113,7 @@ class Chsel:
         first = space.encode(initial_set[:1])[0]
         best = archive.best_solution
         start = first if settings.emitter.start == "initial" else best
-        draws, watch = Draws(problem.key, index), ArchiveWatch(observer, index)
+        draws, watch = Draws(problem.key, index), ArchiveWatch(observer, index, settings.search)
         watch.start(archive)
         self._search(objective, archive, start, count, settings.emitter, draws, watch)
         # 7: E <- cells of M with the |E_0| lowest costs

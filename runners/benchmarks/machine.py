@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from chsel.device import gpus
-from runners.environment import environment
+from replay.environment import environment
 
 _PACKAGES = ("numba", "llvmlite", "scipy")
 

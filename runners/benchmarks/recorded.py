@@ -9,12 +9,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from chsel.points import KnownPoints
+from replay.environment import environment
 from replay.events import HypothesesFound, Probe, ProblemPosed, Recorder, SessionStarted
+from replay.step_observer import StepObserver
 from runners.benchmarks.ours import Steps, method
 from runners.benchmarks.problems import PosedProblem, drill
 from runners.benchmarks.timing import in_turn
-from runners.environment import environment
-from runners.recording import RecordingConfig, StepObserver, open_recorder
+from runners.recording import RecordingConfig, open_recorder
 
 _PROBE = 0.1  # seconds: what a probe takes, in which a recorder may end what it has begun
 _FILES = {

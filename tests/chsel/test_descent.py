@@ -117,8 +117,9 @@ def test_descent_reports_every_block_as_it_stands() -> None:
     objective, blocks = contacts(), Blocks()
     settings = DescentSettings(restarts=4, iterations=5, rate=0.001, stop_below=None)
     poses, costs = descend(objective, starts(3), settings, blocks)
-    assert blocks.iterations == [5, 10, 15, 20]
+    assert blocks.iterations == [0, 5, 10, 15, 20]
     assert blocks.total == 20
+    np.testing.assert_array_equal(blocks.traced[0][0], SE3Space().encode(starts(3)))
     for vectors, cost in blocks.traced:
         np.testing.assert_array_equal(cost, objective.costs(vectors))
         rows = vectors[:, :6].reshape(-1, 2, 3)
@@ -134,8 +135,8 @@ def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to() -> None:
     stopping, going = Blocks(), Blocks()
     descend(objective, starts(3), DescentSettings(), stopping)
     descend(objective, starts(3), DescentSettings(stop_below=None), going)
-    assert stopping.iterations == [50]
-    assert going.iterations == list(range(50, 501, 50))
+    assert stopping.iterations == [0, 50]
+    assert going.iterations == list(range(0, 501, 50))
 
 
 def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> None:
@@ -144,7 +145,7 @@ def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> 
     settings = DescentSettings(restarts=12, iterations=10, rate=0.001, stop_below=0.05)
     initial = starts(4)
     descend(objective, initial, settings, blocks)
-    costs = [objective.costs(SE3Space().encode(initial)), *(cost for _, cost in blocks.traced)]
+    costs = [cost for _, cost in blocks.traced]
     gains = [
         np.where(a > 0.0, (a - b) / np.maximum(a, 1e-300), 0.0).mean() for a, b in pairwise(costs)
     ]

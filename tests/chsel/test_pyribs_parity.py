@@ -97,7 +97,7 @@ def search(name: str, seed: int, **settings: Any) -> GridArchive:
     count = BATCH + 1 if name == "cma_mega" else BATCH
     draws = Draws(StreamKey(seed, 0))
     options = EmitterSettings(iterations=ITERATIONS, **settings)
-    watch = ArchiveWatch(NullObserver(), 0)
+    watch = ArchiveWatch(NullObserver(), 0, "search")
     SEARCHES[name](quadratic, archive, START, count, options, draws, watch)
     return archive
 

@@ -43,8 +43,8 @@ class StageKeeper:
         """Nothing to keep."""
 
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """Vectors and costs of the descent; the search shows its archive besides."""
-        if stage == "descent":
+        """Vectors and costs of the descent; E_0's and the search's archives are kept besides."""
+        if stage == "descent" and iteration > 0:
             self._keep(f"descent {iteration}", {"vectors": vectors.copy(), "costs": cost.copy()})
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:

@@ -210,10 +210,10 @@ def any_events(request: pytest.FixtureRequest) -> list[Event]:
 
 @pytest.fixture
 def assert_same() -> Callable[[Any, Any], None]:
-    """Asserts that two lists of events are equal to the bit, but for wall-clock times."""
+    """Asserts that two lists of events are equal to the bit."""
 
     def check(read: Any, written: Any) -> None:
-        read, written = list(read), [e for e in written if not isinstance(e, Timed)]
+        read, written = list(read), list(written)
         assert [type(e).__name__ for e in read] == [type(e).__name__ for e in written]
         for index, (a, b) in enumerate(zip(read, written, strict=True)):
             assert same_bits(a, b), f"event {index} of type {type(a).__name__} differs"

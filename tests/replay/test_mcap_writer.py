@@ -29,7 +29,6 @@ from replay.events import (
     ProblemPosed,
     SessionEnded,
     SnapshotTaken,
-    Timed,
 )
 from replay.mcap_reader import read_recording
 from replay.mcap_writer import McapRecorder
@@ -72,17 +71,6 @@ recorder.close()
         assert result.returncode == 0, result.stderr
     assert len(paths[0].read_bytes()) > 10_000
     assert paths[0].read_bytes() == paths[1].read_bytes()
-
-
-def test_wall_clock_times_leave_no_trace(events, write):
-    slower = [
-        Timed(e.step, {"registration": 99.0, "cost": 1.0}) if isinstance(e, Timed) else e
-        for e in events
-    ]
-    without = [e for e in events if not isinstance(e, Timed)]
-    expected = write(events).read_bytes()
-    assert write(slower).read_bytes() == expected
-    assert write(without).read_bytes() == expected
 
 
 def test_one_bit_of_one_event_changes_the_file(events, write):
@@ -179,7 +167,7 @@ recorder.flush()
     assert result.stderr == ""
     assert result.stdout == f"recording {path} cannot be written: File too large\n"
     recording = read_recording(path, partial=True)
-    assert_same(list(recording.events())[:10], events[:11])  # the eleventh is a Timed
+    assert_same(list(recording.events())[:11], events[:11])
 
 
 def test_a_recording_that_exists_is_not_overwritten(tmp_path):

@@ -16,7 +16,8 @@ from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
 from replay.events import Event, SnapshotTaken, Traced
 from replay.recorder import NullRecorder
-from runners.recording import RecordingConfig, StepObserver, make_run_folder, open_recorder
+from replay.step_observer import StepObserver
+from runners.recording import RecordingConfig, make_run_folder, open_recorder
 
 
 def test_run_folders_of_one_second_differ_and_stay_in_the_log_folder(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def empty_archive() -> GridArchive:
 def found(name: str, kind: int, interval: int = 0, count: int = COUNT) -> GridArchive:
     """The archive after a search."""
     archive = empty_archive()
-    draws, watch = Draws(StreamKey(4, 0)), ArchiveWatch(Watcher(interval), 0)
+    draws, watch = Draws(StreamKey(4, 0)), ArchiveWatch(Watcher(interval), 0, "search")
     settings = EmitterSettings(iterations=ITERATIONS, sigma0=0.2)
     SEARCHES[name](LandscapeObjective(kind), archive, START, count, settings, draws, watch)  # type: ignore[arg-type]
     return archive
@@ -164,11 +164,11 @@ def test_segments_of_any_length_give_the_same_bytes(name: str) -> None:
 
 def test_an_observer_hears_every_ten_iterations_and_at_its_interval() -> None:
     watcher = Watcher(7)
-    watch = ArchiveWatch(watcher, 0)
+    watch = ArchiveWatch(watcher, 0, "cma_me")
     assert list(watch.segments(16)) == [(0, 7), (7, 10), (10, 14), (14, 16)]
     assert list(watch.segments(0)) == []
     for _, last in watch.segments(16):
-        watch.after("cma_me", last, 16, empty_archive())
+        watch.after(last, 16, empty_archive())
     expected = [("snapshot", 7), ("trace", 10), ("cma_me", 10), ("snapshot", 14)]
     assert watcher.heard == [*expected, ("trace", 16), ("cma_me", 16), ("snapshot", 16)]
 

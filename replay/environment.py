@@ -7,7 +7,18 @@ import platform
 import subprocess
 from pathlib import Path
 
-PACKAGES = ("chsel-replay", "numpy", "torch", "libigl", "trimesh", "manifold3d", "pybullet", "mcap")
+PACKAGES = (
+    "chsel-replay",
+    "numpy",
+    "numba",
+    "llvmlite",
+    "torch",
+    "libigl",
+    "trimesh",
+    "manifold3d",
+    "pybullet",
+    "mcap",
+)
 
 
 def environment() -> dict[str, str]:

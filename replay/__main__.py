@@ -1,0 +1,80 @@
+"""`python -m replay VERB FILE ...`: everything that is done with recordings."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import NoReturn
+
+from chsel.errors import ChselError
+from replay.verbs import VERBS
+
+TRACEBACK = "--traceback"
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that says in one line what is wrong."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print it and exit with status 2."""
+        print(f"error: {self.prog}: {message} (--help shows what is accepted)", file=sys.stderr)
+        sys.exit(2)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a verb; its exit status. A user's mistake is one line on stderr and status 2."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    show_traceback = TRACEBACK in words
+    words = [word for word in words if word != TRACEBACK]
+    warnings.showwarning = _print_warning
+    try:
+        given = _parser(words[0] if words else "").parse_args(words)
+        status: int = importlib.import_module(f"replay.verbs.{given.verb}").run(given)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # whoever read the output has had enough of it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (ChselError, OSError, MemoryError) as error:
+        if show_traceback:
+            raise
+        print(f"error: {_message(error)}", file=sys.stderr)
+        return 2
+    return status
+
+
+def _parser(verb: str) -> Parser:
+    """The parser of all verbs, with the arguments of one."""
+    parser = Parser(prog="replay", description=__doc__)
+    parser.add_argument(TRACEBACK, action="store_true", help="show where an error came from")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for name, what in VERBS.items():
+        module = importlib.import_module(f"replay.verbs.{name}") if name == verb else None
+        description = module.__doc__ if module else what
+        of = verbs.add_parser(name, help=what, description=description)
+        if module:
+            module.add_arguments(of)
+    return parser
+
+
+def _message(error: Exception) -> str:
+    """One line: what was wrong, and what is accepted."""
+    if isinstance(error, MemoryError):
+        return f"there is not enough memory: {error or 'an array is too large'}"
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}"
+    return " ".join(str(error).split("\n"))
+
+
+def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
+    print(f"warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,309 @@
+"""Whether today's code gives the recorded bits, and if not, where it first does not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chsel.errors import ChselError
+from chsel.online import pose_problem
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from replay.differences import apart, difference
+from replay.environment import environment
+from replay.events import (
+    Event,
+    HypothesesFound,
+    ProblemPosed,
+    SessionStarted,
+    SnapshotTaken,
+    Traced,
+)
+from replay.mcap_reader import Recording
+from replay.recorder import ListRecorder
+from replay.registration import NamedMethod, recorded_method, register_again
+
+EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
+_PATIENCE = 10  # times the recorded iterations of a stage; more are not worth waiting for
+_ARCHIVE = ("lower", "upper", "cells", "solutions", "objectives", "measures")
+_HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell", "elites")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What verifying one step showed.
+
+    outcome: "equal", "differs", or "no result" where the recorded registration did not end.
+    stage: the first that differs. before: how many stages before it are equal. differences: of
+    the recorded numbers, line by line. largest_ulps: over all of them. seconds: of registering.
+    """
+
+    step: int
+    method: str
+    outcome: str
+    stage: str = ""
+    before: int = 0
+    differences: tuple[str, ...] = ()
+    largest_ulps: int = 0
+    environment: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    def report(self) -> str:
+        """The verdict for people; several lines if it is "differs"."""
+        if self.outcome != DIFFERS:
+            return f"step {self.step}, {self.method}: {self.outcome}"
+        lines = [
+            f"step {self.step}, {self.method}: differs",
+            f"first difference: {self.stage} ({self.before} recorded stages before it are equal)",
+            *self.differences,
+            f"largest difference: {self.largest_ulps} ulp",
+            "environment: " + ("; ".join(self.environment) or "the same as recorded"),
+        ]
+        return "\n  ".join(lines)
+
+
+def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator[Verdict]:
+    """Verdicts on steps of a recording (None: on all that pose a problem), in their order.
+
+    Raises RecordingError if the recording does not tell its method, or lacks a step.
+    """
+    method = recorded_method(recording)
+    wanted = recording.checked_steps(steps)
+    differing = environment_differences(recording.start)
+    previous: Hypotheses | None = None
+    events = recording.events()
+    posed = next((event for event in events if isinstance(event, ProblemPosed)), None)
+    while posed is not None:
+        of_step, following = _until_next_problem(events)
+        if posed.step in wanted:
+            yield _verified(recording.start, posed, of_step, method, previous, differing)
+        found = [event.hypotheses for event in of_step if isinstance(event, HypothesesFound)]
+        previous = found[0] if found else previous
+        posed = following
+
+
+def environment_differences(start: SessionStarted) -> tuple[str, ...]:
+    """What of the recorded environment is otherwise here."""
+    here = environment()
+    return tuple(
+        f"{name} {value} -> {here.get(name, 'unknown')}"
+        for name, value in start.environment.items()
+        if here.get(name) != value
+    )
+
+
+def _until_next_problem(events: Iterator[Event]) -> tuple[list[Event], ProblemPosed | None]:
+    of_step: list[Event] = []
+    for event in events:
+        if isinstance(event, ProblemPosed):
+            return of_step, event
+        of_step.append(event)
+    return of_step, None
+
+
+def _verified(
+    start: SessionStarted,
+    posed: ProblemPosed,
+    recorded: Sequence[Event],
+    method: NamedMethod,
+    previous: Hypotheses | None,
+    environment: tuple[str, ...],
+) -> Verdict:
+    """Run the registration of a step again, and compare."""
+    step = posed.step
+    expected = _result(recorded)
+    if expected is None:
+        return Verdict(step, method.name, NO_RESULT)
+    comparison = _Comparison()
+    if not start.source:  # else the sets are another recording's
+        _compare_sets(comparison, posed.problem, method, previous)
+    watching = _Watching(_last_iterations(recorded))
+    snapshots = [event.archive for event in recorded if isinstance(event, SnapshotTaken)]
+    found, failure, seconds = None, "", 0.0
+    try:
+        seconds = register_again(
+            posed, method.method, watching, start, snapshot_interval=_interval(snapshots)
+        )
+        found = _result(watching.events)
+    except (_FarBeyondError, ChselError) as error:
+        failure = str(error)
+    _compare_stages(comparison, recorded, watching.events, ended=found is not None)
+    if found is not None:
+        _compare_results(comparison, expected, found)
+    else:
+        comparison.stage_is("the end of the registration", equal=False)
+        comparison.differences.append(f"today's registration does not end: {failure}")
+    return comparison.verdict(step, method.name, environment, seconds)
+
+
+@dataclass
+class _Comparison:
+    """Collects differences; the first names the stage."""
+
+    stage: str = ""
+    before: int = 0
+    differences: list[str] = field(default_factory=list)
+    largest: int = 0
+
+    def stage_is(self, name: str, *, equal: bool) -> None:
+        """A stage is compared."""
+        if equal and not self.stage:
+            self.before += 1
+        elif not equal and not self.stage:
+            self.stage = name
+
+    def arrays(self, pairs: dict[str, tuple[NDArray, NDArray]]) -> bool:
+        """Whether pairs of arrays, recorded and found, are equal; keeps how they are not."""
+        texts = [difference(name, *pair) for name, pair in pairs.items()]
+        self.differences += [text for text in texts if text is not None]
+        self.largest = max([self.largest, *(apart(*pair) for pair in pairs.values())])
+        return not any(texts)
+
+    def verdict(
+        self, step: int, method: str, environment: tuple[str, ...], seconds: float
+    ) -> Verdict:
+        """What all comparisons say."""
+        if not self.stage:
+            return Verdict(step, method, EQUAL, before=self.before, seconds=seconds)
+        return Verdict(
+            step,
+            method,
+            DIFFERS,
+            self.stage,
+            self.before,
+            tuple(self.differences),
+            self.largest,
+            environment,
+            seconds,
+        )
+
+
+class _FarBeyondError(Exception):
+    """A registration goes on long after the recorded one had ended."""
+
+
+class _Watching(ListRecorder):
+    """Keeps events, and stops a registration that goes on far beyond the recorded one."""
+
+    def __init__(self, last: dict[str, int]) -> None:
+        super().__init__()
+        self._last = last
+
+    def record(self, event: Event) -> None:
+        """Keep it, or raise."""
+        if isinstance(event, Traced):
+            last = self._last.get(event.stage, 0)
+            if event.iteration > _PATIENCE * last + 1000:
+                raise _FarBeyondError(
+                    f"{_stage_name(event)} is far beyond the last recorded one, {last}"
+                )
+        super().record(event)
+
+
+def _compare_sets(
+    comparison: _Comparison,
+    problem: RegistrationProblem,
+    method: NamedMethod,
+    previous: Hypotheses | None,
+) -> None:
+    """Whether E_0 and E_l follow from the step before as recorded (CHSEL, Alg. 2)."""
+    again = pose_problem(
+        problem.sdf,
+        problem.points,
+        problem.workspace,
+        problem.free_resolution,
+        problem.key,
+        method.method.online,
+        previous,
+    )
+    for name, field_name in (("E_0", "initial_set"), ("E_l", "low_cost_set")):
+        pair = (getattr(problem, field_name), getattr(again, field_name))
+        comparison.stage_is(f"making {name}", equal=comparison.arrays({name: pair}))
+
+
+def _compare_stages(
+    comparison: _Comparison, recorded: Sequence[Event], found: Sequence[Event], *, ended: bool
+) -> None:
+    """Compare traces and snapshots in the order in which they were recorded.
+
+    ended: whether the registration ended; if not, what it did not come to is not compared.
+    """
+    here = _by_stage(found)
+    for name, event in _by_stage(recorded).items():
+        other = here.get(name)
+        if other is None and ended:
+            comparison.stage_is(f"{name}, which does not come about", equal=False)
+        elif isinstance(event, Traced):
+            comparison.stage_is(name, equal=event == other)
+        elif isinstance(event, SnapshotTaken) and isinstance(other, SnapshotTaken):
+            first = not comparison.stage
+            equal = _snapshot_bits(event.archive) == _snapshot_bits(other.archive)
+            comparison.stage_is(name, equal=equal)
+            if first and not equal:
+                comparison.arrays(_archive_pairs(name, event.archive, other.archive))
+
+
+def _compare_results(comparison: _Comparison, expected: Hypotheses, found: Hypotheses) -> None:
+    pairs = {name: (getattr(expected, name), getattr(found, name)) for name in _HYPOTHESES}
+    equal = comparison.arrays(pairs)
+    comparison.stage_is("choosing the hypotheses", equal=equal)
+    kept, ours = expected.archive, found.archive
+    if (kept is None) is not (ours is None):
+        comparison.stage_is("the last archive", equal=False)
+    elif kept is not None and ours is not None:
+        same = _snapshot_bits(kept) == _snapshot_bits(ours)
+        comparison.stage_is("the last archive", equal=same)
+        if not same:
+            comparison.arrays(_archive_pairs("last archive", kept, ours))
+
+
+def _by_stage(events: Sequence[Event]) -> dict[str, Traced | SnapshotTaken]:
+    """Traces and snapshots by a name; those of later passes are numbered."""
+    named: dict[str, Traced | SnapshotTaken] = {}
+    for event in events:
+        if isinstance(event, Traced | SnapshotTaken):
+            name, number = _stage_name(event), 1
+            while name in named:
+                number += 1
+                name = f"{_stage_name(event)} (pass {number})"
+            named[name] = event
+    return named
+
+
+def _stage_name(event: Traced | SnapshotTaken) -> str:
+    if isinstance(event, Traced):
+        return f"{event.stage}, iteration {event.iteration}"
+    return f"archive, iteration {event.archive.iteration}"
+
+
+def _archive_pairs(
+    name: str, recorded: ArchiveSnapshot, found: ArchiveSnapshot
+) -> dict[str, tuple[NDArray, NDArray]]:
+    return {f"{name}: {part}": (getattr(recorded, part), getattr(found, part)) for part in _ARCHIVE}
+
+
+def _snapshot_bits(archive: ArchiveSnapshot) -> tuple[object, ...]:
+    """All of a snapshot, range and names included."""
+    bytes_of = tuple(np.ascontiguousarray(getattr(archive, part)).tobytes() for part in _ARCHIVE)
+    return (archive.iteration, archive.refinement, archive.measure_names, archive.shape, *bytes_of)
+
+
+def _result(events: Sequence[Event]) -> Hypotheses | None:
+    return next((e.hypotheses for e in events if isinstance(e, HypothesesFound)), None)
+
+
+def _last_iterations(events: Sequence[Event]) -> dict[str, int]:
+    """The last recorded iteration of each stage."""
+    last: dict[str, int] = {}
+    for event in events:
+        if isinstance(event, Traced):
+            last[event.stage] = max(last.get(event.stage, 0), event.iteration)
+    return last
+
+
+def _interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
+    """Iterations between the recorded snapshots; 0 if there are the first and the last alone."""
+    iterations = sorted({archive.iteration for archive in snapshots})
+    return iterations[1] if len(iterations) > 2 else 0
