@@ -4,15 +4,19 @@ Zhong, Fazeli and Berenson, "CHSEL: Producing Diverse Plausible Pose Estimates f
 Free Space Data", Robotics: Science and Systems, 2023.
 """
 
-from chsel.api import register
-from chsel.cost import RelaxedCost
-from chsel.cost_settings import CostSettings
-from chsel.engine import CompiledCost
-from chsel.errors import ChselError
-from chsel.mesh import load_mesh
-from chsel.points import KnownPoints, Workspace
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from chsel.api import register
+    from chsel.cost import RelaxedCost
+    from chsel.cost_settings import CostSettings
+    from chsel.engine import CompiledCost
+    from chsel.errors import ChselError
+    from chsel.mesh import load_mesh
+    from chsel.points import KnownPoints, Workspace
+    from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+    from chsel.sdf import SdfGrid
 
 __all__ = [
     "ArchiveSnapshot",
@@ -28,3 +32,31 @@ __all__ = [
     "load_mesh",
     "register",
 ]
+
+_PLACES = {
+    "ArchiveSnapshot": "problem",
+    "ChselError": "errors",
+    "CompiledCost": "engine",
+    "CostSettings": "cost_settings",
+    "Hypotheses": "problem",
+    "KnownPoints": "points",
+    "RegistrationProblem": "problem",
+    "RelaxedCost": "cost",
+    "SdfGrid": "sdf",
+    "Workspace": "points",
+    "load_mesh": "mesh",
+    "register": "api",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, so that `replay info` need not wait for torch."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from chsel.arrays import FloatArray
-from chsel.errors import SettingError, require_positive
+from chsel.errors import SettingError, require_at_most, require_positive
 from chsel.objective import Objective
 from chsel.observer import Observer
 from chsel.space import transforms_of
+
+MOST_ITERATIONS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,9 @@ class DescentSettings:
     def __post_init__(self) -> None:
         require_positive("restarts", self.restarts, zero=True)
         require_positive("iterations", self.iterations)
+        for name in ("restarts", "iterations"):
+            require_at_most(name, getattr(self, name), MOST_ITERATIONS)
+        require_at_most("restarts x iterations", self.restarts * self.iterations, MOST_ITERATIONS)
         require_positive("rate", self.rate)
         if self.stop_below is not None and not np.isfinite(self.stop_below):
             raise SettingError(f"stop_below is {self.stop_below}; accepted: a number, or null")

@@ -6,14 +6,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from chsel.archive import GridArchive
 from chsel.arrays import FloatArray, IntArray
-from chsel.errors import require_choice, require_positive
+from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.kernels import emitters as kernels
 from chsel.kernels.emitters import me_search, mega_search
 from chsel.objective import Objective
 from chsel.observer import Observer
 from chsel.streams import Purpose, StreamKey, normals
+
+MOST_ITERATIONS = 1_000_000
+_MOST_DRAWN = 4_000_000  # normal draws held at once, 8 bytes each
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,7 @@ class EmitterSettings:
 
     def __post_init__(self) -> None:
         require_positive("iterations", self.iterations, zero=True)
+        require_at_most("iterations", self.iterations, MOST_ITERATIONS)
         require_positive("sigma0", self.sigma0)
         require_positive("rate", self.rate)
         require_choice("start", self.start, ("best", "initial"))
@@ -41,15 +47,28 @@ class EmitterSettings:
 
 @dataclass(frozen=True)
 class Draws:
-    """The random numbers of one search, drawn before its first iteration."""
+    """The random numbers of one search; none depends on what the search does with others."""
 
     key: StreamKey
     refinement: int = 0
 
     def normals(self, iterations: int, batch: int, dimension: int) -> FloatArray:
         """Standard normal draws (iterations, batch, dimension) for the evolution strategy."""
+        none = np.zeros((0, batch, dimension))
+        return np.concatenate([none, *self.blocks(iterations, batch, dimension)])
+
+    def blocks(self, iterations: int, batch: int, dimension: int) -> Iterator[FloatArray]:
+        """The same draws, as many iterations at a time as `block` says."""
         stream = self.key.stream(Purpose.EMITTER, self.refinement)
-        return normals(stream, (iterations, batch, dimension))
+        size = self.block(batch, dimension)
+        for first in range(0, iterations, size):
+            yield normals(stream, (min(size, iterations - first), batch, dimension))
+
+    @staticmethod
+    def block(batch: int, dimension: int) -> int:
+        """Iterations that are drawn at a time: 10 or a multiple, so that no pair is torn."""
+        step = ArchiveWatch.trace_interval
+        return max(1, min(100, _MOST_DRAWN // (step * batch * dimension))) * step
 
     def elites(self, iterations: int) -> FloatArray:
         """Uniform draws (iterations,) that choose an elite for a restart."""
@@ -86,7 +105,8 @@ def cma_mega(
     """
     batch, measures, total = max(count - 1, 1), archive.measure.count, settings.iterations
     problem = _problem(objective, archive)
-    normals, elites = draws.normals(total, batch, measures + 1), draws.elites(total)
+    normals, elites = draws.blocks(total, batch, measures + 1), draws.elites(total)
+    size = draws.block(batch, measures + 1)
     search = mega_search(
         start,
         measures,
@@ -96,7 +116,10 @@ def cma_mega(
         ribs_parity=settings.ribs_parity,
     )
     for first, last in watch.segments(total):
-        kernels.cma_mega(*problem, archive.cells, search, normals, elites, first, last)
+        if first % size == 0:
+            drawn, uniform = next(normals), elites[first : first + size]
+        place = first % size, last - first // size * size
+        kernels.cma_mega(*problem, archive.cells, search, drawn, uniform, *place)
         watch.after(last, total, archive)
 
 
@@ -115,7 +138,8 @@ def cma_me(
     """
     total = settings.iterations
     problem = _problem(objective, archive)
-    normals, elites = draws.normals(total, count, len(start)), draws.elites(total)
+    normals, elites = draws.blocks(total, count, len(start)), draws.elites(total)
+    size = draws.block(count, len(start))
     search = me_search(
         start,
         archive.measure.count,
@@ -124,7 +148,10 @@ def cma_me(
         ribs_parity=settings.ribs_parity,
     )
     for first, last in watch.segments(total):
-        kernels.cma_me(*problem, archive.cells, search, normals, elites, first, last)
+        if first % size == 0:
+            drawn, uniform = next(normals), elites[first : first + size]
+        place = first % size, last - first // size * size
+        kernels.cma_me(*problem, archive.cells, search, drawn, uniform, *place)
         watch.after(last, total, archive)
 
 

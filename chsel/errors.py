@@ -48,6 +48,12 @@ def require_choice(name: str, value: object, accepted: Iterable[str]) -> None:
         raise SettingError(f"{name} is {value!r}; accepted: {', '.join(accepted)}")
 
 
+def require_at_most(name: str, value: float, most: float) -> None:
+    """Raise SettingError if `value` is beyond what any registration can need."""
+    if value > most:
+        raise SettingError(f"{name} is {value!r}; accepted: at most {most:_}")
+
+
 def require_positive(name: str, value: float, *, zero: bool = False) -> None:
     """Raise SettingError unless `value` is a finite number above zero (or at zero, if `zero`)."""
     finite = isinstance(value, int | float) and value == value and abs(value) != float("inf")

@@ -16,6 +16,7 @@ from chsel.sdf import SdfGrid
 
 FEW_INTERIOR_POINTS = 25
 _MAX_VOXELS = 100_000_000
+_MAX_NODES = 10_000_000  # of the lattice over the SDF grid
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,11 @@ def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
     alpha, spacing = settings.penetration_tolerance, interior_spacing(sdf, settings)
     lower, upper = sdf.bounds
     counts = np.floor((upper - lower) / spacing).astype(int) + 1
+    if not math.prod(counts.tolist()) <= _MAX_NODES:
+        raise SettingError(
+            f"interior_spacing {spacing} m makes {math.prod(counts.tolist()):.1e} nodes; "
+            f"accepted: at most {_MAX_NODES:.0e}, so a coarser interior_spacing"
+        )
     nodes = lower + np.indices(counts).reshape(3, -1).T * spacing
     query = sdf.query(nodes, lookup=settings.lookup, outside=settings.outside)
     s, n = (part.numpy() for part in query)

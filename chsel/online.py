@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from chsel.arrays import FloatArray
-from chsel.errors import require_choice, require_positive
+from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.points import KnownPoints, Workspace
 from chsel.pose import axis_angle, compose, inverse, product, random_rotations, rotation_vector
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.streams import Purpose, StreamKey, normals, uniforms
 
+MOST_HYPOTHESES = 1_000_000
 _CENTROID_SPREAD = 0.05
 
 
@@ -40,6 +41,7 @@ class OnlineSettings:
 
     def __post_init__(self) -> None:
         require_positive("hypotheses", self.hypotheses)
+        require_at_most("hypotheses", self.hypotheses, MOST_HYPOTHESES)
         choices = ("so3", "upright", "origin", "contact_centroid")
         require_choice("initial", self.initial, choices)
         require_choice("rotation_law", self.rotation_law, ("axis_gauss", "rotvec_gauss"))

@@ -11,7 +11,7 @@ from chsel.arrays import BoolArray, FloatArray, IntArray, digest, frozen
 from chsel.errors import PoseError, SettingError, require_positive
 from chsel.points import KnownPoints, Workspace
 from chsel.pose import check_rigid
-from chsel.sdf import SdfGrid
+from chsel.sdf import COARSEST, FINEST, SdfGrid
 from chsel.streams import StreamKey
 
 
@@ -38,6 +38,11 @@ class RegistrationProblem:
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
+        if not FINEST <= self.free_resolution <= COARSEST:
+            raise SettingError(
+                f"free_resolution is {self.free_resolution}; "
+                f"accepted: {FINEST:g} to {COARSEST:g} (m)"
+            )
         for name in ("initial_set", "low_cost_set"):
             poses = frozen(name, getattr(self, name), (None, 4, 4), error=PoseError)
             check_rigid(name, poses)

@@ -20,6 +20,8 @@ from chsel.pose import as_tensor
 LOOKUPS = ("nearest", "trilinear")
 OUTSIDE = ("surface_point", "bounding_box")
 MAX_NODES = 50_000_000
+FINEST, COARSEST = 1e-6, 1e3  # m: of a grid's nodes, so that no node's place is lost to rounding
+FARTHEST = 1e6  # m: of a grid's first node
 Derived = TypeVar("Derived")
 _NORMAL_RANGE = 1e-3  # nearer than this to the surface, the face normal is the better gradient
 
@@ -75,6 +77,10 @@ class SdfGrid:
 
     def __post_init__(self) -> None:
         require_positive("SDF resolution", self.resolution)
+        if not FINEST <= self.resolution <= COARSEST:
+            raise SdfError(
+                f"SDF resolution is {self.resolution}; accepted: {FINEST:g} to {COARSEST:g} (m)"
+            )
         values = frozen("SDF values", self.values, (None, None, None), error=SdfError)
         if min(values.shape) < 2:
             raise SdfError(f"SDF values have shape {values.shape}; accepted: at least 2 per axis")
@@ -84,7 +90,10 @@ class SdfGrid:
                 "the border of the SDF grid touches the object; accepted: a grid padded so that "
                 "every node of its border is outside"
             )
-        object.__setattr__(self, "origin", frozen("SDF origin", self.origin, (3,), error=SdfError))
+        origin = frozen("SDF origin", self.origin, (3,), error=SdfError)
+        if np.abs(origin).max() > FARTHEST:
+            raise SdfError(f"SDF origin is {origin.tolist()}; accepted: up to {FARTHEST:g} (m)")
+        object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "gradients", gradients)
 

@@ -8,10 +8,12 @@ import numpy as np
 
 from chsel.archive import GridArchive
 from chsel.arrays import BoolArray, FloatArray, IntArray
-from chsel.errors import ChselError, require_choice, require_positive
-from chsel.measures import Measure
+from chsel.errors import ChselError, require_at_most, require_choice, require_positive
+from chsel.measures import MEASURES, Measure
 from chsel.objective import Objective
 from chsel.problem import ArchiveSnapshot, Hypotheses
+
+MOST_CELLS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,10 @@ class ArchiveSettings:
             require_positive(name, getattr(self, name))
         for name in ("tolerance_per_point", "tolerance"):
             require_positive(name, getattr(self, name), zero=True)
+        require_choice("measure", self.measure, MEASURES)
+        require_at_most("bins", self.bins, MOST_CELLS)
+        count = MEASURES[self.measure].count
+        require_at_most(f"bins ** {count}, the number of cells,", self.bins**count, MOST_CELLS)
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
+def program() -> NoReturn:
+    """The command `chsel-replay`."""
+    sys.exit(main())
+
+
 def _parser(verb: str) -> Parser:
     """The parser of all verbs, with the arguments of one."""
     parser = Parser(prog="replay", description=__doc__)
@@ -77,4 +82,4 @@ def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -128,7 +128,11 @@ class Logged:
 
 @dataclass(frozen=True)
 class SessionEnded:
-    """Closes a recording; outcome is "finished", "interrupted" or "failed: REASON"."""
+    """Closes a recording.
+
+    outcome: "finished", "interrupted", "failed: REASON", or "recovered: REASON" where a damaged
+    recording did not tell.
+    """
 
     step: int
     outcome: str

@@ -1,29 +1,24 @@
-"""Runs registrations again: recorded problems, with the recorded method or another."""
+"""Runs registrations and records them: new ones, and recorded problems again."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import yaml
 
+from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError
 from chsel.evaluation.result_numbers import result_numbers
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.presets import PRESETS
+from chsel.problem import Hypotheses
 from chsel.settings import settings_mapping
-from replay.events import (
-    HypothesesFound,
-    Measured,
-    ProblemPosed,
-    Recorder,
-    SessionStarted,
-    Timed,
-)
-from replay.mcap_reader import Recording
+from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder
+from replay.mcap.reader import Recording
 from replay.step_observer import StepObserver
 
 
@@ -39,6 +34,20 @@ class NamedMethod:
     def config(self) -> dict[str, Any]:
         """As the configuration of a recording has it."""
         return {"name": self.name, **self.settings}
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """What a registration gave: its result, numbers about it, and wall-clock seconds by stage."""
+
+    hypotheses: Hypotheses
+    numbers: Mapping[str, float]
+    seconds: Mapping[str, float]
+
+    @property
+    def total_seconds(self) -> float:
+        """Of all stages."""
+        return sum(self.seconds.values())
 
 
 def recorded_method(recording: Recording) -> NamedMethod:
@@ -76,28 +85,29 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
     return _named(name or recorded, settings)
 
 
-def register_again(
+def register_recorded(
     posed: ProblemPosed,
     method: Method,
     recorder: Recorder,
-    start: SessionStarted,
+    world_from_object: FloatArray | None,
     *,
     snapshot_interval: int = 0,
-    timings: bool = False,
-) -> float:
-    """Register a recorded problem and record all about it; seconds that the registration took."""
-    step, problem = posed.step, posed.problem
+    show: Callable[[str, int, int], None] = lambda *_: None,
+) -> Registered:
+    """Register a problem, and record it with all that the registration gives.
+
+    world_from_object (4, 4): the true pose, where known. show: gets stage, iteration and total.
+    """
     recorder.record(posed)
-    observer = StepObserver(recorder, step, snapshot_interval, lambda *_: None)
+    observer = StepObserver(recorder, posed.step, snapshot_interval, show)
     begun = time.perf_counter()
-    hypotheses = method.register(problem, observer)
-    seconds = time.perf_counter() - begun
-    recorder.record(HypothesesFound(step, hypotheses))
-    numbers = result_numbers(hypotheses, problem, start.world_from_object)
-    recorder.record(Measured(step, numbers))
-    if timings:
-        recorder.record(Timed(step, observer.seconds))
-    return seconds
+    hypotheses = method.register(posed.problem, observer)
+    seconds = dict(observer.seconds)
+    seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
+    recorder.record(HypothesesFound(posed.step, hypotheses))
+    numbers = result_numbers(hypotheses, posed.problem, world_from_object)
+    recorder.record(Measured(posed.step, numbers))
+    return Registered(hypotheses, numbers, seconds)
 
 
 def _named(name: str, settings: Mapping[str, Any]) -> NamedMethod:

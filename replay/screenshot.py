@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import socket
 import subprocess
 import sys
 import tempfile
@@ -14,8 +13,9 @@ from typing import IO
 from rerun.experimental import ViewerClient
 
 from chsel.errors import RecordingError
-from replay.rerun_clock import PROBE
-from replay.rerun_live import HOST, is_listening, viewer_program
+from replay.rerun.clock import PROBE
+from replay.rerun.live import HOST, is_listening, viewer_program
+from replay.rerun.viewer import free_port
 
 START_SECONDS = 60.0
 SETTLE_SECONDS = 8.0  # until the layout stands and the notice of the start is gone
@@ -31,9 +31,7 @@ def save_screenshot(
     """
     if not rrd.is_file():
         raise RecordingError(f"recording {rrd} does not exist; accepted: a .rrd file")
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        port = int(probe.getsockname()[1])
+    port = free_port()
     options = ["--headless", "--hide-welcome-screen", "--bind", HOST, "--port", str(port)]
     command = [str(viewer_program()), *options, "--window-size", f"{width}x{height}"]
     with tempfile.TemporaryFile("w+") as output:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,14 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
-from replay.mcap_reader import Recording
+from replay.mcap.reader import Recording
+from replay.mcap.recovery import tells_loss
 from replay.recorder import ListRecorder
-from replay.registration import NamedMethod, recorded_method, register_again
+from replay.registration import NamedMethod, recorded_method, register_recorded
 
 EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
+LOST: Literal["lost"] = "lost"  # of a result that a damaged recording does not tell
+Previous = Hypotheses | Literal["lost"] | None
 _PATIENCE = 10  # times the recorded iterations of a stage; more are not worth waiting for
 _ARCHIVE = ("lower", "upper", "cells", "solutions", "objectives", "measures")
 _HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell", "elites")
@@ -72,15 +76,14 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
     method = recorded_method(recording)
     wanted = recording.checked_steps(steps)
     differing = environment_differences(recording.start)
-    previous: Hypotheses | None = None
     events = recording.events()
-    posed = next((event for event in events if isinstance(event, ProblemPosed)), None)
+    before, posed = _until_next_problem(events)
+    previous = _previous(before, None)
     while posed is not None:
         of_step, following = _until_next_problem(events)
         if posed.step in wanted:
             yield _verified(recording.start, posed, of_step, method, previous, differing)
-        found = [event.hypotheses for event in of_step if isinstance(event, HypothesesFound)]
-        previous = found[0] if found else previous
+        previous = _previous(of_step, previous)
         posed = following
 
 
@@ -94,6 +97,12 @@ def environment_differences(start: SessionStarted) -> tuple[str, ...]:
     )
 
 
+def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
+    """Iterations between recorded snapshots; 0 if there are the first and the last alone."""
+    iterations = sorted({archive.iteration for archive in snapshots})
+    return iterations[1] if len(iterations) > 2 else 0
+
+
 def _until_next_problem(events: Iterator[Event]) -> tuple[list[Event], ProblemPosed | None]:
     of_step: list[Event] = []
     for event in events:
@@ -103,30 +112,56 @@ def _until_next_problem(events: Iterator[Event]) -> tuple[list[Event], ProblemPo
     return of_step, None
 
 
+def _previous(events: Sequence[Event], previous: Previous) -> Previous:
+    """The last result after these events, LOST if it may have been lost."""
+    for event in events:
+        if isinstance(event, HypothesesFound):
+            previous = event.hypotheses
+        elif tells_loss(event):
+            previous = LOST
+    return previous
+
+
+def _events_of(step: int, events: Sequence[Event]) -> tuple[list[Event], bool]:
+    """The events of a step, and whether all are there; its result alone if some may be lost."""
+    whole = True
+    for event in events:
+        if isinstance(event, HypothesesFound) and event.step == step:
+            break
+        whole = whole and not tells_loss(event)
+    own = [event for event in events if getattr(event, "step", None) == step]
+    return [event for event in own if whole or isinstance(event, HypothesesFound)], whole
+
+
 def _verified(
     start: SessionStarted,
     posed: ProblemPosed,
-    recorded: Sequence[Event],
+    events: Sequence[Event],
     method: NamedMethod,
-    previous: Hypotheses | None,
+    previous: Previous,
     environment: tuple[str, ...],
 ) -> Verdict:
     """Run the registration of a step again, and compare."""
     step = posed.step
+    recorded, whole = _events_of(step, events)
     expected = _result(recorded)
     if expected is None:
         return Verdict(step, method.name, NO_RESULT)
     comparison = _Comparison()
-    if not start.source:  # else the sets are another recording's
+    if not start.source and previous != LOST:  # else the sets are of what is not in this recording
         _compare_sets(comparison, posed.problem, method, previous)
-    watching = _Watching(_last_iterations(recorded))
+    watching = _Watching(recorded) if whole else ListRecorder()
     snapshots = [event.archive for event in recorded if isinstance(event, SnapshotTaken)]
     found, failure, seconds = None, "", 0.0
     try:
-        seconds = register_again(
-            posed, method.method, watching, start, snapshot_interval=_interval(snapshots)
+        registered = register_recorded(
+            posed,
+            method.method,
+            watching,
+            start.world_from_object,
+            snapshot_interval=snapshot_interval(snapshots),
         )
-        found = _result(watching.events)
+        found, seconds = registered.hypotheses, registered.total_seconds
     except (_FarBeyondError, ChselError) as error:
         failure = str(error)
     _compare_stages(comparison, recorded, watching.events, ended=found is not None)
@@ -187,12 +222,16 @@ class _FarBeyondError(Exception):
 class _Watching(ListRecorder):
     """Keeps events, and stops a registration that goes on far beyond the recorded one."""
 
-    def __init__(self, last: dict[str, int]) -> None:
+    def __init__(self, recorded: Sequence[Event]) -> None:
         super().__init__()
-        self._last = last
+        self._last = _last_iterations(recorded)
+        snapshots = [event.archive for event in recorded if isinstance(event, SnapshotTaken)]
+        self._snapshots = {archive.iteration for archive in snapshots}
 
     def record(self, event: Event) -> None:
-        """Keep it, or raise."""
+        """Keep it if there is anything to compare it with, or raise."""
+        if isinstance(event, SnapshotTaken) and event.archive.iteration not in self._snapshots:
+            return
         if isinstance(event, Traced):
             last = self._last.get(event.stage, 0)
             if event.iteration > _PATIENCE * last + 1000:
@@ -209,15 +248,20 @@ def _compare_sets(
     previous: Hypotheses | None,
 ) -> None:
     """Whether E_0 and E_l follow from the step before as recorded (CHSEL, Alg. 2)."""
-    again = pose_problem(
-        problem.sdf,
-        problem.points,
-        problem.workspace,
-        problem.free_resolution,
-        problem.key,
-        method.method.online,
-        previous,
-    )
+    try:
+        again = pose_problem(
+            problem.sdf,
+            problem.points,
+            problem.workspace,
+            problem.free_resolution,
+            problem.key,
+            method.method.online,
+            previous,
+        )
+    except ChselError as error:  # such as elites that are no poses
+        comparison.stage_is("making E_0", equal=False)
+        comparison.differences.append(f"E_0 and E_l cannot be made again: {error}")
+        return
     for name, field_name in (("E_0", "initial_set"), ("E_l", "low_cost_set")):
         pair = (getattr(problem, field_name), getattr(again, field_name))
         comparison.stage_is(f"making {name}", equal=comparison.arrays({name: pair}))
@@ -301,9 +345,3 @@ def _last_iterations(events: Sequence[Event]) -> dict[str, int]:
         if isinstance(event, Traced):
             last[event.stage] = max(last.get(event.stage, 0), event.iteration)
     return last
-
-
-def _interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
-    """Iterations between the recorded snapshots; 0 if there are the first and the last alone."""
-    iterations = sorted({archive.iteration for archive in snapshots})
-    return iterations[1] if len(iterations) > 2 else 0

@@ -177,6 +177,9 @@ def run(
         outcome = "finished"
     except KeyboardInterrupt:
         outcome = "interrupted"
+    except SystemExit:  # whoever read the output has had enough of it
+        _finish(folder, recorder, session_run.step, started, rows, "interrupted")
+        raise
     except Exception as error:
         with suppress(OSError):  # the first error is the one to tell
             _finish(folder, recorder, session_run.step, started, rows, f"failed: {error}")
@@ -204,8 +207,11 @@ def _finish(
     try:
         with nullcontext() if finished else suppress(RecordingError):
             _end(recorder, step, "info" if finished else "warning", outcome)
-    finally:
-        _summarise(folder, started, rows, outcome)
+    except RecordingError as error:
+        with suppress(OSError):  # the first error is the one to tell
+            _summarise(folder, started, rows, f"failed: {error}")
+        raise
+    _summarise(folder, started, rows, outcome)
 
 
 def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 from chsel.errors import RecordingError, require_positive
 from replay.background_recorder import BackgroundRecorder
 from replay.events import Recorder
-from replay.mcap_writer import McapRecorder
+from replay.mcap.writer import McapRecorder
 from replay.recorder import TeeRecorder
-from replay.rerun_recorder import RerunRecorder
+from runners.pictures import open_pictures
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,6 @@ def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
         recorders.append(BackgroundRecorder(McapRecorder(folder / "recording.mcap")))
     if config.rerun or config.live:
         path = folder / "recording.rrd" if config.rerun else None
-        pictures = RerunRecorder(path, live=config.live)
+        pictures = open_pictures(path, live=config.live, alone=not config.mcap)
         recorders.append(BackgroundRecorder(pictures, patient=False))
     return TeeRecorder(recorders)

@@ -6,22 +6,19 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from chsel.evaluation.result_numbers import result_numbers
 from chsel.methods.method import Method
 from chsel.online import pose_problem
 from chsel.problem import Hypotheses
 from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
 from replay.events import (
-    HypothesesFound,
     Logged,
-    Measured,
     Probe,
     ProblemPosed,
     Recorder,
     Timed,
 )
-from replay.step_observer import StepObserver
+from replay.registration import register_recorded
 from runners.recording import RecordingConfig
 from runners.sessions.session import Session
 
@@ -98,23 +95,21 @@ class SessionRun:
             self._method.online,
             self.previous,
         )
-        self._recorder.record(ProblemPosed(step, problem))
-        observer = StepObserver(self._recorder, step, self._snapshot_interval, self._show)
-        begun = time.perf_counter()
-        hypotheses = self._method.register(problem, observer)
-        seconds |= observer.seconds
-        seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
-        self._recorder.record(HypothesesFound(step, hypotheses))
-        measured = result_numbers(hypotheses, problem, self._session.world_from_object)
-        self._recorder.record(Measured(step, measured))
-        self.previous = hypotheses
-        row = {"best_cost": float(hypotheses.cost[0]), "distinct": hypotheses.distinct}
-        return row | {"digest": hypotheses.digest} | measured
+        registered = register_recorded(
+            ProblemPosed(step, problem),
+            self._method,
+            self._recorder,
+            self._session.world_from_object,
+            snapshot_interval=self._snapshot_interval,
+            show=self._show,
+        )
+        seconds |= registered.seconds
+        found = self.previous = registered.hypotheses
+        row = {"best_cost": float(found.cost[0]), "distinct": found.distinct}
+        return row | {"digest": found.digest} | dict(registered.numbers)
 
 
 def _line(row: Row) -> str:
-    """What the recording's log says about a probe."""
+    """What the recording's log says about a probe; results speak for themselves."""
     text = f"probe {row['step']}: {row['outcome']}, {row['contacts']} contacts"
-    if "best_cost" not in row:
-        return f"{text}, too little for a registration"
-    return f"{text}, best cost {row['best_cost']:.4g}, {row['distinct']} distinct hypotheses"
+    return text if "best_cost" in row else f"{text}, too little for a registration"

@@ -9,7 +9,7 @@ from chsel.cost_settings import CostSettings
 from chsel.descent import DescentSettings, descend
 from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
 from chsel.engine import CompiledCost
-from chsel.errors import require_choice, require_positive
+from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.measures import measure_named
 from chsel.objective import Objective
 from chsel.observer import NullObserver, Observer
@@ -25,6 +25,8 @@ from chsel.selection import (
 )
 from chsel.space import PlaneSettings, search_space, transforms_of
 from chsel.streams import Purpose
+
+MOST_PASSES = 10_000
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class ChselSettings:
     def __post_init__(self) -> None:
         require_choice("search", self.search, SEARCHES)
         require_positive("passes", self.passes)
+        require_at_most("passes", self.passes, MOST_PASSES)
         measure_named(self.archive.measure, planar=self.plane is not None)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from chsel.errors import SettingError
 from replay.events import Probe
-from replay.mcap_reader import read_recording
+from replay.mcap.reader import read_recording
 
 
 @dataclass(frozen=True)

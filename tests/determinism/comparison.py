@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from chsel.arrays import digest
+from replay.differences import ulps
 from tests.determinism.stages import Stages
 
 GOLDEN_FILE = Path(__file__).with_name("golden.json")
@@ -73,17 +74,6 @@ def other_versions() -> str:
     )
 
 
-def ulps(left: np.ndarray, right: np.ndarray) -> list[int]:
-    """How many steps between neighbouring numbers lie between two arrays, entry by entry."""
-    return [abs(a - b) for a, b in zip(_ranks(left), _ranks(right), strict=True)]
-
-
-def _ranks(numbers: np.ndarray) -> list[int]:
-    """Where each number stands in the order of all doubles, -0.0 right below 0.0."""
-    bits = np.ascontiguousarray(numbers, dtype=np.float64).view(np.int64).reshape(-1)
-    return [int(b) if b >= 0 else -1 - (int(b) & (2**63 - 1)) for b in bits]
-
-
 def differences(
     golden: Golden, record: dict[str, Stages], nearby: dict[str, Stages] | None = None
 ) -> list[str]:
@@ -121,7 +111,7 @@ def _first_difference(
 def _by_samples(expected: list[str], arrays: dict[str, np.ndarray]) -> str:
     ours = np.array([float.fromhex(number) for number in _samples(arrays)])
     theirs = np.array([float.fromhex(number) for number in expected])
-    apart = max(ulps(theirs, ours))
+    apart = int(ulps(theirs, ours).max())
     place = "in" if apart else "but not in"
     return f"{f'by up to {apart} ulp ' if apart else ''}{place} the numbers in golden.json"
 
@@ -133,6 +123,6 @@ def _by_arrays(usual: dict[str, np.ndarray], arrays: dict[str, np.ndarray]) -> s
             said.append(f"{name} {array.shape} instead of {usual[name].shape}")
         elif digest(array) != digest(usual[name]):
             apart = ulps(usual[name], array)
-            unequal = sum(steps > 0 for steps in apart)
-            said.append(f"{unequal} of {array.size} {name} by up to {max(apart)} ulp")
+            unequal = int((apart > 0).sum())
+            said.append(f"{unequal} of {array.size} {name} by up to {apart.max()} ulp")
     return "; ".join(said)

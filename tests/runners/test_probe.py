@@ -19,7 +19,7 @@ import yaml
 from chsel.errors import RecordingError
 from chsel.methods import build_method
 from chsel.pose import apply, axis_angle, compose
-from replay.mcap_reader import read_recording
+from replay.mcap.reader import read_recording
 
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 QUICK = (

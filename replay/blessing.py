@@ -1,0 +1,173 @@
+"""Makes a recording again with today's results, and says what changes."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from chsel.arrays import FloatArray
+from chsel.errors import RecordingError
+from chsel.evaluation.pose_error import pose_errors
+from chsel.online import pose_problem
+from chsel.pose import inverse
+from chsel.problem import Hypotheses
+from replay.differences import apart
+from replay.environment import environment
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Measured,
+    ProblemPosed,
+    SessionStarted,
+    SnapshotTaken,
+    Timed,
+    Traced,
+)
+from replay.mcap.reader import Recording, read_recording
+from replay.mcap.recovery import tells_loss
+from replay.mcap.writer import McapRecorder
+from replay.recorder import ListRecorder
+from replay.registration import recorded_method, register_recorded
+from replay.verification import snapshot_interval
+
+_RESULTS = (SnapshotTaken, Traced, HypothesesFound, Measured, Timed)
+
+
+@dataclass(frozen=True)
+class Change:
+    """How the result of a step differs from the recorded one.
+
+    equal: to the bit, with all stages on the way. ulps: the most between two of the costs or
+    poses, if there are as many. Pairs are recorded and new. position, rotation: from the recorded
+    best pose to the new one, metres and radians. position_error, rotation_error: of the best,
+    where the truth is known.
+    """
+
+    step: int
+    equal: bool
+    ulps: int
+    best_cost: tuple[float, float]
+    distinct: tuple[int, int]
+    position: float
+    rotation: float
+    position_error: tuple[float, float] | None
+    rotation_error: tuple[float, float] | None
+
+
+def write_blessed(recording: Recording, path: Path) -> Recording:
+    """Write the recording with today's results to a new file; as it reads.
+
+    The file is removed again if that fails. Raises RecordingError if the recording was recovered
+    with losses, behind which E_0 and E_l do not follow from what is left.
+    """
+    if any(tells_loss(event) for event in recording.events()):
+        raise RecordingError(f"recording {recording.path} has lost events; accepted: whole ones")
+    recorder = McapRecorder(path)
+    try:
+        for event in _todays_events(recording):
+            recorder.record(event)
+            if isinstance(event, HypothesesFound):
+                recorder.flush()
+        recorder.close()
+        return read_recording(path)
+    except BaseException:
+        recorder.close()
+        os.unlink(path)
+        raise
+
+
+def changes(recorded: Recording, new: Recording) -> list[Change]:
+    """What differs, step by step, between results that are there in both."""
+    truth = recorded.start.world_from_object
+    before, after = _outputs(recorded), _outputs(new)
+    return [
+        _change(
+            step,
+            recorded.hypotheses(step),
+            new.hypotheses(step),
+            truth,
+            equal=before[step] == after[step],
+        )
+        for step in recorded.steps
+        if recorded.has_result(step)
+    ]
+
+
+def _outputs(recording: Recording) -> dict[int, list[object]]:
+    """All that today's code has a say in, by step, as far as its digests tell."""
+    outputs: dict[int, list[object]] = {step: [] for step in recording.steps}
+    for event in recording.events():
+        match event:
+            case ProblemPosed():
+                outputs[event.step].append(event.problem.digest)
+            case Traced():
+                outputs[event.step].append(event)
+            case SnapshotTaken():
+                outputs[event.step].append((event.archive.iteration, event.archive.digest))
+            case HypothesesFound():
+                archive = event.hypotheses.archive
+                outputs[event.step].append((event.hypotheses.digest, archive and archive.digest))
+    return outputs
+
+
+def _todays_events(recording: Recording) -> Iterator[Event]:
+    """The events of a recording, every registration run again; E_0 and E_l follow anew."""
+    method, start = recorded_method(recording), recording.start
+    previous: Hypotheses | None = None
+    again: int | None = None  # the step whose recorded results are left out
+    for event in recording.events():
+        if isinstance(event, SessionStarted):
+            yield dataclasses.replace(event, environment=environment())
+        elif isinstance(event, ProblemPosed) and recording.has_result(event.step):
+            again, kept = event.step, ListRecorder()
+            problem = event.problem
+            if not start.source:
+                problem = pose_problem(
+                    problem.sdf,
+                    problem.points,
+                    problem.workspace,
+                    problem.free_resolution,
+                    problem.key,
+                    method.method.online,
+                    previous,
+                )
+            registered = register_recorded(
+                ProblemPosed(event.step, problem),
+                method.method,
+                kept,
+                start.world_from_object,
+                snapshot_interval=snapshot_interval(recording.snapshots(event.step)),
+            )
+            previous = registered.hypotheses
+            yield from kept.events
+            if recording.has_timings:
+                yield Timed(event.step, registered.seconds)
+        elif not (isinstance(event, _RESULTS) and event.step == again):
+            yield event
+
+
+def _change(
+    step: int, recorded: Hypotheses, new: Hypotheses, truth: FloatArray | None, *, equal: bool
+) -> Change:
+    shift, turn = pose_errors(new.object_from_world[:1], inverse(recorded.object_from_world[0]))
+    errors: list[tuple[float, float]] | None = None  # of position, of rotation
+    if truth is not None:
+        before, after = (pose_errors(h.object_from_world[:1], truth) for h in (recorded, new))
+        errors = [(float(old[0]), float(now[0])) for old, now in zip(before, after, strict=True)]
+    return Change(
+        step=step,
+        equal=equal,
+        ulps=max(
+            apart(recorded.cost, new.cost),
+            apart(recorded.object_from_world, new.object_from_world),
+        ),
+        best_cost=(float(recorded.cost[0]), float(new.cost[0])),
+        distinct=(recorded.distinct, new.distinct),
+        position=float(shift[0]),
+        rotation=float(turn[0]),
+        position_error=errors[0] if errors else None,
+        rotation_error=errors[1] if errors else None,
+    )

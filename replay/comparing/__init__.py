@@ -1,0 +1,1 @@
+"""Methods on the same problems, and recordings side by side."""

@@ -1,0 +1,371 @@
+"""How two recordings differ: message by message, each number to the bit."""
+
+from __future__ import annotations
+
+import filecmp
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from chsel.errors import ChselError, RecordingError, SettingError
+from replay.comparing.message_content import (
+    Content,
+    attachment_content,
+    message_content,
+    printable,
+    step_of,
+)
+from replay.differences import apart, difference
+from replay.mcap.attachments import MESH, SDF_GRID
+from replay.mcap.encoding import decode
+from replay.mcap.file import McapFile, StoredMessage
+from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.schemas import MESSAGES, RECORDS, message_class
+
+BOTH, FIRST, SECOND = "both", "first", "second"
+_LONGEST_TEXT = 60
+_ABSENT = object()
+_BEFORE_ALL_STEPS = -1
+_MALFORMED = (ChselError, ValueError, RecursionError)
+
+
+class Key(NamedTuple):
+    """What two messages have in common to be compared: `number` counts those with the same rest.
+
+    about: stage and iteration of a trace or archive, else empty.
+    """
+
+    topic: str
+    step: int
+    about: str
+    number: int
+
+    @property
+    def kind(self) -> tuple[str, int, str]:
+        """All but the number."""
+        return self[:3]
+
+    def __str__(self) -> str:
+        parts = [printable(self.topic)]
+        if self.topic.startswith("/"):
+            parts.append("start" if self.step == _BEFORE_ALL_STEPS else f"step {self.step}")
+        parts += [printable(self.about)] if self.about else []
+        parts += [f"number {self.number + 1}"] if self.number else []
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One field that differs, or a message that one recording alone has (`field` is empty then).
+
+    having: "both", "first" or "second". text: what is different. ulps: units in the last place,
+    the most over an array; None for all but floating point.
+    """
+
+    key: Key
+    having: str
+    field: str
+    text: str
+    ulps: int | None = None
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.text}"
+
+
+@dataclass
+class TopicDiff:
+    """What differs on one topic, or in one attachment.
+
+    count: of messages in either. differing: of those in both. only_first, only_second: without a
+    counterpart. fields: in how many messages each differs. largest_ulps: None without numbers.
+    """
+
+    count: int = 0
+    differing: int = 0
+    only_first: int = 0
+    only_second: int = 0
+    steps: set[int] = field(default_factory=set)
+    fields: Counter[str] = field(default_factory=Counter)
+    largest_ulps: int | None = None
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether nothing differs."""
+        return not (self.differing or self.only_first or self.only_second)
+
+
+@dataclass
+class RecordingDiff:
+    """All that differs between two recordings.
+
+    same_bytes: whether the files are equal. topics: every topic and attachment met. differences:
+    in the order of the first recording, all or as many as were to be kept.
+    """
+
+    same_bytes: bool
+    topics: dict[str, TopicDiff] = field(default_factory=dict)
+    differences: list[Difference] = field(default_factory=list)
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether the recordings say the same."""
+        return all(topic.is_equal for topic in self.topics.values())
+
+
+class Ignored:
+    """What is left out: topics ("/timed", or "/points" for all below it), attachments, fields.
+
+    A word without "/" is each of these that has the name, and what is nested in it.
+    """
+
+    def __init__(self, words: Sequence[str] = ()) -> None:
+        """Raises SettingError for a word that names nothing."""
+        for word in words:
+            if not _is_known(word):
+                accepted = ", ".join([*RECORDS, *FOXGLOVE, MESH, SDF_GRID])
+                raise SettingError(
+                    f"{word!r} names nothing in a recording; accepted: names of fields, {accepted}"
+                )
+        self._words = tuple(words)
+
+    def topic(self, name: str) -> bool:
+        """Whether a whole topic or attachment is left out."""
+        return any(_is_topic(word, name) or word == name for word in self._words)
+
+    def field(self, path: str) -> bool:
+        """Whether a field is left out."""
+        return any(
+            path == word or path.startswith((f"{word}.", f"{word}[")) for word in self._words
+        )
+
+
+def recording_diff(
+    first: Path, second: Path, *, ignored: Ignored | None = None, keep: int | None = None
+) -> RecordingDiff:
+    """Compare two recordings, each read twice and never held as a whole.
+
+    keep: how many differences to keep beside those of the session's start; None: all. Raises
+    RecordingError if a file cannot be read, or one of its checksums is wrong.
+    """
+    ignored = ignored or Ignored()
+    one, other = _Survey(first, ignored), _Survey(second, ignored)
+    found = RecordingDiff(filecmp.cmp(one.path, other.path, shallow=False))
+    if not found.same_bytes:
+        for name in dict.fromkeys([*one.attachments, *other.attachments]):
+            pair = (one.attachments.get(name), other.attachments.get(name))
+            key = Key(name, _BEFORE_ALL_STEPS, "", 0)
+            _take(found, key, _compared_attachments(key, *pair, ignored), keep)
+        for paired in _pairs(one, other):
+            _take(found, paired.key, _compared_messages(paired, ignored), keep)
+    return found
+
+
+class _Survey:
+    """What is in a recording: attachments, and how many messages of each kind."""
+
+    def __init__(self, path: Path, ignored: Ignored) -> None:
+        self.path = path.expanduser()
+        self._ignored = ignored
+        self.attachments: dict[str, bytes] = {}
+        self.counts = Counter(key.kind for key, _ in self.messages())
+
+    def messages(self) -> Iterator[tuple[Key, StoredMessage]]:
+        """All messages that are not left out, in their order, as the file has them."""
+        schemas = {topic: message_class(name).DESCRIPTOR for topic, name in RECORDS.items()}
+        schemas |= {topic: kind.DESCRIPTOR for topic, kind in FOXGLOVE.items()}
+        file = McapFile(self.path, {topic: kind.full_name for topic, kind in schemas.items()})
+        numbers: Counter[tuple[str, int, str]] = Counter()
+        for message in file.messages():
+            if not self._ignored.topic(message.topic):
+                kind = (message.topic, step_of(message), _about(message))
+                yield Key(*kind, numbers[kind]), message
+                numbers[kind] += 1
+        self.attachments = {
+            name: data for name, data in file.attachments.items() if not self._ignored.topic(name)
+        }
+
+    def has(self, key: Key) -> bool:
+        """Whether there is such a message."""
+        return key.number < self.counts[key.kind]
+
+
+class _Pair(NamedTuple):
+    """Messages that belong together; moved: whether others of the first stand between them."""
+
+    key: Key
+    first: StoredMessage | None
+    second: StoredMessage | None
+    moved: bool = False
+
+
+def _pairs(first: _Survey, second: _Survey) -> Iterator[_Pair]:
+    """Pairs in the order of the first recording.
+
+    A message that the second alone has comes where it stands there. Messages wait only where the
+    orders of the two recordings differ.
+    """
+    waiting: dict[Key, StoredMessage] = {}
+    others = second.messages()
+    for key, message in first.messages():
+        if not second.has(key):
+            yield _Pair(key, message, None)
+            continue
+        while key not in waiting:
+            other_key, other = next(others, (None, None))
+            if other_key is None or other is None:
+                raise RecordingError(f"recording {second.path} has changed while it was read")
+            if first.has(other_key):
+                waiting[other_key] = other
+            else:
+                yield _Pair(other_key, None, other)
+        found = waiting.pop(key)
+        yield _Pair(key, message, found, moved=bool(waiting))
+    for other_key, other in others:
+        yield _Pair(other_key, None, other)
+
+
+def _about(message: StoredMessage) -> str:
+    """Stage and iteration of a trace or archive, by which another number of them shifts nothing."""
+    if message.topic in ("/trace", "/archive"):
+        with suppress(*_MALFORMED):
+            values = decode(RECORDS[message.topic], message.data)
+            stage = f"{values['stage']} " if "stage" in values else ""
+            later = f" (pass {values['refinement'] + 1})" if values.get("refinement") else ""
+            return f"{stage}iteration {values['iteration']}{later}"
+    return ""
+
+
+def _take(
+    found: RecordingDiff, key: Key, differences: Sequence[Difference], keep: int | None
+) -> None:
+    """Count a message or attachment and its differences."""
+    topic = found.topics.setdefault(key.topic, TopicDiff())
+    topic.count += 1
+    if not differences:
+        return
+    having = differences[0].having
+    topic.differing += having == BOTH
+    topic.only_first += having == FIRST
+    topic.only_second += having == SECOND
+    topic.steps.add(key.step)
+    topic.fields.update(item.field for item in differences if item.field)
+    ulps = [item.ulps for item in differences if item.ulps is not None]
+    topic.largest_ulps = max([*ulps, topic.largest_ulps or 0]) if ulps else topic.largest_ulps
+    for item in differences:
+        if keep is None or len(found.differences) < keep or key.topic == "/session":
+            found.differences.append(item)
+
+
+def _compared_messages(pair: _Pair, ignored: Ignored) -> list[Difference]:
+    key, first, second, moved = pair
+    if first is None or second is None:
+        return [_lonely(key, FIRST if second is None else SECOND)]
+    order = [Difference(key, BOTH, "order", "order: it stands later in the second recording")]
+    found = order if moved else []
+    if first.data == second.data and key.topic in RECORDS:
+        return found
+    contents = _read(message_content, first), _read(message_content, second)
+    return found + _compared(key, *contents, ignored)
+
+
+def _compared_attachments(
+    key: Key, first: bytes | None, second: bytes | None, ignored: Ignored
+) -> list[Difference]:
+    if first is None or second is None:
+        return [_lonely(key, FIRST if second is None else SECOND)]
+    if first == second:
+        return []
+    one = _read(attachment_content, key.topic, first)
+    return _compared(key, one, _read(attachment_content, key.topic, second), ignored)
+
+
+def _read(read: Any, *what: Any) -> Content:
+    """What is said; the mere bytes of what is malformed, and why it is."""
+    try:
+        content: Content = read(*what)
+    except _MALFORMED as error:
+        data = what[-1].data if isinstance(what[-1], StoredMessage) else what[-1]
+        return {"malformed": str(error), "bytes": data}
+    return content
+
+
+def _compared(
+    key: Key, first: Mapping[str, Any], second: Mapping[str, Any], ignored: Ignored
+) -> list[Difference]:
+    """What differs between two contents, in the order of the first."""
+    names = [*first, *(name for name in second if name not in first)]
+    found = []
+    for name in names:
+        if not ignored.field(name):
+            pair = (first.get(name, _ABSENT), second.get(name, _ABSENT))
+            text = _difference(name, *pair)
+            if text is not None:
+                found.append(Difference(key, BOTH, name, text, _ulps(name, *pair)))
+    return found
+
+
+def _lonely(key: Key, having: str) -> Difference:
+    return Difference(key, having, "", f"only in the {having} recording")
+
+
+def _difference(name: str, first: Any, second: Any) -> str | None:
+    """How two values differ, or None if they have the same bits."""
+    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+        if first.shape != second.shape or first.dtype != second.dtype:
+            return f"{name}: {_shown(first)} -> {_shown(second)}"
+        return difference(name, first, second)
+    if type(first) is type(second):
+        if isinstance(first, float):
+            if np.float64(first).tobytes() == np.float64(second).tobytes():
+                return None
+        elif first is second or first == second:
+            return None
+    if isinstance(first, bytes) and isinstance(second, bytes):
+        return f"{name}: {len(first)} bytes -> {len(second)} others"
+    text = f"{name}: {_shown(first)} -> {_shown(second)}"
+    steps = _ulps(name, first, second)
+    return text if steps is None else f"{text} ({steps} ulp)"
+
+
+def _ulps(name: str, first: Any, second: Any) -> int | None:
+    """Units in the last place between numbers; None of settings, and of all that is no number."""
+    if name.startswith("config"):
+        return None
+    if isinstance(first, float) and isinstance(second, float):
+        first, second = np.array([first]), np.array([second])
+    if not (isinstance(first, np.ndarray) and isinstance(second, np.ndarray)):
+        return None
+    if first.dtype != np.float64 or first.shape != second.shape or second.dtype != first.dtype:
+        return None
+    return apart(first, second)
+
+
+def _shown(value: Any) -> str:
+    if value is _ABSENT:
+        return "absent"
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape}"
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    text = printable(value) if isinstance(value, str) else repr(value)
+    return text if len(text) <= _LONGEST_TEXT else f"{text[: _LONGEST_TEXT - 1]}…"
+
+
+def _is_topic(word: str, name: str) -> bool:
+    """Whether a word is a topic, or a part of the topics that a topic belongs to."""
+    topic = "/" + word.strip("/")
+    return name == topic or name.startswith(f"{topic}/")
+
+
+def _is_known(word: str) -> bool:
+    """Whether a word names topics, attachments or fields."""
+    fields = {name for message in MESSAGES.values() for name in message}
+    fields |= {field.name for kind in FOXGLOVE.values() for field in kind.DESCRIPTOR.fields}
+    fields |= {MESH, SDF_GRID, "points", "poses", "vertices", "faces"}
+    topic = any(_is_topic(word, name) for name in (*RECORDS, *FOXGLOVE))
+    return topic or word in fields or word.split(".")[0].split("[")[0] in fields

@@ -1,0 +1,76 @@
+"""Writes what other programs read: npz, csv or json, every number exact.
+
+Tables and JSON have the shortest decimals that read back to the same bits. JSON is standard: what
+is not finite is null. An npz file holds no pickled object.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chsel.errors import RecordingError, require_choice
+from replay.new_file import new_file
+from replay.standard_json import standard
+
+FORMATS = ("npz", "csv", "json")
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """The same content in three forms.
+
+    arrays: of an npz file, by name. document: plain values, mappings, lists and arrays, for JSON.
+    header, rows: of a table.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    document: Any
+    header: tuple[str, ...]
+    rows: Iterable[tuple[Any, ...]]
+
+
+def write_export(exported: Exported, path: Path, file_format: str) -> None:
+    """Write a new file. RecordingError if it exists or cannot be written."""
+    require_choice("format", file_format, FORMATS)
+    write = {"npz": _write_npz, "csv": _write_csv, "json": _write_json}[file_format]
+    try:
+        with new_file(path) as beside, beside.open("xb") as file:
+            write(exported, file)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _write_npz(exported: Exported, file: IO[bytes]) -> None:
+    arrays: dict[str, Any] = dict(exported.arrays)
+    np.savez(file, **arrays)
+
+
+def _write_csv(exported: Exported, file: IO[bytes]) -> None:
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(exported.header)
+    writer.writerows([_cell(value) for value in row] for row in exported.rows)
+    text.flush()
+    text.detach()
+
+
+def _write_json(exported: Exported, file: IO[bytes]) -> None:
+    file.write(json.dumps(standard(exported.document), allow_nan=False).encode() + b"\n")
+
+
+def _cell(value: Any) -> str:
+    """A number by its shortest exact decimal, a truth value as 0 or 1, None as nothing."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return repr(value)
+    return str(int(value) if isinstance(value, bool) else value)

@@ -1,0 +1,83 @@
+"""What stands once in a recording, beside its messages: the object's mesh and its SDF grid."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import trimesh
+
+from chsel.errors import RecordingError
+from chsel.sdf import SdfGrid
+from replay.mcap.encoding import decode, encode
+
+MESH = "mesh.ply"
+SDF_GRID = "sdf_grid"
+MEDIA_TYPES = {MESH: "model/ply", SDF_GRID: "application/protobuf; message=chsel.SdfGrid"}
+
+_VERTEX = np.dtype(("<f8", 3))
+_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
+_HEADER = """\
+ply
+format binary_little_endian 1.0
+comment metres
+element vertex {vertices}
+property double x
+property double y
+property double z
+element face {faces}
+property list uchar int vertex_indices
+end_header
+"""
+_HEADER_PATTERN = _HEADER.replace("{vertices}", r"(\d{1,9})").replace("{faces}", r"(\d{1,9})")
+_LONGEST_HEADER = len(_HEADER) + 20
+
+
+def mesh_to_ply(mesh: trimesh.Trimesh) -> bytes:
+    """Vertices and faces of a mesh as a PLY file with float64 coordinates; exact."""
+    vertices = np.ascontiguousarray(mesh.vertices, "<f8")
+    _check_mesh(vertices, mesh.faces)
+    faces = np.zeros(len(mesh.faces), _FACE)
+    faces["count"] = 3
+    faces["vertices"] = mesh.faces
+    header = _HEADER.format(vertices=len(vertices), faces=len(faces))
+    return header.encode() + vertices.tobytes() + faces.tobytes()
+
+
+def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
+    """The mesh that `mesh_to_ply` wrote; RecordingError for any other file."""
+    header = re.match(_HEADER_PATTERN.encode(), data[:_LONGEST_HEADER])
+    if header is None:
+        raise RecordingError(f"attachment {MESH} has no header as written by this project")
+    vertex_count, face_count = int(header[1]), int(header[2])
+    split = header.end() + vertex_count * _VERTEX.itemsize
+    if len(data) != split + face_count * _FACE.itemsize:
+        raise RecordingError(f"attachment {MESH} is not as long as its header says")
+    vertices = np.frombuffer(data, "<f8", vertex_count * 3, header.end()).reshape(-1, 3)
+    faces = np.frombuffer(data, _FACE, face_count, split)
+    indices = faces["vertices"].astype(np.int64)
+    if (faces["count"] != 3).any():
+        raise RecordingError(f"attachment {MESH} has a face that is no triangle")
+    _check_mesh(vertices, indices)
+    return trimesh.Trimesh(vertices.astype(np.float64), indices, process=False)
+
+
+def _check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Raise RecordingError unless vertices (V, 3) are finite and faces (F, 3) are of them."""
+    if len(faces) == 0:
+        raise RecordingError("the mesh has no faces; accepted: triangles")
+    if not np.isfinite(vertices).all():
+        raise RecordingError("the mesh has a vertex that is not finite; accepted: finite numbers")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise RecordingError("the mesh has a face that is no triangle of its vertices")
+
+
+def sdf_to_bytes(sdf: SdfGrid) -> bytes:
+    """A grid as a protobuf message; exact."""
+    fields = ("origin", "resolution", "values", "gradients")
+    return encode("SdfGrid", {name: getattr(sdf, name) for name in fields})
+
+
+def sdf_from_bytes(data: bytes) -> SdfGrid:
+    """The grid that `sdf_to_bytes` wrote."""
+    return SdfGrid(**decode("SdfGrid", data))

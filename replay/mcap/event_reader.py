@@ -1,0 +1,297 @@
+"""Joins the messages of a recording to the events that they were."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from chsel.arrays import FloatArray
+from chsel.errors import RecordingError
+from chsel.mesh import mesh_digest
+from chsel.points import KnownPoints, Workspace
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Logged,
+    Measured,
+    Probe,
+    SessionEnded,
+    SessionStarted,
+    SnapshotTaken,
+    Timed,
+    Traced,
+)
+from replay.mcap.attachments import MESH, SDF_GRID, mesh_from_ply, sdf_from_bytes
+from replay.mcap.contents import Contents
+from replay.mcap.encoding import decode
+from replay.mcap.event_checks import check_event, check_free_resolution, check_poses
+from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
+from replay.mcap.file import StoredMessage
+from replay.mcap.foxglove_messages import cloud_points, log_level_and_text
+from replay.mcap.plain_config import config_from_json
+from replay.mcap.schemas import FORMAT_VERSION, RECORDS, STEP_TIME, message_class
+from replay.mcap.wire import check_wire
+
+_VIEWS = ("/object_pose", "/gripper_path", "/hypothesis_poses")  # they repeat what records say
+_CLOUDS = {"/points/free": 3, "/points/occupied": 3, "/points/known": 4}  # columns
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedProblem:
+    """A problem without its points and grid, which the events before it give."""
+
+    step: int
+    initial_set: FloatArray
+    low_cost_set: FloatArray
+    workspace: Workspace
+    free_resolution: float
+    key: StreamKey
+    points_digest: str
+    digest: str
+
+    def completed(self, sdf: SdfGrid, points: KnownPoints) -> RegistrationProblem:
+        """The whole problem; RecordingError unless it is the one that was recorded."""
+        problem = RegistrationProblem(
+            sdf=sdf,
+            points=points,
+            initial_set=self.initial_set,
+            workspace=self.workspace,
+            free_resolution=self.free_resolution,
+            key=self.key,
+            low_cost_set=self.low_cost_set,
+        )
+        _check_digest(f"the problem of step {self.step}", problem.digest, self.digest)
+        _check_digest(f"all points of step {self.step}", points.digest, self.points_digest)
+        return problem
+
+
+class EventReader:
+    """Joins messages to events. `within` is the topic of an event whose points are yet to come."""
+
+    def __init__(self, attachments: dict[str, bytes]) -> None:
+        self.entries: list[Event | RecordedProblem] = []
+        self.within: str | None = None
+        self.contents = Contents()
+        self.closed = False  # whether the contents, which come last, were there
+        self._order = EventOrder()
+        self._sdf_digest = ""
+        self._points_digest = ""  # of all points known so far, as recorded
+        self._attachments = attachments
+        self._opening: dict[str, Any] = {}
+        self._clouds: dict[str, FloatArray] = {}
+        self._counts = {"free": 0, "occupied": 0, "known": 0}
+        self._last_snapshot: ArchiveSnapshot | None = None
+        self._last_elites: FloatArray | None = None
+
+    def take(self, message: StoredMessage) -> None:
+        """Read one message. Raises RecordingError if it is malformed or out of place."""
+        topic, data = message.topic, message.data
+        if topic in _VIEWS:
+            return
+        if not self._fits(topic):
+            raise RecordingError(f"a message on {topic} is out of place")
+        step = message.log_time // STEP_TIME - 1
+        if topic in _CLOUDS:
+            if step != self._opening.get("step", BEFORE_ALL_STEPS):
+                raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
+            self._clouds[topic] = cloud_points(data, _CLOUDS[topic])
+        elif topic == "/log":
+            self._append(Logged(step, *log_level_and_text(data)))
+        elif topic == "/contents":
+            self._compare_contents(data)
+        else:
+            if topic == "/session":
+                _check_version(data)
+            values = decode(RECORDS[topic], data)
+            if values.get("step", step) != step:
+                raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
+            if topic in ("/session", "/probe"):
+                self.within, self._opening = topic, values
+            else:
+                self._append(self._event(topic, values))
+
+    def _fits(self, topic: str) -> bool:
+        """Whether a message on this topic can follow the ones before it."""
+        if self.closed:
+            return False
+        if self.within is not None:
+            return topic == "/known_points" or (topic in _CLOUDS and topic not in self._clouds)
+        if not self.entries:
+            return topic == "/session"
+        return topic not in (*_CLOUDS, "/known_points", "/session")
+
+    def _append(self, entry: Event | RecordedProblem) -> None:
+        if isinstance(entry, RecordedProblem):
+            self._order.pose(entry.step)
+            self.contents.pose(entry.step)
+        else:
+            self._order.take(entry)
+            check_event(entry)
+            self.contents.take(entry)
+        self.entries.append(entry)
+
+    def _compare_contents(self, data: bytes) -> None:
+        """The last message says again what came before it."""
+        self.closed = True
+        recorded = decode(RECORDS["/contents"], data)
+        for name, column in self.contents.values().items():
+            if recorded[name].tobytes() != column.tobytes():
+                raise RecordingError(f"its contents, as read, have another {name} than recorded")
+
+    def _event(self, topic: str, values: dict[str, Any]) -> Event | RecordedProblem:
+        match topic:
+            case "/known_points":
+                return self._close(values)
+            case "/problem":
+                return self._problem(values)
+            case "/archive":
+                self._last_snapshot = _snapshot(values)
+                return SnapshotTaken(values["step"], self._last_snapshot)
+            case "/trace":
+                costs = (values["lowest_cost"], values["median_cost"], values["highest_cost"])
+                named = ("step", "stage", "iteration", "digest")
+                return Traced(**{name: values[name] for name in named}, costs=costs)
+            case "/hypotheses":
+                return self._hypotheses(values)
+            case "/measured":
+                return Measured(values["step"], _mapping("measured", values["values"]))
+            case "/timed":
+                return Timed(values["step"], _mapping("timed", values["seconds"]))
+            case _:
+                return SessionEnded(**values)
+
+    def _close(self, values: dict[str, Any]) -> SessionStarted | Probe:
+        """The event that was open, now that its points are there."""
+        clouds = {
+            topic: self._clouds.pop(topic, np.zeros((0, columns)))
+            for topic, columns in _CLOUDS.items()
+        }
+        free, occupied, known = clouds.values()
+        points = KnownPoints(free, occupied, known[:, :3], known[:, 3])
+        for name in self._counts:
+            count = len(getattr(points, name))
+            self._counts[name] += count
+            if (count, self._counts[name]) != (values[f"new_{name}"], values[name]):
+                raise RecordingError(f"{name} points of step {values['step']} are missing")
+        _check_digest(f"new points of step {values['step']}", points.digest, values["new_digest"])
+        if values["step"] != self._opening.get("step", BEFORE_ALL_STEPS):
+            raise RecordingError(f"the points of step {values['step']} follow another probe")
+        self._points_digest = values["digest"]
+        topic, self.within = self.within, None
+        if topic == "/session":
+            self._sdf_digest = self._opening["sdf_digest"]
+            return _session(self._opening, points, self._attachments)
+        return Probe(**self._opening, new_points=points)
+
+    def _problem(self, values: dict[str, Any]) -> RecordedProblem:
+        step, low_cost_set = values["step"], values["low_cost_set"]
+        if low_cost_set is None:
+            low_cost_set = self._last_elites
+        else:
+            check_poses(f"the low-cost set of step {step}", low_cost_set)
+        if low_cost_set is None:
+            raise RecordingError(f"the low-cost set of step {step} is missing")
+        if len(values["initial_set"]) == 0:
+            raise RecordingError(f"the initial set of step {step} is empty; accepted: some poses")
+        check_poses(f"the initial set of step {step}", values["initial_set"])
+        check_free_resolution(values["free_resolution"])
+        _check_digest(
+            f"all points before the problem of step {step}",
+            self._points_digest,
+            values["points_digest"],
+        )
+        _check_digest(
+            f"the SDF grid of the problem of step {step}", self._sdf_digest, values["sdf_digest"]
+        )
+        return RecordedProblem(
+            step=step,
+            initial_set=values["initial_set"],
+            low_cost_set=low_cost_set,
+            workspace=_workspace(values["workspace"]),
+            free_resolution=values["free_resolution"],
+            key=StreamKey(values["key_seed"], values["key_step"]),
+            points_digest=values["points_digest"],
+            digest=values["digest"],
+        )
+
+    def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
+        archive = self._last_snapshot if values["archive_is_last_snapshot"] else None
+        if values["archive"] is not None:
+            archive = _snapshot(values["archive"])
+        elif values["archive_is_last_snapshot"] and archive is None:
+            raise RecordingError(f"the archive of step {values['step']} is missing")
+        named = ("object_from_world", "cost", "duplicate", "cell", "elites")
+        found = Hypotheses(**{name: values[name] for name in named}, archive=archive)
+        _check_digest(f"the hypotheses of step {values['step']}", found.digest, values["digest"])
+        self._last_elites = found.elites
+        return HypothesesFound(values["step"], found)
+
+
+def _session(
+    values: dict[str, Any], points: KnownPoints, attachments: dict[str, bytes]
+) -> SessionStarted:
+    missing = [name for name in (MESH, SDF_GRID) if name not in attachments]
+    if missing:
+        raise RecordingError(f"it lacks the attachment {missing[0]}")
+    mesh, sdf = mesh_from_ply(attachments[MESH]), sdf_from_bytes(attachments[SDF_GRID])
+    _check_digest(f"attachment {MESH}", mesh_digest(mesh), values["mesh_digest"])
+    _check_digest(f"attachment {SDF_GRID}", sdf.digest, values["sdf_digest"])
+    config = config_from_json(values["config"])
+    named = ("runner", "object", "session", "method", "seed", "free_resolution", "source")
+    return SessionStarted(
+        **{name: values[name] for name in (*named, "world_from_object")},
+        config=config,
+        mesh=mesh,
+        sdf=sdf,
+        workspace=_workspace(values["workspace"]),
+        initial_points=points,
+        environment=_mapping("the environment", values["environment"]),
+    )
+
+
+def _mapping(what: str, items: tuple[dict[str, Any], ...]) -> dict[str, Any]:
+    """The values of named items; RecordingError if two have one name."""
+    mapping = {item["name"]: item["value"] for item in items}
+    if len(mapping) != len(items):
+        raise RecordingError(f"{what} has a name twice; accepted: each name once")
+    return mapping
+
+
+def _check_version(data: bytes) -> None:
+    """Raise RecordingError for a session of another format, before reading more of it."""
+    session: Any = message_class("Session")()
+    check_wire(session.DESCRIPTOR, data)
+    try:
+        session.ParseFromString(data)
+    except DecodeError:
+        raise RecordingError("a message is no valid chsel.Session") from None
+    version = session.format_version
+    if version > FORMAT_VERSION:
+        raise RecordingError(
+            f"written by a newer version: format {version}; this one reads up to {FORMAT_VERSION}"
+        )
+    if version < 1:
+        raise RecordingError(f"it has format version {version}; accepted: 1 to {FORMAT_VERSION}")
+
+
+def _snapshot(values: dict[str, Any]) -> ArchiveSnapshot:
+    values = dict(values)
+    step, digest = values.pop("step"), values.pop("digest")
+    snapshot = ArchiveSnapshot(**values)
+    _check_digest(f"an archive of step {step}", snapshot.digest, digest)
+    return snapshot
+
+
+def _workspace(bounds: FloatArray) -> Workspace:
+    return Workspace(*bounds.tolist())
+
+
+def _check_digest(what: str, digest: str, recorded: str) -> None:
+    if digest != recorded:
+        raise RecordingError(f"{what} has digest {digest}, not {recorded} as recorded")

@@ -1,0 +1,146 @@
+"""The messages of a recording that are Foxglove's, so that viewers show them as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from google.protobuf.message import DecodeError, Message
+
+from chsel.arrays import FloatArray
+from chsel.errors import RecordingError
+from replay.mcap.wire import check_wire
+
+FOXGLOVE: Mapping[str, type[Message]] = {
+    "/points/free": PointCloud,
+    "/points/occupied": PointCloud,
+    "/points/known": PointCloud,
+    "/object_pose": FrameTransform,
+    "/gripper_path": PosesInFrame,
+    "/hypothesis_poses": PosesInFrame,
+    "/log": Log,
+}
+"""Topics that carry Foxglove's messages. Points and log are the only copy of what they say."""
+
+WORLD = "world"
+OBJECT = "object"
+_LEVELS = {"info": Log.INFO, "warning": Log.WARNING}
+_NAMES = ("x", "y", "z", "sdf")
+
+
+def point_cloud(points: FloatArray, time: int) -> bytes:
+    """Points (N, 3), or (N, 4) with their signed distance, in the world; exact."""
+    columns = points.shape[1]
+    message = PointCloud(
+        frame_id=WORLD,
+        point_stride=8 * columns,
+        fields=_fields(columns),
+        data=np.ascontiguousarray(points, "<f8").tobytes(),
+    )
+    message.pose.orientation.w = 1.0
+    return _stamped(message, time)
+
+
+def cloud_points(data: bytes, columns: int) -> FloatArray:
+    """The points (N, columns) that `point_cloud` wrote; RecordingError for any other cloud."""
+    message = _parsed(PointCloud, data)
+    stride = 8 * columns
+    if message.point_stride != stride or list(message.fields) != _fields(columns):
+        names = ", ".join(_NAMES[:columns])
+        raise RecordingError(f"a point cloud has other fields than {names} as float64")
+    if len(message.data) % stride:
+        raise RecordingError(
+            f"a point cloud has {len(message.data)} bytes, no multiple of {stride}"
+        )
+    return np.frombuffer(message.data, "<f8").astype(np.float64, copy=False).reshape(-1, columns)
+
+
+def poses_in_world(world_from_body: FloatArray, time: int) -> bytes:
+    """Poses (B, 4, 4) as positions and quaternions: for viewing, rounded."""
+    message = PosesInFrame(frame_id=WORLD)
+    quaternions = _quaternions(world_from_body[:, :3, :3]).tolist()
+    for position, quaternion in zip(world_from_body[:, :3, 3].tolist(), quaternions, strict=True):
+        _set_pose(message.poses.add(), position, quaternion)
+    return _stamped(message, time)
+
+
+def object_in_world(world_from_object: FloatArray, time: int) -> bytes:
+    """The pose (4, 4) of the object as a transform between frames: for viewing, rounded."""
+    message = FrameTransform(parent_frame_id=WORLD, child_frame_id=OBJECT)
+    x, y, z = world_from_object[:3, 3].tolist()
+    message.translation.x, message.translation.y, message.translation.z = x, y, z
+    _set_quaternion(message.rotation, _quaternions(world_from_object[None, :3, :3])[0].tolist())
+    return _stamped(message, time)
+
+
+def log_line(level: str, text: str, time: int) -> bytes:
+    """A line of text of level "info" or "warning"."""
+    if level not in _LEVELS:
+        raise RecordingError(f"log level is {level!r}; accepted: {', '.join(_LEVELS)}")
+    return _stamped(Log(level=_LEVELS[level], message=text), time)
+
+
+def log_level_and_text(data: bytes) -> tuple[str, str]:
+    """What `log_line` wrote."""
+    message = _parsed(Log, data)
+    for name, level in _LEVELS.items():
+        if message.level == level:
+            return name, message.message
+    raise RecordingError(f"a log line is of level {message.level}; accepted: {', '.join(_LEVELS)}")
+
+
+def _fields(columns: int) -> list[PackedElementField]:
+    return [
+        PackedElementField(name=name, offset=8 * index, type=PackedElementField.FLOAT64)
+        for index, name in enumerate(_NAMES[:columns])
+    ]
+
+
+def _stamped(message: Any, time: int) -> bytes:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(time, 10**9)
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
+
+
+def _parsed(kind: Any, data: bytes) -> Any:
+    check_wire(kind.DESCRIPTOR, data)
+    try:
+        return kind.FromString(data)
+    except DecodeError:
+        raise RecordingError(f"a message is no valid {kind.DESCRIPTOR.full_name}") from None
+
+
+def _set_pose(message: Any, position: list[float], quaternion: list[float]) -> None:
+    message.position.x, message.position.y, message.position.z = position
+    _set_quaternion(message.orientation, quaternion)
+
+
+def _set_quaternion(message: Any, quaternion: list[float]) -> None:
+    message.x, message.y, message.z, message.w = quaternion
+
+
+def _quaternions(rotations: FloatArray) -> FloatArray:
+    """Unit quaternions (B, 4), as x y z w, of rotations (B, 3, 3).
+
+    Each row of the outer product of a quaternion with itself is a multiple of it, and all its
+    entries follow from the rotation without a root; the row of the largest entry is the stablest.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(rotations, 0, -1)
+    outer = np.array(
+        [
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
+        ]
+    )  # (4, 4, B)
+    largest = np.argmax(np.diagonal(outer), axis=1)
+    rows = np.moveaxis(outer, -1, 0)[np.arange(len(rotations)), largest]
+    unit: FloatArray = rows / np.sqrt((rows**2).sum(axis=1, keepdims=True))
+    return unit

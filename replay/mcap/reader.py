@@ -1,0 +1,149 @@
+"""Reads a recording back: its events as they were, and every registration problem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import reduce
+from pathlib import Path
+
+from chsel.errors import ChselError, RecordingError
+from chsel.points import KnownPoints
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Probe,
+    ProblemPosed,
+    SessionEnded,
+    SessionStarted,
+    SnapshotTaken,
+    Timed,
+)
+from replay.mcap.event_reader import EventReader, RecordedProblem
+from replay.mcap.file import McapFile, StoredMessage
+from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.schemas import RECORDS, message_class
+from replay.mcap.texts import one_line
+
+
+class Recording:
+    """What a session left behind.
+
+    path: of the file. damage: what cut reading short, None if the file is whole. start: how the
+    session began. ended: how it ended, None if it did not. probes: in their order. steps: those
+    with a registration problem.
+    """
+
+    def __init__(
+        self, path: Path, entries: list[Event | RecordedProblem], damage: str | None
+    ) -> None:
+        if not entries or not isinstance(entries[0], SessionStarted):
+            raise RecordingError(f"recording {path} has no session in it")
+        self.path = path
+        self.damage = damage
+        self.start = entries[0]
+        self.ended = next((entry for entry in entries if isinstance(entry, SessionEnded)), None)
+        self.probes = [entry for entry in entries if isinstance(entry, Probe)]
+        self.steps = tuple(entry.step for entry in entries if isinstance(entry, RecordedProblem))
+        self._entries = entries
+
+    def events(self) -> Iterator[Event]:
+        """All events in the order in which they were recorded."""
+        points = self.start.initial_points
+        for entry in self._entries:
+            if isinstance(entry, Probe):
+                points = points.merged(entry.new_points)
+            if isinstance(entry, RecordedProblem):
+                yield ProblemPosed(entry.step, self._completed(entry, points))
+            else:
+                yield entry
+
+    def problem(self, step: int) -> RegistrationProblem:
+        """The registration problem of a step, from the file alone; its digest is checked."""
+        self._check_step(step, self.steps, "registration problem")
+        news: list[KnownPoints] = []
+        for entry in self._entries:
+            if isinstance(entry, Probe):
+                news.append(entry.new_points)
+            if isinstance(entry, RecordedProblem) and entry.step == step:
+                break
+        assert isinstance(entry, RecordedProblem)
+        points = reduce(KnownPoints.merged, news, self.start.initial_points)
+        return self._completed(entry, points)
+
+    def checked_steps(self, steps: Sequence[int] | None) -> tuple[int, ...]:
+        """Steps with a registration problem, in order; None means all. RecordingError if not."""
+        for step in steps or ():
+            self._check_step(step, self.steps, "registration problem")
+        return self.steps if steps is None else tuple(s for s in self.steps if s in set(steps))
+
+    def hypotheses(self, step: int) -> Hypotheses:
+        """What the registration of a step found."""
+        found = {e.step: e.hypotheses for e in self._entries if isinstance(e, HypothesesFound)}
+        self._check_step(step, tuple(found), "result")
+        return found[step]
+
+    def has_result(self, step: int) -> bool:
+        """Whether the registration of a step ended with hypotheses."""
+        return any(isinstance(e, HypothesesFound) and e.step == step for e in self._entries)
+
+    @property
+    def has_timings(self) -> bool:
+        """Whether wall-clock times were recorded."""
+        return any(isinstance(entry, Timed) for entry in self._entries)
+
+    def snapshots(self, step: int) -> list[ArchiveSnapshot]:
+        """The archive over the registration of a step; empty if the method keeps none."""
+        taken = [e for e in self._entries if isinstance(e, SnapshotTaken)]
+        return [event.archive for event in taken if event.step == step]
+
+    def _completed(self, entry: RecordedProblem, points: KnownPoints) -> RegistrationProblem:
+        with _blaming(self.path):
+            return entry.completed(self.start.sdf, points)
+
+    def _check_step(self, step: int, accepted: tuple[int, ...], what: str) -> None:
+        if step not in accepted:
+            steps = ", ".join(map(str, accepted)) or "none"
+            raise RecordingError(
+                f"recording {self.path} has no {what} of step {step}; accepted: {steps}"
+            )
+
+
+def read_recording(
+    path: str | Path,
+    *,
+    partial: bool = False,
+    watch: Callable[[StoredMessage], None] | None = None,
+) -> Recording:
+    """Read a recording, every checksum and digest checked.
+
+    With `partial`, an unfinished or damaged file gives all events before the first damage, which
+    `Recording.damage` names. `watch` is given every message, as it is met. Raises RecordingError
+    if the file does not exist, is no recording of this project, is of another format version, or
+    is unfinished or damaged.
+    """
+    path = Path(path).expanduser()
+    schemas = {topic: message_class(name).DESCRIPTOR.full_name for topic, name in RECORDS.items()}
+    schemas |= {topic: kind.DESCRIPTOR.full_name for topic, kind in FOXGLOVE.items()}
+    file = McapFile(path, schemas, partial=partial)
+    events = EventReader(file.attachments)
+    for message in file.messages():
+        if watch is not None:
+            watch(message)
+        with _blaming(path):
+            events.take(message)
+    if events.within is not None and file.damage is None:
+        raise RecordingError(f"recording {path} ends within an event on {events.within}")
+    if not events.closed and events.entries and file.damage is None:
+        raise RecordingError(f"recording {path} ends without its contents")
+    return Recording(path, events.entries, file.damage)
+
+
+@contextmanager
+def _blaming(path: Path) -> Iterator[None]:
+    """Name the file in whatever is wrong with its content."""
+    try:
+        yield
+    except (ChselError, ValueError, RecursionError, OverflowError, MemoryError) as error:
+        raise RecordingError(f"recording {path}: {one_line(str(error))}") from error

@@ -1,0 +1,328 @@
+"""Everything whole in a damaged or unfinished recording, as a finished one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from chsel.errors import ChselError, RecordingError
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Logged,
+    Probe,
+    ProblemPosed,
+    SessionEnded,
+    SessionStarted,
+    SnapshotTaken,
+    Traced,
+)
+from replay.mcap.contents import Row, rows
+from replay.mcap.encoding import decode
+from replay.mcap.event_checks import RECOVERED, check_event
+from replay.mcap.event_order import EventOrder
+from replay.mcap.event_reader import EventReader, RecordedProblem
+from replay.mcap.file import StoredMessage
+from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.reader import read_recording
+from replay.mcap.salvage import Gap, Salvage
+from replay.mcap.schemas import RECORDS, STEP_TIME, message_class
+from replay.mcap.texts import one_line
+from replay.mcap.whole_records import Damage
+from replay.mcap.writer import McapRecorder
+from replay.new_file import new_file
+
+_OF_REGISTRATION = (Traced, SnapshotTaken, HypothesesFound)
+_WRONG = (ChselError, ValueError, RecursionError)  # what reading a message may raise
+_OF_POINTS = ("/points/free", "/points/occupied", "/points/known", "/known_points")
+
+
+@dataclass
+class Recovered:
+    """What a recovery found.
+
+    damage: why the file cannot be read as it is; None if it can, and nothing is lost. probes,
+    problems, results: steps of those kept. damages: bytes that cannot be believed. messages:
+    how many are known to be missing. events: lost for other reasons than missing bytes. complete:
+    whether the recording's own list of contents was there, so that all losses are known.
+    lost_probes: first and last of steps in a row; without the list, those that may be lost.
+    lost_problems, lost_results: steps of registrations; without the list, those known to be lost.
+    ended: outcome, where the recording told it.
+    """
+
+    damage: str | None = None
+    damages: list[Damage] = field(default_factory=list)
+    probes: list[int] = field(default_factory=list)
+    problems: list[int] = field(default_factory=list)
+    results: list[int] = field(default_factory=list)
+    messages: int = 0
+    events: list[str] = field(default_factory=list)
+    complete: bool = False
+    lost_probes: list[tuple[int, int]] = field(default_factory=list)
+    lost_problems: list[int] = field(default_factory=list)
+    lost_results: list[int] = field(default_factory=list)
+    ended: str | None = None
+
+    @property
+    def nothing_lost(self) -> bool:
+        """Whether all that the recording ever held is kept."""
+        return self.complete and not (self.messages or self.events or self.lost_probes)
+
+
+def recover(path: Path, out: Path) -> Recovered:
+    """Write a finished recording of all that is whole in another one.
+
+    Raises RecordingError if the session's start is not whole, with which nothing makes sense; if
+    `path` is no recording; or if `out` exists or cannot be written.
+    """
+    with new_file(out) as beside:
+        recovery = _Recovery(path)
+        recorder = McapRecorder(beside)
+        try:
+            for event in recovery.events():
+                if isinstance(event, Probe):
+                    recorder.flush()  # as a session does, so that a chunk holds one probe
+                recorder.record(event)
+        finally:
+            recorder.close()
+    return recovery.found
+
+
+def tells_loss(event: Event) -> bool:
+    """Whether an event stands where a recovery could not keep what had been recorded."""
+    return (
+        isinstance(event, Logged) and event.level == "warning" and event.text.startswith(RECOVERED)
+    )
+
+
+class _Recovery:
+    """The events of a file that are worth keeping, and what is found on the way."""
+
+    def __init__(self, path: Path) -> None:
+        self.found = Recovered()
+        self._path = path
+        self._order = EventOrder()
+        self._lost_steps: set[int] = set()  # of registrations
+
+    def events(self) -> Iterator[Event]:
+        """Each event as it was; where some are lost, a warning; an end where there is none."""
+        try:
+            for _ in (recording := read_recording(self._path)).events():
+                """Every digest of a problem is compared."""
+        except RecordingError as error:
+            if not self._path.is_file():
+                raise
+            self.found.damage = str(error)
+            yield from self._counted(self._salvaged())
+        else:
+            self.found.complete = True
+            yield from self._counted(recording.events())
+
+    def _counted(self, events: Iterator[Event]) -> Iterator[Event]:
+        """The events, noted down."""
+        found = self.found
+        for event in events:
+            match event:
+                case Probe():
+                    found.probes.append(event.step)
+                case ProblemPosed():
+                    found.problems.append(event.step)
+                case HypothesesFound():
+                    found.results.append(event.step)
+                case SessionEnded() if found.ended is None:
+                    found.ended = event.outcome
+            yield event
+
+    def _salvaged(self) -> Iterator[Event]:
+        names = {topic: message_class(name).DESCRIPTOR.full_name for topic, name in RECORDS.items()}
+        names |= {topic: kind.DESCRIPTOR.full_name for topic, kind in FOXGLOVE.items()}
+        self._file = file = Salvage(self._path, names)
+        reader = _GapReader(file.attachments)
+        unsure: list[tuple[int, int]] = []  # first and last step of those with missing messages
+        gap = False
+        for message in file.messages():
+            if isinstance(message, Gap):
+                self._check_started(reader)
+                self.found.messages += message.messages
+                reader.gap()
+                gap = True
+                yield from self._warning(f"{message.messages} messages are lost here")
+                continue
+            if gap:
+                unsure.append((max(self._order.step, 0), message.log_time // STEP_TIME - 1))
+                gap = False
+            yield from self._taken(reader, message)
+        self._check_started(reader)
+        yield from self._end(reader, file)
+        self._account(reader, unsure)
+
+    def _taken(self, reader: _GapReader, message: StoredMessage) -> Iterator[Event]:
+        """The events that a message completes, or a warning if one is lost with it."""
+        try:
+            reader.take(message)
+            entries = reader.drained()
+        except _WRONG as error:
+            if reader.start is None:
+                raise RecordingError(f"{self._nothing()}: {one_line(str(error))}") from error
+            reader.gap()
+            entries = []
+            if message.topic not in _OF_POINTS or not self.found.messages:
+                step = message.log_time // STEP_TIME - 1
+                yield from self._lost(f"{message.topic} of step {step}: {one_line(str(error))}")
+            # else its probe was lost with the messages before it
+        for entry in entries:
+            yield from self._kept(reader, entry)
+
+    def _kept(self, reader: _GapReader, entry: Event | RecordedProblem) -> Iterator[Event]:
+        """The event, if it still makes sense where it is; else a warning, once a registration."""
+        step = getattr(entry, "step", -1)
+        if isinstance(entry, _OF_REGISTRATION) and step in self._lost_steps:
+            return  # with its problem
+        try:
+            event = reader.completed(entry) if isinstance(entry, RecordedProblem) else entry
+            self._order.take(event)
+        except _WRONG as error:
+            what, reason = f"{type(entry).__name__} of step {step}", one_line(str(error))
+            if isinstance(entry, (RecordedProblem, *_OF_REGISTRATION)):
+                self._lost_steps.add(step)
+                what = f"the registration of step {step}"
+                reason = "something it needs was lost before" if reader.wanting else reason
+            yield from self._lost(f"{what}: {reason}")
+        else:
+            yield event
+
+    def _end(self, reader: _GapReader, file: Salvage) -> Iterator[Event]:
+        """What a recording without its end needs."""
+        self.found.damages = file.damages
+        self.found.complete = reader.closed
+        if reader.within is not None:
+            yield from self._lost(f"the last event on {reader.within}: its points are missing")
+        if not reader.closed and file.rest is not None:
+            yield from self._warning(f"what followed is lost, {file.rest.reason}")
+        if self.found.ended is None:
+            yield SessionEnded(self._order.step, f"{RECOVERED}how the session ended is not known")
+            self.found.ended = None  # that was no outcome
+
+    def _account(self, reader: _GapReader, unsure: Sequence[tuple[int, int]]) -> None:
+        """Which steps are lost: as the contents say, or else as far as can be known."""
+        found = self.found
+        kept = sorted(set(found.probes))
+        if not reader.closed:
+            found.lost_problems = sorted(self._lost_steps)
+            found.lost_probes = [s for first, last in unsure for s in _without(first, last, kept)]
+            return
+        listed = reader.rows
+        lost = Counter(row.step for row in listed) - Counter(found.probes)
+        found.lost_probes = _in_a_row(sorted(lost))
+        found.lost_problems = _missing((r.step for r in listed if r.posed), found.problems)
+        found.lost_results = _missing((r.step for r in listed if r.hypotheses >= 0), found.results)
+
+    def _lost(self, what: str) -> Iterator[Event]:
+        self.found.events.append(what)
+        return self._warning(f"lost: {what}")
+
+    def _warning(self, text: str) -> Iterator[Event]:
+        """A line in the recording; behind the session's end there can be none."""
+        if self.found.ended is None:
+            warning = Logged(self._order.step, "warning", f"{RECOVERED}{text}")
+            self._order.take(warning)
+            yield warning
+
+    def _check_started(self, reader: _GapReader) -> None:
+        """Raise RecordingError if the session's start is not there by now."""
+        if reader.start is None:
+            raise RecordingError(f"{self._nothing()}: the start of its session is not there")
+
+    def _nothing(self) -> str:
+        """What is wrong if there is no session, with the first damage, which is why."""
+        damages = self._file.damages[:1]
+        where = [f" (bytes {d.start} to {d.end}: {d.reason})" for d in damages]
+        return f"nothing can be recovered from {self._path}{''.join(where)}"
+
+
+class _GapReader(EventReader):
+    """Joins messages to events where some messages may be missing.
+
+    start: how the session began. wanting: whether messages were lost by now. rows: of the
+    contents, once they were there.
+    """
+
+    def __init__(self, attachments: dict[str, bytes]) -> None:
+        super().__init__(attachments)
+        self.start: SessionStarted | None = None
+        self.rows: list[Row] = []
+        self._points: Any = None
+        self.wanting = False
+
+    def gap(self) -> None:
+        """Messages are missing here: what they belonged to is lost."""
+        self.wanting = True
+        self.within, self._opening = None, {}
+        self._clouds.clear()
+        self._last_snapshot = None
+
+    def drained(self) -> list[Event | RecordedProblem]:
+        """The events since the last call; the session's start stays, as the first of all."""
+        keep = 0 if self.start is None else 1
+        news = self.entries[keep:]
+        del self.entries[1:]
+        for entry in news:
+            if isinstance(entry, SessionStarted):
+                self.start, self._points = entry, entry.initial_points
+            elif isinstance(entry, Probe):
+                self._points = self._points.merged(entry.new_points)
+        return news
+
+    def completed(self, entry: RecordedProblem) -> ProblemPosed:
+        """The whole problem; RecordingError if points or elites of lost messages are missing."""
+        assert self.start is not None
+        return ProblemPosed(entry.step, entry.completed(self.start.sdf, self._points))
+
+    def _append(self, entry: Event | RecordedProblem) -> None:
+        if not isinstance(entry, RecordedProblem):
+            check_event(entry)
+        self.entries.append(entry)
+
+    def _close(self, values: dict[str, Any]) -> SessionStarted | Probe:
+        if self.wanting:  # points that are lost were counted; the new ones must all be there
+            self._counts = {name: values[name] - values[f"new_{name}"] for name in self._counts}
+        return super()._close(values)
+
+    def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
+        try:
+            return super()._hypotheses(values)
+        except _WRONG:
+            self._last_elites = values["elites"]  # the next problem, if it refers to them, is
+            raise  # believed for its own digest alone
+
+    def _compare_contents(self, data: bytes) -> None:
+        self.closed = True
+        self.rows = rows(decode(RECORDS["/contents"], data))
+
+
+def _missing(steps: Iterable[int], kept: Iterable[int]) -> list[int]:
+    return sorted(set(steps) - set(kept))
+
+
+def _in_a_row(steps: Sequence[int]) -> list[tuple[int, int]]:
+    """Steps in ascending order, as first and last of those in a row."""
+    pairs: list[tuple[int, int]] = []
+    for step in steps:
+        if pairs and step == pairs[-1][1] + 1:
+            pairs[-1] = (pairs[-1][0], step)
+        else:
+            pairs.append((step, step))
+    return pairs
+
+
+def _without(first: int, last: int, kept: Sequence[int]) -> list[tuple[int, int]]:
+    """Steps from first to last that are not among those kept, which are in ascending order."""
+    pairs = []
+    for step in kept:
+        if first <= step <= last:
+            pairs.append((first, step - 1))
+            first = step + 1
+    return [pair for pair in [*pairs, (first, last)] if pair[0] <= pair[1]]

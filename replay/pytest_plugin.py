@@ -1,0 +1,139 @@
+"""Stored replays as tests: `pytest --replays DIR` makes an item of every recorded registration.
+
+Recordings are also collected where pytest walks by itself, if the folder is named by the setting
+`replays` in pytest's configuration. What a failing item says is the report of `replay verify`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:  # a run of pytest without recordings loads nothing of this package
+    from replay.verification import Verdict
+
+_SUFFIX = ".mcap"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """--replays DIR, and the setting `replays`."""
+    group = parser.getgroup("replays", "stored registrations, run again")
+    group.addoption(
+        "--replays",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="verify every registration of the recordings in this folder (or of this file)",
+    )
+    parser.addini("replays", "folders whose recordings are tests", type="paths", default=[])
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Collect what --replays names beside what the command line names."""
+    for given in config.getoption("--replays"):
+        path = config.invocation_params.dir / given
+        if not path.exists():
+            raise pytest.UsageError(f"--replays {given} does not exist; accepted: a folder or file")
+        config.args.append(str(path))
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """A recording that lies where recordings are tests."""
+    if file_path.suffix != _SUFFIX:
+        return None
+    config = parent.config
+    named = [config.invocation_params.dir / given for given in config.getoption("--replays")]
+    folders = [Path(path).resolve() for path in [*named, *config.getini("replays")]]
+    if any(file_path.resolve().is_relative_to(folder) for folder in folders):
+        return StoredReplay.from_parent(parent, path=file_path)
+    return None
+
+
+class StoredReplay(pytest.File):
+    """One recording, read once to be collected and once to be run."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(**more)
+        self._coming: Iterator[Verdict] | None = None
+        self._verdicts: dict[int, Verdict] = {}
+
+    def collect(self) -> Iterable[pytest.Item]:
+        """An item for each registration that has a result; one that fails for an unusable file."""
+        from chsel.errors import ChselError
+        from replay.mcap.reader import read_recording
+        from replay.registration import recorded_method
+
+        try:
+            recording = read_recording(self.path)
+            recorded_method(recording)
+            steps = [step for step in recording.steps if recording.has_result(step)]
+            reason = "" if steps else f"recording {self.path} has no registration with a result"
+        except ChselError as error:
+            reason = str(error)
+        if reason:
+            yield UnusableRecording.from_parent(self, name="recording", reason=reason)
+            return
+        for step in steps:
+            name = f"step {step}, {recording.start.method}"
+            yield ReplayedStep.from_parent(self, name=name, step=step)
+
+    def verdict(self, step: int) -> Verdict:
+        """The verdict on a step; others that were selected are come to on the way."""
+        if self._coming is None:
+            items = (item for item in self.session.items if item.parent is self)
+            self._coming = _verdicts(
+                self.path, [i.step for i in items if isinstance(i, ReplayedStep)]
+            )
+        while step not in self._verdicts:
+            verdict = next(self._coming)
+            self._verdicts[verdict.step] = verdict
+        return self._verdicts[step]
+
+
+def _verdicts(path: Path, steps: list[int]) -> Iterator[Verdict]:
+    """Verdicts on steps of a file that is read now, and given up with the last."""
+    from replay.mcap.reader import read_recording
+    from replay.verification import verify
+
+    yield from verify(read_recording(path), steps)
+
+
+class UnusableRecording(pytest.Item):
+    """A file that is no recording with results."""
+
+    def __init__(self, *, reason: str, **more: Any) -> None:
+        super().__init__(**more)
+        self._reason = reason
+
+    def runtest(self) -> None:
+        """Fail with the reason."""
+        pytest.fail(self._reason, pytrace=False)
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        """Where it is."""
+        return self.path, None, f"{self.path.name}: {self.name}"
+
+
+class ReplayedStep(pytest.Item):
+    """One registration, run again."""
+
+    parent: StoredReplay
+
+    def __init__(self, *, step: int, **more: Any) -> None:
+        super().__init__(**more)
+        self.step = step
+
+    def runtest(self) -> None:
+        """Fail with the report unless every bit is equal."""
+        from replay.verification import EQUAL
+
+        verdict = self.parent.verdict(self.step)
+        if verdict.outcome != EQUAL:
+            pytest.fail(f"{self.path}: {verdict.report()}", pytrace=False)
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        """Where it is."""
+        return self.path, None, f"{self.path.name}: {self.name}"

@@ -1,0 +1,206 @@
+"""What is in a recording, from a few of its bytes if it is finished."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chsel.errors import RecordingError
+from replay.mcap.encoding import decode
+from replay.mcap.file import StoredMessage
+from replay.mcap.index import McapIndex
+from replay.mcap.plain_config import config_from_json
+from replay.mcap.schemas import FORMAT_VERSION, MESSAGES
+from replay.mcap.texts import check_name
+from replay.standard_json import standard
+
+# What reads everything takes seconds to import, so that it is imported where everything is read.
+if TYPE_CHECKING:
+    from replay.mcap.reader import Recording
+
+_OF_THE_SESSION = ("runner", "object", "session", "method", "seed", "source", "free_resolution")
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What `info` tells of a recording.
+
+    size: of the file, bytes. session: names, seed, configuration and the like, plain values.
+    steps: a mapping for each probe, named as the columns of the message `Contents`; points are
+    all known with the probe. outcome: how the session ended, None if that is not told.
+    attachments: bytes by name. messages, message_bytes: by topic; bytes are known where everything
+    was read. checked: whether it was. damage: what is wrong, None if nothing is.
+    """
+
+    path: Path
+    size: int
+    session: Mapping[str, Any]
+    steps: tuple[Mapping[str, Any], ...]
+    outcome: str | None
+    attachments: Mapping[str, int]
+    messages: Mapping[str, int]
+    message_bytes: Mapping[str, int] | None = None
+    checked: bool = False
+    damage: str | None = None
+
+    @property
+    def registrations(self) -> int:
+        """How many registration problems have a result."""
+        return sum(step["hypotheses"] >= 0 for step in self.steps)
+
+    @property
+    def integrity(self) -> str:
+        """A line about what holds of the file."""
+        if self.damage is not None:
+            return f"{self.damage}; what is whole was read, and `recover` may save it"
+        if self.checked:
+            return "finished; everything was read, all checksums and digests are right"
+        return "finished; checksums of what was read are right (--check reads everything)"
+
+    def plain(self) -> dict[str, Any]:
+        """All of it as JSON has it."""
+        integrity = {
+            "whole": self.damage is None,
+            "checked": self.checked,
+            "damage": self.damage,
+        }
+        return {
+            "path": str(self.path),
+            "bytes": self.size,
+            **self.session,
+            "outcome": self.outcome,
+            "registrations": self.registrations,
+            "integrity": integrity,
+            "steps": standard([*self.steps]),
+            "attachments": dict(self.attachments),
+            "messages": dict(self.messages),
+            "message_bytes": None if self.message_bytes is None else dict(self.message_bytes),
+        }
+
+
+def recording_info(path: str | Path, *, check: bool = False) -> RecordingInfo:
+    """What is in a recording.
+
+    Of a finished one, the index, first and last messages are read. With `check`, and where a file
+    has no index, all is read that is whole. Raises RecordingError if nothing can be read.
+    """
+    path = Path(path).expanduser()
+    try:
+        indexed = _from_index(McapIndex(path))
+    except RecordingError:  # unfinished or damaged, or no recording: reading it all will tell
+        return _from_everything(path)
+    if not check:
+        return indexed
+    try:
+        checked = _from_everything(path)
+    except RecordingError as error:
+        return replace(indexed, checked=True, damage=str(error).removeprefix(f"recording {path}: "))
+    return replace(checked, damage=checked.damage or _contradiction(indexed, checked))
+
+
+def _from_index(index: McapIndex) -> RecordingInfo:
+    session, contents = index.message("/session"), index.message("/contents")
+    if session is None or contents is None:
+        raise RecordingError(f"recording {index.path} has no session or no contents")
+    ended = index.message("/session_ended")
+    return RecordingInfo(
+        index.path,
+        index.size,
+        _session(index.path, session),
+        _rows(decode("Contents", contents)),
+        None if ended is None else decode("SessionEnded", ended)["outcome"],
+        index.attachments,
+        index.messages,
+    )
+
+
+def _from_everything(path: Path) -> RecordingInfo:
+    from replay.mcap.attachments import MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
+    from replay.mcap.reader import read_recording
+
+    tally = _Tally()
+    recording = read_recording(path, partial=True, watch=tally.take)
+    steps, damage = _checked_steps(recording)
+    start = recording.start
+    return RecordingInfo(
+        path,
+        path.stat().st_size,
+        _session(path, tally.session),
+        steps,
+        None if recording.ended is None else recording.ended.outcome,
+        {MESH: len(mesh_to_ply(start.mesh)), SDF_GRID: len(sdf_to_bytes(start.sdf))},
+        tally.messages,
+        tally.bytes,
+        checked=True,
+        damage=recording.damage or damage,
+    )
+
+
+def _checked_steps(recording: Recording) -> tuple[tuple[Mapping[str, Any], ...], str | None]:
+    """A mapping for each probe, the digests of problems checked; and the first that is wrong."""
+    from replay.mcap.contents import Contents
+
+    contents, damage = Contents(), None
+    try:
+        for event in recording.events():
+            contents.take(event)
+    except RecordingError as error:
+        damage = str(error).removeprefix(f"recording {recording.path}: ")
+    return _rows(contents.values()), damage
+
+
+class _Tally:
+    """Counts messages and bytes by topic, and keeps the session's."""
+
+    def __init__(self) -> None:
+        self.session = b""
+        self.messages: dict[str, int] = {}
+        self.bytes: dict[str, int] = {}
+
+    def take(self, message: StoredMessage) -> None:
+        if message.topic == "/session":
+            self.session = message.data
+        self.messages[message.topic] = self.messages.get(message.topic, 0) + 1
+        self.bytes[message.topic] = self.bytes.get(message.topic, 0) + len(message.data)
+
+
+def _session(path: Path, data: bytes) -> dict[str, Any]:
+    """The plain values of a session's first message, its configuration taken apart."""
+    values = decode("Session", data)
+    if values["format_version"] != FORMAT_VERSION:
+        raise RecordingError(f"recording {path} has format version {values['format_version']}")
+    for name in ("runner", "object", "session", "method", "source"):
+        check_name(f"{name} of recording {path}", values[name])
+    config = config_from_json(values["config"])
+    preset = config.get("preset")
+    return {
+        **standard({name: values[name] for name in _OF_THE_SESSION}),
+        "preset": preset.get("name") if isinstance(preset, Mapping) else None,
+        "format_version": values["format_version"],
+        "workspace": standard(values["workspace"].tolist()),
+        "true_pose": values["world_from_object"] is not None,
+        "sdf_digest": values["sdf_digest"],
+        "mesh_digest": values["mesh_digest"],
+        "environment": {item["name"]: item["value"] for item in values["environment"]},
+        "config": config,
+    }
+
+
+def _rows(columns: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    """A mapping for each row of the columns of `Contents`."""
+    names = tuple(MESSAGES["Contents"])
+    rows = zip(*(columns[name].tolist() for name in names), strict=True)
+    return tuple(dict(zip(names, row, strict=True)) for row in rows)
+
+
+def _contradiction(indexed: RecordingInfo, checked: RecordingInfo) -> str | None:
+    """What the index says that is not so; None if all is so."""
+    for topic, count in indexed.messages.items():
+        found = checked.messages.get(topic, 0)
+        if count != found:
+            return f"damaged: its index tells of {count} messages on {topic}, there are {found}"
+    if indexed.attachments != checked.attachments:
+        return "damaged: its index tells of other attachments than there are"
+    return None

@@ -1,0 +1,189 @@
+"""How the viewer lays a Rerun recording out, so that it needs no click."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint import encodings
+
+from chsel.points import Workspace
+from replay.rerun.clock import ITERATION, PROBE
+from replay.rerun.colors import BACKGROUND, GRID
+from replay.rerun.curves import SEARCH_FRAME
+from replay.rerun.legend import LEGEND_FRAME
+from replay.rerun.plane import Frame
+from replay.rerun.scene import CUMULATIVE
+
+USUAL_ARCHIVE = Frame(40, 40)
+"""Cells of the map that is made room for until the first snapshot is there."""
+_EYE_DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the workspace's middle; probes move along +x
+_EYE_DISTANCE = 1.06  # in diagonals of the workspace
+_LOOK_DOWN = 0.04  # in heights of the workspace, whose near corner would be cut off
+_GRID_LINES = 5  # at least these across the diagonal of the workspace
+
+
+def session_blueprint(
+    workspace: Workspace,
+    *,
+    pose_known: bool,
+    archive: Frame | None = USUAL_ARCHIVE,
+    timed: bool = False,
+) -> rrb.Blueprint:
+    """Scene, archive and text above, curves below; opens at the last probe.
+
+    archive: size of the heat map in cells; None for a method without an archive. timed: whether
+    there are wall-clock times to show.
+    """
+    scene = rrb.Vertical(scene_view(workspace), legend_view(), row_shares=[9, 1])
+    upper: list[rrb.View | rrb.Container] = [scene, _text_views()]
+    shares = [9.0, 4.0]
+    if archive is not None:
+        upper.insert(1, archive_view(archive))
+        shares = [9.0, 7.0, 4.0]
+    above = rrb.Horizontal(*upper, column_shares=shares)
+    below = rrb.Horizontal(*_curve_views(pose_known=pose_known, timed=timed))
+    return at_last_probe(rrb.Vertical(above, below, row_shares=[65, 35]))
+
+
+def at_last_probe(views: rrb.Container) -> rrb.Blueprint:
+    """The views alone, all panels collapsed, at the last probe."""
+    return rrb.Blueprint(
+        views,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=PROBE, play_state="following"),
+    )
+
+
+def scene_view(
+    workspace: Workspace, root: str = "scene", name: str = "Scene", *, more: Sequence[str] = ()
+) -> rrb.Spatial3DView:
+    """The scene under the entity `root`, looked at obliquely from where the probes come from.
+
+    more: entities beside it that the view shows too, each with all below it.
+    """
+    lower, upper = workspace.bounds
+    centre = (lower + upper) / 2
+    diagonal = float(np.linalg.norm(upper - lower))
+    away = _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION) * diagonal
+    return rrb.Spatial3DView(
+        origin=f"/{root}",
+        contents=["$origin/**", *(f"/{entity}/**" for entity in more)],
+        name=name,
+        background=rrb.Background(color=BACKGROUND, kind="SolidColor"),
+        line_grid=rrb.LineGrid3D(
+            visible=True,
+            spacing=10.0 ** np.floor(np.log10(diagonal / _GRID_LINES)),
+            plane=rr.components.Plane3D((0.0, 0.0, 1.0), float(lower[2])),
+            stroke_width=1.0,
+            color=GRID,
+        ),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=centre + _EYE_DISTANCE * away,
+            look_target=centre - (0.0, 0.0, _LOOK_DOWN * (upper[2] - lower[2])),
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+        overrides={f"/{root}/{path}": _up_to_now() for path in CUMULATIVE},
+    )
+
+
+def archive_view(
+    frame: Frame,
+    root: str = "archive",
+    name: str = "Archive: lowest cost by cell; dots: hypotheses",
+) -> rrb.Spatial2DView:
+    """The heat map under the entity `root`; the mouse finds its costs, not its colours."""
+    return plane_view(root, name, frame, (0.2, 0.28, 0.2, 0.24), inert=f"/{root}/colors")
+
+
+def legend_view(root: str = "legend") -> rrb.Spatial2DView:
+    """What the colours of the scene mean."""
+    return plane_view(root, "Legend", LEGEND_FRAME, (0.0, 0.0, 0.0, 0.0), titlebar=False)
+
+
+def _curve_views(*, pose_known: bool, timed: bool) -> list[rrb.View | rrb.Container]:
+    views: list[rrb.View | rrb.Container] = [
+        rrb.Tabs(
+            curves_view("cost", "Cost by probe"),
+            curves_view("search", "by iteration"),
+        ),
+        plane_view("search_plot", "Cost of the search", SEARCH_FRAME, (0.22, 0.1, 0.28, 0.24)),
+    ]
+    if pose_known:
+        errors = [("position", "Position error [m]"), ("rotation", "Rotation error [rad]")]
+        views.append(rrb.Vertical(*(curves_view(f"error/{kind}", name) for kind, name in errors)))
+    if timed:
+        views.append(curves_view("seconds", "Seconds by stage"))
+    views.append(
+        rrb.Tabs(curves_view("distinct", "Distinct hypotheses"), curves_view("measured", "Other"))
+    )
+    return views
+
+
+def _text_views() -> rrb.Container:
+    columns = rrb.TextLogColumns(
+        timeline_columns=[encodings.TimelineColumn(PROBE, visible=False)],
+        text_log_columns=[
+            encodings.TextLogColumn(encodings.TextLogColumnKind.LogLevel, visible=True),
+            encodings.TextLogColumn(encodings.TextLogColumnKind.Body, visible=True),
+        ],
+    )
+    return rrb.Vertical(
+        rrb.TextDocumentView(origin="/session", name="Session"),
+        rrb.TextLogView(origin="/log", name="Log", columns=columns),
+        row_shares=[5, 3],
+    )
+
+
+def curves_view(root: str, name: str, *, legend: bool = True) -> rrb.TimeSeriesView:
+    """The curves under the entity `root`, from the first moment to shortly after this one."""
+    return rrb.TimeSeriesView(
+        origin=f"/{root}",
+        name=name,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
+        axis_x=rrb.TimeAxis(
+            view_range=rrb.TimeRange(
+                start=rrb.TimeRangeBoundary.infinite(),
+                end=rrb.TimeRangeBoundary.cursor_relative(seq=4),
+            )
+        ),
+    )
+
+
+def plane_view(
+    root: str,
+    name: str,
+    frame: Frame,
+    margins: tuple[float, float, float, float],
+    *,
+    inert: str = "",
+    titlebar: bool = True,
+) -> rrb.Spatial2DView:
+    """A drawing with room for its labels: left, right, top and bottom, in longer sides of it.
+
+    inert: an entity that the mouse does not find.
+    """
+    side = max(frame.width, frame.height)
+    left, right, top, bottom = (margin * side for margin in margins)
+    return rrb.Spatial2DView(
+        origin=f"/{root}",
+        name=name,
+        titlebar=titlebar,
+        background=BACKGROUND,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(-left, frame.width + right), y_range=(-top, frame.height + bottom)
+        ),
+        overrides={inert: rrb.EntityBehavior(interactive=False)} if inert else None,
+    )
+
+
+def _up_to_now() -> rrb.VisibleTimeRanges:
+    """All moments from the first one to that of the cursor, on both timelines."""
+    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=0)
+    return rrb.VisibleTimeRanges(
+        [rrb.VisibleTimeRange(name, start=start, end=end) for name in (PROBE, ITERATION)]
+    )

@@ -1,0 +1,195 @@
+"""Several methods on the same recorded problems, side by side in one Rerun recording."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from math import degrees, isfinite, log10
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from chsel.engine import CompiledCost
+from chsel.errors import RecordingError
+from chsel.problem import Hypotheses, RegistrationProblem
+from replay.comparing.comparison import CommonCost, common_cost, numbers_under
+from replay.events import Probe, ProblemPosed
+from replay.mcap.reader import Recording
+from replay.rerun.clock import PROBE
+from replay.rerun.colors import SERIES, CostScale, Rgb, number
+from replay.rerun.comparison_layout import (
+    CURVES,
+    SUMMARY_FRAME,
+    comparison_blueprint,
+    entity_names,
+)
+from replay.rerun.drawing import check_new
+from replay.rerun.hypotheses import HypothesisMeshes, coarsened, shown_hypotheses
+from replay.rerun.legend import Legend
+from replay.rerun.plane import color_array, on_screen, texts
+from replay.rerun.scene import Scene, bare_mesh
+
+APPLICATION = "chsel comparison"
+_FACES = 24_000  # of all methods' meshes of one colour together
+_FEWEST_FACES = 1_000
+_NOTE = 15.2  # where the legend tells of the scale, in units of its view
+
+
+def save_comparison(
+    path: Path, recording: Recording, results: Mapping[str, Mapping[int, Hypotheses]]
+) -> None:
+    """Write a new .rrd: a 3-D view for each method, curves of all below, at the last of the steps.
+
+    results: hypotheses by the label of a method, then by step; a method may lack steps. Costs,
+    and with them the order of a step's hypotheses, are those of `common_cost`.
+    Raises RecordingError if there is no result, a step has no problem, or the file cannot be
+    written or exists; nothing is left of it then.
+    """
+    steps = {step for found in results.values() for step in found}
+    if not steps:
+        raise RecordingError("there is no result to compare; accepted: at least one")
+    recording.checked_steps(sorted(steps))
+    check_new(path)
+    stream = rr.RecordingStream(APPLICATION, send_properties=False)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    try:
+        stream.set_sinks(rr.FileSink(path))
+    except (OSError, RuntimeError) as error:
+        raise RecordingError(f"{path} cannot be written ({error}); accepted: a new .rrd") from None
+    try:
+        _draw(stream, recording, results, max(steps))
+    except BaseException:
+        stream.disconnect()
+        path.unlink(missing_ok=True)
+        raise
+    stream.disconnect()
+
+
+def _draw(
+    stream: rr.RecordingStream,
+    recording: Recording,
+    results: Mapping[str, Mapping[int, Hypotheses]],
+    last: int,
+) -> None:
+    drawing = _Comparison(stream, recording, tuple(results))
+    drawn: set[int] = set()
+    for event in recording.events():
+        if isinstance(event, Probe):
+            if event.step > last:
+                return
+            stream.set_time(PROBE, sequence=event.step)
+            drawing.scene.add_probe(event)
+        elif isinstance(event, ProblemPosed) and event.step not in drawn:
+            drawn.add(event.step)
+            of_step = {name: by[event.step] for name, by in results.items() if event.step in by}
+            if of_step:
+                stream.set_time(PROBE, sequence=event.step)
+                drawing.add_results(event.problem, of_step)
+
+
+class _Comparison:
+    """Draws one scene for all, and the results of each method."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, recording: Recording, labels: tuple[str, ...]
+    ) -> None:
+        start = recording.start
+        known = start.world_from_object is not None
+        self.scene = Scene(stream)
+        self._stream = stream
+        self._names = entity_names(labels)
+        self._start = start
+        self._cost: CommonCost = common_cost(recording)
+        self._legend = Legend(stream)
+        self._meshes = {
+            label: HypothesisMeshes(stream, f"hypotheses/{name}")
+            for label, name in self._names.items()
+        }
+        stream.send_recording_name(f"{start.object}, seed {start.seed}: {', '.join(labels)}")
+        stream.send_blueprint(comparison_blueprint(start.workspace, self._names, pose_known=known))
+        mesh = bare_mesh(start.mesh)
+        stream.set_time(PROBE, sequence=min((p.step for p in recording.probes), default=0))
+        self.scene.set_up(mesh, start.workspace, start.world_from_object)
+        self.scene.add_points(start.initial_points, new=False)
+        self._legend.set_up(pose_known=known)
+        coarse = coarsened(mesh, max(_FACES // len(labels), _FEWEST_FACES))
+        for n, (label, meshes) in enumerate(self._meshes.items()):
+            meshes.set_up(coarse)
+            self._style(label, SERIES[n % len(SERIES)])
+
+    def add_results(self, problem: RegistrationProblem, found: Mapping[str, Hypotheses]) -> None:
+        """The hypotheses of methods, by their labels, for one problem."""
+        with warnings.catch_warnings(action="ignore"):  # whoever registered has been warned
+            judge = CompiledCost.of(problem, self._cost.settings)
+        judged = {label: ranked(hypotheses, judge) for label, hypotheses in found.items()}
+        shown = [h.cost[shown_hypotheses(h)] for h in judged.values()]
+        scale = CostScale.of(np.concatenate(shown))
+        self._legend.label(scale, at=_NOTE, note=f"one scale for all:\n{self._cost.name}")
+        for label, meshes in self._meshes.items():
+            hypotheses = judged.get(label)
+            if hypotheses is None or len(hypotheses.cost) == 0:
+                meshes.hide()
+                self._summarise(label, "no result")
+            else:
+                meshes.draw(hypotheses, scale)
+                numbers = numbers_under(judge, hypotheses, self._start)
+                self._add_numbers(label, numbers)
+                count = f"{len(shown_hypotheses(hypotheses))} of {len(hypotheses.cost)} drawn"
+                self._summarise(label, *_summary(numbers, count))
+
+    def _add_numbers(self, label: str, numbers: Mapping[str, float]) -> None:
+        values = dict(numbers)
+        for name in ("best_cost", "median_cost"):
+            if numbers[name] > 0.0:
+                values[f"log10_{name}"] = log10(numbers[name])
+        for name in CURVES.keys() & values.keys():
+            if isfinite(values[name]):
+                self._stream.log(self._curve(name, label), rr.Scalars(values[name]))
+
+    def _summarise(self, label: str, *rows: str) -> None:
+        """Text below the view of a method."""
+        place = SUMMARY_FRAME.width / 2, 0.1
+        text = texts([(*place, "\n".join(rows))])
+        self._stream.log(f"summary/{self._names[label]}/text", text)
+
+    def _style(self, label: str, color: Rgb) -> None:
+        """Name and colour the curves of a method, and say so below its view."""
+        for name in CURVES:
+            line = rr.SeriesLines(names=[label], colors=[color], widths=[2.0])
+            point = rr.SeriesPoints(names=[label], colors=[color], marker_sizes=[2.5])
+            self._stream.log(self._curve(name, label), line, point, static=True)
+        chip = rr.Points2D([(0.35, 0.5)], colors=color_array(color), radii=on_screen(6.0))
+        self._stream.log(f"summary/{self._names[label]}/color", chip, static=True)
+
+    def _curve(self, name: str, label: str) -> str:
+        return f"curves/{name}/{self._names[label]}"
+
+
+def ranked(hypotheses: Hypotheses, judge: CompiledCost) -> Hypotheses:
+    """The same hypotheses with their costs by a judge, ascending.
+
+    Of poses that repeat each other, the one that was the first by its method's cost stays it.
+    """
+    cost = judge.evaluate(hypotheses.object_from_world)
+    order = np.argsort(cost, kind="stable")
+    return replace(
+        hypotheses,
+        object_from_world=hypotheses.object_from_world[order],
+        cost=cost[order],
+        duplicate=hypotheses.duplicate[order],
+        cell=hypotheses.cell[order],
+    )
+
+
+def _summary(numbers: Mapping[str, float], count: str) -> list[str]:
+    rows = [f"best cost {number(numbers['best_cost'])}, {count}"]
+    errors = [
+        f"{which} {1000.0 * numbers[f'{which}_position_error']:.1f} mm, "
+        f"{degrees(numbers[f'{which}_rotation_error']):.1f}°"
+        for which in ("best", "closest")
+        if f"{which}_position_error" in numbers
+    ]
+    return [*rows, "; ".join(errors)] if errors else rows

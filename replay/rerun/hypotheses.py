@@ -1,0 +1,129 @@
+"""The hypotheses of a registration as translucent meshes, coloured by cost."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+import trimesh
+
+from chsel.arrays import FloatArray, IntArray
+from chsel.pose import inverse
+from chsel.problem import Hypotheses
+from replay.rerun.colors import CostScale, cost_colors
+from replay.rerun.scene import display_mesh
+
+LEVELS = 8
+"""Steps of the cost scale; a mesh entity has one colour, so each step is an entity."""
+MOST = 200
+"""More hypotheses than these are not drawn: the lowest in cost are."""
+DISPLAY_FACES = 6000
+"""Meshes with more faces are coarsened for display."""
+
+_NO_POSES = np.zeros((0, 4, 4))
+_HIDDEN = np.zeros((1, 4, 4))  # without any pose, the viewer draws the mesh once, at the origin
+_NO_COST = np.full(1, np.nan)
+_BEST_ALPHA = 130
+_ALPHA = (70, 18)  # of the lowest and the highest step
+
+
+class HypothesisMeshes:
+    """Draws sets of hypotheses under the entity `root`: one mesh a step of the scale, and poses."""
+
+    def __init__(self, stream: rr.RecordingStream, root: str = "scene/hypotheses") -> None:
+        self._stream = stream
+        self._root = root
+        self._best_color: tuple[int, int, int, int] | None = None
+        self._hidden: set[str] = set()  # entities that show nothing, by what was logged last
+
+    def set_up(self, mesh: trimesh.Trimesh, *, most_faces: int = DISPLAY_FACES) -> None:
+        """Store the object's mesh once for each colour, and show none."""
+        coarse = coarsened(mesh, most_faces)
+        self._stream.log(f"{self._root}/best", display_mesh(coarse), static=True)
+        for level in range(LEVELS):
+            fraction = level / (LEVELS - 1)
+            alpha = round(_ALPHA[0] + fraction * (_ALPHA[1] - _ALPHA[0]))
+            drawn = display_mesh(coarse, (*_rgb((level + 0.5) / LEVELS), alpha))
+            self._stream.log(self._level(level), drawn, static=True)
+        self.hide()
+
+    def draw(self, hypotheses: Hypotheses, scale: CostScale | None = None) -> None:
+        """Show the hypotheses that repeat no other, at most MOST; the first is the best.
+
+        scale: of the colours; by default that of the hypotheses shown.
+        """
+        shown = shown_hypotheses(hypotheses)
+        poses = inverse(hypotheses.object_from_world[shown])
+        cost = hypotheses.cost[shown]
+        levels = cost_levels(cost, scale)
+        if len(levels):
+            self._color_best(0.0 if scale is None else (levels[0] + 0.5) / LEVELS)
+        levels[:1] = -1
+        self._poses(f"{self._root}/best", poses[:1], cost[:1])
+        for level in range(LEVELS):
+            chosen = levels == level
+            self._poses(self._level(level), poses[chosen], cost[chosen])
+
+    def hide(self) -> None:
+        """Show none."""
+        for entity in (f"{self._root}/best", *map(self._level, range(LEVELS))):
+            self._poses(entity, _NO_POSES, np.zeros(0))
+
+    def _color_best(self, fraction: float) -> None:
+        """Colour the best hypothesis by its place on the scale, if it has another colour yet."""
+        color = (*_rgb(fraction), _BEST_ALPHA)
+        if color != self._best_color:
+            self._best_color = color
+            self._stream.log(f"{self._root}/best", rr.Mesh3D.from_fields(albedo_factor=color))
+
+    def _level(self, level: int) -> str:
+        return f"{self._root}/cost_step_{level + 1}"
+
+    def _poses(self, entity: str, world_from_object: FloatArray, cost: FloatArray) -> None:
+        if len(world_from_object) == 0:
+            if entity in self._hidden:
+                return
+            self._hidden.add(entity)
+            world_from_object, cost = _HIDDEN, _NO_COST
+        else:
+            self._hidden.discard(entity)
+        poses = rr.InstancePoses3D(
+            translations=world_from_object[:, :3, 3].astype(np.float32),
+            mat3x3=world_from_object[:, :3, :3].astype(np.float32),
+        )
+        self._stream.log(entity, poses, rr.AnyValues(cost=cost))
+
+
+def shown_hypotheses(hypotheses: Hypotheses) -> IntArray:
+    """Indices of the hypotheses that are drawn: no duplicates, the lowest in cost."""
+    return np.flatnonzero(~hypotheses.duplicate)[:MOST]
+
+
+def cost_levels(cost: FloatArray, scale: CostScale | None = None) -> IntArray:
+    """The step of the cost scale, from 0, of each cost (B,); by default among its like."""
+    fraction = (scale or CostScale.of(cost)).fraction(cost)
+    return np.minimum((fraction * LEVELS).astype(np.int64), LEVELS - 1)
+
+
+def coarsened(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
+    """A mesh of roughly `most_faces` faces for the eye alone: vertices of a cell become one.
+
+    The cell is doubled in number of faces it swallows until few enough are left.
+    """
+    faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
+    cell = float(np.sqrt(mesh.area / max(most_faces, 1)))
+    coarse = mesh
+    while len(coarse.faces) > most_faces:
+        _, group = np.unique(np.rint(vertices / cell), axis=0, return_inverse=True)
+        group = group.reshape(-1)
+        count = np.bincount(group)
+        centres = [np.bincount(group, vertices[:, axis]) / count for axis in range(3)]
+        a, b, c = group[faces].T
+        kept = (a != b) & (b != c) & (c != a)
+        coarse = trimesh.Trimesh(np.stack(centres, axis=1), group[faces][kept], process=False)
+        cell *= 1.2
+    return coarse
+
+
+def _rgb(fraction: float) -> tuple[int, int, int]:
+    red, green, blue = cost_colors(fraction).tolist()
+    return red, green, blue

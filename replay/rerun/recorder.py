@@ -1,0 +1,195 @@
+"""Writes a session as a Rerun recording: what people look at."""
+
+from __future__ import annotations
+
+import warnings
+from functools import singledispatchmethod
+from pathlib import Path
+
+import rerun as rr
+
+from chsel.errors import RecordingError
+from chsel.problem import ArchiveSnapshot, Hypotheses
+from replay import events
+from replay.events import Recorder
+from replay.rerun.archive import ArchiveMap, map_frame
+from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
+from replay.rerun.clock import Clock
+from replay.rerun.colors import number
+from replay.rerun.curves import Curves, SearchPlot
+from replay.rerun.hypotheses import HypothesisMeshes
+from replay.rerun.legend import Legend
+from replay.rerun.live import live_sink
+from replay.rerun.plane import Frame
+from replay.rerun.scene import Scene, bare_mesh
+from replay.rerun.text import session_markdown
+
+APPLICATION = "chsel"
+_LOG_LEVELS = {"info": rr.TextLogLevel.INFO, "warning": rr.TextLogLevel.WARN}
+_FLUSH_SECONDS = 10.0
+
+
+class RerunRecorder(Recorder):
+    """A recorder whose file, live viewer or both show a session as it happens.
+
+    path: where the recording goes; None for a live viewer alone. live: also show it in a viewer on
+    this machine; without one, a warning. Timelines are those of `Clock`; no wall clock is written.
+    Raises RecordingError if the file cannot be written.
+    """
+
+    def __init__(self, path: Path | None, *, live: bool = False) -> None:
+        self._stream = rr.RecordingStream(APPLICATION, send_properties=False)
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+        self._open(path, live=live)
+        self._closed = False
+        self._clock = Clock(self._stream)
+        self._scene = Scene(self._stream)
+        self._meshes = HypothesisMeshes(self._stream)
+        self._legend = Legend(self._stream)
+        self._archive = ArchiveMap(self._stream)
+        self._curves = Curves(self._stream)
+        self._search = SearchPlot(self._stream)
+        self._started: events.SessionStarted | None = None
+        self._archive_frame: Frame | None = USUAL_ARCHIVE
+        self._fitted = False
+        self._timed = False
+        self._lagging = False
+
+    def record(self, event: events.Event) -> None:
+        """Draw one event."""
+        self._clock.set_probe(getattr(event, "step", 0))
+        self._draw(event)
+
+    def flush(self) -> None:
+        """Hand all events so far to the operating system, and to the viewer if there is one."""
+        self._curves.send_traces()
+        self._archive.send()
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_SECONDS)
+        except RuntimeError as error:
+            if not self._lagging:
+                self._lagging = True
+                warnings.warn(f"the live view or the file does not follow: {error}", stacklevel=2)
+
+    def close(self) -> None:
+        """Finish the file. Closing twice is closing once."""
+        if not self._closed:
+            self._closed = True
+            self.flush()
+            self._stream.disconnect()
+
+    def _open(self, path: Path | None, *, live: bool) -> None:
+        sinks: list[rr.FileSink | rr.GrpcSink] = []
+        if path is not None:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.open("wb").close()
+            except OSError as error:
+                raise RecordingError(
+                    f"{path} cannot be written ({error.strerror}); accepted: a new .rrd file"
+                ) from None
+            sinks.append(rr.FileSink(path))
+        if live and (viewer := live_sink()) is not None:
+            sinks.append(viewer)
+        if sinks:
+            self._stream.set_sinks(*sinks)
+        else:
+            self._stream.disconnect()
+
+    @singledispatchmethod
+    def _draw(self, event: events.Event) -> None:
+        raise TypeError(f"{type(event).__name__} is not an event")
+
+    @_draw.register
+    def _(self, event: events.SessionStarted) -> None:
+        name = f"{event.object}, {event.method}, seed {event.seed}"
+        known = event.world_from_object is not None
+        self._stream.send_recording_name(name)
+        self._started = event
+        self._lay_out()
+        text = rr.TextDocument(session_markdown(event), media_type=rr.MediaType.MARKDOWN)
+        self._stream.log("session", text, static=True)
+        mesh = bare_mesh(event.mesh)
+        self._scene.set_up(mesh, event.workspace, event.world_from_object)
+        self._meshes.set_up(mesh)
+        self._legend.set_up(pose_known=known)
+        self._curves.set_up()
+        self._scene.add_points(event.initial_points, new=False)
+
+    @_draw.register
+    def _(self, event: events.Probe) -> None:
+        self._scene.add_probe(event)
+
+    @_draw.register
+    def _(self, event: events.ProblemPosed) -> None:
+        self._clock.start_registration()
+        self._archive.start()
+        self._search.start()
+
+    @_draw.register
+    def _(self, event: events.SnapshotTaken) -> None:
+        self._clock.advance(f"archive {event.archive.refinement}", event.archive.iteration)
+        self._archive.draw(event.step, self._clock.moment, event.archive)
+        self._fit_layout(event.archive)
+
+    @_draw.register
+    def _(self, event: events.Traced) -> None:
+        self._clock.advance(event.stage, event.iteration)
+        self._search.add(self._clock.iteration, event)
+        self._curves.add_trace(self._clock.moment, event)
+
+    @_draw.register
+    def _(self, event: events.HypothesesFound) -> None:
+        self._meshes.draw(event.hypotheses)
+        self._legend.draw(event.hypotheses)
+        self._archive.mark(event.step, self._clock.moment, event.hypotheses)
+        self._fit_layout(event.hypotheses.archive)
+        self._curves.add_hypotheses(event.hypotheses)
+        self._search.draw(event.step)
+        self._log_result(event.hypotheses)
+
+    @_draw.register
+    def _(self, event: events.Measured) -> None:
+        for name, value in event.values.items():
+            self._curves.add_measured(name, value)
+
+    @_draw.register
+    def _(self, event: events.Timed) -> None:
+        for stage, seconds in event.seconds.items():
+            self._curves.add_seconds(stage, seconds)
+        if not self._timed:
+            self._timed = True
+            self._lay_out()
+
+    @_draw.register
+    def _(self, event: events.Logged) -> None:
+        level = _LOG_LEVELS.get(event.level, event.level.upper())
+        self._stream.log("log", rr.TextLog(event.text, level=level))
+
+    @_draw.register
+    def _(self, event: events.SessionEnded) -> None:
+        """Nothing to draw: runners also log the outcome as text."""
+
+    def _log_result(self, hypotheses: Hypotheses) -> None:
+        """A line of text about the result."""
+        best = f"best cost {number(hypotheses.cost[0])}, " if len(hypotheses.cost) else ""
+        text = f"{best}{hypotheses.distinct} distinct hypotheses"
+        self._stream.log("log", rr.TextLog(text, level=rr.TextLogLevel.INFO))
+
+    def _fit_layout(self, archive: ArchiveSnapshot | None) -> None:
+        """Lay the views out anew once the first registration shows what archive there is."""
+        if not self._fitted:
+            self._fitted = True
+            self._archive_frame = None if archive is None else map_frame(archive)
+            self._lay_out()
+
+    def _lay_out(self) -> None:
+        if self._started is not None:
+            layout = session_blueprint(
+                self._started.workspace,
+                pose_known=self._started.world_from_object is not None,
+                archive=self._archive_frame,
+                timed=self._timed,
+            )
+            self._stream.send_blueprint(layout)

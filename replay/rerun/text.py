@@ -1,0 +1,46 @@
+"""What a session is, as text for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+from replay.events import SessionStarted
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes a value out each time, also where one object stands in two places."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def session_markdown(started: SessionStarted) -> str:
+    """A table that says what was run, then the whole configuration, then where it ran."""
+    preset = _find(started.config, "preset")
+    rows = {
+        "object": started.object,
+        "session": started.session,
+        "method": f"{started.method}, preset {preset}" if preset else started.method,
+        "seed": started.seed,
+        "true pose": "known" if started.world_from_object is not None else "unknown",
+    }
+    if started.source:
+        rows["problems of"] = f"recording {started.source}"
+    lines = [f"| {name} | **{text}** |" for name, text in rows.items()]
+    table = [lines[0], "|---|---|", *lines[1:]]
+    parts = ["\n".join(table)]
+    for title, mapping in (("Configuration", started.config), ("Environment", started.environment)):
+        if mapping:
+            text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False)
+            parts.append(f"**{title}**\n```\n{text}```")
+    return "\n\n".join(parts) + "\n"
+
+
+def _find(config: Mapping[str, Any], name: str) -> Any:
+    """The choice of a group at the top of the configuration, or in its group `method`."""
+    method = config.get("method")
+    found = config.get(name) or (method.get(name) if isinstance(method, Mapping) else None)
+    return found.get("name") if isinstance(found, Mapping) else found

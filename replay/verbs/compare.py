@@ -1,0 +1,242 @@
+"""Run several methods on exactly the same recorded problems, and judge all by one cost.
+
+A problem is as it was recorded: its low-cost set E_l follows from what the recorded method found
+before, so no method goes on from results of its own. Status 1 if a registration failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Table
+
+from chsel.errors import RecordingError, SettingError
+from chsel.problem import Hypotheses
+from chsel.threads import threads
+from replay.comparing.columns import Column, columns_in_table
+from replay.comparing.comparison import (
+    CommonCost,
+    Outcome,
+    common_cost,
+    compared,
+    medians,
+    recorded_label,
+)
+from replay.comparing.contenders import METHODS_HELP, Contender, contenders
+from replay.comparing.csv_file import write_csv
+from replay.mcap.reader import Recording, read_recording
+from replay.step_ranges import STEPS_HELP, chosen_steps
+
+_FEW_STEPS = 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The file, its steps, the methods with their settings, and what to save."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        required=True,
+        metavar="METHOD",
+        help=f"{METHODS_HELP}; after them KEY=VALUE for all methods that have the setting, or "
+        "METHOD:KEY=VALUE for one",
+    )
+    parser.add_argument("--steps", metavar="STEPS", help=STEPS_HELP)
+    parser.add_argument("--each", action="store_true", help="show every step, not medians alone")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads, 1 by default")
+    parser.add_argument("--save-csv", type=Path, metavar="OUT", help="all numbers")
+    parser.add_argument("--save-plot", type=Path, metavar="OUT", help="a png, svg or pdf")
+    parser.add_argument("--save-rerun", type=Path, metavar="OUT", help="a Rerun recording")
+
+
+def run(given: argparse.Namespace) -> int:
+    """Print a table of medians, of all steps if wanted; 1 if a registration failed."""
+    _check_outputs(given)
+    if given.threads < 1:
+        raise SettingError(f"--threads is {given.threads}; accepted: at least 1")
+    recording = read_recording(given.file)
+    if not recording.steps:
+        raise RecordingError(f"recording {given.file} has no registration problem to compare on")
+    steps = chosen_steps(given.steps, recording.steps)
+    labels = [word for word in given.methods if "=" not in word]
+    changes = [word for word in given.methods if "=" in word]
+    methods = contenders(recording, labels, changes)
+    cost = common_cost(recording)
+    with threads(given.threads):
+        outcomes = _compared(recording, methods, steps, cost)
+    console = Console(highlight=False)
+    each = given.each or len(steps) <= _FEW_STEPS
+    _tell(console, recording, methods, outcomes, cost, each=each, count=given.threads)
+    _save(given, recording, methods, outcomes, cost)
+    for path in (given.save_csv, given.save_plot, given.save_rerun):
+        if path is not None:
+            console.print(f"written: {path}", markup=False, soft_wrap=True)
+    again = {method.label for method in methods}
+    return int(any(outcome.failure for outcome in outcomes if outcome.label in again))
+
+
+def _check_outputs(given: argparse.Namespace) -> None:
+    """Raise before any work what would make it end in nothing."""
+    paths = [path for path in (given.save_csv, given.save_plot, given.save_rerun) if path]
+    for path in paths:
+        if path.exists() or path.is_symlink():
+            raise RecordingError(f"{path} exists; accepted: a new file")
+        if not path.parent.is_dir():
+            raise RecordingError(f"{path.parent} is no folder; accepted: a file in one that exists")
+        if paths.count(path) > 1:
+            raise RecordingError(f"{path} is named twice; accepted: a file for each")
+    if given.save_plot is not None:
+        from replay.comparing.plot import require_picture
+
+        require_picture(given.save_plot)
+
+
+def _compared(
+    recording: Recording, methods: Sequence[Contender], steps: Sequence[int], cost: CommonCost
+) -> list[Outcome]:
+    waiting = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    outcomes = []
+    with Progress(
+        *columns, console=waiting, transient=True, disable=not waiting.is_terminal
+    ) as progress:
+        task = progress.add_task("registering", total=len(steps) * (len(methods) + 1))
+        for outcome in compared(recording, methods, steps, cost):
+            outcomes.append(outcome)
+            progress.update(task, advance=1, description=f"step {outcome.step}")
+    return outcomes
+
+
+def _tell(
+    console: Console,
+    recording: Recording,
+    methods: Sequence[Contender],
+    outcomes: Sequence[Outcome],
+    cost: CommonCost,
+    *,
+    each: bool,
+    count: int,
+) -> None:
+    columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
+    labels = [recorded_label(recording), *(method.label for method in methods)]
+    steps = list(dict.fromkeys(outcome.step for outcome in outcomes))
+    of_label = {label: [o for o in outcomes if o.label == label] for label in labels}
+    if each:
+        table = _table(f"each step, {_costs(cost)}", ["step", "method"], columns)
+        for step in steps:
+            for outcome in (outcome for outcome in outcomes if outcome.step == step):
+                _add(table, [str(step), outcome.label], columns, outcome)
+            table.add_section()
+        console.print(table, "")
+    if len(steps) > 1:
+        title = f"medians over {len(steps)} steps, {_costs(cost)}"
+        some_failed = any(outcome.failure for outcome in outcomes)
+        table = _table(title, ["method", "steps"] if some_failed else ["method"], columns)
+        for label in labels:
+            found = [outcome for outcome in of_label[label] if not outcome.failure]
+            texts = [label, str(len(found))] if some_failed else [label]
+            _add(table, texts, columns, Outcome(0, label, None, medians(found)))
+        console.print(table, "")
+    console.print(_legend(columns, count))
+    for method in methods:
+        if method.changes:
+            console.print(
+                f"{method.label} with {', '.join(method.changes)}", markup=False, soft_wrap=True
+            )
+        _tell_bits(console, method, of_label[method.label])
+    for outcome in outcomes:
+        if outcome.failure:
+            what = f"step {outcome.step}, {outcome.label}: {outcome.failure}"
+            console.print(what, markup=False, soft_wrap=True)
+
+
+def _legend(columns: Sequence[Column], count: int) -> str:
+    """What the numbers of a table are about."""
+    text = "problems as recorded, with their E_0 and E_l; "
+    if any(column.name.endswith("_error") for column in columns):
+        text += "mm, °: to the true pose, of the best hypothesis by cost and of the nearest; "
+    return text + f"ms: of one registration by {count} thread{'s' if count > 1 else ''}"
+
+
+def _costs(cost: CommonCost) -> str:
+    return f"costs of all by {cost.name}"
+
+
+def _table(title: str, texts: Sequence[str], columns: Sequence[Column]) -> Table:
+    table = Table(
+        title=title,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+        show_edge=False,
+    )
+    for text in texts:
+        justify = "left" if text == "method" else "right"
+        table.add_column(text, justify=justify, overflow="fold")  # type: ignore[arg-type]
+    for column in columns:
+        table.add_column(column.heading, justify="right", no_wrap=True)
+    return table
+
+
+def _add(table: Table, texts: list[str], columns: Sequence[Column], outcome: Outcome) -> None:
+    cells = [column.shown(outcome.numbers.get(column.name)) for column in columns]
+    style = "dim" if outcome.label.startswith("recorded:") else ""
+    if outcome.failure and columns:
+        cells[0] = "failed"
+    table.add_row(*map(escape, texts), *cells, style=style)
+
+
+def _tell_bits(console: Console, method: Contender, outcomes: Sequence[Outcome]) -> None:
+    """Whether a method with the recorded settings gives what was recorded."""
+    known = [outcome for outcome in outcomes if outcome.as_recorded is not None]
+    other = [str(outcome.step) for outcome in known if not outcome.as_recorded]
+    if not known:
+        return
+    text = f"{method.label} has the recorded settings: "
+    if other:
+        text += f"{len(other)} of {len(known)} results are not those recorded, at step "
+        text += f"{', '.join(other)} (verify tells where)"
+    else:
+        text += f"its {len(known)} results are those recorded, to the bit"
+    console.print(text, markup=False, soft_wrap=True)
+
+
+def _save(
+    given: argparse.Namespace,
+    recording: Recording,
+    methods: Sequence[Contender],
+    outcomes: Sequence[Outcome],
+    cost: CommonCost,
+) -> None:
+    if given.save_csv is not None:
+        write_csv(given.save_csv, outcomes, methods, cost)
+    if given.save_plot is not None:
+        from replay.comparing.plot import write_plot
+
+        start = recording.start
+        title = f"{start.object}, {start.session} session, seed {start.seed}, {_costs(cost)}"
+        write_plot(given.save_plot, outcomes, title)
+    if given.save_rerun is not None:
+        from replay.rerun.comparison import save_comparison
+
+        save_comparison(given.save_rerun, recording, _results(recording, outcomes))
+
+
+def _results(recording: Recording, outcomes: Sequence[Outcome]) -> dict[str, dict[int, Hypotheses]]:
+    """Hypotheses by label and step; without the recorded ones if a method has them all again."""
+    results: dict[str, dict[int, Hypotheses]] = {}
+    for outcome in outcomes:
+        if outcome.hypotheses is not None:
+            results.setdefault(outcome.label, {})[outcome.step] = outcome.hypotheses
+    again = {outcome.label for outcome in outcomes if outcome.as_recorded}
+    again -= {outcome.label for outcome in outcomes if not outcome.as_recorded}
+    if again:
+        results.pop(recorded_label(recording), None)
+    return results

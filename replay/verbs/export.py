@@ -1,0 +1,67 @@
+"""Write hypotheses, points, archives or numbers of a recording as npz, csv or json."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from pathlib import Path
+
+from rich.console import Console
+from rich.filesize import decimal
+
+from chsel.errors import SettingError
+from replay.export import FORMATS, write_export
+from replay.export_content import EXPORTS, exported_archive
+from replay.mcap.reader import read_recording
+from replay.step_ranges import STEPS_HELP
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What, of which steps, in which form, where."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = "\n\n".join(f"{name}: {inspect.getdoc(of)}" for name, of in EXPORTS.items())
+    parser.add_argument("file", metavar="FILE", help="a recording")
+    parser.add_argument("--what", required=True, choices=EXPORTS, help="what to write")
+    parser.add_argument("--format", choices=FORMATS, help="npz, or as the name of OUT ends")
+    parser.add_argument(
+        "-o", "--out", type=Path, help="a new file; else RECORDING_WHAT.FORMAT in this folder"
+    )
+    parser.add_argument("--steps", metavar="A..B", help=STEPS_HELP)
+    parser.add_argument(
+        "--last", action="store_true", help="of the archives, the last of each step"
+    )
+
+
+def run(given: argparse.Namespace) -> int:
+    """Write the file and say where it is."""
+    file_format = _format(given.format, given.out)
+    if given.last and given.what != "archive":
+        raise SettingError(f"--last does not go with {given.what}; accepted: --what archive")
+    recording = read_recording(given.file)
+    if given.what == "archive":
+        exported = exported_archive(recording, given.steps, last=given.last)
+    else:
+        exported = EXPORTS[given.what](recording, given.steps)
+    path = given.out or Path(f"{recording.path.stem}_{given.what}.{file_format}")
+    write_export(exported, path, file_format)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"{path}  {decimal(path.stat().st_size)}", markup=False)
+    if given.what == "points" and file_format != "json":
+        lower, upper = recording.start.workspace.lower, recording.start.workspace.upper
+        bounds = ",".join(f"[{a!r},{b!r}]" for a, b in zip(lower, upper, strict=True))
+        console.print(
+            f"probe with these: python -m runners.probe object=NAME session=points "
+            f"session.path={path} 'session.workspace=[{bounds}]' "
+            f"session.free_resolution={recording.start.free_resolution!r}",
+            markup=False,
+        )
+    return 0
+
+
+def _format(named: str | None, out: Path | None) -> str:
+    """The format that is asked for, by its name or by that of the file."""
+    suffix = out.suffix.lower().removeprefix(".") if out is not None else ""
+    of_file = suffix if suffix in FORMATS else None
+    if named is not None and of_file not in (None, named):
+        raise SettingError(f"--format is {named} and {out} ends in {suffix}; accepted: one of them")
+    return named or of_file or "npz"

@@ -1,0 +1,156 @@
+"""Show what is in recordings: session, steps, points, results, sizes, versions, integrity.
+
+Status 0 if all files are whole, 1 if one is unfinished or damaged, 2 if one cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.filesize import decimal
+from rich.table import Table
+from rich.text import Text
+
+from chsel.errors import RecordingError
+from replay.recording_info import RecordingInfo, recording_info
+
+_IN_FULL = 3  # files; of more, each is a line
+_EITHER_END = 5  # steps that are shown of many
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Files, how thoroughly, how much, and as what."""
+    parser.add_argument("files", nargs="+", metavar="FILE", help="recordings")
+    parser.add_argument("--check", action="store_true", help="read everything, check every digest")
+    parser.add_argument("--steps", action="store_true", help="show all steps, however many")
+    parser.add_argument("--json", action="store_true", help="print all as one JSON document")
+
+
+def run(given: argparse.Namespace) -> int:
+    """Print what is in the files; a list in JSON if there are several."""
+    infos: list[RecordingInfo] = []
+    documents: list[dict[str, Any]] = []
+    status = 0
+    for file in given.files:
+        try:
+            info = recording_info(file, check=given.check)
+        except RecordingError as error:
+            print(f"error: {_printable(str(error))}", file=sys.stderr)
+            documents.append({"path": file, "error": str(error)})
+            status = 2
+            continue
+        infos.append(info)
+        documents.append(info.plain())
+        status = max(status, int(info.damage is not None))
+    if given.json:
+        document = documents if len(documents) > 1 else documents[0]
+        print(json.dumps(document, indent=2, allow_nan=False))
+    else:
+        _show(Console(highlight=False), infos, brief=len(given.files) > _IN_FULL, all_=given.steps)
+    return status
+
+
+def _show(console: Console, infos: Sequence[RecordingInfo], *, brief: bool, all_: bool) -> None:
+    for info in infos:
+        if brief:
+            console.print(Text(_overview(info)), soft_wrap=True)
+        else:
+            console.print(Text(_printable(str(info.path)), style="bold"), soft_wrap=True)
+            console.print(_facts(info))
+            if info.steps:
+                console.print(_step_table(info.steps, all_=all_))
+
+
+def _overview(info: RecordingInfo) -> str:
+    """One line about a file."""
+    session = info.session
+    facts = [
+        f"{session['object']}, {session['session']}, {session['method']}",
+        f"{len(info.steps)} probes, {info.registrations} registrations",
+        decimal(info.size),
+        "whole" if info.damage is None else info.damage,
+    ]
+    return _printable(f"{info.path}: {', '.join(facts)}")
+
+
+def _facts(info: RecordingInfo) -> Table:
+    """Names and what they are, but for the steps."""
+    session = info.session
+    preset = f", preset {session['preset']}" if session["preset"] else ""
+    counts = f"probes {len(info.steps)}, registrations {info.registrations}"
+    files = ", ".join(f"{name} {decimal(size)}" for name, size in info.attachments.items())
+    facts = {
+        "object": session["object"],
+        "session": f"{session['session']}, runner {session['runner']}; {counts}",
+        "method": f"{session['method']}{preset}, seed {session['seed']}",
+        "source": f"recording {session['source']}" if session["source"] else "",
+        "true pose": "known" if session["true_pose"] else "unknown",
+        "outcome": info.outcome or "not told: the session did not end",
+        "size": f"{decimal(info.size)}, of that, uncompressed: {files}",
+        "messages": _messages(info),
+        "environment": _environment(session["environment"]),
+        "format": f"version {session['format_version']}",
+        "integrity": info.integrity,
+    }
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, fact in facts.items():
+        if fact:
+            table.add_row(f"  {name}", Text(_printable(fact)))
+    return table
+
+
+def _messages(info: RecordingInfo) -> str:
+    """How many on each topic, with bytes where they are known, the most first."""
+    sizes = info.message_bytes
+    if sizes is None:
+        ordered = sorted(info.messages.items(), key=lambda item: -item[1])
+        return ", ".join(f"{count} {topic}" for topic, count in ordered)
+    return ", ".join(
+        f"{info.messages[topic]} {topic} ({decimal(size)})"
+        for topic, size in sorted(sizes.items(), key=lambda item: -item[1])
+    )
+
+
+def _environment(environment: Mapping[str, str]) -> str:
+    return ", ".join(f"{k.removeprefix('package ')} {v}" for k, v in environment.items())
+
+
+def _step_table(steps: Sequence[Mapping[str, Any]], *, all_: bool) -> Table:
+    """A row for each probe, or for the first and last of many."""
+    table = Table(title="known points after each probe, and what registering gave")
+    table.box, table.title_justify, table.collapse_padding = SIMPLE_HEAD, "left", True
+    names = ("step", "free", "occupied", "known", "contacts", "hypotheses", "distinct", "best cost")
+    for name in names:
+        table.add_column(name, justify="right")
+    many = not all_ and len(steps) > 2 * _EITHER_END + 2
+    for index, step in enumerate(steps):
+        if many and index == _EITHER_END:
+            table.add_row("...", *[""] * (len(names) - 1))
+        if not many or not _EITHER_END <= index < len(steps) - _EITHER_END:
+            table.add_row(*_cells(step))
+    if many:
+        table.caption = f"{len(steps) - 2 * _EITHER_END} more steps (--steps shows all)"
+        table.caption_justify = "left"
+    return table
+
+
+def _cells(step: Mapping[str, Any]) -> list[str]:
+    points = [str(step[name]) for name in ("step", "free", "occupied", "known", "contacts")]
+    if step["hypotheses"] < 0:
+        return [*points, "no result" if step["posed"] else "", "", ""]
+    cost = "" if math.isnan(step["best_cost"]) else f"{step['best_cost']:.4g}"
+    return [*points, str(step["hypotheses"]), str(step["distinct"]), cost]
+
+
+def _printable(text: str) -> str:
+    """The text without signs that would steer a terminal: a file may hold any."""
+    return "".join(sign if sign.isprintable() else "\N{REPLACEMENT CHARACTER}" for sign in text)

@@ -1,0 +1,70 @@
+"""Save everything whole of a damaged or unfinished recording as a finished one.
+
+Status 0 if there was something to save, 2 if not.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from replay.mcap.recovery import Recovered, recover
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The damaged file and the new one."""
+    parser.add_argument("file", metavar="FILE", type=Path, help="a recording.mcap")
+    parser.add_argument(
+        "-o", "--out", metavar="OUT", type=Path, required=True, help="a new file; never overwrites"
+    )
+
+
+def run(given: argparse.Namespace) -> int:
+    """Write the new recording, and tell what was kept and what was lost."""
+    path, out = given.file.expanduser(), given.out.expanduser()
+    found = recover(path, out)
+    console = Console(highlight=False, soft_wrap=True)
+    _tell_losses(console, found)
+    kept = f"{len(found.probes)} probes, {len(found.problems)} registration problems, "
+    console.print(f"kept: {kept}{len(found.results)} results")
+    console.print(str(out), markup=False)
+    return 0
+
+
+def _tell_losses(console: Console, found: Recovered) -> None:
+    if found.damage is None:
+        console.print("nothing is lost: the recording is whole")
+        return
+    console.print(found.damage, markup=False)
+    if found.damages:
+        table = Table(title="bytes lost", title_justify="left", box=SIMPLE_HEAD)
+        table.add_column("from", justify="right")
+        table.add_column("to", justify="right")
+        table.add_column("why")
+        for damage in found.damages:
+            table.add_row(str(damage.start), str(damage.end), damage.reason)
+        Console(highlight=False, markup=False).print(table)
+    if found.nothing_lost:
+        console.print("nothing of the session is lost")
+    if found.messages:
+        console.print(f"lost messages: {found.messages}")
+    if found.lost_probes:
+        spans = [str(a) if a == b else f"{a} to {b}" for a, b in found.lost_probes]
+        doubt = "" if found.complete else "at most "
+        console.print(f"lost probes: {doubt}those of step {', '.join(spans)}")
+    _tell_steps(console, "lost registration problems", found.lost_problems)
+    _tell_steps(console, "lost results", found.lost_results)
+    for event in found.events:
+        console.print(f"lost: {event}", markup=False)
+    if not found.complete:
+        console.print("the session's end is missing: what else was in it cannot be known")
+
+
+def _tell_steps(console: Console, what: str, steps: Sequence[int]) -> None:
+    if steps:
+        console.print(f"{what}: those of step {', '.join(map(str, steps))}")

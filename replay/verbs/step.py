@@ -1,0 +1,129 @@
+"""Register one recorded problem again, with another method or other settings; record that.
+
+The new recording has all that the problem follows from, and names its source by digest. Status 1
+if method and settings are the recorded ones and the result is not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from chsel.engine import CompiledCost
+from chsel.errors import SettingError
+from chsel.methods import METHODS
+from replay.comparing.comparison import common_cost, numbers_under
+from replay.mcap.reader import Recording, read_recording
+from replay.registration import other_method
+from replay.rerun.drawing import check_new, draw_recording
+from replay.step_again import StepAgain, register_step_again
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The file, its step, the method with its settings, and what to write."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
+    parser.add_argument("--step", type=int, required=True, metavar="K", help="a recorded problem")
+    parser.add_argument(
+        "--method",
+        nargs="+",
+        default=[],
+        metavar=("NAME", "KEY=VALUE"),
+        help=f"one of {', '.join(METHODS)}, by default the recorded one; then settings such as "
+        "cost.free_scale=40, or preset=NAME",
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, help="a new file; else RECORDING_stepK_METHOD.mcap in this folder"
+    )
+    parser.add_argument(
+        "--snapshot-interval",
+        type=int,
+        metavar="N",
+        help="iterations between snapshots of the archive, 0 for first and last; else as recorded",
+    )
+    parser.add_argument("--save-rerun", type=Path, metavar="RRD", help="also draw it: a new file")
+
+
+def run(given: argparse.Namespace) -> int:
+    """Register, record, and print how the result compares with the recorded one."""
+    name, changes = _named(given.method)
+    interval = given.snapshot_interval
+    if interval is not None and interval < 0:
+        raise SettingError(f"--snapshot-interval is {interval}; accepted: 0 or more")
+    if given.save_rerun is not None:
+        check_new(given.save_rerun)
+    recording = read_recording(given.file)
+    method = other_method(recording, name, changes)
+    path = given.out or Path(f"{recording.path.stem}_step{given.step}_{method.name}.mcap")
+    preset = next((text.partition("=")[2] for text in changes if text.startswith("preset=")), None)
+    waiting = Console(stderr=True)
+    with waiting.status(f"registering step {given.step} by {method.name}"):
+        again = register_step_again(
+            recording, given.step, method, path, preset=preset, interval=interval
+        )
+    console = Console(highlight=False)
+    console.print(_table(recording, again))
+    console.print(_verdict(again), soft_wrap=True)
+    console.print(f"registered in {again.seconds:.2f} s")
+    console.print(f"written: {path}", markup=False, soft_wrap=True)
+    if given.save_rerun is not None:
+        draw_recording(again.recording, given.save_rerun)
+        console.print(f"written: {given.save_rerun}", markup=False, soft_wrap=True)
+    return int(again.as_recorded and again.recorded is not None and not again.equal)
+
+
+def _named(words: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The method's name, None for the recorded one, and the changes of its settings."""
+    names = [word for word in words if "=" not in word]
+    if len(names) > 1:
+        raise SettingError(f"--method names {' and '.join(names)}; accepted: one, then KEY=VALUE")
+    return (names[0] if names else None), [word for word in words if "=" in word]
+
+
+def _table(recording: Recording, again: StepAgain) -> Table:
+    """The recorded result and the new one, judged by one cost."""
+    cost = common_cost(recording)
+    judge = CompiledCost.of(again.problem, cost.settings)
+    truth = recording.start.world_from_object is not None
+    title = f"cost: {cost.name}"
+    if truth:
+        title += "; errors to the true pose: best hypothesis, closest one"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
+    table.add_column("method")
+    errors = ("mm", "°", "mm", "°") if truth else ()
+    for name in ("best cost", "median cost", "distinct", *errors):
+        table.add_column(name, justify="right")
+    if again.recorded is not None:
+        numbers = numbers_under(judge, again.recorded, recording.start)
+        table.add_row(f"recorded: {recording.start.method}", *_cells(numbers, truth=truth))
+    numbers = numbers_under(judge, again.found, recording.start)
+    table.add_row(again.recording.start.method, *_cells(numbers, truth=truth))
+    return table
+
+
+def _cells(numbers: Mapping[str, float], *, truth: bool) -> list[str]:
+    costs = [numbers.get(name, math.nan) for name in ("best_cost", "median_cost")]
+    cells = [*(f"{cost:.4g}" for cost in costs), f"{numbers['distinct']:.0f}"]
+    for which in ("best", "closest") if truth else ():
+        position = numbers.get(f"{which}_position_error", math.nan)
+        rotation = numbers.get(f"{which}_rotation_error", math.nan)
+        cells += [f"{1000.0 * position:.1f}", f"{math.degrees(rotation):.1f}"]
+    return cells
+
+
+def _verdict(again: StepAgain) -> str:
+    """Whether the result has the recorded bits, and whether it should."""
+    if again.recorded is None:
+        return "no result was recorded to compare with"
+    settings = "method and settings are the recorded ones"
+    if again.equal:
+        same = f"equal to the recorded result, every bit; digest {again.found.digest}"
+        return f"{same}; {settings}" if again.as_recorded else same
+    if again.as_recorded:
+        return f"differs from the recorded result, though {settings}: `verify` says where"
+    return "differs from the recorded result, as another method or other settings may"

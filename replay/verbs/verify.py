@@ -1,0 +1,67 @@
+"""Run every registration of recordings again and compare hypotheses, costs and archives.
+
+Status 0 if all bits are equal, 1 if not, 2 if a file cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from rich.console import Console
+from rich.progress import Progress
+
+from chsel.errors import SettingError
+from replay.file_verification import FileVerdict, recordings_in, verified_files
+from replay.verification import NO_RESULT
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Files, steps, processes."""
+    parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or folders of them")
+    parser.add_argument(
+        "--step", type=int, action="append", metavar="K", help="this step alone; may be repeated"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
+
+
+def run(given: argparse.Namespace) -> int:
+    """Print a line for each file, and a report for each step that differs."""
+    if given.jobs < 1:
+        raise SettingError(f"--jobs is {given.jobs}; accepted: at least 1")
+    console = Console(highlight=False, soft_wrap=True)
+    paths = recordings_in(given.files)
+    begun, status, equal, total = time.perf_counter(), 0, 0, 0
+    waiting = Console(stderr=True)
+    with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress:
+        task = progress.add_task("verifying", total=len(paths))
+        for file in verified_files(paths, given.step, jobs=given.jobs):
+            _tell(console, file)
+            progress.advance(task)
+            status = max(status, file.status)
+            equal += file.equal
+            total += len(file.verdicts)
+    if len(paths) > 1:
+        rate = total / (time.perf_counter() - begun)
+        console.print(
+            f"{len(paths)} recordings: {equal} of {total} steps equal, {rate:.0f} steps/s"
+        )
+    return status
+
+
+def _tell(console: Console, file: FileVerdict) -> None:
+    if file.unusable:
+        print(f"error: {file.unusable}", file=sys.stderr)
+        return
+    compared = [verdict for verdict in file.verdicts if verdict.outcome != NO_RESULT]
+    methods = ", ".join(sorted({verdict.method for verdict in file.verdicts})) or "no method"
+    line = f"{file.path}: {file.equal} of {len(compared)} steps equal ({methods}), "
+    line += f"{file.seconds:.1f} s"
+    without = len(file.verdicts) - len(compared)
+    if without:
+        line += f", {without} without a result"
+    console.print(line)
+    for verdict in compared:
+        if file.status == 1 and verdict.outcome != "equal":
+            console.print(verdict.report(), markup=False)

@@ -1,0 +1,86 @@
+"""Make the Rerun recording anew from the MCAP file alone, and open it or save it."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import webbrowser
+from contextlib import suppress
+from pathlib import Path
+
+from rich.console import Console
+
+from chsel.errors import RecordingError
+from replay.mcap.reader import Recording, read_recording
+from replay.rerun.drawing import check_new, draw_recording
+from replay.rerun.viewer import has_screen, web_server, window
+
+_STEP_HELP = "probe to show, by default the last; in a saved file and in a browser none follows it"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What to look at, and where."""
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording.mcap")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--save", type=Path, metavar="RRD", help="write a new file, open nothing")
+    where.add_argument("--web", action="store_true", help="in a browser on this machine")
+    parser.add_argument("--step", type=int, metavar="K", help=_STEP_HELP)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Draw the recording and show it."""
+    if given.save is not None:
+        check_new(given.save)
+    elif not given.web and not has_screen():
+        raise RecordingError(
+            f"there is no screen to show {given.file} on; accepted: --save OUT.rrd, or --web"
+        )
+    recording = read_recording(given.file, partial=True)
+    _check_step(recording, given.step)
+    said = Console(highlight=False)
+    if recording.damage is not None:
+        warnings = Console(highlight=False, stderr=True)
+        what = f"warning: {given.file} is {recording.damage}; what is whole of it is shown"
+        warnings.print(what, soft_wrap=True, markup=False)
+    if given.save is not None:
+        _draw(recording, given.save, given.step)
+        said.print(str(given.save), soft_wrap=True, markup=False)
+        return 0
+    with tempfile.TemporaryDirectory(prefix="replay-view-") as folder:
+        rrd = Path(folder) / "recording.rrd"
+        if given.web:  # which takes no order where to stand
+            _draw(recording, rrd, given.step)
+            _show_in_browser(rrd, said)
+        else:
+            _draw(recording, rrd)
+            with suppress(KeyboardInterrupt), window(rrd, step=given.step) as viewer:
+                viewer.wait()
+    return 0
+
+
+def _show_in_browser(rrd: Path, said: Console) -> None:
+    """Serve the viewer until Ctrl-C."""
+    with suppress(KeyboardInterrupt), web_server(rrd) as (server, address):
+        said.print(address, soft_wrap=True, markup=False)
+        said.print("Ctrl-C ends it")
+        if has_screen():  # else a browser for text might take the terminal over
+            webbrowser.open(address)
+        server.wait()
+
+
+def _draw(recording: Recording, path: Path, last: int | None = None) -> None:
+    progress = Console(stderr=True)
+    if progress.is_terminal:
+        with progress.status(f"drawing {len(recording.probes)} probes"):
+            draw_recording(recording, path, last=last)
+    else:
+        draw_recording(recording, path, last=last)
+
+
+def _check_step(recording: Recording, step: int | None) -> None:
+    steps = sorted({probe.step for probe in recording.probes})
+    if step is not None and step not in steps:
+        accepted = f"{steps[0]} to {steps[-1]}" if steps else "none"
+        raise RecordingError(
+            f"recording {recording.path} has no probe {step}; accepted: {accepted}"
+        )

@@ -1,0 +1,551 @@
+"""Files made to do harm: refused in one line, in little time and memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+
+from chsel.cost_settings import CostSettings
+from chsel.descent import DescentSettings
+from chsel.emitters import Draws, EmitterSettings
+from chsel.errors import RecordingError, SdfError, SettingError
+from chsel.interior import interior_points
+from chsel.methods.chsel import ChselSettings
+from chsel.online import OnlineSettings
+from chsel.points import KnownPoints
+from chsel.problem import RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.selection import ArchiveSettings
+from chsel.streams import Purpose, StreamKey, normals
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Logged,
+    Measured,
+    Probe,
+    ProblemPosed,
+    SessionEnded,
+    Timed,
+    Traced,
+)
+from replay.mcap.plain_config import DEEPEST, config_from_json, config_to_json
+from replay.mcap.reader import read_recording
+from replay.mcap.schemas import RECORDS, message_class
+from replay.mcap.writer import McapRecorder
+from tests.replay.mutations import file_of, joined, packed, split, unpacked
+
+Records = list[tuple[int, bytes]]
+Change = Callable[[Records], None]
+
+
+@pytest.fixture
+def refused(
+    write: Callable[[list[Event]], Path], make_events: Callable[..., list[Event]]
+) -> Callable[..., None]:
+    """Asserts that a recording with other records is refused with a message."""
+
+    def check(change: Change, message: str) -> None:
+        path = write(make_events(steps=2, elites=3, free=3))
+        everything = split(path.read_bytes()[8:-8])
+        change(everything)
+        path.write_bytes(file_of(everything))
+        with pytest.raises(RecordingError, match=message) as caught:
+            read_recording(path)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+
+    return check
+
+
+def first_of(everything: Records, opcode: int) -> int:
+    return next(i for i, (found, _) in enumerate(everything) if found == opcode)
+
+
+def changed_message(topic: str, change: Callable[[Any], None]) -> Change:
+    """A change of the first message on a topic of the project's own."""
+
+    def apply(everything: Records) -> None:
+        numbers = {
+            content[8 : 8 + int.from_bytes(content[4:8], "little")]: content[:2]
+            for opcode, content in everything
+            if opcode == Opcode.CHANNEL
+        }
+        for place, (opcode, content) in enumerate(everything):
+            if opcode != Opcode.CHUNK:
+                continue
+            inside = split(unpacked(content))
+            for i, (kind, data) in enumerate(inside):
+                if kind == Opcode.MESSAGE and data[:2] == numbers[topic.encode()]:
+                    message: Any = message_class(RECORDS[topic]).FromString(data[22:])
+                    change(message)
+                    inside[i] = (kind, data[:22] + message.SerializeToString())
+                    everything[place] = (opcode, packed(joined(inside)))
+                    return
+
+    return apply
+
+
+def test_an_attachment_may_not_stand_twice(refused: Callable[..., None]) -> None:
+    def twice(everything: Records) -> None:
+        place = first_of(everything, Opcode.ATTACHMENT)
+        everything.insert(place, everything[place])
+
+    refused(twice, "the attachment 'mesh.ply' stands in it twice")
+
+
+def test_no_data_stand_behind_their_end_or_outside_of_chunks(refused: Callable[..., None]) -> None:
+    def behind(everything: Records) -> None:
+        end = first_of(everything, Opcode.DATA_END)
+        last = max(i for i, (opcode, _) in enumerate(everything) if opcode == Opcode.CHUNK)
+        everything.insert(end + 1, everything.pop(last))
+
+    def outside(everything: Records) -> None:
+        everything.insert(1, (Opcode.MESSAGE, bytes(30)))
+
+    refused(behind, "data follow the end of its data")
+    refused(outside, "a message stands outside of a chunk")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (bytes(5), "a chunk ends within a record"),
+        (joined([(Opcode.MESSAGE, bytes(10))]), "a message has 10 bytes; accepted: at least 22"),
+        (joined([(Opcode.MESSAGE, bytes(30))])[:-1], "a record of 30 bytes does not fit"),
+        (joined([(Opcode.CHANNEL, b"\1\0\1\0\xff\xff\xff\xff")]), "4294967295 bytes do not fit"),
+        (joined([(Opcode.MESSAGE, bytes(22))]), "channel 0 does not exist"),
+    ],
+)
+def test_lengths_within_a_chunk_are_not_believed(
+    refused: Callable[..., None], content: bytes, message: str
+) -> None:
+    def other(everything: Records) -> None:
+        place = first_of(everything, Opcode.CHUNK)
+        everything[place] = (Opcode.CHUNK, packed(content))
+
+    refused(other, message)
+
+
+def test_a_channel_may_not_become_another(refused: Callable[..., None]) -> None:
+    def redescribed(everything: Records) -> None:
+        place = first_of(everything, Opcode.CHUNK)
+        inside = split(unpacked(everything[place][1]))
+        channels = [content for opcode, content in inside if opcode == Opcode.CHANNEL]
+        other = channels[0][:2] + channels[1][2:]
+        inside.append((Opcode.CHANNEL, other))
+        everything[place] = (Opcode.CHUNK, packed(joined(inside)))
+
+    refused(redescribed, r"channel \d+ is described twice, and not the same")
+
+
+def test_records_of_unknown_kinds_are_passed_by(
+    events: list[Event], write: Callable[[list[Event]], Path], assert_same: Callable[..., None]
+) -> None:
+    path = write(events)
+    everything = split(path.read_bytes()[8:-8])
+    for place in (1, 3, len(everything) - 2):
+        everything.insert(place, (200, b"whatever"))
+        everything.insert(place, (Opcode.METADATA, b"\0" * 8))
+    path.write_bytes(file_of(everything))
+    assert_same(read_recording(path).events(), events)
+
+
+def test_a_summary_that_starts_nowhere_is_damage(
+    events: list[Event], write: Callable[[list[Event]], Path]
+) -> None:
+    path = write(events)
+    data = bytearray(path.read_bytes())
+    data[-28:-20] = b"\xff" * 8
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="its summary starts beyond its end"):
+        read_recording(path)
+
+
+def set_field(name: str, value: Any) -> Callable[[Any], None]:
+    return lambda message: setattr(message, name, value)
+
+
+def repeat_name(field: str) -> Callable[[Any], None]:
+    def change(message: Any) -> None:
+        items = getattr(message, field)
+        items.add().CopyFrom(items[0])
+
+    return change
+
+
+def number(field: str, place: int, value: float) -> Callable[[Any], None]:
+    def change(message: Any) -> None:
+        array = getattr(message, field)
+        numbers = np.frombuffer(array.data, array.dtype).copy()
+        numbers[place] = value
+        array.data = numbers.tobytes()
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("topic", "change", "message"),
+    [
+        ("/session", set_field("config", "{" * 50_000), "its configuration is no JSON"),
+        ("/session", set_field("config", "[" * 100_000), "its configuration is no JSON"),
+        ("/session", set_field("config", '{"a": 1, "a": 2}'), "a mapping has a key twice"),
+        ("/session", set_field("config", '{"a": NaN}'), r"config\.a is nan; accepted: finite"),
+        ("/session", set_field("config", '{"a": 1e999}'), r"config\.a is inf; accepted: finite"),
+        ("/session", set_field("config", '{"a": 1' + "0" * 9000 + "}"), "has 9001 digits"),
+        ("/session", set_field("config", '{"a": "' + "x" * 2**20 + '"}'), "accepted: at most 1048"),
+        ("/session", set_field("config", r'{"a": "\ud800"}'), "without control characters"),
+        ("/session", set_field("object", "\x1b[2J"), r"object holds the character '\\x1b' at 0"),
+        ("/session", set_field("runner", "a\nb"), "accepted: a name on one line"),
+        ("/session", set_field("free_resolution", 1e-12), "free_resolution is 1e-12; accepted"),
+        ("/session", set_field("free_resolution", float("nan")), "free_resolution is nan"),
+        ("/session", number("world_from_object", 0, 3.0), "is not a rigid transform"),
+        ("/session", number("workspace", 0, np.inf), "workspace.* is not finite"),
+        ("/session", repeat_name("environment"), "the environment has a name twice"),
+        ("/probe", set_field("outcome", "gone"), "accepted: contact, free, points"),
+        ("/probe", set_field("step", 1), "has a time of step 0, not its own"),
+        ("/probe", number("gripper_path", 0, np.nan), r"gripper_path\[0\] is not a rigid"),
+        ("/trace", set_field("lowest_cost", 1e12), "accepted: lowest, median, highest"),
+        ("/trace", set_field("median_cost", float("nan")), "accepted: lowest, median, highest"),
+        ("/trace", set_field("stage", "a\x07b"), "without control characters"),
+        ("/problem", number("initial_set", 5, 7.0), "initial set of step 1.* is not a rigid"),
+        ("/problem", set_field("points_digest", "a\nb"), "all points before the problem of step 1"),
+        ("/problem", set_field("sdf_digest", "0"), "the SDF grid of the problem of step 1"),
+        ("/problem", set_field("free_resolution", 0.0), "free_resolution is 0.0"),
+        ("/measured", repeat_name("values"), "measured has a name twice"),
+        ("/timed", repeat_name("seconds"), "timed has a name twice"),
+        ("/session_ended", set_field("outcome", "fine"), "accepted: finished, interrupted, failed"),
+    ],
+)
+def test_what_a_message_says_is_checked(
+    refused: Callable[..., None], topic: str, change: Callable[[Any], None], message: str
+) -> None:
+    refused(changed_message(topic, change), message)
+
+
+def result(events: list[Event]) -> HypothesesFound:
+    return next(event for event in events if isinstance(event, HypothesesFound))
+
+
+def with_result(event: HypothesesFound, **values: Any) -> HypothesesFound:
+    return HypothesesFound(event.step, dataclasses.replace(event.hypotheses, **values))
+
+
+def with_archive(event: HypothesesFound, **values: Any) -> HypothesesFound:
+    archive = event.hypotheses.archive
+    assert archive is not None
+    return with_result(event, archive=dataclasses.replace(archive, **values))
+
+
+def turned(array: np.ndarray) -> np.ndarray:
+    return array[::-1].copy()
+
+
+WRONG: dict[str, Callable[[HypothesesFound], HypothesesFound]] = {
+    "cost .* out of order": lambda e: with_result(e, cost=turned(e.hypotheses.cost)),
+    "cost .* is -inf": lambda e: with_result(e, cost=np.array([-np.inf, 1, 2, 3, 4.0])),
+    "object_from_world .* not a rigid": lambda e: with_result(
+        e, object_from_world=1.5 * e.hypotheses.object_from_world
+    ),
+    "object_from_world .* not finite where": lambda e: with_result(
+        e, object_from_world=np.nan * e.hypotheses.object_from_world
+    ),
+    "elites .* not a rigid": lambda e: with_result(e, elites=0.0 * e.hypotheses.elites),
+    "cell .* out of range; accepted: -1 to 1599": lambda e: with_result(
+        e, cell=np.full(5, 1600, dtype=np.int64)
+    ),
+    "cell .* out of range; accepted: -1 to -1": lambda e: with_result(e, archive=None),
+    "has cells out of order": lambda e: with_archive(e, cells=np.zeros(12, dtype=np.int64)),
+    "has 2 axes, but names": lambda e: with_archive(e, measure_names=("x",)),
+    "has an empty range": lambda e: with_archive(e, lower=np.array([-0.3, 0.3])),
+    "objectives .* not finite": lambda e: with_archive(e, objectives=np.full(12, np.nan)),
+    r"cells, \(4294967295, 4294967295\)": lambda e: with_archive(e, shape=(2**32 - 1,) * 2),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_a_result_that_cannot_be_is_refused_by_writer_and_reader(
+    events: list[Event],
+    write: Callable[[list[Event]], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    message: str,
+) -> None:
+    changed = [
+        WRONG[message](event) if isinstance(event, HypothesesFound) else event for event in events
+    ]
+    with pytest.raises(RecordingError, match=message):
+        write(changed)
+    monkeypatch.setattr("replay.mcap.writer.check_event", lambda event: None)
+    path = write(changed)
+    with pytest.raises(RecordingError, match=message):
+        read_recording(path)
+
+
+def test_a_diverged_start_of_infinite_cost_is_a_result(
+    events: list[Event], write: Callable[[list[Event]], Path], assert_same: Callable[..., None]
+) -> None:
+    index = max(i for i, event in enumerate(events) if isinstance(event, HypothesesFound))
+    last = events[index]
+    assert isinstance(last, HypothesesFound)
+    cost, poses = last.hypotheses.cost.copy(), last.hypotheses.object_from_world.copy()
+    cost[-1], poses[-1, :3] = np.inf, np.nan
+    events[index] = with_result(last, cost=cost, object_from_world=poses)
+    assert_same(read_recording(write(events)).events(), events)
+
+
+def swapped(first: type, second: type) -> Callable[[list[Event]], None]:
+    def change(events: list[Event]) -> None:
+        i = next(i for i, event in enumerate(events) if isinstance(event, first))
+        j = next(j for j, event in enumerate(events) if isinstance(event, second))
+        events[i], events[j] = events[j], events[i]
+
+    return change
+
+
+def repeated(kind: type) -> Callable[[list[Event]], None]:
+    def change(events: list[Event]) -> None:
+        i = next(i for i, event in enumerate(events) if isinstance(event, kind))
+        events.insert(i, events[i])
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda events: events.insert(3, Probe(0, "free", KnownPoints())), "probe 0 follows probe"),
+        (repeated(ProblemPosed), "step 1 has a second registration problem"),
+        (repeated(HypothesesFound), "HypothesesFound of step 1 is in no registration of it"),
+        (swapped(Traced, HypothesesFound), "SnapshotTaken of step 1 is in no registration"),
+        (swapped(ProblemPosed, Measured), "Traced of step 1 is in no registration of it"),
+        (repeated(SessionEnded), "an event follows the end of the session"),
+        (lambda events: events.insert(9, Logged(0, "info", "")), "step 0 follows one of step 1"),
+        (lambda events: events.insert(3, Timed(0, {"a": np.inf})), "a time is not finite"),
+        (lambda events: events.insert(3, Logged(0, "info", "\x00")), "without control characters"),
+    ],
+)
+def test_events_out_of_order_are_refused_by_writer_and_reader(
+    events: list[Event],
+    write: Callable[[list[Event]], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[list[Event]], None],
+    message: str,
+) -> None:
+    change(events)
+    with pytest.raises(RecordingError, match=message):
+        write(events)
+    monkeypatch.setattr("replay.mcap.writer.check_event", lambda event: None)
+    with monkeypatch.context() as careless:
+        careless.setattr("replay.mcap.writer.EventOrder.take", _anything)
+        path = write(events)
+    with pytest.raises(RecordingError, match=message):
+        read_recording(path)
+
+
+def _anything(order: Any, event: Event) -> None:
+    order.step = max(order.step, getattr(event, "step", -1))
+
+
+def test_a_refused_event_is_not_in_the_recording(
+    tmp_path: Path, events: list[Event], assert_same: Callable[..., None]
+) -> None:
+    recorder = McapRecorder(tmp_path / "a.mcap")
+    recorder.record(events[0])
+    recorder.record(events[1])
+    with pytest.raises(RecordingError, match="accepted: contact, free, points"):
+        recorder.record(Probe(0, "gone", events[0].initial_points))
+    recorder.close()
+    assert_same(read_recording(tmp_path / "a.mcap").events(), events[:2])
+
+
+def test_a_configuration_comes_back_and_depth_is_bounded() -> None:
+    config = {"é": [1, 2.5, None, True, {"x": "\t\n"}], "seed": 2**64 - 1, "small": -1e-300}
+    assert config_from_json(config_to_json(config)) == config
+    nested: Any = 0
+    for _ in range(DEEPEST + 1):
+        nested = [nested]
+    for wrong in ({"a": nested}, {"a": float("nan")}, {"a": 10**30}, {"a\x00": 1}):
+        with pytest.raises(RecordingError, match="accepted"):
+            config_to_json(wrong)
+        with pytest.raises(RecordingError, match="accepted"):
+            config_from_json(json.dumps(wrong))
+
+
+def test_an_older_recording_without_newer_topics_and_optional_fields_is_read(
+    write: Callable[[list[Event]], Path],
+    make_events: Callable[..., list[Event]],
+    assert_same: Callable[..., None],
+) -> None:
+    """What a version appends is optional: files from before it lack the topic and the field."""
+    events = make_events(steps=1)[:1]
+    events[0] = dataclasses.replace(events[0], world_from_object=None, environment={})
+    path = write(events)
+    everything = split(path.read_bytes()[8:-8])
+    place = first_of(everything, Opcode.CHUNK)
+    late = (b"/timed", b"/trace", b"/gripper_path", b"/measured")
+    inside = [
+        (opcode, content)
+        for opcode, content in split(unpacked(everything[place][1]))
+        if not (opcode == Opcode.CHANNEL and any(topic in content for topic in late))
+    ]
+    everything[place] = (Opcode.CHUNK, packed(joined(inside)))
+    path.write_bytes(file_of(everything))
+    assert_same(read_recording(path).events(), events)
+
+
+def test_unknown_fields_of_a_message_are_passed_by(
+    events: list[Event], write: Callable[[list[Event]], Path], assert_same: Callable[..., None]
+) -> None:
+    """A later program of the same format version may append fields."""
+    path = write(events)
+    everything = split(path.read_bytes()[8:-8])
+
+    def longer(message: Any) -> None:
+        message.MergeFromString(b"\xfa\x3e\x03new")  # field 1007
+
+    changed_message("/probe", longer)(everything)
+    path.write_bytes(file_of(everything))
+    assert_same(read_recording(path).events(), events)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: DescentSettings(restarts=1_000_001), "restarts is 1000001; accepted: at most"),
+        (
+            lambda: DescentSettings(restarts=10**5, iterations=11),
+            "restarts x iterations is 1100000",
+        ),
+        (lambda: EmitterSettings(iterations=10**7), "iterations is 10000000; accepted: at most"),
+        (lambda: ArchiveSettings(bins=4000), r"bins \*\* 2, the number of cells, is 16000000"),
+        (lambda: ArchiveSettings(measure="rotation_6", bins=15), r"bins \*\* 6"),
+        (lambda: OnlineSettings(hypotheses=10**7), "hypotheses is 10000000; accepted: at most"),
+        (lambda: ChselSettings(passes=10_001), "passes is 10001; accepted: at most 10_000"),
+    ],
+)
+def test_settings_have_upper_bounds(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        make()
+
+
+def test_a_spacing_too_fine_for_the_grid_is_refused(events: list[Event]) -> None:
+    sdf: SdfGrid = events[0].sdf  # type: ignore[union-attr]
+    with pytest.raises(SettingError, match=r"interior_spacing 1e-06 m makes 3\.0e\+15 nodes"):
+        interior_points(sdf, CostSettings(free_term="interior", interior_spacing=1e-6))
+
+
+def test_grids_whose_nodes_cannot_be_told_apart_are_refused(events: list[Event]) -> None:
+    sdf: SdfGrid = events[0].sdf  # type: ignore[union-attr]
+    for resolution in (1e-320, 1e300):
+        with pytest.raises(SdfError, match=r"SDF resolution is .*accepted: 1e-06 to 1000"):
+            dataclasses.replace(sdf, resolution=resolution)
+    with pytest.raises(SdfError, match=r"SDF origin is .*; accepted: up to 1e"):
+        dataclasses.replace(sdf, origin=np.full(3, 1e308))
+    problem: RegistrationProblem = next(e.problem for e in events if isinstance(e, ProblemPosed))
+    with pytest.raises(SettingError, match="free_resolution is 1e-300; accepted"):
+        dataclasses.replace(problem, free_resolution=1e-300)
+
+
+def test_draws_made_in_blocks_are_those_made_at_once() -> None:
+    draws = Draws(StreamKey(5, 2), 1)
+    together = draws.normals(2500, 3, 3)
+    assert [len(block) for block in draws.blocks(2500, 3, 3)] == [1000, 1000, 500]
+    assert draws.block(100_000, 9) == 10
+    at_once = normals(draws.key.stream(Purpose.EMITTER, 1), (2500, 3, 3))
+    assert together.tobytes() == at_once.tobytes()
+    assert draws.normals(0, 3, 3).shape == (0, 3, 3)
+
+
+_BOMBS = """
+import resource, sys
+import numpy as np
+from chsel.errors import RecordingError
+from replay.mcap.reader import read_recording
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for path in sys.argv[1:]:
+    try:
+        read_recording(path, partial=path.endswith("zeros.mcap"))
+        print("read")
+    except RecordingError as error:
+        print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+
+
+def bomb(path: Path, whole: bytes, content: bytes) -> Path:
+    """A recording whose first chunk is followed by another of such content."""
+    everything = split(whole[8:-8])
+    place = first_of(everything, Opcode.CHUNK)
+    everything.insert(place + 1, (Opcode.CHUNK, packed(content)))
+    path.write_bytes(file_of(everything))
+    assert path.stat().st_size < 100_000
+    return path
+
+
+def test_bombs_take_little_memory(
+    tmp_path: Path, write: Callable[[list[Event]], Path], make_events: Callable[..., list[Event]]
+) -> None:
+    path = write(make_events(steps=1, free=1)[:1])
+    whole = path.read_bytes()
+    sequence = len([o for o, _ in split(unpacked(split(whole[8:-8])[3][1])) if o == Opcode.MESSAGE])
+    assert sequence > 0
+    size = 15 * 2**20
+
+    def message(channel: int, data: bytes, number: int = sequence) -> bytes:
+        head = channel.to_bytes(2, "little") + number.to_bytes(4, "little")
+        return joined([(Opcode.MESSAGE, head + (10**9).to_bytes(8, "little") * 2 + data)])
+
+    numbers = {
+        content[8 : 8 + int.from_bytes(content[4:8], "little")].decode(): content[0]
+        for opcode, content in split(whole[8:-8])
+        if opcode == Opcode.CHANNEL
+    }
+    bombs = {
+        "zeros": bytes(size),
+        "too large": bytes(2**28),
+        "fields": message(numbers["/measured"], b"\x12\x00" * (size // 2)),
+        "list": message(numbers["/archive"], b"\x2a\x80\x80\x80\x07" + b"\x01" * (7 * 2**21)),
+        "records": joined([(Opcode.METADATA, b"")]) * (size // 9),
+        "log lines": b"".join(
+            message(numbers["/log"], b"\x10\x02", sequence + i) for i in range(size // 250)
+        ),
+        "empty messages": joined([(Opcode.MESSAGE, b"")]) * (size // 9),
+    }
+    paths = [bomb(tmp_path / f"{name}.mcap", whole, data) for name, data in bombs.items()]
+    command = [sys.executable, "-c", _BOMBS, *map(str, paths)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.stderr == ""
+    *errors, grown = done.stdout.splitlines()
+    assert len(errors) == len(bombs)
+    for message in (
+        "a chunk claims 268435456 bytes",
+        "chsel.Measured has more fields than any recorded",
+        "chsel.ArchiveSnapshot has a list of 14680064 bytes",
+        "it holds more than",
+        "a message has 0 bytes; accepted: at least 22",
+    ):
+        assert any(message in error for error in errors), message
+    assert int(grown) < 150  # MB
+
+
+def test_a_frame_that_lies_about_its_size_is_not_unpacked(
+    tmp_path: Path, write: Callable[[list[Event]], Path], events: list[Event]
+) -> None:
+    path = write(events)
+    everything = split(path.read_bytes()[8:-8])
+    data = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(2**24))
+    head = bytes(16) + (2**24).to_bytes(8, "little") + bytes(4)
+    chunk = head + b"\4\0\0\0zstd" + len(data).to_bytes(8, "little") + data
+    everything.insert(2, (Opcode.CHUNK, chunk))
+    path.write_bytes(file_of(everything))
+    with pytest.raises(RecordingError, match="is damaged before byte"):
+        read_recording(path)

@@ -1,0 +1,453 @@
+"""What the reader gives back, and how it meets files that are not what they should be."""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import zstandard
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Chunk, Header
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from chsel.errors import RecordingError
+from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SnapshotTaken
+from replay.mcap.encoding import decode, encode
+from replay.mcap.reader import read_recording
+from replay.mcap.schemas import FORMAT_VERSION, RECORDS, message_class
+
+Change = Callable[[str, bytes], bytes | None]
+
+
+def rewritten(path: Path, change: Change, *, topics: tuple[str, ...] = ()) -> Path:
+    """A whole, checksummed copy of a recording with other messages or attachments.
+
+    `change` gets topic or attachment name and the bytes, and gives new bytes or None to leave out.
+    Topics named in `topics` are left out altogether.
+    """
+    copy = path.with_suffix(".changed.mcap")
+    with path.open("rb") as source, copy.open("wb") as target:
+        reader, writer = make_reader(source), Writer(target, enable_data_crcs=True)
+        writer.start("chsel", "")
+        for attachment in reader.iter_attachments():
+            data = change(attachment.name, attachment.data)
+            if data is not None:
+                writer.add_attachment(0, 0, attachment.name, attachment.media_type, data)
+        summary = reader.get_summary()
+        for schema in summary.schemas.values():
+            writer.register_schema(schema.name, schema.encoding, schema.data)
+        channels = {}
+        for channel in summary.channels.values():
+            if channel.topic not in topics:
+                number = writer.register_channel(channel.topic, "protobuf", channel.schema_id)
+                channels[channel.topic] = number
+        sequence = 0
+        for _, channel, message in reader.iter_messages():
+            data = change(channel.topic, message.data)
+            if data is not None and channel.topic in channels:
+                time = message.log_time
+                writer.add_message(channels[channel.topic], time, data, time, sequence)
+                sequence += 1
+        writer.finish()
+    return copy
+
+
+def edited(topic: str, **values) -> Change:
+    """A change of some fields of all messages of a topic."""
+
+    def change(name: str, data: bytes) -> bytes:
+        return (
+            encode(RECORDS[name], decode(RECORDS[name], data) | values) if name == topic else data
+        )
+
+    return change
+
+
+def test_every_event_comes_back_to_the_bit(any_events, write, assert_same):
+    recording = read_recording(write(any_events))
+    assert recording.damage is None
+    assert_same(recording.events(), any_events)
+
+
+def test_problems_are_rebuilt_from_the_file_alone(events, write):
+    recording = read_recording(write(events))
+    posed = {e.step: e.problem for e in events if isinstance(e, ProblemPosed)}
+    assert recording.steps == tuple(posed) == (1, 2)
+    for step in reversed(recording.steps):
+        problem = recording.problem(step)
+        assert problem.digest == posed[step].digest
+        assert problem.points.digest == posed[step].points.digest
+        assert problem.low_cost_set.tobytes() == posed[step].low_cost_set.tobytes()
+        assert problem.key == posed[step].key
+    assert len(recording.problem(2).low_cost_set) == 12
+
+
+def test_probes_hypotheses_and_snapshots_are_found_by_step(events, write):
+    recording = read_recording(write(events))
+    assert [probe.step for probe in recording.probes] == [0, 1, 2]
+    written = [e for e in events if isinstance(e, HypothesesFound)][-1]
+    assert recording.hypotheses(2).digest == written.hypotheses.digest
+    assert recording.hypotheses(2).archive.digest == written.hypotheses.archive.digest
+    taken = [e.archive.digest for e in events if isinstance(e, SnapshotTaken) and e.step == 2]
+    assert [snapshot.digest for snapshot in recording.snapshots(2)] == taken
+    assert recording.snapshots(0) == []
+    assert recording.ended.outcome == "finished"
+
+
+def test_steps_without_a_registration_are_named(events, write):
+    path = write(events)
+    recording = read_recording(path)
+    with pytest.raises(RecordingError, match="no registration problem of step 0; accepted: 1, 2"):
+        recording.problem(0)
+    with pytest.raises(RecordingError, match="no result of step 7; accepted: 1, 2"):
+        recording.hypotheses(7)
+
+
+def test_arrays_read_back_cannot_be_changed(events, write):
+    found = read_recording(write(events)).hypotheses(1)
+    with pytest.raises(ValueError, match="read-only"):
+        found.cost[0] = 0.0
+
+
+def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
+    """Without any code of this project: the file describes itself."""
+    with write(events).open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        attachments = {item.name: item.data for item in reader.iter_attachments()}
+        stored = [(c.topic, s.name, m) for s, c, m in reader.iter_messages()]
+    pool = descriptor_pool.DescriptorPool()
+    added = set()
+    for schema in summary.schemas.values():
+        for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+            if proto.name not in added:
+                pool.Add(proto)
+                added.add(proto.name)
+
+    def parsed(name, data):
+        return message_factory.GetMessageClass(pool.FindMessageTypeByName(name)).FromString(data)
+
+    def array(message):
+        stored = np.frombuffer(message.data, message.dtype).reshape(tuple(message.shape))
+        return stored.astype(np.float64)  # a grid may be stored in 32 bits
+
+    points, elites = {"free": [], "occupied": [], "known": []}, None
+    for topic, name, message in stored:
+        content = parsed(name, message.data)
+        if topic.startswith("/points/"):
+            columns = content.point_stride // 8
+            points[topic[8:]].append(np.frombuffer(content.data, "<f8").reshape(-1, columns))
+        if topic == "/hypotheses":
+            elites = array(content.elites)
+        if topic == "/problem" and content.step == 2:
+            low_cost_set = (
+                array(content.low_cost_set) if content.HasField("low_cost_set") else elites
+            )
+            break
+    grid = parsed("chsel.SdfGrid", attachments["sdf_grid"])
+    expected = next(e.problem for e in events if isinstance(e, ProblemPosed) and e.step == 2)
+    known = np.concatenate(points["known"])
+    for found, wanted in (
+        (np.concatenate(points["free"]), expected.points.free),
+        (np.concatenate(points["occupied"]), expected.points.occupied),
+        (known[:, :3], expected.points.known),
+        (known[:, 3], expected.points.sdf),
+        (array(content.initial_set), expected.initial_set),
+        (low_cost_set, expected.low_cost_set),
+        (array(content.workspace), expected.workspace.bounds),
+        (array(grid.values), expected.sdf.values),
+        (array(grid.gradients), expected.sdf.gradients),
+        (array(grid.origin), expected.sdf.origin),
+    ):
+        assert found.shape == wanted.shape
+        assert found.tobytes() == wanted.tobytes()
+    assert grid.resolution == expected.sdf.resolution
+    assert (content.key_seed, content.key_step) == (expected.key.seed, expected.key.step)
+    assert content.free_resolution == expected.free_resolution
+    assert content.digest == expected.digest
+    mesh = trimesh.load(io.BytesIO(attachments["mesh.ply"]), file_type="ply", process=False)
+    assert mesh.vertices.tobytes() == events[0].mesh.vertices.tobytes()
+    assert mesh.faces.tolist() == events[0].mesh.faces.tolist()
+
+
+def test_a_flipped_bit_anywhere_is_detected(make_events, write):
+    path = write(make_events(steps=2, elites=3, free=3))
+    whole = path.read_bytes()
+    random = np.random.default_rng(3)
+    for position in [*random.choice(len(whole), 250, replace=False), *range(-40, 0)]:
+        flipped = bytearray(whole)
+        flipped[position] ^= 1 << random.integers(8)
+        path.write_bytes(flipped)
+        with pytest.raises(RecordingError, match=re.escape(str(path))):
+            read_recording(path)
+
+
+def test_the_record_that_holds_the_checksum_of_the_data_cannot_be_hidden(events, write):
+    path = write(events)
+    whole = bytearray(path.read_bytes())
+    (summary_start,) = struct.unpack_from("<Q", whole, len(whole) - 8 - 20)
+    data_end = summary_start - 13  # opcode, length, checksum
+    assert whole[data_end] == Opcode.DATA_END
+    whole[data_end] = 200  # a record of no known kind, which readers skip
+    path.write_bytes(whole)
+    with pytest.raises(RecordingError, match="the end of its data is missing"):
+        read_recording(path)
+
+
+def test_a_flipped_bit_in_a_chunk_is_named_and_what_is_before_it_kept(events, write, assert_same):
+    path = write(events)
+    whole = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    assert len(chunks) == 2
+    whole[chunks[1].chunk_start_offset + chunks[1].chunk_length // 2] ^= 4
+    path.write_bytes(whole)
+    with pytest.raises(RecordingError, match=r"is damaged before byte \d+: "):
+        read_recording(path)
+    recording = read_recording(path, partial=True)
+    assert recording.damage.startswith("damaged before byte")
+    assert_same(recording.events(), events[:1])
+
+
+def events_of(path: Path) -> list[Event]:
+    """All whole events of an unfinished recording, none if not even the session is whole."""
+    try:
+        return list(read_recording(path, partial=True).events())
+    except RecordingError as error:
+        if "has no session in it" not in str(error):
+            raise
+        return []
+
+
+def test_a_cut_anywhere_is_unfinished_and_keeps_whole_events(make_events, write, assert_same):
+    events = make_events(steps=2, elites=3, free=3)
+    path = write(events)
+    whole = path.read_bytes()
+    kept = set()
+    for length in [8, 9, 30, *range(100, len(whole), 211), len(whole) - 1]:
+        path.write_bytes(whole[:length])
+        with pytest.raises(RecordingError, match="is unfinished; accepted: a closed recording"):
+            read_recording(path)
+        found = events_of(path)
+        assert_same(found, events[: len(found)])
+        kept.add(len(found))
+    assert kept == {0, 1, len(events)}
+
+
+def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
+    path = write(events[:3])
+    seen = []
+
+    def without_the_last_points(topic: str, data: bytes) -> bytes | None:
+        seen.append(topic)
+        if topic == "/contents":
+            return None
+        return None if topic == "/known_points" and seen.count(topic) == 2 else data
+
+    cut = rewritten(path, without_the_last_points)
+    with pytest.raises(RecordingError, match="ends within an event on /probe"):
+        read_recording(cut)
+    cut.write_bytes(cut.read_bytes()[:-1])
+    assert_same(read_recording(cut, partial=True).events(), events[:2])
+
+
+def test_rewriting_alone_is_no_damage(events, write, assert_same):
+    copy = rewritten(write(events), lambda name, data: data)
+    assert_same(read_recording(copy).events(), events)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is no MCAP file; accepted: a recording.mcap that this project wrote"),
+        (b"ply\nformat ascii 1.0\n", "is no MCAP file"),
+        (MCAP0_MAGIC, "is unfinished"),
+        (MCAP0_MAGIC * 2, "is damaged before byte"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, content, message):
+    path = tmp_path / "recording.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=message):
+        read_recording(path)
+
+
+def test_missing_files_and_folders_are_named(tmp_path):
+    with pytest.raises(RecordingError, match=r"nowhere\.mcap does not exist; accepted: "):
+        read_recording(tmp_path / "nowhere.mcap")
+    with pytest.raises(RecordingError, match="is a folder; accepted: "):
+        read_recording(tmp_path)
+
+
+def test_recordings_of_other_programs_are_refused(tmp_path):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "")
+        writer.finish()
+    with pytest.raises(RecordingError, match="is another program's"):
+        read_recording(path)
+
+
+def test_topics_nobody_wrote_on_may_be_missing(make_events, write, assert_same):
+    events = make_events(steps=1)
+    lacking = rewritten(write(events), lambda name, data: data, topics=("/trace", "/timed"))
+    assert_same(read_recording(lacking).events(), events)
+
+
+def test_a_recording_tells_at_its_end_what_was_in_it(events, write):
+    with pytest.raises(RecordingError, match="ends without its contents"):
+        read_recording(rewritten(write(events), drop("/contents")))
+    with pytest.raises(RecordingError, match="another best_cost than recorded"):
+        read_recording(
+            rewritten(write(events), edited("/contents", best_cost=np.array([np.nan, 0.5, 0.5])))
+        )
+    with pytest.raises(RecordingError, match="a message on /log is out of place"):
+        read_recording(rewritten(write(events), drop("/session", "/points/free", "/known_points")))
+
+
+def drop(*names: str) -> Change:
+    return lambda name, data: None if name in names else data
+
+
+def test_an_empty_recording_has_no_session(write):
+    with pytest.raises(RecordingError, match="has no session in it"):
+        read_recording(write([]))
+
+
+def test_another_format_version_is_named_before_all_else(events, write):
+    def newer(name: str, data: bytes) -> bytes:
+        if name != "/session":
+            return data
+        session = message_class("Session").FromString(data)
+        session.format_version = FORMAT_VERSION + 1
+        session.ClearField("workspace")
+        return session.SerializeToString()
+
+    with pytest.raises(RecordingError, match="newer version: format 2; this one reads up to 1"):
+        read_recording(rewritten(write(events), newer))
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "sdf_grid"])
+def test_a_missing_attachment_is_named(events, write, name):
+    with pytest.raises(RecordingError, match=f"lacks the attachment {name}"):
+        read_recording(rewritten(write(events), drop(name)))
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "sdf_grid"])
+def test_a_changed_attachment_has_another_digest(events, write, name):
+    def nudged(found: str, data: bytes) -> bytes:
+        if found != name:
+            return data
+        position = data.index(b"end_header\n") + 11 if name == "mesh.ply" else len(data) - 8
+        return data[:position] + bytes([data[position] ^ 1]) + data[position + 1 :]
+
+    with pytest.raises(RecordingError, match=f"attachment {name} has digest .* not .* as recorded"):
+        read_recording(rewritten(write(events), nudged))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (edited("/hypotheses", cost=np.zeros(5)), "the hypotheses of step 1 has digest"),
+        (edited("/archive", cells=np.arange(12)), "an archive of step 1 has digest"),
+        (edited("/known_points", new_digest="0"), "new points of step -1 has digest"),
+        (edited("/known_points", occupied=9), "occupied points of step -1 are missing"),
+        (edited("/session", config="[1]"), "its configuration is no mapping"),
+        (edited("/session", config="{"), "Expecting property name"),
+        (edited("/session", workspace=np.ones((2, 3))), "every lower bound below"),
+        (drop("/points/occupied"), "occupied points of step 0 are missing"),
+        (drop("/probe"), "/points/free is out of place"),
+        (drop("/archive"), "the archive of step 1 is missing"),
+        (drop("/hypotheses"), "the low-cost set of step 2 is missing"),
+    ],
+)
+def test_content_that_contradicts_itself_is_refused(events, write, change, message):
+    with pytest.raises(RecordingError, match=message):
+        read_recording(rewritten(write(events), change))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        edited("/problem", initial_set=np.eye(4)[None]),
+        edited("/problem", key_seed=1),
+        edited("/problem", free_resolution=0.03),
+        edited("/problem", low_cost_set=np.eye(4)[None]),
+        edited("/problem", workspace=np.array([[0.0] * 3, [1.0] * 3])),
+        edited("/problem", digest="0"),
+    ],
+)
+def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write, change):
+    recording = read_recording(rewritten(write(events), change))
+    with pytest.raises(RecordingError, match="the problem of step 2 has digest"):
+        recording.problem(2)
+    with pytest.raises(RecordingError, match="the problem of step 1 has digest"):
+        list(recording.events())
+
+
+def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):
+    """Measured values are in no digest; that they are all there follows from their numbering."""
+    path = write(events)
+    whole = path.read_bytes()
+    with path.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[1]
+    start = chunk.chunk_start_offset
+    end = start + chunk.chunk_length + chunk.message_index_length
+    path.write_bytes(whole[:start] + whole[end:])
+    with pytest.raises(RecordingError, match="damaged before byte"):
+        read_recording(path)
+    twice = path.with_name("twice.mcap")
+    twice.write_bytes(whole[:end] + whole[start:])
+    with pytest.raises(RecordingError, match=r"message \d+ is missing, \d+ follows"):
+        read_recording(twice)
+
+
+def hostile(chunk: Chunk) -> bytes:
+    """A file with one chunk."""
+    records = RecordBuilder()
+    Header("chsel", "").write(records)
+    chunk.write(records)
+    return MCAP0_MAGIC + records.end() + MCAP0_MAGIC
+
+
+def test_a_chunk_may_not_claim_more_than_the_file_can_hold(tmp_path):
+    path = tmp_path / "bomb.mcap"
+    zeros = zstandard.ZstdCompressor(level=1).compress(bytes(300 * 2**20))
+    assert len(zeros) < 100_000
+    crc, size = zlib.crc32(bytes(300 * 2**20)), 300 * 2**20
+    for claimed in (size, 10):
+        path.write_bytes(hostile(Chunk("zstd", zeros, 0, 0, crc, claimed)))
+        with pytest.raises(RecordingError, match=f"a chunk claims {claimed} bytes"):
+            read_recording(path)
+    path.write_bytes(hostile(Chunk("lz4", b"", 0, 0, 0, 0)))
+    with pytest.raises(RecordingError, match="compressed by 'lz4'; accepted: zstd"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize("opcode", [1, 3, 4, 6, 9, 12, 200])
+def test_hostile_lengths_are_refused_at_once(tmp_path, opcode):
+    path = tmp_path / "hostile.mcap"
+    for length in (2**63, 100):
+        record = struct.pack("<BQ", opcode, length) + b"\xff" * 40
+        path.write_bytes(MCAP0_MAGIC + record + MCAP0_MAGIC)
+        with pytest.raises(RecordingError, match="damaged before byte"):
+            read_recording(path)
+
+
+def test_probes_are_whole(events, write):
+    probe = read_recording(write(events)).probes[2]
+    written = [e for e in events if isinstance(e, Probe)][2]
+    assert probe.gripper_path.tobytes() == written.gripper_path.tobytes()
+    assert probe.contacts.shape == (2, 3)
+    assert (probe.contact_normals == -probe.contacts).all()

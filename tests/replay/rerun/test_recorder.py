@@ -1,0 +1,564 @@
+"""The Rerun recording, read back with Rerun's own reader."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from rerun.chunk import RrdReader
+
+from chsel.errors import RecordingError
+from chsel.points import KnownPoints, Workspace
+from chsel.pose import compose, inverse, random_rotations
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.background_recorder import BackgroundRecorder
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Logged,
+    Measured,
+    Probe,
+    ProblemPosed,
+    SessionEnded,
+    SessionStarted,
+    SnapshotTaken,
+    Timed,
+    Traced,
+)
+from replay.rerun import live as rerun_live
+from replay.rerun.hypotheses import LEVELS, MOST
+from replay.rerun.recorder import RerunRecorder
+
+WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+MESH = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
+SDF = SdfGrid.from_mesh(MESH, 0.05)
+INITIAL = KnownPoints(free=np.array([[0.4, 0.4, 0.4]]))
+TRUTH = compose(np.eye(3), np.array([0.1, 0.0, 0.0]))
+MESH_ENTITIES = [
+    "/scene/hypotheses/best",
+    *(f"/scene/hypotheses/cost_step_{n + 1}" for n in range(LEVELS)),
+]
+
+Row = tuple[dict[str, int], dict[str, Any]]
+"""Times by timeline, and values by component."""
+
+
+def started(world_from_object: np.ndarray | None = TRUTH) -> SessionStarted:
+    return SessionStarted(
+        runner="probe",
+        object="box",
+        session="simulated",
+        method="chsel",
+        seed=3,
+        config={"preset": {"name": "paper"}, "method": {"qd": {"bins": [40, 40]}}},
+        mesh=MESH,
+        sdf=SDF,
+        workspace=WORKSPACE,
+        free_resolution=0.025,
+        initial_points=INITIAL,
+        world_from_object=world_from_object,
+    )
+
+
+def probe(step: int) -> Probe:
+    rng = np.random.default_rng(step)
+    contacts = rng.uniform(-0.1, 0.1, (1 + step, 3))
+    positions = np.linspace([-0.4, 0.0, 0.0], [-0.1, 0.0, 0.01 * step], 5)
+    path = compose(np.tile(np.eye(3), (5, 1, 1)), positions)
+    return Probe(
+        step,
+        "contact",
+        KnownPoints(
+            free=rng.uniform(-0.4, 0.4, (10 + step, 3)),
+            occupied=rng.uniform(-0.4, 0.4, (2, 3)),
+            known=np.concatenate([contacts, rng.uniform(-0.4, 0.4, (3, 3))]),
+            known_sdf=np.concatenate([np.zeros(len(contacts)), np.full(3, 0.02)]),
+        ),
+        gripper_path=path,
+        contacts=contacts,
+        contact_normals=np.tile([1.0, 0.0, 0.0], (len(contacts), 1)),
+    )
+
+
+def snapshot(
+    iteration: int, shape: tuple[int, ...] = (4, 3), refinement: int = 0
+) -> ArchiveSnapshot:
+    cells = np.arange(iteration + 2)
+    names = ("x [m]", "y [m]", "z [m]")[: len(shape)]
+    zeros = np.zeros((len(cells), 9))
+    return ArchiveSnapshot(
+        iteration,
+        refinement,
+        names,
+        shape,
+        np.full(len(shape), -0.3),
+        np.full(len(shape), 0.3),
+        cells,
+        zeros,
+        -1.0 - np.arange(len(cells), dtype=np.float64),
+        np.zeros((len(cells), len(shape))),
+    )
+
+
+def hypotheses(count: int = 6, archive: ArchiveSnapshot | None = None) -> Hypotheses:
+    rng = np.random.default_rng(count)
+    poses = compose(random_rotations(rng, count), rng.uniform(-0.2, 0.2, (count, 3)))
+    duplicate = np.arange(count) % 4 == 2
+    cell = np.full(count, -1) if archive is None else np.arange(count) % len(archive.cells)
+    cost = 1.5 * np.arange(1, count + 1, dtype=np.float64) ** 2
+    return Hypotheses(poses, cost, duplicate, cell, poses, archive)
+
+
+def registration(
+    step: int, *, shape: tuple[int, ...] | None = (4, 3), count: int = 6
+) -> Iterator[Event]:
+    problem = RegistrationProblem(
+        SDF, INITIAL, np.eye(4)[None], WORKSPACE, 0.025, StreamKey(3, step)
+    )
+    yield ProblemPosed(step, problem)
+    yield Traced(step, "gradient_descent", 0, "0", (2.0, 3.0, 900.0))
+    yield Traced(step, "gradient_descent", 50, "0", (1.0, 2.0, 90.0 + step))
+    last = None
+    for iteration in (0, 5):
+        if shape is None:
+            break
+        last = snapshot(iteration, shape)
+        yield SnapshotTaken(step, last)
+        yield Traced(step, "quality_diversity", iteration, "0", (0.5, 1.0, 2.0))
+    yield HypothesesFound(step, hypotheses(count, last))
+    yield Measured(step, {"best_position_error": 0.01 * (step + 1), "coverage_mm2": 4.0})
+    yield Timed(step, {"gradient_descent": 0.25})
+    yield Logged(step, "warning", f"line {step}")
+
+
+def session(count: int = 3) -> list[Event]:
+    events: list[Event] = [started()]
+    for step in range(count):
+        events += [probe(step), *registration(step)]
+    return [*events, SessionEnded(count - 1, "finished")]
+
+
+def write(path: Path, events: Iterable[Event]) -> Path:
+    recorder = RerunRecorder(path)
+    for event in events:
+        recorder.record(event)
+    recorder.close()
+    return path
+
+
+def read(path: Path) -> dict[str, list[Row]]:
+    """All rows of a recording by entity, in the order in which they were logged."""
+    rows: dict[str, list[tuple[bytes, Row]]] = {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for row in batch.to_pylist():
+            times = {name: row.pop(name) for name in chunk.timeline_names}
+            key = row.pop("rerun.controls.RowId")
+            values = {name: value for name, value in row.items() if value is not None}
+            rows.setdefault(chunk.entity_path, []).append((key, (times, values)))
+    return {
+        entity: [row for _, row in sorted(pairs, key=lambda pair: pair[0])]
+        for entity, pairs in rows.items()
+    }
+
+
+def at_probe(rows: list[Row], step: int) -> list[dict[str, Any]]:
+    return [values for times, values in rows if times.get("probe") == step]
+
+
+def until_probe(rows: list[Row], step: int) -> list[dict[str, Any]]:
+    """What a view at a probe draws from: the last value counts."""
+    return [values for times, values in rows if times.get("probe", step + 1) <= step]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("rerun") / "recording.rrd", session())
+
+
+@pytest.fixture(scope="module")
+def rows(recording: Path) -> dict[str, list[Row]]:
+    return read(recording)
+
+
+def test_the_file_holds_one_recording_of_the_application_and_a_blueprint(recording: Path) -> None:
+    reader = RrdReader(recording)
+    assert [entry.application_id for entry in reader.recordings()] == ["chsel"]
+    assert len(reader.blueprints()) >= 1
+
+
+def test_only_our_timelines_exist(rows: dict[str, list[Row]]) -> None:
+    timelines = {name for entity in rows.values() for times, _ in entity for name in times}
+    assert timelines == {"probe", "iteration"}
+
+
+def test_contacts_and_points_are_those_of_the_probe(rows: dict[str, list[Row]]) -> None:
+    for step in range(3):
+        points = probe(step).new_points
+        expected = {
+            "free": points.free,
+            "free/new": points.free,
+            "occupied": points.occupied,
+            "known": points.known[points.sdf != 0.0],
+            "contacts": points.contacts,
+            "contacts/new": probe(step).contacts,
+        }
+        for name, positions in expected.items():
+            shown = at_probe(rows[f"/scene/{name}"], step)[-1]["Points3D:positions"]
+            np.testing.assert_array_equal(
+                np.array(shown, dtype=np.float32), positions.astype(np.float32)
+            )
+
+
+def test_points_known_before_the_first_probe_are_drawn(rows: dict[str, list[Row]]) -> None:
+    first = at_probe(rows["/scene/free"], 0)[0]["Points3D:positions"]
+    np.testing.assert_allclose(first, [[0.4, 0.4, 0.4]], rtol=1e-6)
+
+
+def test_normals_are_arrows_at_the_contacts_that_have_one(tmp_path: Path) -> None:
+    normals = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    event = dataclasses.replace(probe(1), contact_normals=normals)
+    arrows = read(write(tmp_path / "a.rrd", [started(), event]))["/scene/contacts/normals"][-1][1]
+    np.testing.assert_array_equal(
+        np.array(arrows["Arrows3D:origins"], dtype=np.float32),
+        event.contacts[1:].astype(np.float32),
+    )
+    np.testing.assert_allclose(
+        arrows["Arrows3D:vectors"], [[0.0, 0.0, 0.035 * np.sqrt(3.0)]], rtol=1e-6
+    )
+
+
+def test_the_gripper_path_is_one_line_through_its_positions(rows: dict[str, list[Row]]) -> None:
+    shown = at_probe(rows["/scene/gripper/path"], 2)[-1]["LineStrips3D:strips"]
+    expected = probe(2).gripper_path[:, :3, 3].astype(np.float32)
+    np.testing.assert_array_equal(np.array(shown, dtype=np.float32), expected[None])
+
+
+def test_the_object_stands_at_its_true_pose(rows: dict[str, list[Row]]) -> None:
+    values = {name: value for _, row in rows["/scene/object"] for name, value in row.items()}
+    np.testing.assert_allclose(values["Transform3D:translation"], [[0.1, 0.0, 0.0]], rtol=1e-6)
+    assert len(values["Mesh3D:triangle_indices"]) == len(MESH.faces)
+
+
+def shown_hypotheses(rows: dict[str, list[Row]], step: int) -> dict[float, tuple[np.ndarray, str]]:
+    """Pose and entity of each hypothesis drawn at a probe, by cost."""
+    found: dict[float, tuple[np.ndarray, str]] = {}
+    for entity in MESH_ENTITIES:
+        row = until_probe(rows[entity], step)[-1]
+        translations = row["InstancePoses3D:translations"]
+        for cost, where, turn in zip(
+            row["cost"], translations, row["InstancePoses3D:mat3x3"], strict=True
+        ):
+            if not np.isnan(cost):
+                columns = np.reshape(turn, (3, 3)).T  # stored column by column
+                found[cost] = (compose(columns, np.array(where)), entity)
+    return found
+
+
+def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows: dict[str, list[Row]]) -> None:
+    expected = hypotheses(6, snapshot(5))
+    distinct = np.flatnonzero(~expected.duplicate)
+    for step in range(3):
+        shown = shown_hypotheses(rows, step)
+        assert sorted(shown) == expected.cost[distinct].tolist()
+        for index in distinct:
+            pose, _ = shown[float(expected.cost[index])]
+            world_from_object = inverse(expected.object_from_world[index])
+            np.testing.assert_allclose(pose, world_from_object, atol=1e-6)
+
+
+def test_the_lowest_cost_is_drawn_as_the_best_and_the_highest_in_the_last_step(
+    rows: dict[str, list[Row]],
+) -> None:
+    shown = shown_hypotheses(rows, 0)
+    assert shown[min(shown)][1] == "/scene/hypotheses/best"
+    assert shown[max(shown)][1] == f"/scene/hypotheses/cost_step_{LEVELS}"
+
+
+def test_no_mesh_is_drawn_before_the_first_hypotheses(rows: dict[str, list[Row]]) -> None:
+    for entity in MESH_ENTITIES:
+        first = at_probe(rows[entity], 0)[0]
+        assert np.isnan(first["cost"]).all()
+        assert not np.any(first["InstancePoses3D:mat3x3"])
+
+
+def images(rows: list[Row], step: int, dtype: type, channels: int) -> list[np.ndarray]:
+    """The pictures of a probe, each in the format that was given last."""
+    found, shape = [], (0, 0)
+    for times, row in rows:
+        for layout in row.get("Image:format", ()):
+            shape = layout["height"], layout["width"]
+        for pixels in row.get("Image:buffer", ()):
+            if times["probe"] == step:
+                array: np.ndarray = np.array(pixels, dtype=np.uint8).view(dtype)
+                found.append(array.reshape(*shape, channels))
+    return found
+
+
+def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(
+    rows: dict[str, list[Row]],
+) -> None:
+    first, last = images(rows["/archive/cost"], 1, np.float32, 1)
+    costs = first[..., 0]  # cells 0 and 1 of 4 x 3: first column, from below
+    expected = np.full((3, 4), np.nan)
+    expected[2, 0], expected[1, 0] = 1.0, 2.0
+    np.testing.assert_array_equal(costs, expected)
+    assert np.isfinite(last).sum() == 7
+    colors = images(rows["/archive/colors"], 1, np.uint8, 4)[-1][:, :4, :3]
+    empty = np.isnan(last[..., 0])
+    assert len(np.unique(colors[empty], axis=0)) == 1
+    assert len(np.unique(colors[~empty], axis=0)) == 7
+
+
+def test_the_archive_says_what_its_axes_are(rows: dict[str, list[Row]]) -> None:
+    labels = at_probe(rows["/archive/axes"], 2)[-1]["Points2D:labels"]
+    assert {"x [m]", "y [m]", "cost", "-0.2", "0.2"} <= set(labels)
+    assert "probe 2, iteration 5: 7 of 12 cells filled" in labels
+
+
+def test_hypotheses_are_marked_in_their_cells(rows: dict[str, list[Row]]) -> None:
+    marks = at_probe(rows["/archive/hypotheses"], 0)[-1]
+    np.testing.assert_allclose(  # cells 0, 1, 3, 4, 5 of 4 x 3, y down
+        marks["Points2D:positions"], [(0.5, 2.5), (0.5, 1.5), (1.5, 2.5), (1.5, 1.5), (1.5, 0.5)]
+    )
+    assert marks["Points2D:labels"][:2] == ["cost 1.5", "cost 6"]
+
+
+def test_iterations_run_on_over_stages_and_registrations(rows: dict[str, list[Row]]) -> None:
+    drawn = [times for times, values in rows["/archive/cost"] if "Image:buffer" in values]
+    times = [(times["probe"], times["iteration"]) for times in drawn]
+    assert times == [(0, 51), (0, 56), (1, 107), (1, 112), (2, 163), (2, 168)]
+
+
+def test_costs_of_the_search_are_on_the_timeline_of_iterations_alone(
+    rows: dict[str, list[Row]],
+) -> None:
+    series = [
+        (times, values["Scalars:scalars"][0])
+        for times, values in rows["/search/highest"]
+        if "Scalars:scalars" in values
+    ]
+    assert [set(times) for times, _ in series] == [{"iteration"}] * 12
+    assert [value for _, value in series[:5]] == [900.0, 90.0, 2.0, 2.0, 900.0]
+
+
+@pytest.mark.parametrize(
+    ("entity", "expected"),
+    [
+        ("/cost/lowest", [1.5] * 3),
+        ("/cost/median", [18.75] * 3),
+        ("/cost/highest", [54.0] * 3),
+        ("/distinct/hypotheses", [5.0] * 3),
+        ("/error/position/best_position_error", [0.01, 0.02, 0.03]),
+        ("/measured/coverage_mm2", [4.0] * 3),
+        ("/seconds/gradient_descent", [0.25] * 3),
+    ],
+)
+def test_numbers_of_a_step_stand_at_its_probe(
+    rows: dict[str, list[Row]], entity: str, expected: list[float]
+) -> None:
+    series = {
+        times["probe"]: values["Scalars:scalars"]
+        for times, values in rows[entity]
+        if "Scalars:scalars" in values
+    }
+    assert series == {step: [value] for step, value in enumerate(expected)}
+
+
+def test_the_text_tells_the_session_and_its_whole_configuration(rows: dict[str, list[Row]]) -> None:
+    ((_, values),) = rows["/session"]
+    (text,) = values["TextDocument:text"]
+    assert "| method | **chsel, preset paper** |" in text
+    shown = yaml.safe_load(text.split("```")[1])
+    assert shown == {"preset": {"name": "paper"}, "method": {"qd": {"bins": [40, 40]}}}
+
+
+def test_the_log_has_every_line_with_its_level(rows: dict[str, list[Row]]) -> None:
+    lines = [(v["TextLog:text"][0], v["TextLog:level"][0]) for _, v in rows["/log"]]
+    warned = [line for line in lines if line[1] == "WARN"]
+    assert warned == [(f"line {step}", "WARN") for step in range(3)]
+    results = [text for text, level in lines if level == "INFO"]
+    assert len(results) == 3
+    assert all(re.fullmatch(r"best cost \S+, 5 distinct hypotheses", text) for text in results)
+
+
+def test_without_a_true_pose_no_object_is_drawn(tmp_path: Path) -> None:
+    events = [started(world_from_object=None), probe(0), *registration(0)]
+    rows = read(write(tmp_path / "a.rrd", events))
+    assert "/scene/object" not in rows
+    assert len(shown_hypotheses(rows, 0)) == 5
+
+
+def test_a_probe_that_tells_nothing_draws_nothing(tmp_path: Path) -> None:
+    rows = read(write(tmp_path / "a.rrd", [started(), Probe(0, "free", KnownPoints())]))
+    for name in ("contacts", "occupied", "known", "free/new", "gripper/end"):
+        assert at_probe(rows[f"/scene/{name}"], 0)[-1]["Points3D:positions"] == []
+    assert at_probe(rows["/scene/gripper/path"], 0)[-1]["LineStrips3D:strips"] == []
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "filled"),
+    [
+        ((20,), (5, 20), 7 * 5),
+        ((4, 3, 2), (3, 4), 4),
+        ((9, 1), (2, 9), 7 * 2),
+        ((1, 9), (9, 2), 14),
+    ],
+)
+def test_archives_of_other_shapes_are_maps_too(
+    tmp_path: Path, shape: tuple[int, ...], size: tuple[int, int], filled: int
+) -> None:
+    events = [started(), probe(0), *registration(0, shape=shape)]
+    rows = read(write(tmp_path / "a.rrd", events))
+    costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
+    assert costs.shape == size
+    assert np.isfinite(costs).sum() == filled
+
+
+def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path: Path) -> None:
+    events = [started(), probe(0), *registration(0, shape=(4, 3, 2))]
+    rows = read(write(tmp_path / "a.rrd", events))
+    costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
+    assert costs[2, 0] == 1.0  # cells 0 and 1, of costs 1 and 2
+    assert costs[1, 0] == 3.0
+
+
+def test_a_method_without_an_archive_leaves_it_out(tmp_path: Path) -> None:
+    events = [started(), probe(0), *registration(0, shape=None)]
+    rows = read(write(tmp_path / "a.rrd", events))
+    assert "/archive/cost" not in rows
+    assert len(shown_hypotheses(rows, 0)) == 5
+
+
+@pytest.mark.parametrize(("count", "drawn"), [(1, 1), (1000, MOST)])
+def test_few_and_many_hypotheses_are_drawn(tmp_path: Path, count: int, drawn: int) -> None:
+    events = [started(), probe(0), *registration(0, count=count)]
+    rows = read(write(tmp_path / "a.rrd", events))
+    shown = shown_hypotheses(rows, 0)
+    assert len(shown) == drawn
+    assert max(shown) == hypotheses(count).cost[~hypotheses(count).duplicate][drawn - 1]
+    labels = at_probe(rows["/legend/cost"], 0)[-1]["Points2D:labels"]
+    assert f"{drawn} of {count} drawn" in labels
+
+
+def test_costs_of_zero_are_drawn_as_the_lowest(tmp_path: Path) -> None:
+    found = dataclasses.replace(hypotheses(4), cost=np.zeros(4))
+    rows = read(write(tmp_path / "a.rrd", [started(), HypothesesFound(0, found)]))
+    first = at_probe(rows["/scene/hypotheses/cost_step_1"], 0)[-1]
+    assert first["cost"] == [0.0, 0.0]
+
+
+def views_of_the_last_layout(path: Path) -> set[str]:
+    """Their titles."""
+    reader, layouts = RrdReader(path), []
+    for store in reader.blueprints():
+        batches = [chunk.to_record_batch() for chunk in reader.stream(store=store).to_chunks()]
+        rows = [row for batch in batches for row in batch.to_pylist()]
+        titles = {name for row in rows for name in row.get("ViewBlueprint:display_name") or ()}
+        layouts.append((min(row["rerun.controls.RowId"] for row in rows), titles))
+    return max(layouts)[1]
+
+
+def test_times_have_a_view_once_there_are_any(tmp_path: Path) -> None:
+    untimed = [event for event in session(1) if not isinstance(event, Timed)]
+    layout = views_of_the_last_layout(write(tmp_path / "a.rrd", untimed))
+    assert "Distinct hypotheses" in layout
+    assert "Seconds by stage" not in layout
+    late = [*untimed[:2], Timed(0, {"probe": 0.5}), *untimed[2:]]
+    timed = views_of_the_last_layout(write(tmp_path / "b.rrd", late))
+    assert timed - layout == {"Seconds by stage"}
+
+
+def test_closing_twice_is_closing_once(tmp_path: Path) -> None:
+    recorder = RerunRecorder(tmp_path / "a.rrd")
+    recorder.record(started())
+    recorder.close()
+    size = (tmp_path / "a.rrd").stat().st_size
+    recorder.close()
+    assert (tmp_path / "a.rrd").stat().st_size == size
+    assert "/scene/workspace" in read(tmp_path / "a.rrd")
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"cannot be written .*accepted: a new \.rrd file"):
+        RerunRecorder(tmp_path)
+
+
+def test_without_a_viewer_the_live_view_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rerun_live, "is_listening", lambda port: False)
+    monkeypatch.setattr(rerun_live, "viewer_program", lambda: tmp_path / "no_viewer")
+    with pytest.warns(UserWarning, match="no live view: the viewer no_viewer cannot be started"):
+        recorder = RerunRecorder(tmp_path / "a.rrd", live=True)
+    recorder.record(started())
+    recorder.close()
+    assert "/scene/workspace" in read(tmp_path / "a.rrd")
+
+
+def test_a_thread_in_the_background_draws_the_same(
+    tmp_path: Path, rows: dict[str, list[Row]]
+) -> None:
+    recorder = BackgroundRecorder(RerunRecorder(tmp_path / "a.rrd"))
+    for event in session():
+        recorder.record(event)
+    recorder.close()
+    np.testing.assert_equal(read(tmp_path / "a.rrd"), rows)
+
+
+def test_long_searches_are_drawn_to_the_last_iteration(tmp_path: Path) -> None:
+    events: list[Event] = [started(), probe(0), next(registration(0))]
+    for iteration in range(0, 1000, 10):
+        events.append(Traced(0, "cma_mega", iteration, "0", (1.0, 2.0, 3.0 + iteration)))
+        events.append(SnapshotTaken(0, snapshot(iteration % 10)))
+    rows = read(write(tmp_path / "a.rrd", events))
+    highest = [
+        values["Scalars:scalars"][0]
+        for _, values in rows["/search/highest"]
+        if "Scalars:scalars" in values
+    ]
+    assert highest == [3.0 + iteration for iteration in range(0, 1000, 10)]
+    assert len(images(rows["/archive/cost"], 0, np.float32, 1)) == 100
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+import test_rerun_recorder as example
+recorder = example.RerunRecorder(Path(sys.argv[1]))
+for event in example.session():
+    recorder.record(event)
+    if isinstance(event, example.Logged):
+        recorder.flush()
+        if event.step == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL on Windows")
+def test_every_flushed_probe_survives_a_kill(tmp_path: Path, rows: dict[str, list[Row]]) -> None:
+    path = tmp_path / "killed.rrd"
+    command = [sys.executable, "-c", _KILLED, str(path), str(Path(__file__).parent)]
+    killed = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    survived = read(path)
+    for entity, expected in rows.items():
+        until = [row for row in expected if row[0].get("probe", 0) < 2]
+        if "search/" not in entity and "log" not in entity:
+            np.testing.assert_equal(survived[entity], until, err_msg=entity)
+    assert len(survived["/log"]) == 4  # a line that was logged and one about the result, twice

@@ -1,0 +1,120 @@
+"""Small recordings of real registrations, which fuzzing starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from chsel.methods import build_method
+from chsel.online import pose_problem
+from chsel.points import KnownPoints, Workspace
+from chsel.problem import Hypotheses
+from chsel.sdf import SdfGrid
+from chsel.settings import settings_mapping
+from chsel.streams import StreamKey
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Logged,
+    Measured,
+    Probe,
+    ProblemPosed,
+    SessionEnded,
+    SessionStarted,
+)
+from replay.mcap.writer import McapRecorder
+from replay.recorder import ListRecorder
+from replay.step_observer import StepObserver
+
+_SIDES = (0.1, 0.06, 0.04)
+_DESCENT = {"restarts": 2, "iterations": 4, "stop_below": None}
+_ONLINE = {"hypotheses": 4}
+_COST = {"penetration_tolerance": -0.005}
+METHODS: dict[str, dict[str, Any]] = {
+    "gradient_descent": {"descent": _DESCENT, "online": _ONLINE, "cost": _COST},
+    "chsel": {
+        "descent": _DESCENT,
+        "online": _ONLINE,
+        "cost": _COST,
+        "emitter": {"iterations": 12},
+        "archive": {"bins": 6},
+    },
+}
+
+
+def registered_session(name: str, *, seed: int = 3) -> list[Event]:
+    """The events of two steps of a box, each registered by a method of METHODS."""
+    method = build_method(name, METHODS[name])
+    random = np.random.default_rng(seed)
+    mesh = trimesh.creation.box(_SIDES)
+    config = {"seed": seed, "method": {"name": name, **settings_mapping(method.settings)}}
+    start = SessionStarted(
+        runner="probe",
+        object="box",
+        session="points",
+        method=name,
+        seed=seed,
+        config=config,
+        mesh=mesh,
+        sdf=SdfGrid.from_mesh(mesh, 0.02, padding=0.03),
+        workspace=Workspace((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)),
+        free_resolution=0.02,
+        initial_points=KnownPoints(free=random.uniform(-0.2, 0.2, (6, 3))),
+        world_from_object=np.eye(4),
+        environment={"numpy": "2", "platform": "any"},
+    )
+    recorder = ListRecorder()
+    recorder.record(start)
+    points = start.initial_points
+    previous: Hypotheses | None = None
+    for step in range(2):
+        probe = _probe(random, step)
+        recorder.record(probe)
+        points = points.merged(probe.new_points)
+        problem = pose_problem(
+            start.sdf,
+            points,
+            start.workspace,
+            start.free_resolution,
+            StreamKey(seed, step),
+            method.online,
+            previous,
+        )
+        recorder.record(ProblemPosed(step, problem))
+        previous = method.register(problem, StepObserver(recorder, step, 6, lambda *_: None))
+        recorder.record(HypothesesFound(step, previous))
+        recorder.record(Measured(step, {"known_points": float(points.count)}))
+        recorder.record(Logged(step, "info", f"probe {step}: contact"))
+    recorder.record(SessionEnded(1, "finished"))
+    return recorder.events
+
+
+def write_recording(path: Path, events: Iterable[Event]) -> bytes:
+    """The bytes of a new recording of events, at a path."""
+    recorder = McapRecorder(path)
+    try:
+        for event in events:
+            recorder.record(event)
+            if isinstance(event, Logged):
+                recorder.flush()
+    finally:
+        recorder.close()
+    return path.read_bytes()
+
+
+def _probe(random: np.random.Generator, step: int) -> Probe:
+    surface = random.uniform(-0.5, 0.5, (5, 3)) * _SIDES
+    surface[:, step] = 0.5 * _SIDES[step]
+    normals = np.zeros((5, 3))
+    normals[:, step] = 1.0
+    new = KnownPoints(
+        free=random.uniform(-0.2, 0.2, (4, 3)),
+        occupied=np.zeros((1, 3)),
+        known=np.concatenate([surface, surface + 0.01 * normals]),
+        known_sdf=np.repeat([0.0, 0.01], 5),
+    )
+    return Probe(step, "contact", new, np.eye(4)[None].repeat(2, axis=0), surface, normals)

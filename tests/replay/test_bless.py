@@ -1,0 +1,94 @@
+"""`replay bless`: today's results become the expected ones, if wanted."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chsel import online
+from replay.__main__ import main
+from replay.mcap.reader import read_recording
+
+REPLAYS = Path(__file__).resolve().parents[1] / "replays"
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    return Path(shutil.copy(REPLAYS / "cracker_box_gradient_descent.mcap", tmp_path / "box.mcap"))
+
+
+@pytest.fixture
+def other_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Code that draws the noise of E_0 otherwise."""
+    drawn = online.normals
+    monkeypatch.setattr(online, "normals", lambda stream, shape: -drawn(stream, shape))
+
+
+def test_nothing_changes_where_all_bits_are_equal(
+    stored: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = stored.read_bytes()
+    assert main(["bless", str(stored), "--yes"]) == 0
+    assert "all 4 results are as recorded, nothing to change" in capsys.readouterr().out
+    assert stored.read_bytes() == before
+    assert list(stored.parent.iterdir()) == [stored]
+
+
+@pytest.mark.usefixtures("other_code")
+def test_todays_results_are_those_that_verify_then_expects(
+    stored: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = read_recording(stored)
+    assert main(["verify", str(stored)]) == 1
+    assert main(["bless", str(stored), "--yes"]) == 0
+    shown = capsys.readouterr().out
+    assert "3 of 4 results change" in shown  # the first E_0 has no noise
+    assert "best cost" in shown
+    assert main(["verify", str(stored)]) == 0
+    blessed = read_recording(stored)
+    assert blessed.steps == recorded.steps
+    assert blessed.hypotheses(8).digest == recorded.hypotheses(8).digest
+    assert blessed.hypotheses(9).digest != recorded.hypotheses(9).digest
+    for step in blessed.steps:
+        points = (blessed.problem(step).points, recorded.problem(step).points)
+        assert points[0].digest == points[1].digest
+    assert not np.array_equal(blessed.problem(9).initial_set, recorded.problem(9).initial_set)
+    assert list(stored.parent.iterdir()) == [stored]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.usefixtures("other_code")
+@pytest.mark.parametrize(("answer", "status"), [("n\n", 1), ("\n", 1), ("y\n", 0)])
+def test_it_asks(stored: Path, answer: str, status: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = stored.read_bytes()
+    monkeypatch.setattr(sys, "stdin", Terminal(answer))
+    assert main(["bless", str(stored)]) == status
+    assert (stored.read_bytes() == before) is (status == 1)
+    assert list(stored.parent.iterdir()) == [stored]
+
+
+def test_where_nobody_can_answer_nothing_is_done(
+    stored: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))
+    assert main(["bless", str(stored)]) == 2
+    assert capsys.readouterr().err == "error: nobody can be asked here; accepted: --yes\n"
+
+
+def test_a_broken_recording_is_left_alone(
+    tmp_path: Path, stored: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored.write_bytes(stored.read_bytes()[:-9])
+    before = stored.read_bytes()
+    assert main(["bless", str(stored), "--yes"]) == 2
+    assert stored.read_bytes() == before
+    assert "is unfinished" in capsys.readouterr().err

@@ -1,0 +1,358 @@
+"""`compare`: several methods on the recorded problems, under one cost."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from rerun.chunk import RrdReader
+
+from chsel.engine import CompiledCost
+from chsel.errors import EngineError, RecordingError, SettingError
+from chsel.methods import build_method
+from chsel.online import pose_problem
+from chsel.points import KnownPoints, Workspace
+from chsel.presets import COST
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.__main__ import main
+from replay.comparing.columns import COLUMNS
+from replay.comparing.comparison import common_cost, compared, medians, recorded_label
+from replay.comparing.contenders import contenders
+from replay.events import Probe, ProblemPosed, SessionEnded, SessionStarted
+from replay.mcap.reader import read_recording
+from replay.mcap.writer import McapRecorder
+from replay.registration import register_recorded
+
+SETTINGS = {
+    "cost": {"free_scale": 30.0},
+    "descent": {"restarts": 2, "iterations": 6},
+    "emitter": {"iterations": 12},
+    "archive": {"bins": 10},
+    "online": {"hypotheses": 6},
+}
+OFFSET = (0.02, 0.0, 0.15)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of three registrations of a box by small settings."""
+    path = tmp_path_factory.mktemp("compare") / "recording.mcap"
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    pose = np.eye(4)
+    pose[:3, 3] = OFFSET
+    random = np.random.default_rng(3)
+    method = build_method("chsel", SETTINGS)
+    start = SessionStarted(
+        runner="probe",
+        object="box",
+        session="points",
+        method="chsel",
+        seed=5,
+        config={
+            "method": {"name": "chsel", **dataclasses.asdict(method.settings)},
+            "preset": {"name": "default"},
+        },
+        mesh=mesh,
+        sdf=SdfGrid.from_mesh(mesh, 0.01, padding=0.03),
+        workspace=Workspace((-0.2, -0.2, 0.0), (0.2, 0.2, 0.3)),
+        free_resolution=0.01,
+        initial_points=KnownPoints(),
+        world_from_object=pose,
+    )
+    recorder = McapRecorder(path)
+    recorder.record(start)
+    points, previous = KnownPoints(), None
+    for step in range(3):
+        contacts = np.asarray(trimesh.sample.sample_surface(mesh, 4, seed=step)[0]) + OFFSET
+        free = random.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.11), (30, 3))
+        new = KnownPoints(free=free, known=contacts, known_sdf=np.zeros(4))
+        points = points.merged(new)
+        recorder.record(Probe(step, "contact", new))
+        problem = pose_problem(
+            start.sdf,
+            points,
+            start.workspace,
+            start.free_resolution,
+            StreamKey(start.seed, step),
+            method.online,
+            previous,
+        )
+        found = _Last(recorder)
+        register_recorded(ProblemPosed(step, problem), method, found, start.world_from_object)
+        previous = found.last.hypotheses
+    recorder.record(SessionEnded(2, "finished"))
+    recorder.close()
+    return path
+
+
+class _Last:
+    """Hands events on and keeps the last one with hypotheses."""
+
+    def __init__(self, recorder) -> None:
+        self._recorder = recorder
+
+    def record(self, event) -> None:
+        self._recorder.record(event)
+        if hasattr(event, "hypotheses"):
+            self.last = event
+
+
+def rows_of(text: str) -> dict[str, list[str]]:
+    """The cells of the table of medians, by label."""
+    cells = [
+        re.split(r"\s{2,}", line.strip()) for line in text.split("medians over")[1].split("\n")
+    ]
+    return {row[0]: row[1:] for row in cells if len(row) >= 8}
+
+
+def test_the_recorded_method_finds_the_recorded_bits_and_the_others_their_own(
+    path, capsys, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert main(["compare", str(path), "--methods", "chsel", "gradient_descent"]) == 0
+    out = capsys.readouterr().out
+    assert "chsel has the recorded settings: its 3 results are those recorded, to the bit" in out
+    assert "each step, costs of all by chsel's, as recorded" in out
+    rows = rows_of(out)
+    *recorded, no_time = rows["recorded: chsel"]
+    *again, time = rows["chsel"]
+    assert (again, no_time) == (recorded, "-")
+    assert float(time) > 0.0
+    assert rows["gradient_descent"][:-1] != recorded
+    costs = [read_recording(path).hypotheses(step).cost for step in range(3)]
+    assert recorded[0] == f"{np.median([cost[0] for cost in costs]):.3g}"
+    assert recorded[1] == f"{np.median([np.median(cost) for cost in costs]):.3g}"
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(None, "-"), (0.0123, "12.3"), (0.09994, "99.9"), (0.1234, "123"), (math.inf, "inf")],
+)
+def test_millimetres_are_shown_in_few_characters(value, shown):
+    column = next(c for c in COLUMNS if c.name == "best_position_error")
+    assert column.shown(value) == shown
+
+
+@pytest.mark.parametrize("columns", ["80", "120"])
+def test_tables_fit_the_terminal(path, capsys, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    main(["compare", str(path), "--methods", "gradient_descent", "chsel_cma_me"])
+    lines = capsys.readouterr().out.split("\n")
+    assert max(map(len, lines)) <= int(columns)
+    assert sum("gradient_descent  " in line for line in lines) == 4  # nowhere broken in two
+
+
+def test_all_sets_are_judged_by_the_recorded_cost(path):
+    recording = read_recording(path)
+    cost = common_cost(recording)
+    assert cost.settings == dataclasses.replace(COST["default"], free_scale=30.0)
+    methods = contenders(recording, ["chsel", "chsel@reference"])
+    outcomes = list(compared(recording, methods, recording.steps, cost))
+    assert [o.step for o in outcomes] == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert [o.label for o in outcomes[:3]] == [
+        recorded_label(recording),
+        "chsel",
+        "chsel@reference",
+    ]
+    for outcome in outcomes:
+        problem = recording.problem(outcome.step)
+        poses = outcome.hypotheses.object_from_world
+        costs = CompiledCost.of(problem, cost.settings).evaluate(poses)
+        best = np.argmin(costs)
+        assert outcome.numbers["best_cost"] == costs[best]
+        assert outcome.numbers["median_cost"] == np.median(costs)
+        assert outcome.numbers["hypotheses"] == len(poses)
+        inverse = np.linalg.inv(poses)
+        errors = np.linalg.norm(inverse[:, :3, 3] - OFFSET, axis=1)
+        assert outcome.numbers["best_position_error"] == pytest.approx(errors[best], abs=1e-12)
+        assert outcome.numbers["closest_position_error"] == pytest.approx(errors.min(), abs=1e-12)
+        angle = np.arccos(np.clip((np.trace(inverse[best, :3, :3]) - 1) / 2, -1, 1))
+        assert outcome.numbers["best_rotation_error"] == pytest.approx(angle, abs=1e-6)
+    own = [o for o in outcomes if o.label == "chsel@reference"]
+    assert any(o.numbers["best_cost"] != o.hypotheses.cost[0] for o in own)
+    assert {o.as_recorded for o in outcomes if o.label == "chsel"} == {True}
+    assert {o.as_recorded for o in outcomes if o.label != "chsel"} == {None}
+    for name, value in medians(own).items():
+        assert value == np.median([o.numbers[name] for o in own])
+
+
+def test_another_result_than_recorded_is_told(path, capsys, monkeypatch):
+    recording = read_recording(path)
+    registered = type(build_method("chsel")).register
+
+    def later(self, problem, observer=None):
+        found = registered(self, problem, observer)
+        if problem.key.step != 1:
+            return found
+        return dataclasses.replace(found, cost=np.nextafter(found.cost, 1e9))
+
+    monkeypatch.setattr(type(build_method("chsel")), "register", later)
+    assert main(["compare", str(path), "--methods", "chsel"]) == 0
+    assert "1 of 3 results are not those recorded, at step 1 (verify" in capsys.readouterr().out
+    methods = contenders(recording, ["chsel"])
+    found = compared(recording, methods, recording.steps, common_cost(recording))
+    assert [o.as_recorded for o in found if o.label == "chsel"] == [True, False, True]
+
+
+def test_changes_reach_the_methods_that_have_the_setting(path):
+    recording = read_recording(path)
+    labels = ["chsel", "chsel@paper", "chsel#two", "gradient_descent"]
+    changes = ["emitter.iterations=20", "cost.known_scale=2", "chsel#two:archive.bins=7"]
+    found = {c.label: c for c in contenders(recording, labels, changes)}
+    assert [c.changes for c in found.values()] == [
+        ("emitter.iterations=20", "cost.known_scale=2"),
+        ("emitter.iterations=20", "cost.known_scale=2"),
+        ("emitter.iterations=20", "cost.known_scale=2", "archive.bins=7"),
+        ("cost.known_scale=2",),
+    ]
+    settings = {label: c.named.method.settings for label, c in found.items()}
+    assert {s.cost.known_scale for s in settings.values()} == {2.0}
+    assert settings["chsel#two"].archive.bins == 7
+    assert settings["chsel"].archive.bins == 10  # as recorded
+    assert settings["chsel@paper"].archive.bins == 40
+    assert settings["chsel@paper"].cost.lookup == "nearest"
+    assert settings["gradient_descent"].descent.iterations == 50  # of the recording's preset
+    assert not any(c.as_recorded for c in found.values())
+    assert contenders(recording, ["chsel"], ["emitter.iterations=12"])[0].as_recorded
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["icp"], "method is 'icp'; accepted: chsel, "),
+        (["chsel@best"], "preset is 'best'; accepted: default, paper, reference"),
+        (["chsel", "chsel"], "chsel is named twice; accepted: NAME, NAME@PRESET"),
+        (["chsel#"], "'chsel#' is no method"),
+        (["chsel", "emitter.iteration=3"], "did you mean emitter.iterations?"),
+        (["gradient_descent", "emitter.iterations=3"], "does not exist in gradient_descent"),
+        (["chsel", "paper:passes=3"], "names no method here; accepted: chsel"),
+        (["chsel", "gradient_descent", "gradient_descent:passes=3"], "exist in gradient_descent"),
+        (["chsel", "passes=many"], "chsel: method.passes is 'many'; accepted: an integer"),
+        (["chsel", "=3"], "'=3' is no setting; accepted: KEY=VALUE"),
+        (["passes=3"], "no method is named; accepted: chsel, "),
+    ],
+)
+def test_what_is_no_method_or_setting_is_named(path, words, message):
+    with pytest.raises(SettingError, match=re.escape(message)):
+        contenders(
+            read_recording(path),
+            [word for word in words if "=" not in word],
+            [word for word in words if "=" in word],
+        )
+
+
+def test_everything_is_saved(path, tmp_path, capsys):
+    saved = {name: tmp_path / f"out.{name}" for name in ("csv", "png", "rrd")}
+    methods = ["--methods", "chsel", "gradient_descent", "descent.iterations=4"]
+    outputs = ["--save-csv", "csv", "--save-plot", "png", "--save-rerun", "rrd"]
+    outputs = [str(saved.get(word, word)) for word in outputs]
+    assert main(["compare", str(path), *methods, "--steps", "1..", *outputs]) == 0
+    assert capsys.readouterr().out.count("written: ") == 3
+    with saved["csv"].open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["step"], row["label"]) for row in rows] == [
+        (step, label) for step in "12" for label in ("recorded: chsel", "chsel", "gradient_descent")
+    ]
+    recording = read_recording(path)
+    first = recording.hypotheses(1)
+    assert float(rows[0]["best_cost"]) == first.cost[0]
+    assert float(rows[0]["median_cost"]) == np.median(first.cost)
+    assert float(rows[0]["best_position_error_m"]) < 0.5
+    assert float(rows[0]["best_rotation_error_rad"]) <= math.pi
+    assert rows[0]["seconds_s"] == ""
+    assert 0.0 < float(rows[1]["seconds_s"]) < 60.0
+    assert {row["method"] for row in rows} == {"chsel", "gradient_descent"}
+    assert [row["changes"] for row in rows[:2]] == ["", "descent.iterations=4"]
+    assert saved["png"].read_bytes().startswith(b"\x89PNG")
+    assert len(list(RrdReader(saved["rrd"]).stream())) > 3
+    again = ["compare", str(path), *methods, "--save-csv", str(saved["csv"])]
+    content = saved["csv"].read_bytes()
+    assert main(again) == 2
+    assert "out.csv exists; accepted: a new file" in capsys.readouterr().err
+    assert saved["csv"].read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--save-plot", "out.jpg"], "out.jpg is no name of a picture; accepted: *.png, *.svg"),
+        (["--save-plot", "nowhere/out.png"], "nowhere is no folder"),
+        (["--save-plot", "out.png", "--save-csv", "out.png"], "out.png is named twice"),
+        (["--threads", "0"], "--threads is 0; accepted: at least 1"),
+        (["--steps", "7"], "there is no step 7; accepted: 0, 1, 2"),
+    ],
+)
+def test_what_cannot_work_is_told_before_any_work(
+    path, tmp_path, monkeypatch, capsys, words, message
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("replay.comparing.comparison.register_recorded", None)
+    assert main(["compare", str(path), "--methods", "chsel", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_recording_is_told_if_it_has_no_problem(make_events, write, capsys):
+    start = write(make_events()[:1])
+    assert main(["compare", str(start), "--methods", "gradient_descent"]) == 2
+    assert "has no registration problem to compare on" in capsys.readouterr().err
+
+
+def test_a_method_that_fails_leaves_the_others_alone(path, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    registered = type(build_method("gradient_descent")).register
+
+    def failing(self, problem, observer=None):
+        if problem.key.step == 1:
+            raise EngineError("no luck at step 1")
+        return registered(self, problem, observer)
+
+    monkeypatch.setattr(type(build_method("gradient_descent")), "register", failing)
+    out = tmp_path / "out.csv"
+    arguments = ["--methods", "gradient_descent", "chsel", "--save-csv", str(out)]
+    assert main(["compare", str(path), *arguments]) == 1
+    said = capsys.readouterr().out
+    assert "step 1, gradient_descent: no luck at step 1" in said
+    assert rows_of(said)["gradient_descent"][0] == "2"
+    assert rows_of(said)["chsel"][0] == "3"
+    with out.open(newline="") as file:
+        rows = {(row["step"], row["label"]): row for row in csv.DictReader(file)}
+    assert rows["1", "gradient_descent"]["failure"] == "no luck at step 1"
+    assert rows["1", "gradient_descent"]["best_cost"] == ""
+    assert rows["2", "gradient_descent"]["failure"] == ""
+    assert rows["1", "chsel"]["bits_as_recorded"] == "yes"
+
+
+def test_a_recording_that_tells_no_method_is_judged_by_the_default_preset(make_events, write):
+    recording = read_recording(write(make_events()))
+    cost = common_cost(recording)
+    assert (cost.settings, cost.name) == (COST["default"], "preset default")
+    with pytest.raises(RecordingError, match="does not tell the settings of chsel"):
+        contenders(recording, ["chsel"])
+    methods = contenders(recording, ["gradient_descent"], ["descent.iterations=2"])
+    found = list(compared(recording, methods, (2,), cost))
+    assert [o.failure for o in found] == ["", ""]
+    assert found[1].numbers["hypotheses"] == 5.0
+
+
+def test_svg_and_pdf_are_the_same_file_each_time(path, tmp_path):
+    from replay.comparing.plot import write_plot
+
+    recording = read_recording(path)
+    outcomes = list(compared(recording, (), recording.steps, common_cost(recording)))
+    infinite = dict(outcomes[0].numbers) | {"best_cost": math.inf, "median_cost": 0.0}
+    outcomes[0] = dataclasses.replace(outcomes[0], numbers=infinite)
+    for suffix, head in ((".svg", b"<?xml"), (".pdf", b"%PDF")):
+        names = [tmp_path / f"{index}{suffix}" for index in range(2)]
+        for name in names:
+            write_plot(name, outcomes, "title")
+        first, second = (name.read_bytes() for name in names)
+        assert first.startswith(head)
+        assert first == second

@@ -1,0 +1,255 @@
+"""What is exported is what was recorded, to the bit, and other programs can read it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from chsel.errors import RecordingError, SettingError
+from chsel.points import KnownPoints
+from chsel.pose import inverse
+from replay import export
+from replay.__main__ import main
+from replay.events import HypothesesFound, Probe, SnapshotTaken
+from replay.export_content import EXPORTS, exported_archive
+from replay.mcap.reader import read_recording
+from runners.sessions.points import PointsSession, PointsSettings
+
+
+@pytest.fixture
+def recording(events, write):
+    """Three probes, two registrations, an archive of two snapshots in each."""
+    return read_recording(write(events))
+
+
+def exported(recording, tmp_path: Path, what: str, file_format: str, *more: str) -> Path:
+    """The file that the command writes."""
+    path = tmp_path / f"out.{file_format}"
+    path.unlink(missing_ok=True)
+    assert main(["export", str(recording.path), "--what", what, "-o", str(path), *more]) == 0
+    return path
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def arrays(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def standard_json(path: Path) -> Any:
+    def refuse(name: str):
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def same_bits(left, right) -> bool:
+    left, right = np.asarray(left), np.asarray(right)
+    equal = left.dtype == right.dtype and left.shape == right.shape
+    return equal and left.tobytes() == right.tobytes()
+
+
+@pytest.mark.parametrize("file_format", ["npz", "csv"])
+def test_a_points_session_on_exported_points_has_the_recorded_problems(
+    recording, tmp_path, file_format
+):
+    path = exported(recording, tmp_path, "points", file_format)
+    workspace = tuple(zip(*recording.start.workspace.bounds.tolist(), strict=True))
+    session = PointsSession(PointsSettings(str(path), workspace), None)
+    assert session.workspace == recording.start.workspace
+    points, steps = KnownPoints(), []
+    for probe, original in zip(session.probes(), recording.probes, strict=True):
+        points = points.merged(probe.new_points)
+        steps.append(probe.step)
+        if probe.step in recording.steps:
+            assert points.digest == recording.problem(probe.step).points.digest
+            assert same_bits(probe.new_points.known, original.new_points.known)
+    assert steps == [0, 1, 2]
+    if file_format == "npz":
+        truth = recording.start.world_from_object
+        np.testing.assert_allclose(session.world_from_object, truth, rtol=0, atol=1e-15)
+
+
+def test_points_of_single_steps_are_those_that_came_with_them(recording, tmp_path):
+    path = exported(recording, tmp_path, "points", "npz", "--steps", "1..")
+    new = [probe.new_points for probe in recording.probes]
+    found = arrays(path)
+    assert same_bits(found["free"], np.concatenate([new[1].free, new[2].free]))
+    assert found["free_step"].tolist() == [1] * 40 + [2] * 40
+    assert found["known_sdf"].tolist() == [0.0, 0.01, 0.0, 0.0, 0.01, 0.01]
+    assert same_bits(found["world_from_object"], recording.start.world_from_object)
+    document = standard_json(exported(recording, tmp_path, "points", "json", "--steps", "1.."))
+    assert same_bits(document["free"], found["free"])
+    assert document["known_step"] == [1, 1, 2, 2, 2, 2]
+
+
+def test_hypotheses_are_the_recorded_ones(recording, events, tmp_path):
+    written = {e.step: e.hypotheses for e in events if isinstance(e, HypothesesFound)}
+    found = arrays(exported(recording, tmp_path, "hypotheses", "npz"))
+    document = standard_json(exported(recording, tmp_path, "hypotheses", "json"))
+    rows = table(exported(recording, tmp_path, "hypotheses", "csv"))
+    assert found["steps"].tolist() == [1, 2]
+    assert same_bits(found["true_world_from_object"], recording.start.world_from_object)
+    assert [(int(row["step"]), int(row["rank"])) for row in rows] == [
+        (step, rank) for step in (1, 2) for rank in range(5)
+    ]
+    for entry, (step, hypotheses) in zip(document["steps"], written.items(), strict=True):
+        for name in ("object_from_world", "cost", "duplicate", "cell"):
+            assert same_bits(found[f"step_{step}/{name}"], getattr(hypotheses, name))
+            assert same_bits(entry[name], getattr(hypotheses, name))
+        of_step = [row for row in rows if row["step"] == str(step)]
+        matrices = [[float(row[f"m{i // 4}{i % 4}"]) for i in range(16)] for row in of_step]
+        assert same_bits(np.reshape(matrices, (-1, 4, 4)), hypotheses.object_from_world)
+        assert [float(row["cost"]) for row in of_step] == hypotheses.cost.tolist()
+        assert [row["duplicate"] for row in of_step] == ["0", "0", "1", "0", "1"]
+        assert [int(row["cell"]) for row in of_step] == [3, -1, 5, 1599, 0]
+
+
+def test_positions_and_quaternions_turn_the_object_into_the_world(recording, tmp_path):
+    rows = table(exported(recording, tmp_path, "hypotheses", "csv", "--steps", "2"))
+    world_from_object = inverse(recording.hypotheses(2).object_from_world)
+    for row, pose in zip(rows, world_from_object, strict=True):
+        assert [float(row[name]) for name in "xyz"] == pose[:3, 3].tolist()
+        x, y, z, w = (float(row[name]) for name in ("qx", "qy", "qz", "qw"))
+        vector = np.array([x, y, z])
+        for axis in np.eye(3):  # v' = v + 2 q x (q x v + w v)
+            turned = axis + 2 * np.cross(vector, np.cross(vector, axis) + w * axis)
+            np.testing.assert_allclose(turned, pose[:3, :3] @ axis, atol=1e-14)
+
+
+def test_archives_are_the_recorded_ones(recording, events, tmp_path):
+    taken = [e.archive for e in events if isinstance(e, SnapshotTaken)]
+    assert len(taken) == 4
+    found = arrays(exported(recording, tmp_path, "archive", "npz"))
+    document = standard_json(exported(recording, tmp_path, "archive", "json"))["snapshots"]
+    names = [(step, index) for step in (1, 2) for index in (0, 1)]
+    assert [(entry["step"], entry["snapshot"]) for entry in document] == names
+    for (step, index), archive, entry in zip(names, taken, document, strict=True):
+        for name in ("cells", "objectives", "measures", "solutions", "lower", "upper"):
+            stored = found[f"step_{step}/snapshot_{index}/{name}"]
+            assert same_bits(stored, getattr(archive, name))
+            assert same_bits(entry[name], getattr(archive, name))
+        assert entry["iteration"] == archive.iteration == 10 * index
+        assert entry["measure_names"] == ["x (m)", "y (m)"]
+        assert found[f"step_{step}/snapshot_{index}/shape"].tolist() == [40, 40]
+    rows = table(exported(recording, tmp_path, "archive", "csv"))
+    assert len(rows) == 4 * 12
+    flat = [[float(row[f"solution_{i}"]) for i in range(9)] for row in rows]
+    assert same_bits(flat, np.concatenate([archive.solutions for archive in taken]))
+    pairs = [[float(row["measure_0"]), float(row["measure_1"])] for row in rows]
+    assert same_bits(pairs, np.concatenate([archive.measures for archive in taken]))
+
+
+def test_last_archives_are_those_of_the_results(recording, tmp_path):
+    found = arrays(exported(recording, tmp_path, "archive", "npz", "--last"))
+    for step in (1, 2):
+        archive = recording.hypotheses(step).archive
+        assert same_bits(found[f"step_{step}/snapshot_0/solutions"], archive.solutions)
+    assert not any("snapshot_1" in name for name in found)
+
+
+def test_an_archive_that_is_no_snapshot_is_exported_too(make_events, write):
+    events = [e for e in make_events() if not isinstance(e, SnapshotTaken)]
+    recording = read_recording(write(events))
+    document = exported_archive(recording, None).document["snapshots"]
+    assert [(entry["step"], entry["snapshot"]) for entry in document] == [(1, 0), (2, 0)]
+    assert same_bits(document[1]["cells"], recording.hypotheses(2).archive.cells)
+
+
+def test_metrics_are_all_recorded_numbers(recording, tmp_path):
+    rows = table(exported(recording, tmp_path, "metrics", "csv"))
+    values = {(int(r["step"]), r["source"], r["name"]): float(r["value"]) for r in rows}
+    assert len(values) == len(rows) == 3 * 4 + 2 * (3 + 1 + 2)
+    assert values[0, "contents", "free"] == 80.0
+    assert values[2, "contents", "contacts"] == 3.0
+    assert (0, "contents", "best_cost") not in values
+    assert values[2, "contents", "best_cost"] == recording.hypotheses(2).cost[0]
+    assert str(values[1, "measured", "best_cost"]) == "-0.0"
+    assert np.isnan(values[1, "measured", "coverage_mm2"])
+    document = standard_json(exported(recording, tmp_path, "metrics", "json"))
+    undefined = [row for row in document if row["value"] is None]
+    assert [row["name"] for row in undefined] == ["coverage_mm2"] * 2
+    found = arrays(exported(recording, tmp_path, "metrics", "npz", "--steps", "2"))
+    assert set(found["step"].tolist()) == {2}
+    assert "timed" in found["source"].tolist()
+    assert found["value"].dtype == np.float64
+
+
+@pytest.mark.parametrize("what", EXPORTS)
+def test_every_recording_can_be_exported(any_events, write, tmp_path, what):
+    recording = read_recording(write(any_events))
+    for file_format in ("npz", "csv", "json"):
+        path = exported(recording, tmp_path, what, file_format)
+        if file_format == "npz":
+            assert all(array.dtype != object for array in arrays(path).values())
+        elif file_format == "json":
+            standard_json(path)
+        else:
+            table(path)
+
+
+def test_points_stand_in_the_order_of_the_probes(any_events, write, tmp_path):
+    recording = read_recording(write(any_events))
+    found = arrays(exported(recording, tmp_path, "points", "npz"))
+    events = [any_events[0].initial_points]
+    events += [e.new_points for e in any_events if isinstance(e, Probe)]
+    for name in ("free", "occupied", "known"):
+        assert same_bits(found[name], np.concatenate([getattr(new, name) for new in events]))
+
+
+def test_the_file_is_named_after_the_recording(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(recording.path), "--what", "metrics", "--format", "csv"]) == 0
+    name = f"{recording.path.stem}_metrics.csv"
+    assert (
+        (tmp_path / name).read_text().startswith("step,source,name,value\n0,contents,free,80.0\n")
+    )
+    assert capsys.readouterr().out.startswith(f"{name}  ")
+
+
+def test_no_file_is_overwritten(recording, tmp_path, capsys):
+    path = tmp_path / "mine.csv"
+    path.write_text("mine")
+    words = ["export", str(recording.path), "--what", "points", "-o"]
+    assert main([*words, str(path)]) == 2
+    assert "mine.csv exists; accepted: the name of a new file" in capsys.readouterr().err
+    assert path.read_text() == "mine"
+    before = recording.path.read_bytes()
+    assert main([*words, str(recording.path)]) == 2
+    assert recording.path.read_bytes() == before
+    assert main([*words, str(tmp_path / "no" / "folder.csv")]) == 2
+    assert "no does not exist; accepted: a file in one" in capsys.readouterr().err
+
+
+def test_nothing_is_left_of_a_file_that_cannot_be_finished(recording, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(export, "_write_json", full)
+    content = EXPORTS["points"](recording, None)
+    with pytest.raises(RecordingError, match=r"out\.json cannot be written: No space left"):
+        export.write_export(content, tmp_path / "out.json", "json")
+    assert [file.suffix for file in tmp_path.iterdir()] == [".mcap"]
+
+
+def test_what_does_not_fit_is_named(recording, tmp_path, capsys):
+    words = ["export", str(recording.path), "--what"]
+    for more, message in {
+        ("points", "--last"): "--last does not go with points; accepted: --what archive",
+        ("points", "--format", "csv", "-o", "a.npz"): "--format is csv and a.npz ends in npz",
+        ("hypotheses", "--steps", "0"): "there is no step 0; accepted: 1, 2",
+        ("archive", "--steps", "x"): "'x' names no steps",
+    }.items():
+        assert main([*words, *more]) == 2
+        assert message in capsys.readouterr().err
+    with pytest.raises(SettingError, match="there is no step 3"):
+        EXPORTS["metrics"](recording, "3")

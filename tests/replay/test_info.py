@@ -1,0 +1,345 @@
+"""What `info` tells of a recording, from how little, and of what kind of file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Statistics
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from chsel.errors import RecordingError
+from replay.__main__ import main
+from replay.events import Event, HypothesesFound, Probe, ProblemPosed
+from replay.mcap.index import McapIndex
+from replay.mcap.writer import McapRecorder
+from replay.recording_info import recording_info
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+ROW = r"(?m)^ +(\d+) +\d+ +\d+ +\d+ +\d+ "  # of the table of steps
+
+
+@pytest.fixture
+def write_steps(tmp_path: Path) -> Callable[[list[Event]], Path]:
+    """Records events as a run does: with a chunk for every step."""
+
+    def record(events: list[Event]) -> Path:
+        path = tmp_path / f"steps{len(list(tmp_path.iterdir()))}.mcap"
+        recorder = McapRecorder(path)
+        for event in events:
+            if isinstance(event, Probe):
+                recorder.flush()
+            recorder.record(event)
+        recorder.close()
+        return path
+
+    return record
+
+
+def strict_json(text: str):
+    """The values of standard JSON."""
+
+    def refuse(name: str):
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_info_tells_what_the_session_was(events, write_steps):
+    path = write_steps(events)
+    info = recording_info(path)
+    assert info.session["object"] == "Bohrmaschine ½″ 电钻"
+    assert info.session["seed"] == 2**64 - 1
+    assert info.session["environment"]["torch"] == "2.13.0"
+    assert info.session["config"] == {
+        "object": {"name": "电钻", "scale": 1.5},
+        "flags": [True, None, -1, 1e-300],
+    }
+    assert (info.size, info.outcome, info.registrations) == (path.stat().st_size, "finished", 2)
+    assert [step["step"] for step in info.steps] == [0, 1, 2]
+    assert [step["free"] for step in info.steps] == [80, 120, 160]
+    assert [step["occupied"] for step in info.steps] == [2, 4, 6]
+    assert [step["known"] for step in info.steps] == [0, 2, 6]
+    assert [step["contacts"] for step in info.steps] == [0, 1, 3]
+    assert [step["posed"] for step in info.steps] == [False, True, True]
+    assert [step["hypotheses"] for step in info.steps] == [-1, 5, 5]
+    assert [step["distinct"] for step in info.steps] == [-1, 3, 3]
+    found = [event for event in events if hasattr(event, "hypotheses")]
+    best = [event.hypotheses.cost[0] for event in found]
+    assert [step["best_cost"] for step in info.steps[1:]] == best
+    assert not info.checked
+    assert info.damage is None
+
+
+def test_the_index_tells_what_reading_everything_tells(any_events, write_steps):
+    path = write_steps(any_events)
+    quick, thorough = recording_info(path), recording_info(path, check=True)
+    assert quick.message_bytes is None
+    with path.open("rb") as file:
+        stored = [
+            (channel.topic, len(m.data)) for _, channel, m in make_reader(file).iter_messages()
+        ]
+    assert sum(thorough.message_bytes.values()) == sum(size for _, size in stored)
+    assert quick.messages == {
+        topic: sum(topic == name for name, _ in stored) for topic in {name for name, _ in stored}
+    }
+    tellers = [dict(info.plain()) for info in (quick, thorough)]
+    integrity = [teller.pop("integrity") for teller in tellers]
+    for teller in tellers:
+        del teller["message_bytes"]
+    assert tellers[0] == tellers[1]
+    assert [entry["checked"] for entry in integrity] == [False, True]
+    assert all(entry["whole"] for entry in integrity)
+
+
+def test_of_a_finished_file_the_middle_is_not_read(make_events, write_steps):
+    path = write_steps(make_events(steps=5))
+    with path.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[4]
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    whole = path.read_bytes()
+    path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    assert recording_info(path).damage is None
+    checked = recording_info(path, check=True)
+    assert checked.damage.startswith("damaged before byte")
+    assert 0 < len(checked.steps) < 5
+
+
+def test_what_is_whole_of_an_unfinished_file_is_told(events, write_steps, capsys):
+    path = write_steps(events)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    info = recording_info(path)
+    assert info.damage == "unfinished"
+    assert info.outcome is None
+    assert len(info.steps) < 3
+    assert main(["info", str(path)]) == 1
+    shown = capsys.readouterr().out
+    assert "unfinished; what is whole was read, and `recover` may save it" in shown
+    assert "the session did not end" in shown
+
+
+def summary_start(path: Path) -> int:
+    with path.open("rb") as file:
+        return (
+            make_reader(file).get_summary() and struct.unpack("<Q", path.read_bytes()[-28:-20])[0]
+        )
+
+
+def test_a_damaged_index_is_named(events, write_steps):
+    path = write_steps(events)
+    whole, start = path.read_bytes(), summary_start(path)
+    path.write_bytes(whole[: start + 20] + bytes([whole[start + 20] ^ 1]) + whole[start + 21 :])
+    info = recording_info(path)
+    assert info.damage == "damaged: the checksum of its summary is wrong"
+    assert [step["step"] for step in info.steps] == [0, 1, 2]
+
+
+def with_summary(path: Path, change: Callable[[object], object]) -> Path:
+    """A copy with other records in its index, and the right checksum."""
+    whole, start = path.read_bytes(), summary_start(path)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    records = RecordBuilder()
+    listed = [*summary.schemas.values(), *summary.channels.values(), summary.statistics]
+    for record in [*listed, *summary.chunk_indexes, *summary.attachment_indexes]:
+        change(record).write(records)
+    data = records.end()
+    crc = zlib.crc32(struct.pack("<BQQQ", 2, 20, start, 0), zlib.crc32(data))
+    Footer(summary_start=start, summary_offset_start=0, summary_crc=crc).write(records)
+    copy = path.with_suffix(".other.mcap")
+    copy.write_bytes(whole[:start] + data + records.end() + MCAP0_MAGIC)
+    return copy
+
+
+def test_an_index_that_tells_of_other_messages_is_found_out(events, write_steps):
+    def more(record):
+        if not isinstance(record, Statistics):
+            return record
+        counts = {n: count + (count == 3) for n, count in record.channel_message_counts.items()}
+        return dataclasses.replace(record, channel_message_counts=counts)
+
+    copy = with_summary(write_steps(events), more)
+    assert recording_info(copy).damage is None
+    assert "its index tells of 4 messages on /" in recording_info(copy, check=True).damage
+
+
+@pytest.mark.parametrize(
+    ("of", "lie", "message"),
+    [
+        (ChunkIndex, {"chunk_start_offset": 2**63}, "it should lie from byte"),
+        (ChunkIndex, {"chunk_start_offset": 2**40}, "it should lie from byte"),
+        (ChunkIndex, {"chunk_length": 2**63 - 10**6}, "it should lie from byte"),
+        (ChunkIndex, {"chunk_start_offset": 8}, "there is none at byte 8"),
+        (ChunkIndex, {"chunk_length": 3}, "has a damaged chunk"),
+        (ChunkIndex, {"message_index_offsets": {}}, "has 0 messages on /session"),
+        (ChunkIndex, {"message_index_offsets": {999: 0}}, "has a damaged chunk"),
+        (Statistics, {"channel_message_counts": {}}, "its statistics are missing"),
+        (Statistics, {"channel_message_counts": {999: 1}}, "name channels that do not exist"),
+        (Statistics, {"channel_message_counts": {1: 2}}, "has 1 messages on /session"),
+    ],
+)
+def test_an_index_that_leads_astray_is_left_for_the_file_itself(
+    events, write_steps, of, lie, message
+):
+    path = write_steps(events)
+    copy = with_summary(path, lambda r: dataclasses.replace(r, **lie) if isinstance(r, of) else r)
+    with pytest.raises(RecordingError, match=message):
+        McapIndex(copy).message("/session")
+    info = recording_info(copy)
+    assert info.checked
+    assert info.damage is None
+    assert info.steps[1:] == recording_info(path).steps[1:]
+
+
+def test_another_programs_index_is_not_used(tmp_path):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "")
+        channel = writer.register_channel("/session", "json", 0)
+        writer.add_message(channel, 0, b"{}", 0)
+        writer.finish()
+    with pytest.raises(RecordingError, match="its header is not that of profile chsel"):
+        McapIndex(path)
+    with pytest.raises(RecordingError, match="is another program's"):
+        recording_info(path)
+
+
+def test_a_problem_that_contradicts_the_points_is_found_by_checking(events, write, capsys):
+    posed = next(event for event in events if isinstance(event, ProblemPosed))
+    vars(posed.problem)["digest"] = "0" * 32
+    path = write(events)
+    assert recording_info(path).damage is None
+    assert "the problem of step 1 has digest" in recording_info(path, check=True).damage
+    assert main(["info", str(path), "--check"]) == 1
+    assert "the problem of step 1 has digest" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_problem_without_a_result_counts_as_no_registration(events, write, capsys):
+    cut = [e for e in events if not (isinstance(e, HypothesesFound) and e.step == 2)]
+    path = write(cut)
+    assert recording_info(path).registrations == 1
+    assert main(["info", str(path)]) == 0
+    assert "no result" in capsys.readouterr().out
+
+
+def test_a_chunk_that_lies_about_its_size_is_not_unpacked(tmp_path):
+    zeros = bytes(2000)
+    packed = zstandard.ZstdCompressor().compress(zeros)
+    records = RecordBuilder()
+    Header("chsel", "").write(records)
+    Chunk("zstd", packed, 0, 0, zlib.crc32(zeros), 2**40).write(records)
+    data = MCAP0_MAGIC + records.end()
+    start = data.index(packed) - 53
+    assert data[start] == 6  # the chunk's opcode
+    Channel(1, "/session", "protobuf", {}, 0).write(records)
+    Statistics(0, 1, {1: 1}, 1, 1, 0, 0, 0, 0).write(records)
+    ChunkIndex(len(data) - start, start, "zstd", len(packed), 0, 0, {1: 0}, 0, 2**40).write(records)
+    summary = records.end()
+    crc = zlib.crc32(struct.pack("<BQQQ", 2, 20, len(data), 0), zlib.crc32(summary))
+    Footer(len(data), 0, crc).write(records)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(data + summary + records.end() + MCAP0_MAGIC)
+    with pytest.raises(RecordingError, match=f"a chunk claims {2**40} bytes"):
+        McapIndex(path).message("/session")
+
+
+def test_flipped_bits_and_cuts_give_an_error_or_an_answer(events, write):
+    path = write(events)
+    whole = path.read_bytes()
+    random = np.random.default_rng(3)
+    told = 0
+    for position in random.integers(0, len(whole), 150).tolist():
+        flipped = bytes([whole[position] ^ (1 << int(random.integers(8)))])
+        for data in (whole[:position] + flipped + whole[position + 1 :], whole[:position]):
+            path.write_bytes(data)
+            try:
+                info = recording_info(path)
+            except RecordingError:
+                continue
+            told += 1
+            assert info.session["object"] == "Bohrmaschine ½″ 电钻"
+            assert [step["free"] for step in info.steps] == [80, 120, 160][: len(info.steps)]
+    assert told > 30
+
+
+def test_json_is_standard_and_a_list_of_several(events, write, tmp_path, capsys):
+    path = write(events)
+    assert main(["info", str(path), "--json"]) == 0
+    single = strict_json(capsys.readouterr().out)
+    assert single["steps"][0]["best_cost"] is None
+    assert single["integrity"] == {"whole": True, "checked": False, "damage": None}
+    other = tmp_path / "other.mcap"
+    other.write_bytes(b"no recording")
+    assert main(["info", str(path), str(other), "--json", "--check"]) == 2
+    shown = capsys.readouterr()
+    several = strict_json(shown.out)
+    assert several[0]["message_bytes"]["/contents"] > 0
+    assert "is no MCAP file; accepted: " in several[1]["error"]
+    assert shown.err.startswith("error: recording")
+    assert shown.err.count("\n") == 1
+
+
+def test_of_many_files_each_is_a_line(events, write, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    paths = [str(write(events)) for _ in range(4)]
+    cut = Path(paths[-1])
+    cut.write_bytes(cut.read_bytes()[:-1])
+    assert main(["info", *paths]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("whole" in line for line in lines) == 3
+    assert sum("unfinished" in line for line in lines) == 1
+    assert all("best cost" not in line for line in lines)
+
+
+def test_of_many_steps_the_first_and_last_are_shown(make_events, write, capsys):
+    path = str(write(make_events(steps=20, elites=1, free=1)))
+    assert main(["info", path]) == 0
+    few = capsys.readouterr().out
+    assert "10 more steps (--steps shows all)" in few
+    assert main(["info", path, "--steps"]) == 0
+    every = capsys.readouterr().out
+    assert "more steps" not in every
+    shown = [[int(row[1]) for row in re.finditer(ROW, text)] for text in (few, every)]
+    assert shown == [[0, 1, 2, 3, 4, 15, 16, 17, 18, 19], list(range(20))]
+
+
+def test_files_that_cannot_be_used_are_named(tmp_path, capsys):
+    assert main(["info", str(tmp_path / "nowhere.mcap")]) == 2
+    assert "nowhere.mcap does not exist; accepted: " in capsys.readouterr().err
+    assert main(["info", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+
+
+def test_a_finished_recording_is_told_of_without_the_numerics(events, write):
+    """Importing them takes longer than all the rest."""
+    code = (
+        "import sys, types\n"
+        "package = types.ModuleType('chsel')\n"  # without its __init__
+        "package.__path__ = [sys.argv[1] + '/chsel']\n"
+        "sys.modules['chsel'] = package\n"
+        "from replay.__main__ import main\n"
+        "assert main(['info', sys.argv[2]]) == 0\n"
+        "print('heavy:', [name for name in ('torch', 'trimesh', 'scipy') if name in sys.modules])\n"
+    )
+    path = write(events)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(REPOSITORY), str(path)],
+        capture_output=True,
+        text=True,
+        cwd=REPOSITORY,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "heavy: []"

@@ -1,0 +1,151 @@
+"""A change of the code, planted into a copy of it, turns the stored replays red at its stage."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+REPLAYS = REPOSITORY / "tests" / "replays"
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A line of the code that becomes another, and the stage that `verify` must name first."""
+
+    file: str
+    line: str
+    planted: str
+    recording: str
+    stage: str
+
+
+PLANTS = {
+    "nothing": Plant(
+        "chsel/selection.py", "def select_elites(", "def select_elites(", "cracker_box_chsel", ""
+    ),
+    "a constant of the cost": Plant(
+        "chsel/kernels/cost.py",
+        "value = model.known_scale * excess",
+        "value = 1.0000000000001 * model.known_scale * excess",
+        "points_exact_descent",
+        "descent, iteration 0",
+    ),
+    "the order of a sum": Plant(
+        "chsel/kernels/cost.py",
+        "def _with_known(sums, model, pose, places):  # type: ignore[no-untyped-def]\n"
+        '    """sum |s - v|, with gradient (s - v) n, over points of known signed distance '
+        '(Eq. 10)."""\n'
+        "    field, table = model.field, model.field.table\n"
+        "    xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
+        "    locate(pose, field.box, xs, ys, zs, places, len(xs))\n"
+        "    for n in range(len(xs)):\n",
+        "def _with_known(sums, model, pose, places):\n"
+        "    field, table = model.field, model.field.table\n"
+        "    xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
+        "    locate(pose, field.box, xs, ys, zs, places, len(xs))\n"
+        "    for n in range(len(xs) - 1, -1, -1):\n",
+        "points_exact_descent",
+        "descent, iteration 0",
+    ),
+    "the draws of the search": Plant(
+        "chsel/emitters.py",
+        "self.key.stream(Purpose.EMITTER, self.refinement)",
+        "self.key.stream(Purpose.EMITTER, self.refinement + 1)",
+        "cracker_box_chsel",
+        "cma_mega, iteration 10",
+    ),
+    "one draw of E_0": Plant(
+        "chsel/online.py",
+        "shift = settings.translation_noise * normals(stream, (count, 3))",
+        "shift = settings.translation_noise * normals(stream, (count, 3))[::-1]",
+        "cracker_box_chsel",
+        "making E_0",
+    ),
+    "the range of the archive": Plant(
+        "chsel/selection.py",
+        "half = settings.range_sigmas * np.maximum(",
+        "half = (settings.range_sigmas + 1e-14) * np.maximum(",
+        "cracker_box_chsel",
+        "archive, iteration 0",
+    ),
+    "the choice of hypotheses": Plant(
+        "chsel/selection.py",
+        'order = np.argsort(costs, kind="stable")\n    good',
+        'order = np.argsort(costs, kind="stable")[1:]\n    good',
+        "cracker_box_chsel",
+        "choosing the hypotheses",
+    ),
+}
+
+
+RUN = """
+import importlib.util, sys
+class Planted:
+    def find_spec(self, name, path=None, target=None):
+        if name == sys.argv[1]:
+            return importlib.util.spec_from_file_location(name, sys.argv[2])
+sys.meta_path.insert(0, Planted())
+from replay.__main__ import main
+status = main(["verify", sys.argv[3]])
+assert sys.modules[sys.argv[1]].__file__ == sys.argv[2]
+sys.exit(status)
+"""
+
+
+def verified_with(plant: Plant, folder: Path) -> subprocess.CompletedProcess[str]:
+    """`replay verify` with a module of the code replaced; kernels are compiled anew for one."""
+    original = (REPOSITORY / plant.file).read_text()
+    assert original.count(plant.line) == 1
+    folder.mkdir()
+    planted = folder / Path(plant.file).name
+    planted.write_text(original.replace(plant.line, plant.planted))
+    module = plant.file.removesuffix(".py").replace("/", ".")
+    recording = REPLAYS / f"{plant.recording}.mcap"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    if "kernels" in plant.file:
+        environment["CHSEL_CACHE_DIR"] = str(folder)
+    return subprocess.run(
+        [sys.executable, "-c", RUN, module, str(planted), str(recording)],
+        cwd=REPOSITORY,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, subprocess.CompletedProcess[str]]:
+    """All plants verified, two at a time."""
+    folder = tmp_path_factory.mktemp("plants")
+    with ThreadPoolExecutor(2) as pool:
+        folders = [folder / str(index) for index in range(len(PLANTS))]
+        return dict(zip(PLANTS, pool.map(verified_with, PLANTS.values(), folders), strict=True))
+
+
+@pytest.mark.parametrize("name", [name for name, plant in PLANTS.items() if plant.stage])
+def test_a_planted_change_is_found_and_its_stage_named(
+    name: str, runs: dict[str, subprocess.CompletedProcess[str]]
+) -> None:
+    done = runs[name]
+    assert done.returncode == 1, done.stderr
+    stages = re.findall(r"first difference: (.*) \(", done.stdout)
+    steps = re.findall(r"step \d+, \w+: differs", done.stdout)
+    assert len(steps) == len(stages) > 0
+    assert set(stages) == {PLANTS[name].stage}, done.stdout
+
+
+def test_without_a_change_the_bits_are_those_recorded(
+    runs: dict[str, subprocess.CompletedProcess[str]],
+) -> None:
+    """What the tests above see is their plants alone."""
+    done = runs["nothing"]
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "4 of 4 steps equal" in done.stdout

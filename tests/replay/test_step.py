@@ -1,0 +1,259 @@
+"""A recorded step again: what is run, what is written, what is said."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.errors import RecordingError, SettingError
+from chsel.methods import build_method, preset_settings
+from chsel.online import pose_problem
+from chsel.points import KnownPoints, Workspace
+from chsel.problem import Hypotheses
+from chsel.sdf import SdfGrid
+from chsel.settings import settings_mapping
+from chsel.streams import StreamKey
+from replay import step_again
+from replay.__main__ import main
+from replay.environment import environment
+from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SessionEnded, SessionStarted
+from replay.mcap.reader import Recording, read_recording
+from replay.mcap.writer import McapRecorder
+from replay.recorder import ListRecorder
+from replay.registration import NamedMethod, other_method, register_recorded
+from replay.verification import EQUAL, verify
+
+QUICK = {
+    "descent": {"restarts": 1, "iterations": 10},
+    "emitter": {"iterations": 12},
+    "archive": {"bins": 10},
+    "online": {"hypotheses": 8},
+}
+
+
+def quick_method() -> NamedMethod:
+    settings = settings_mapping(preset_settings("chsel"))
+    settings |= {name: settings[name] | change for name, change in QUICK.items()}
+    return NamedMethod("chsel", settings, build_method("chsel", settings))
+
+
+def session_events(method: NamedMethod) -> list[Event]:
+    """A box touched thrice, registered from the second probe on, snapshots every 4 iterations."""
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    start = SessionStarted(
+        runner="probe",
+        object="box",
+        session="points",
+        method="chsel",
+        seed=5,
+        config={"method": method.config, "preset": {"name": "default"}},
+        mesh=mesh,
+        sdf=SdfGrid.from_mesh(mesh, 0.01, padding=0.03),
+        workspace=Workspace((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)),
+        free_resolution=0.02,
+        initial_points=KnownPoints(free=[[0.15, 0.0, 0.0]]),
+        world_from_object=np.eye(4),
+        environment={"python": "2.7"},
+    )
+    recorder, points, previous = ListRecorder(), start.initial_points, None
+    recorder.record(start)
+    for step, contact in enumerate([[0.05, 0.0, 0.01], [0.0, 0.03, 0.0], [0.01, 0.0, 0.02]]):
+        new = KnownPoints(free=2.0 * np.array([contact]), known=[contact], known_sdf=[0.0])
+        points = points.merged(new)
+        recorder.record(Probe(step, "contact", new))
+        if step > 0:
+            key = StreamKey(start.seed, step)
+            online = method.method.online
+            problem = pose_problem(
+                start.sdf, points, start.workspace, start.free_resolution, key, online, previous
+            )
+            posed = ProblemPosed(step, problem)
+            register_recorded(
+                posed, method.method, recorder, start.world_from_object, snapshot_interval=4
+            )
+            found = [event for event in recorder.events if isinstance(event, HypothesesFound)]
+            previous = found[-1].hypotheses
+    return [*recorder.events, SessionEnded(2, "finished")]
+
+
+def written(events: list[Event], path: Path) -> Recording:
+    recorder = McapRecorder(path)
+    for event in events:
+        recorder.record(event)
+    recorder.close()
+    return read_recording(path)
+
+
+@pytest.fixture(scope="module")
+def session() -> list[Event]:
+    return session_events(quick_method())
+
+
+@pytest.fixture
+def recording(session, tmp_path) -> Recording:
+    return written(session, tmp_path / "session.mcap")
+
+
+@pytest.fixture
+def step(recording, tmp_path, monkeypatch):
+    """Runs the command in an empty folder; its status."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return lambda *words: main(["step", str(recording.path), *words])
+
+
+def test_the_recorded_method_gives_the_recorded_bits(recording, step, capsys):
+    assert step("--step", "2") == 0
+    said = capsys.readouterr().out
+    expected = recording.hypotheses(2)
+    assert f"equal to the recorded result, every bit; digest {expected.digest}" in said
+    assert "method and settings are the recorded ones" in said
+    again = read_recording("session_step2_chsel.mcap")
+    assert again.hypotheses(2).digest == expected.digest
+    digests = [[a.digest for a in of.snapshots(2)] for of in (recording, again)]
+    assert digests[0] == digests[1]
+    assert len(digests[0]) > 2
+
+
+def test_the_new_recording_holds_the_problem_and_says_where_it_is_from(recording, step):
+    assert step("--step", "1", "-o", "again.mcap") == 0
+    again = read_recording("again.mcap")
+    assert again.steps == (1,)
+    assert again.problem(1).digest == recording.problem(1).digest
+    assert [probe.step for probe in again.probes] == [0, 1]
+    digest = hashlib.blake2b(recording.path.read_bytes(), digest_size=16).hexdigest()
+    assert again.start.source == digest
+    assert again.start.config["source"] == {
+        "step": 1,
+        "method": "chsel",
+        "hypotheses": recording.hypotheses(1).digest,
+    }
+    assert again.start.config["method"] == recording.start.config["method"]
+    assert again.start.environment == environment()
+    assert (again.start.object, again.start.seed) == ("box", 5)
+    assert again.start.mesh.vertices.tolist() == recording.start.mesh.vertices.tolist()
+    assert again.ended == SessionEnded(1, "finished")
+    assert [verdict.outcome for verdict in verify(again)] == [EQUAL]
+
+
+def test_another_method_with_other_settings_is_recorded_as_such(recording, step, capsys):
+    words = ("--step", "2", "--method", "gradient_descent", "cost.free_scale=40", "preset=paper")
+    assert step(*words) == 0
+    said = capsys.readouterr().out
+    assert "differs from the recorded result, as another method or other settings may" in said
+    again = read_recording("session_step2_gradient_descent.mcap")
+    assert again.start.method == "gradient_descent"
+    assert again.start.config["method"]["name"] == "gradient_descent"
+    assert again.start.config["method"]["cost"]["free_scale"] == 40
+    assert again.start.config["method"]["descent"]["stop_below"] is None
+    assert again.start.config["preset"] == {"name": "paper"}
+    assert again.problem(2).digest == recording.problem(2).digest
+    assert again.hypotheses(2).digest != recording.hypotheses(2).digest
+    method = other_method(recording, "gradient_descent", words[4:])
+    expected = method.method.register(recording.problem(2))
+    assert again.hypotheses(2).digest == expected.digest
+    assert [verdict.outcome for verdict in verify(again)] == [EQUAL]
+
+
+def test_settings_of_the_recorded_method_can_change_alone(recording, step):
+    assert step("--step", "2", "--method", "emitter.iterations=4", "--snapshot-interval", "0") == 0
+    again = read_recording("session_step2_chsel.mcap")
+    expected = recording.start.config["method"]
+    assert again.start.config["method"] == {
+        **expected,
+        "emitter": {**expected["emitter"], "iterations": 4},
+    }
+    assert [archive.iteration for archive in again.snapshots(2)] == [0, 4]
+
+
+def test_a_step_again_can_be_taken_again(recording, step):
+    assert step("--step", "2", "-o", "once.mcap") == 0
+    assert step("--step", "2", "-o", "twice.mcap") == 0
+    assert Path("once.mcap").read_bytes() == Path("twice.mcap").read_bytes()
+    assert main(["step", "once.mcap", "--step", "2", "-o", "of_it.mcap"]) == 0
+    of_it = read_recording("of_it.mcap")
+    once = hashlib.blake2b(Path("once.mcap").read_bytes(), digest_size=16).hexdigest()
+    assert of_it.start.source == once
+    assert of_it.hypotheses(2).digest == recording.hypotheses(2).digest
+
+
+def test_a_result_that_is_not_the_recorded_one_is_told(session, tmp_path, capsys):
+    events = list(session)
+    index = max(i for i, event in enumerate(events) if isinstance(event, HypothesesFound))
+    found: Hypotheses = events[index].hypotheses
+    cost = np.nextafter(found.cost, np.inf)
+    events[index] = HypothesesFound(2, dataclasses.replace(found, cost=cost))
+    path = written(events, tmp_path / "changed.mcap").path
+    assert main(["step", str(path), "--step", "2", "-o", str(tmp_path / "a.mcap")]) == 1
+    said = capsys.readouterr().out
+    assert "differs from the recorded result, though method and settings are the recorded" in said
+    more = ["--method", "emitter.iterations=4"]
+    assert main(["step", str(path), "--step", "2", "-o", str(tmp_path / "b.mcap"), *more]) == 0
+
+
+def test_a_problem_without_a_result_can_be_registered(session, tmp_path, capsys):
+    events = [e for e in session if not (isinstance(e, HypothesesFound) and e.step == 2)]
+    path = written(events, tmp_path / "lacking.mcap").path
+    assert main(["step", str(path), "--step", "2", "-o", str(tmp_path / "a.mcap")]) == 0
+    assert "no result was recorded to compare with" in capsys.readouterr().out
+    again = read_recording(tmp_path / "a.mcap")
+    assert again.start.config["source"]["hypotheses"] is None
+
+
+def test_nothing_is_overwritten(recording, step, capsys):
+    Path("mine.mcap").write_bytes(b"mine")
+    assert step("--step", "2", "-o", "mine.mcap") == 2
+    assert Path("mine.mcap").read_bytes() == b"mine"
+    before = recording.path.read_bytes()
+    assert step("--step", "2", "-o", str(recording.path)) == 2
+    assert recording.path.read_bytes() == before
+    assert step("--step", "2", "--save-rerun", "mine.mcap") == 2
+    assert capsys.readouterr().err.count("exists") == 3
+    assert [file.name for file in Path().iterdir()] == ["mine.mcap"]
+
+
+def test_nothing_is_left_of_a_registration_that_fails(recording, step, monkeypatch, capsys):
+    def failing(*_, **__):
+        raise SettingError("the object is too small")
+
+    monkeypatch.setattr(step_again, "register_recorded", failing)
+    assert step("--step", "2") == 2
+    assert capsys.readouterr().err == "error: the object is too small\n"
+    assert not list(Path().iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--step", "0"), "has no registration problem of step 0; accepted: 1, 2"),
+        (("--step", "2", "--method", "a", "b"), "--method names a and b; accepted: one, then"),
+        (("--step", "2", "--method", "chselle"), "chselle"),
+        (("--step", "2", "--method", "emitter.iteration=4"), "emitter.iteration does not exist"),
+        (("--step", "2", "--snapshot-interval", "-1"), "--snapshot-interval is -1; accepted: 0"),
+    ],
+)
+def test_what_does_not_exist_is_named(step, capsys, words, message):
+    assert step(*words) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not list(Path().iterdir())
+
+
+def test_it_can_be_drawn_too(step):
+    assert step("--step", "2", "--save-rerun", "view.rrd") == 0
+    assert Path("view.rrd").read_bytes()[:3] == b"RRF"
+
+
+def test_a_digest_names_a_file_as_b2sum_does(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"abc")
+    assert step_again.file_digest(path) == "cf4ab791c62b8d2b2109c90275287816"
+    with pytest.raises(RecordingError, match="nowhere cannot be read: No such file"):
+        step_again.file_digest(tmp_path / "nowhere")

@@ -1,0 +1,123 @@
+"""Makes stored replays: `python -m tests.replays.make [NAME ...]`, of today's code.
+
+Existing files stay as they are, as the bits that later code must give; to accept new bits, use
+`python -m replay bless`. Needs PyBullet for simulated sessions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from chsel.pose import apply, axis_angle, compose
+from chsel.sdf import SdfGrid
+from runners.objects.loader import ObjectConfig, load_object
+
+FOLDER = Path(__file__).parent
+MOST_BYTES = 2**20
+_POINTS = "points.npz"
+_SMALL = ["session.object_resolution=0.02", "recording=mcap", "recording.snapshot_interval=0"]
+_QUICK = ["method.archive.bins=10", "method.emitter.iterations=30"]
+_CHSEL = ("chsel", "chsel_cma_me")
+_OBJECTS = {  # with the session and the preset of CHSEL, CHSEL with CMA-ME, gradient descent
+    "drill": ("simulated default", "simulated paper", "simulated reference"),
+    "mustard": ("simulated paper", "simulated reference", "kinematic default"),
+    "hammer": ("simulated reference", "kinematic default", "simulated paper"),
+    "cracker_box": ("kinematic default", "simulated paper", "simulated default"),
+    "spam_can": ("simulated paper", "simulated default", "kinematic reference"),
+    "clamp": ("simulated default", "kinematic reference", "simulated paper"),
+}
+
+
+def cases() -> dict[str, list[str]]:
+    """What is stored, by name: arguments of `python -m runners.probe`."""
+    found = {}
+    for name, choices in _OBJECTS.items():
+        for method, choice in zip((*_CHSEL, "gradient_descent"), choices, strict=True):
+            session, preset = choice.split()
+            found[f"{name}_{method}"] = [
+                f"object={name}",
+                f"session={session}",
+                f"preset={preset}",
+                f"method={method}",
+                "session.start_probe=8",
+                *_SMALL,
+                *(_QUICK if method in _CHSEL else []),
+            ]
+    points = ["session=points", f"session.path={_POINTS}", *_SMALL]
+    plane = "method.plane={plane_height: 0.0}"
+    return found | {
+        "points_mustard": ["object=mustard", *points, *_QUICK, "recording.snapshot_interval=10"],
+        "points_two_passes": ["object=drill", *points, *_QUICK, "method.passes=2", "seed=3"],
+        "points_on_a_table": [
+            "object=spam_can", *points, *_QUICK, plane, "method.archive.measure=plane_position",
+        ],
+        "points_interior": [
+            "object=hammer", *points, *_QUICK, "preset=reference",
+            "method.cost.volume_normalise=true",
+        ],
+        "points_exact_descent": [
+            "object=clamp", *points, "method=gradient_descent", "method.cost.gradient=exact",
+            "method.cost.known_tolerance=0.002",
+        ],
+    }  # fmt: skip
+
+
+def write_points(path: Path, name: str) -> None:
+    """A file of points of every kind that become known in four steps, around a model at rest."""
+    model = load_object(ObjectConfig(name, scale=1.0, epsilon=0.001, configuration="drill"), Path())
+    random = np.random.default_rng(5)
+    sdf = SdfGrid.from_mesh(model.mesh, 0.01)
+    turned = axis_angle(np.array([[0.0, 0.0, 1.0]]), np.array([0.7]))
+    world_from_object = compose(turned, np.array([[0.1, 0.05, 0.1]]))[0]
+    lower, upper = model.mesh.bounds
+    anywhere = random.uniform(lower - 0.08, upper + 0.08, (4000, 3))
+    distance = np.asarray(sdf.query(anywhere)[0])
+    chosen = {
+        "surface": np.asarray(model.mesh.triangles_center)[:: len(model.mesh.faces) // 12][:12],
+        "free": anywhere[distance > 0.01][:1200],
+        "occupied": anywhere[distance < -0.004][:8],
+        "known": anywhere[np.abs(distance) < 0.01][:8],
+    }
+    arrays = {kind: apply(world_from_object, points) for kind, points in chosen.items()}
+    steps = {f"{kind}_step": np.arange(len(points)) % 4 for kind, points in arrays.items()}
+    np.savez(
+        path,
+        **arrays,
+        **steps,
+        known_sdf=distance[np.abs(distance) < 0.01][:8],
+        world_from_object=world_from_object,
+    )
+
+
+def make(name: str, arguments: list[str]) -> Path:
+    """Run the session and keep its recording."""
+    target = FOLDER / f"{name}.mcap"
+    with tempfile.TemporaryDirectory() as folder:
+        if "session=points" in arguments:
+            write_points(Path(folder) / _POINTS, arguments[0].removeprefix("object="))
+        command = [sys.executable, "-m", "runners.probe", "logs=.", *arguments]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
+        (recording,) = Path(folder).rglob("recording.mcap")
+        shutil.move(recording, target)
+    return target
+
+
+def main() -> None:
+    """Make those named, or all that do not exist."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    named = parser.parse_args().names
+    for name, arguments in cases().items():
+        if name in named or (not named and not (FOLDER / f"{name}.mcap").exists()):
+            print(f"{name}: {make(name, arguments).stat().st_size} bytes", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,214 @@
+"""Disks that fail under a run: one clear error, status 2, and the recording so far intact."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from chsel.errors import RecordingError
+from replay.__main__ import main as replay_main
+from replay.events import Logged
+from replay.mcap.reader import Recording, read_recording
+from replay.recorder import NullRecorder
+from runners.pictures import CheckedPictures
+from runners.recording import RecordingConfig, open_recorder
+from tests.replay.kill import points_session, reported_probes
+
+PROBES = 6
+TIMEOUT = 120
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """The overrides of a session whose archives grow to megabytes."""
+    overrides = points_session(tmp_path_factory.mktemp("points"))
+    quick = ("method.descent.restarts=2", "method.descent.iterations=20")
+    return (*overrides, *quick, "method.archive.bins=400", "method.emitter.iterations=200")
+
+
+def start(
+    logs: Path, *overrides: str, limit: int | None = None, stdout: int = subprocess.PIPE
+) -> subprocess.Popen[str]:
+    """The command, with a limit on the size of files in bytes."""
+
+    def set_limit() -> None:
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    return subprocess.Popen(
+        [sys.executable, "-u", "-m", "runners.probe", *overrides, f"logs={logs}"],
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "COLUMNS": "120", "OMP_NUM_THREADS": "1"},
+        preexec_fn=set_limit,
+    )
+
+
+def run_folder(logs: Path) -> Path:
+    (folder,) = (logs / "probe").iterdir()
+    return folder
+
+
+def only_error(errors: str) -> str:
+    """The one error among the lines; what is said of the pictures besides is a warning."""
+    lines = errors.splitlines()
+    assert all(line.startswith(("warning: ", "compiling the kernels")) for line in lines[:-1]), (
+        lines
+    )
+    assert lines[-1].startswith("error: ")
+    return lines[-1]
+
+
+def recovered(path: Path) -> Recording:
+    out = path.with_name("recovered.mcap")
+    assert replay_main(["recover", str(path), "-o", str(out)]) == 0
+    return read_recording(out)
+
+
+def test_a_full_disk_is_one_error_and_every_reported_probe_stays(
+    session: tuple[str, ...], tmp_path: Path
+) -> None:
+    process = start(tmp_path, *session, "recording=both", limit=1_200_000)
+    output, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 2
+    folder = run_folder(tmp_path)
+    reason = f"recording {folder / 'recording.mcap'} cannot be written: File too large"
+    assert only_error(errors) == f"error: {reason}"
+    recording = recovered(folder / "recording.mcap")
+    assert 1 <= reported_probes(output) < PROBES
+    assert set(range(reported_probes(output))) <= set(recording.steps)
+    assert json.loads((folder / "summary.json").read_text())["outcome"] == f"failed: {reason}"
+
+
+def test_a_disk_that_is_full_for_the_pictures_alone_is_told(
+    session: tuple[str, ...], tmp_path: Path
+) -> None:
+    process = start(tmp_path, *session, "recording=rerun", limit=500_000)
+    _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 2
+    path = run_folder(tmp_path) / "recording.rrd"
+    assert only_error(errors) == (
+        f"error: recording {path} cannot be written: the disk may be full"
+    )
+
+
+def test_a_folder_that_is_removed_during_the_run_is_noticed(
+    session: tuple[str, ...], tmp_path: Path
+) -> None:
+    process = start(tmp_path, *session, "recording=both")
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith("probe "):
+            folder = run_folder(tmp_path)
+            shutil.rmtree(folder)
+            break
+    output, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 2
+    assert only_error(errors) == (
+        f"error: recording {folder / 'recording.mcap'} was removed while it was written"
+    )
+    assert reported_probes(output) < PROBES - 1  # it did not go on to the end
+    assert not folder.exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder no one can write to")
+def test_a_folder_that_cannot_be_written_is_one_error(session: tuple[str, ...]) -> None:
+    """Not even by root."""
+    process = start(Path("/proc/self"), *session)
+    _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 2
+    assert errors.count("\n") == 1
+    assert errors.startswith("error: run folder /proc/self/probe/")
+    assert "cannot be made (" in errors
+    assert errors.endswith("); accepted: a writable logs=DIR\n")
+
+
+def test_two_runs_at_once_write_two_whole_and_equal_recordings(
+    session: tuple[str, ...], tmp_path: Path
+) -> None:
+    processes = [start(tmp_path, *session, "recording=mcap") for _ in range(2)]
+    for process in processes:
+        _, errors = process.communicate(timeout=TIMEOUT)
+        assert (process.returncode, errors) == (0, "")
+    one, other = sorted(tmp_path.rglob("recording.mcap"))
+    assert len(read_recording(one).steps) == PROBES
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_output_that_nobody_reads_ends_the_run_with_a_whole_recording(
+    session: tuple[str, ...], tmp_path: Path
+) -> None:
+    """As with `| head`: no error is printed, and the status is that of a broken pipe."""
+    process = start(tmp_path, *session, "recording=both")
+    assert process.stdout is not None
+    while not process.stdout.readline().startswith("probe "):
+        assert process.poll() is None
+    process.stdout.close()
+    assert process.stderr is not None
+    assert process.stderr.read() == ""
+    assert process.wait(timeout=TIMEOUT) == 1
+    recording = read_recording(run_folder(tmp_path) / "recording.mcap")
+    assert recording.ended is not None
+    assert recording.ended.outcome == "interrupted"
+    assert 1 <= len(recording.steps) < PROBES
+    summary = json.loads((run_folder(tmp_path) / "summary.json").read_text())
+    assert summary["outcome"] == "interrupted"
+
+
+def test_two_runs_never_share_a_recording(tmp_path: Path) -> None:
+    config = RecordingConfig(rerun=False)
+    recorder = open_recorder(tmp_path, config)
+    with pytest.raises(RecordingError, match=r"recording\.mcap cannot be written: File exists"):
+        open_recorder(tmp_path, config)
+    recorder.close()
+
+
+@pytest.mark.parametrize(("content", "whole"), [(b"...RRF2FOOT....", True), (b"...", False)])
+def test_pictures_without_their_end_are_an_error_or_a_warning(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder, content: bytes, whole: bool
+) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(content)
+    for alone in (False, True):
+        pictures = CheckedPictures(NullRecorder(), path, alone=alone)
+        pictures.flush()
+        if alone and not whole:
+            with pytest.raises(RecordingError, match="cannot be written to its end"):
+                pictures.close()
+        else:
+            pictures.close()
+        pictures.close()  # once more is nothing more
+    assert len(recwarn) == (0 if whole else 1)
+
+
+def test_pictures_that_no_longer_grow_are_told_at_the_next_flush(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(b"...")
+    pictures = CheckedPictures(NullRecorder(), path, alone=True)
+    for text in ("a", "b"):
+        pictures.record(Logged(0, "info", text))
+        path.write_bytes(path.read_bytes() + b"...")
+        pictures.flush()
+    pictures.flush()  # nothing to draw since
+    pictures.record(Logged(0, "info", "c"))
+    with pytest.raises(RecordingError, match="cannot be written: the disk may be full"):
+        pictures.flush()
+    pictures.close()
+
+
+def test_pictures_that_are_gone_are_told_at_the_next_flush(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    beside = CheckedPictures(NullRecorder(), path, alone=False)
+    with pytest.warns(UserWarning, match="is not there any more; `replay view` makes it anew"):
+        beside.flush()
+    beside.flush()  # tells it once
+    with pytest.raises(RecordingError, match="is not there any more"):
+        CheckedPictures(NullRecorder(), path, alone=True).flush()
