@@ -538,7 +538,7 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-import test_rerun_recorder as example
+import test_recorder as example
 recorder = example.RerunRecorder(Path(sys.argv[1]))
 for event in example.session():
     recorder.record(event)
