@@ -28,7 +28,7 @@ class OnlineSettings:
     metres. rotation_noise: sigma_R, radians. rotation_law: "axis_gauss" a uniform axis and a
     Gaussian angle, "rotvec_gauss" a Gaussian rotation vector. keep_best: the first of E_0 is the
     best pose itself. low_cost_set: E_l is "elites" of the whole archive, the "estimates" alone,
-    or "none".
+    or "none". update: the next E_0 is "noise" around the best pose, or each of the "own" poses.
     """
 
     hypotheses: int = 30
@@ -38,6 +38,7 @@ class OnlineSettings:
     rotation_law: str = "rotvec_gauss"
     keep_best: bool = True
     low_cost_set: str = "elites"
+    update: str = "noise"
 
     def __post_init__(self) -> None:
         require_positive("hypotheses", self.hypotheses)
@@ -46,6 +47,7 @@ class OnlineSettings:
         require_choice("initial", self.initial, choices)
         require_choice("rotation_law", self.rotation_law, ("axis_gauss", "rotvec_gauss"))
         require_choice("low_cost_set", self.low_cost_set, ("elites", "estimates", "none"))
+        require_choice("update", self.update, ("noise", "own"))
         require_positive("translation_noise", self.translation_noise, zero=True)
         require_positive("rotation_noise", self.rotation_noise, zero=True)
 
@@ -64,7 +66,10 @@ def pose_problem(
         initial_set = first_initial_set(workspace, points, key, settings)
         low_cost_set = np.zeros((0, 4, 4))
     else:
-        initial_set = updated_initial_set(previous, key, settings)
+        own = settings.update == "own"
+        initial_set = (
+            previous.object_from_world if own else updated_initial_set(previous, key, settings)
+        )
         low_cost_set = _low_cost_set(previous, settings)
     return RegistrationProblem(
         sdf, points, initial_set, workspace, free_resolution, key, low_cost_set

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -10,8 +11,8 @@ from chsel.archive import GridArchive
 from chsel.arrays import BoolArray, FloatArray, IntArray
 from chsel.errors import ChselError, require_at_most, require_choice, require_positive
 from chsel.measures import MEASURES, Measure
-from chsel.objective import Objective
 from chsel.problem import ArchiveSnapshot, Hypotheses
+from chsel.space import SearchSpace
 
 MOST_CELLS = 10_000_000
 
@@ -135,8 +136,17 @@ def repeated(object_from_world: FloatArray) -> BoolArray:
     return flags
 
 
+class Judge(Protocol):
+    """What gives transforms their costs, by way of its search space."""
+
+    space: SearchSpace
+
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        """Costs (B,) of search vectors (B, d)."""
+
+
 def ranked_hypotheses(
-    objective: Objective,
+    objective: Judge,
     object_from_world: FloatArray,
     cells: IntArray,
     elites: FloatArray,

@@ -25,6 +25,10 @@ class Purpose(IntEnum):
     MESH_SAMPLES = 7
     CONTROL_NOISE = 8
     SENSOR_NOISE = 9
+    ICP_SURFACE = 10
+    CMA_ES = 11
+    PLAUSIBLE_ROTATIONS = 12
+    METRIC_POINTS = 13
 
 
 @dataclass(frozen=True)

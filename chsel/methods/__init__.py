@@ -9,8 +9,16 @@ from typing import Any
 from chsel import presets
 from chsel.errors import require_choice
 from chsel.methods.chsel import Chsel, ChselSettings
+from chsel.methods.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
+from chsel.methods.icp import Icp, preset_icp
+from chsel.methods.medial_constraint import MedialConstraint, preset_medial_constraint
+from chsel.methods.medial_constraint_cma_me import (
+    MedialConstraintCmaMe,
+    preset_medial_constraint_cma_me,
+)
 from chsel.methods.method import Method
+from chsel.methods.svgd import Svgd, preset_svgd
 from chsel.settings import build_settings
 
 
@@ -39,6 +47,12 @@ _METHODS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
     "chsel": (Chsel, _chsel),
     "chsel_cma_me": (Chsel, _chsel_cma_me),
     "gradient_descent": (GradientDescent, _gradient_descent),
+    "icp": (Icp, preset_icp),
+    "svgd": (Svgd, preset_svgd),
+    "cvo": (Cvo, preset_cvo),
+    "cvo_no_free_space": (Cvo, preset_cvo_no_free_space),
+    "medial_constraint": (MedialConstraint, preset_medial_constraint),
+    "medial_constraint_cma_me": (MedialConstraintCmaMe, preset_medial_constraint_cma_me),
 }
 METHODS = tuple(_METHODS)
 

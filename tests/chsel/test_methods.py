@@ -12,8 +12,10 @@ import trimesh
 
 from chsel import Hypotheses, KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.cost import RelaxedCost
+from chsel.cost_settings import CostSettings
 from chsel.errors import ChselError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.online import pose_problem
@@ -51,12 +53,36 @@ def known_points(contacts: int = 60) -> KnownPoints:
     return KnownPoints(free=free[sdf.numpy() > 0.02], known=apply(WORLD_FROM_OBJECT, surface))
 
 
+QUICK = {
+    "descent": {"restarts": 2, "iterations": 15},
+    "emitter": {"iterations": 6},
+    "cma_es": {"generations": 15},
+}
+RELAXED = [
+    name
+    for name in METHODS
+    if isinstance(getattr(preset_settings(name), "cost", None), CostSettings)
+]
+"""Methods that minimise the relaxed cost."""
+
+
 def quick(name: str, preset: str = "default", **changes: object) -> Method:
     settings = settings_mapping(preset_settings(name, preset))
-    settings["descent"] |= {"restarts": 2, "iterations": 15}
-    if "emitter" in settings:
-        settings["emitter"] |= {"iterations": 6}
+    for group in QUICK.keys() & settings.keys():
+        settings[group] |= QUICK[group]
+    for count in {"iterations", "max_iterations"} & settings.keys():
+        settings[count] = 8
     return build_method(name, settings | changes)
+
+
+def judged(method: Method, problem: RegistrationProblem, poses: np.ndarray) -> np.ndarray | None:
+    """Costs of poses by code of its own, for methods whose cost has some."""
+    cost = getattr(method.settings, "cost", None)
+    if isinstance(cost, CostSettings):
+        return RelaxedCost.of(problem, cost).evaluate(poses)
+    if isinstance(cost, MedialCostSettings):
+        return MedialCost(problem, cost).evaluate(poses)
+    return None
 
 
 def posed(
@@ -87,7 +113,7 @@ class Watcher:
         self.archives.append(archive)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", sorted({*METHODS} - {"icp", "svgd", "cvo", "cvo_no_free_space"}))
 def test_a_method_finds_the_pose_of_an_object_touched_all_over(name: str) -> None:
     method = build_method(name)
     problem = pose_problem(
@@ -107,14 +133,15 @@ def test_hypotheses_are_sorted_by_the_cost_of_exactly_these_poses(name: str, pre
     found = method.register(problem)
     assert found.object_from_world.shape == (30, 4, 4)
     assert (np.diff(found.cost) >= 0.0).all()
-    cost = RelaxedCost.of(problem, method.settings.cost).evaluate(found.object_from_world)
-    np.testing.assert_allclose(found.cost, cost, rtol=1e-9, atol=1e-12)
+    cost = judged(method, problem, found.object_from_world)
+    if cost is not None:
+        np.testing.assert_allclose(found.cost, cost, rtol=1e-9, atol=1e-12)
     assert found.duplicate.sum() == 30 - len(np.unique(found.object_from_world, axis=0))
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", RELAXED)
 def test_costs_beyond_all_numbers_are_an_error_that_says_so(name: str, preset: str) -> None:
     cost = settings_mapping(preset_settings(name, preset))["cost"] | {"known_scale": 1e308}
     method = quick(name, preset, cost=cost)

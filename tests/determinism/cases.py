@@ -37,6 +37,7 @@ class Case:
         settings = settings_mapping(preset_settings(self.method, self.preset))
         quick: dict[str, Any] = {"descent": {"restarts": 2, "iterations": 15}}
         quick |= {"emitter": {"iterations": 12}, "online": {"hypotheses": 12}}
+        quick |= {"cma_es": {"generations": 25}, "iterations": 20, "max_iterations": 6}
         if self.long:
             quick = {"descent": {"stop_below": None}}
         for changes in (quick, self.changes):
@@ -96,6 +97,15 @@ _COSTS = {
     "free points alone": Case(classes=("free",)),
     "contacts alone": Case("chsel_cma_me", classes=("contacts",)),
 }
+_BASELINES = {
+    "SVGD, median": Case("svgd", changes={"kernel": "median"}, classes=ALL_CLASSES),
+    "ICP without an end": Case("icp", changes={"stop_below": None, "iterations": 60}),
+    "CVO, balanced": Case("cvo", changes={"balanced": True}, body="mallet", place="mallet"),
+    "medial, on a plane": Case(
+        "medial_constraint_cma_me", changes={"plane": OBLIQUE}, place="standing"
+    ),
+    "medial, one start": Case("medial_constraint", changes={"cma_es": {"starts": "single"}}),
+}
 _SESSIONS = {
     "two passes": Case(changes={"passes": 2}, body="mallet", place="mallet", steps=2),
     "two passes of CMA-ME": Case("chsel_cma_me", changes={"passes": 2}, body="mallet"),
@@ -143,4 +153,12 @@ _LONG = {
     "long CMA-ME": Case("chsel_cma_me", "reference", body="mallet", place="mallet", long=True),
     "long descent": Case("gradient_descent", "paper", body="mallet", place="mallet", long=True),
 }
-CASES: dict[str, Case] = {**_PRODUCT, **_COSTS, **_SESSIONS, **_MEASURES, **_PLANES, **_LONG}
+CASES: dict[str, Case] = {
+    **_PRODUCT,
+    **_COSTS,
+    **_BASELINES,
+    **_SESSIONS,
+    **_MEASURES,
+    **_PLANES,
+    **_LONG,
+}

@@ -8,6 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from chsel.arrays import FloatArray
+from chsel.cost_settings import CostSettings
+from chsel.emitters import SEARCHES
 from chsel.engine import CompiledCost
 from chsel.measures import MEASURES
 from chsel.methods.method import Method
@@ -43,9 +45,9 @@ class StageKeeper:
         """Nothing to keep."""
 
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """Vectors and costs of the descent; E_0's and the search's archives are kept besides."""
-        if stage == "descent" and iteration > 0:
-            self._keep(f"descent {iteration}", {"vectors": vectors.copy(), "costs": cost.copy()})
+        """Vectors and costs; E_0's, and the archives of searches, are kept besides."""
+        if stage not in SEARCHES and iteration > 0:
+            self._keep(f"{stage} {iteration}", {"vectors": vectors.copy(), "costs": cost.copy()})
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:
         """The archive's range and cells."""
@@ -106,6 +108,8 @@ def _keep_start(stages: Stages, method: Method, problem: RegistrationProblem, st
     draws = normals(problem.key.stream(Purpose.EMITTER), 3000)
     keep(stages, f"step {step}: normal draws", {"draws": draws})
     settings = method.settings
+    if not isinstance(getattr(settings, "cost", None), CostSettings):
+        return  # the kernels of its cost show in its own stages
     space = search_space(settings.plane, problem.sdf)
     objective = Objective(CompiledCost.of(problem, settings.cost), space)
     vectors = space.encode(problem.initial_set)

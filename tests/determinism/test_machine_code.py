@@ -12,20 +12,30 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
+import trimesh
 from numba.core.registry import CPUDispatcher
 
 import chsel.kernels
 from chsel.archive import GridArchive
 from chsel.arrays import FloatArray
+from chsel.evaluation.plausible_set import plausible_set
+from chsel.evaluation.plausible_settings import PlausibleSettings, PoseGridSettings
+from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance
 from chsel.kernels.compiler import compiled
+from chsel.kernels.gaussian_blur import splat
 from chsel.measures import MEASURES
+from chsel.problem import RegistrationProblem
+from chsel.streams import Purpose, StreamKey
+from chsel.surface import surface_points
 from tests.determinism.cases import CASES
 from tests.determinism.libraries import fused as contracted
 from tests.determinism.machine_code import assembly, called, fused, host, loose, optimised, target
-from tests.determinism.problems import grid
+from tests.determinism.problems import grid, scene
 from tests.determinism.stages import run
 
 ENOUGH = ("chsel default", "contacts alone", "chsel reference", "plane_angle", "deep alpha")
+ENOUGH += ("icp default", "svgd default", "SVGD, median", "cvo default", "cvo reference")
+ENOUGH += ("medial_constraint default", "medial_constraint_cma_me default", "medial, one start")
 EXACT = {"sqrt", "floor", "rint", "memset", "memcpy", "memmove"}  # by IEEE 754, or not of numbers
 OTHERS = {
     "Haswell": ("x86_64-unknown-linux-gnu", "haswell", "+avx2,+fma"),
@@ -45,6 +55,20 @@ def code() -> dict[str, str]:
         run(CASES[name], grid(CASES[name].body))
     archive = GridArchive(MEASURES["position_2"], np.zeros(2), np.ones(2), bins=2, dimension=9)
     archive.cells_of(np.zeros((1, 2)))
+    splat(np.zeros((1, 3)), np.zeros(3), 1.0, np.zeros((2, 2, 2)))
+    where = scene(grid("bracket"), "bracket", ("contacts", "free"))
+    key, first = StreamKey(11, 0), np.eye(4)[None]
+    problem = RegistrationProblem(
+        where.sdf, where.points, first, where.workspace, where.free_resolution, key
+    )
+    poses = PoseGridSettings(rotations=5, upright=2)
+    members = plausible_set(problem, first[0], PlausibleSettings(epsilon=10.0, grid=poses))
+    surface = surface_points(where.sdf, 4, key.stream(Purpose.METRIC_POINTS))
+    for method in ("grid", "exact"):
+        settings = DistanceSettings(method=method)
+        box = trimesh.creation.box((0.1, 0.1, 0.1))
+        distance = SurfaceDistance(where.sdf, box, surface, settings)
+        distance.between(first, members.world_from_object)
     return {
         f"{name} {i}": text
         for name, kernel in _from_python().items()

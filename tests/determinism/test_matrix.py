@@ -8,10 +8,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from chsel.cost_settings import FREE_TERMS, GRADIENTS
+from chsel.cost_settings import FREE_TERMS, GRADIENTS, CostSettings
 from chsel.emitters import SEARCHES
 from chsel.measures import MEASURES
 from chsel.methods import METHODS
+from chsel.methods.chsel import ChselSettings
 from chsel.presets import PRESETS
 from chsel.sdf import LOOKUPS, OUTSIDE
 from replay.differences import ulps
@@ -65,8 +66,9 @@ def test_the_settings_for_other_cpus_do_reach_the_compiler(
 
 def test_the_cases_meet_every_choice_at_least_once() -> None:
     settings = [case.build().settings for case in CASES.values()]
-    searches = [made for made in settings if hasattr(made, "archive")]
-    costs = [made.cost for made in settings]
+    searches = [made for made in settings if isinstance(made, ChselSettings)]
+    every = [getattr(made, "cost", None) for made in settings]
+    costs = [cost for cost in every if isinstance(cost, CostSettings)]
     met = {
         METHODS: {case.method for case in CASES.values()},
         PRESETS: {case.preset for case in CASES.values()},

@@ -226,7 +226,7 @@ def test_changes_reach_the_methods_that_have_the_setting(path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["icp"], "method is 'icp'; accepted: chsel, "),
+        (["magic"], "method is 'magic'; accepted: chsel, "),
         (["chsel@best"], "preset is 'best'; accepted: default, paper, reference"),
         (["chsel", "chsel"], "chsel is named twice; accepted: NAME, NAME@PRESET"),
         (["chsel#"], "'chsel#' is no method"),

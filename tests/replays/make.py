@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from chsel.pose import apply, axis_angle, compose
+from chsel.presets import PRESETS
 from chsel.sdf import SdfGrid
 from runners.objects.loader import ObjectConfig, load_object
 
@@ -25,6 +26,14 @@ _POINTS = "points.npz"
 _SMALL = ["session.object_resolution=0.02", "recording=mcap", "recording.snapshot_interval=0"]
 _QUICK = ["method.archive.bins=10", "method.emitter.iterations=30"]
 _CHSEL = ("chsel", "chsel_cma_me")
+_BASELINES: dict[str, list[str]] = {  # with what keeps those brief that take long
+    "icp": [],
+    "svgd": [],
+    "cvo": ["method.max_iterations=20"],
+    "cvo_no_free_space": ["method.max_iterations=20"],
+    "medial_constraint": ["method.cma_es.generations=60"],
+    "medial_constraint_cma_me": ["method.cma_es.generations=40", *_QUICK],
+}
 _OBJECTS = {  # with the session and the preset of CHSEL, CHSEL with CMA-ME, gradient descent
     "drill": ("simulated default", "simulated paper", "simulated reference"),
     "mustard": ("simulated paper", "simulated reference", "kinematic default"),
@@ -46,11 +55,24 @@ def cases() -> dict[str, list[str]]:
                 f"session={session}",
                 f"preset={preset}",
                 f"method={method}",
-                "session.start_probe=8",
+                f"session.start_probe={18 if name == 'drill' else 8}",
                 *_SMALL,
                 *(_QUICK if method in _CHSEL else []),
             ]
-    points = ["session=points", f"session.path={_POINTS}", *_SMALL]
+        for index, (method, brief) in enumerate(_BASELINES.items()):
+            found[f"{name}_{method}"] = [
+                f"object={name}",
+                f"session={('kinematic', 'simulated')[index % 2]}",
+                f"preset={PRESETS[(index + len(name)) % len(PRESETS)]}",
+                f"method={method}",
+                *_SMALL[1:],
+                "session.object_resolution=0.03",
+                "session.free_resolution=0.05",
+                f"session.start_probe={25 if name == 'drill' else 10}",
+                *brief,
+            ]
+    points = ["object.scale=1", "session=points", f"session.path={_POINTS}", *_SMALL[1:]]
+    points.append("session.object_resolution=0.01")
     plane = "method.plane={plane_height: 0.0}"
     return found | {
         "points_mustard": ["object=mustard", *points, *_QUICK, "recording.snapshot_interval=10"],

@@ -1,0 +1,120 @@
+"""Quality-diversity search on the Medial Constraint cost (CHSEL, Sec. VI-D)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from chsel import presets
+from chsel.archive import GridArchive
+from chsel.arrays import FloatArray
+from chsel.cma_es import CmaEsSettings, evolved
+from chsel.emitters import ArchiveWatch, Draws, EmitterSettings
+from chsel.measures import measure_named
+from chsel.medial_cost import MedialCost, MedialCostSettings, MedialObjective
+from chsel.medial_search import medial_cma_me
+from chsel.methods.medial_constraint import CMA_ES, MEDIAL_COST
+from chsel.observer import NullObserver, Observer
+from chsel.online import OnlineSettings
+from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.selection import (
+    ArchiveSettings,
+    OutputSettings,
+    ranked_hypotheses,
+    select_elites,
+    sized_archive,
+)
+from chsel.space import PlaneSettings, search_space, transforms_of
+from chsel.streams import Purpose
+
+ITERATIONS = 500
+TOLERANCE = 1e-5  # m^2, of a mean square: that of 3 mm
+
+_ARCHIVE = ArchiveSettings(tolerance_per_point=0.0, tolerance=TOLERANCE)
+_EMITTER = EmitterSettings(iterations=ITERATIONS)
+_OUTPUT = OutputSettings(tolerance_per_point=0.0, free_tolerance=TOLERANCE)
+
+
+@dataclass(frozen=True)
+class MedialConstraintCmaMeSettings:
+    """All settings of Medial Constraint with CMA-ME; plane restricts the poses to SE(2).
+
+    Tolerances of archive and output are in m^2, as the cost is.
+    """
+
+    cost: MedialCostSettings = field(default_factory=MedialCostSettings)
+    cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)
+    archive: ArchiveSettings = _ARCHIVE
+    emitter: EmitterSettings = _EMITTER
+    output: OutputSettings = _OUTPUT
+    online: OnlineSettings = field(default_factory=OnlineSettings)
+    plane: PlaneSettings | None = None
+
+    def __post_init__(self) -> None:
+        measure_named(self.archive.measure, planar=self.plane is not None)
+
+
+def preset_medial_constraint_cma_me(preset: str) -> MedialConstraintCmaMeSettings:
+    """The settings of a preset, one of chsel.presets.PRESETS."""
+    ours = preset == "default"
+    return MedialConstraintCmaMeSettings(
+        cost=MEDIAL_COST[preset],
+        cma_es=CMA_ES[preset],
+        archive=_ARCHIVE if ours else presets.ARCHIVE[preset],
+        emitter=replace(presets.EMITTER[preset], iterations=ITERATIONS),
+        output=_OUTPUT if ours else presets.OUTPUT[preset],
+        online=presets.ONLINE[preset],
+    )
+
+
+class MedialConstraintCmaMe:
+    """CMA-ES from E_0, then CMA-ME over an archive around what it finds; costs are in m^2."""
+
+    def __init__(self, settings: MedialConstraintCmaMeSettings | None = None) -> None:
+        self.settings = settings or MedialConstraintCmaMeSettings()
+        planar = self.settings.plane is not None
+        self._measure = measure_named(self.settings.archive.measure, planar=planar)
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem."""
+        return self.settings.online
+
+    def register(
+        self, problem: RegistrationProblem, observer: Observer | None = None
+    ) -> Hypotheses:
+        """Hypotheses for the known points of a problem, best first."""
+        observer, settings = observer or NullObserver(), self.settings
+        space = search_space(settings.plane, problem.sdf)
+        objective = MedialObjective(MedialCost(problem, settings.cost), space)
+        key, count = problem.key, len(problem.initial_set)
+        # E' <- CMA-ES on E_0; as poses, so that it holds what hypotheses can be
+        found = evolved(objective, problem.initial_set, settings.cma_es, key, observer)
+        vectors = space.encode(transforms_of(space, found))
+        archive = self._seeded_archive(problem, objective, vectors)
+        # M <- CMA-ME(M, C_M, n_o)
+        first, best = space.encode(problem.initial_set[:1])[0], archive.best_solution
+        start = first if settings.emitter.start == "initial" else best
+        draws, watch = Draws(key), ArchiveWatch(observer, 0, "cma_me")
+        watch.start(archive)
+        medial_cma_me(objective, archive, start, count, settings.emitter, draws, watch)
+        # E <- cells of M with the |E_0| lowest costs
+        stream, known_count = key.stream(Purpose.RESAMPLE), len(problem.points.known)
+        chosen = select_elites(archive.costs, count, settings.output, known_count, stream)
+        elites = transforms_of(space, archive.solutions)
+        snapshot = archive.snapshot(settings.emitter.iterations, 0)
+        cells = archive.occupied[chosen]
+        return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)
+
+    def _seeded_archive(
+        self, problem: RegistrationProblem, objective: MedialObjective, vectors: FloatArray
+    ) -> GridArchive:
+        """The archive that measures of E', vectors (B, d), size, holding E' and E_l."""
+        settings, measure, space = self.settings.archive, self._measure, objective.space
+        costs, measures = objective.costs(vectors), objective.measures(measure, vectors)
+        known_count = len(problem.points.known)
+        archive = sized_archive(measure, measures, costs, settings, known_count, space.dimension)
+        archive.add(vectors, -costs, measures)
+        low_cost = space.encode(problem.low_cost_set)
+        low_costs = objective.costs(low_cost)
+        archive.add(low_cost, -low_costs, objective.measures(measure, low_cost))
+        return archive

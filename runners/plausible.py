@@ -1,0 +1,320 @@
+"""`python -m runners.plausible FILE`: plausible sets, and how recorded hypotheses measure up."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from chsel.arrays import FloatArray
+from chsel.errors import SettingError, require_positive
+from chsel.evaluation.calibration import calibration
+from chsel.evaluation.error import EvaluationError
+from chsel.evaluation.plausible_diversity import cheapest, plausible_diversity
+from chsel.evaluation.plausible_file import load_plausible, save_plausible
+from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
+from chsel.evaluation.plausible_settings import (
+    DEFINITIONS,
+    PlausibleSettings,
+    plausible_settings,
+)
+from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.evaluation.true_pose import find_true_pose
+from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.settings import build_settings, settings_mapping
+from chsel.streams import StreamKey
+from chsel.threads import threads
+from replay.step_ranges import chosen_steps
+from runners.cli import command, plain
+from runners.objects.scans import AssetsConfig
+from runners.plausible_source import Source, open_source
+
+_TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
+_OVERRIDE = re.compile(r"[~+]{0,2}[\w.@/:]+=")
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class MetricsConfig:
+    """How distances are measured, see DistanceSettings; quantile: of the hypotheses by cost."""
+
+    points: int = 500
+    method: str = "nearest"
+    bidirectional: bool = False
+    quantile: float = 1.0
+
+    def __post_init__(self) -> None:
+        DistanceSettings(self.points, self.method, self.bidirectional)
+        cheapest(np.zeros(1), self.quantile)
+
+    @property
+    def distance(self) -> DistanceSettings:
+        """The part that concerns distances."""
+        return DistanceSettings(self.points, self.method, self.bidirectional)
+
+
+@dataclass(frozen=True)
+class PlausibleConfig:
+    """conf/plausible.yaml, checked. object, session, definition: checked where they are used."""
+
+    object: Any
+    session: Any
+    definition: Any
+    metrics: MetricsConfig
+    assets: AssetsConfig
+    file: str | None = None
+    steps: str | None = None
+    guess: tuple[tuple[float, ...], ...] | None = None
+    out: str | None = None
+    seed: int = 0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.file:
+            raise SettingError("file is missing; pass a recording.mcap or a file of known points")
+        StreamKey(self.seed, 0)
+        require_positive("threads", self.threads)
+
+
+@command("plausible")
+def main(config: DictConfig) -> None:
+    """Make, or find, the set of every step, and print what they hold."""
+    values = plain(config)
+    if values["steps"] is not None:
+        values["steps"] = str(values["steps"])
+    checked = build_settings(PlausibleConfig, values, "plausible")
+    path = Path(checked.file or "").expanduser()
+    source = open_source(path, checked.object, checked.session, checked.assets.folder, checked.seed)
+    steps = chosen_steps(checked.steps, source.steps)
+    settings = _settings(checked.definition, source)
+    folder = Path(checked.out).expanduser() if checked.out else path.parent / "plausible"
+    console = Console(highlight=False)
+    with threads(checked.threads):
+        truth = _truth(checked, source, settings, console)
+        rows, failures = _rows(checked, source, steps, settings, truth, folder)
+    console.print(_title(checked, source, settings, truth), style="bold", soft_wrap=True)
+    if rows:
+        console.print(_table(rows))
+    for failure in failures:
+        console.print(failure, soft_wrap=True, markup=False)
+    console.print(f"{folder}  {len(rows)} sets", soft_wrap=True, markup=False)
+    if failures:
+        sys.exit(1)
+
+
+def _settings(definition: Any, source: Source) -> PlausibleSettings:
+    values = dict(definition)
+    values.pop("name", None)
+    if values.get("epsilon") is None:
+        if source.epsilon is None:
+            raise SettingError(
+                "definition.epsilon is missing, as the recording names none of its object; "
+                "accepted: metres above 0, such as 0.001"
+            )
+        values["epsilon"] = source.epsilon
+    return build_settings(PlausibleSettings, values, "definition")
+
+
+def _truth(
+    config: PlausibleConfig, source: Source, settings: PlausibleSettings, console: Console
+) -> FloatArray:
+    """The true pose that the file gives, or else the one that is found near a guess."""
+    if source.world_from_object is not None:
+        if config.guess is not None:
+            raise SettingError("guess is for files without a true pose; this one has it")
+        return source.world_from_object
+    if config.guess is None:
+        raise SettingError(
+            f"{config.file} has no true pose; accepted: a file with world_from_object, or "
+            "guess=[[...],[...],[...],[0,0,0,1]] near it"
+        )
+    problem = source.problems.problem(source.steps[-1])
+    found = find_true_pose(problem, np.array(config.guess))
+    console.print(
+        f"true pose found near the guess, which costs {found.guess_cost:.4g}: it costs "
+        f"{found.cost:.4g}\n{found.world_from_object.tolist()}",
+        soft_wrap=True,
+        markup=False,
+    )
+    return found.world_from_object
+
+
+def _rows(
+    config: PlausibleConfig,
+    source: Source,
+    steps: tuple[int, ...],
+    settings: PlausibleSettings,
+    truth: FloatArray,
+    folder: Path,
+) -> tuple[list[Row], list[str]]:
+    """A row of numbers for every step with a set; what went wrong at the others."""
+    rows: list[Row] = []
+    failures: list[str] = []
+    before: PlausibleSet | None = None
+    measure = _Measure(config.metrics, source, truth)
+    waiting = Console(stderr=True)
+    with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress:
+        for step in progress.track(steps, description="plausible sets"):
+            problem = source.problems.problem(step)
+            begun = time.perf_counter()
+            found = load_plausible(folder, problem, settings, world_from_object=truth)
+            again = found is None
+            if found is None:
+                try:
+                    found = plausible_set(problem, truth, settings, survivors=before)
+                except EvaluationError as error:
+                    failures.append(f"step {step}: {error}")
+                    continue
+                save_plausible(folder, found)
+            before = found
+            row = _row(problem, found, time.perf_counter() - begun if again else None)
+            rows.append(row | measure.of(problem, found, source.problems.found(step)))
+    return rows, failures
+
+
+def _row(problem: RegistrationProblem, found: PlausibleSet, seconds: float | None) -> Row:
+    return {
+        "step": problem.key.step,
+        "contacts": len(problem.points.contacts),
+        "free_points": len(problem.points.free),
+        "members": len(found.index),
+        "kept": len(found.cost),
+        "local": int(found.local.sum()),
+        "true_cost": found.true_cost,
+        "seconds": seconds,
+    }
+
+
+class _Measure:
+    """The metrics of hypotheses; the same points on the surface for all steps of a session."""
+
+    def __init__(self, config: MetricsConfig, source: Source, truth: FloatArray) -> None:
+        self._config, self._source, self._truth = config, source, truth
+        self._distance: SurfaceDistance | None = None
+
+    def of(
+        self, problem: RegistrationProblem, members: PlausibleSet, found: Hypotheses | None
+    ) -> Row:
+        """Coverage, plausibility and diversity in mm^2, its root, and the rank of the truth."""
+        if found is None or len(found.cost) == 0:
+            return {}
+        if self._distance is None:
+            mesh, key = self._source.mesh, StreamKey(problem.key.seed, 0)
+            points = surface_points(mesh, self._config.points, key)
+            self._distance = SurfaceDistance(problem.sdf, mesh, points, self._config.distance)
+        chosen = found.object_from_world[cheapest(found.cost, self._config.quantile)]
+        distances = self._distance.between(chosen, members.world_from_object)
+        metrics = plausible_diversity(distances)
+        row: Row = {
+            "distinct": found.distinct,
+            "coverage": metrics.coverage,
+            "plausibility": metrics.plausibility,
+            "diversity": metrics.diversity,
+            "root": metrics.root,
+        }
+        if len(chosen) > 1:
+            row["rank"] = calibration(self._distance, chosen, self._truth).rank
+        return row
+
+
+def _title(
+    config: PlausibleConfig, source: Source, settings: PlausibleSettings, truth: FloatArray
+) -> str:
+    position = ", ".join(f"{value:.3f}" for value in truth[:3, 3])
+    name = config.definition.get("name", "own")
+    return (
+        f"{source.object}, plausible sets by definition {name}, epsilon "
+        f"{1000.0 * settings.epsilon:g} mm, around ({position}) m"
+    )
+
+
+_COLUMNS = {
+    "step": ("step", "d"),
+    "contacts": ("contacts", "d"),
+    "free_points": ("free", "d"),
+    "true_cost": ("C(X*)", ".4g"),
+    "members": ("members", "d"),
+    "local": ("off grid", "d"),
+    "distinct": ("distinct", "d"),
+    "coverage": ("coverage mm²", ".1f"),
+    "plausibility": ("plausibility mm²", ".1f"),
+    "diversity": ("PD mm²", ".1f"),
+    "root": ("√PD mm", ".1f"),
+    "rank": ("rank", ".2f"),
+    "seconds": ("time", ".2f"),
+}
+
+
+def _table(rows: list[Row]) -> Table:
+    table = Table(box=SIMPLE_HEAD, collapse_padding=True)
+    shown = [key for key in _COLUMNS if any(key in row for row in rows)]
+    for key in shown:
+        table.add_column(_COLUMNS[key][0], justify="right")
+    for row in rows:
+        cells = [
+            format(row[key], _COLUMNS[key][1]) if row.get(key) is not None else "" for key in shown
+        ]
+        if row["seconds"] is None:
+            cells[-1] = "found"
+        elif "seconds" in row:
+            cells[-1] += " s"
+        table.add_row(*cells)
+    return table
+
+
+def named_arguments(arguments: list[str]) -> list[str]:
+    """Arguments as Hydra takes them: the file, and the steps after it, may stand without a name."""
+    kept: list[str] = []
+    files: list[str] = []
+    steps: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        if argument == "--steps":
+            steps.append(next(rest, ""))
+        elif argument.startswith("--steps="):
+            steps.append(argument.partition("=")[2])
+        elif argument in _TAKES_VALUE or argument.startswith("--config-"):
+            kept.append(argument)
+            kept += [] if "=" in argument else [value for value in [next(rest, None)] if value]
+        elif argument.startswith("-") or _OVERRIDE.match(argument):
+            kept.append(argument)
+        else:
+            (steps if files else files).append(argument)
+    kept += [f"file={_quoted(path)}" for path in files]
+    return [*kept, f"steps={_quoted(','.join(steps))}"] if steps else kept
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
+    return f"'{escaped}'"
+
+
+def store_definitions() -> None:
+    """Offer every definition as definition/NAME."""
+    store = ConfigStore.instance()
+    for name in DEFINITIONS:
+        values = settings_mapping(plausible_settings(name, 1.0))
+        # None: that of the object.
+        store.store(group="definition", name=name, node={"name": name, **values, "epsilon": None})
+
+
+def program() -> None:
+    """The command, from the arguments of this process."""
+    store_definitions()
+    sys.argv[1:] = named_arguments(sys.argv[1:])
+    main()
+
+
+if __name__ == "__main__":
+    program()

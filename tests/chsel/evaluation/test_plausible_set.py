@@ -1,0 +1,316 @@
+"""The plausible set against brute force, and what must hold for any."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from chsel.arrays import FloatArray
+from chsel.errors import PoseError, SettingError
+from chsel.evaluation import plausible_set as module
+from chsel.evaluation import position_blocks
+from chsel.evaluation.error import EvaluationError
+from chsel.evaluation.evaluation_cost import EvaluationCost, far_apart
+from chsel.evaluation.plausible_set import grid_around, plausible_set, scan
+from chsel.evaluation.plausible_settings import (
+    EvaluationCostSettings,
+    Offsets,
+    PlausibleSettings,
+    PoseGridSettings,
+    plausible_settings,
+)
+from chsel.points import KnownPoints
+from chsel.pose import apply, compose, inverse, rotation_angle
+from chsel.problem import RegistrationProblem
+from chsel.streams import StreamKey
+from chsel.threads import threads
+from tests.chsel.evaluation.scenes import OBJECTS, WORKSPACE, ball, box, scene
+
+SMALL = PoseGridSettings(
+    Offsets(((-0.06, 0.06, 5),), ((-0.1, 0.0, 2), (0.02, 0.05, 3)), ((0.0, 0.0, 1),)),
+    rotations=30,
+    upright=4,
+)
+MANY = PoseGridSettings(
+    Offsets(((-0.06, 0.06, 7),), ((-0.1, 0.0, 3), (0.01, 0.05, 3)), ((-0.2, 0.3, 6),)),
+    rotations=10,
+    upright=4,
+)
+
+
+@st.composite
+def costs(draw: st.DrawFn) -> EvaluationCostSettings:
+    return EvaluationCostSettings(
+        draw(st.sampled_from(["means", "sums"])),
+        violation=draw(st.sampled_from([1e-3, 0.2, 1e5])),
+        tolerance=draw(st.sampled_from([0.0, 0.01, 0.03])),
+        occupied=draw(st.booleans()),
+        lookup=draw(st.sampled_from(["nearest", "trilinear"])),
+        outside=draw(st.sampled_from(["surface_point", "bounding_box"])),
+    )
+
+
+def brute_force(
+    problem: RegistrationProblem, poses: FloatArray, by: EvaluationCostSettings
+) -> FloatArray:
+    """C (B,) of world_from_object poses (B, 4, 4), term by term as it is defined."""
+    points, sdf = problem.points, problem.sdf
+    known, free, occupied = [], [], []
+    for move in inverse(poses):
+        s = [
+            sdf.query(apply(move, part), lookup=by.lookup, outside=by.outside)[0].numpy()
+            for part in (points.known, points.free, points.occupied)
+        ]
+        known.append(np.abs(s[0] - points.sdf).sum())
+        free.append((s[1] <= -by.tolerance).sum() * by.violation)
+        occupied.append((s[2] >= by.tolerance).sum() * by.violation * by.occupied)
+    counts = np.array([[len(points.known)], [len(points.free)], [len(points.occupied)]])
+    over = np.maximum(counts, 1) if by.combine == "means" else 1
+    total: FloatArray = (np.array([known, free, occupied]) / over).sum(axis=0)
+    return total
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(sorted(OBJECTS)),
+    by=costs(),
+    far=st.sampled_from([0.0, 0.0, 1e4]),
+    share=st.floats(0.0, 0.6),
+    tops=st.sampled_from([1, 8, 48]),
+    aligned=st.booleans(),
+)
+def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
+    seed: int,
+    kind: str,
+    by: EvaluationCostSettings,
+    far: float,
+    share: float,
+    tops: int,
+    aligned: bool,
+) -> None:
+    """Also where points come to lie on the borders of cells, if aligned."""
+    stream = np.random.default_rng(seed)
+    problem, truth = scene(stream, OBJECTS[kind](stream), far=far)
+    if aligned:
+        known = np.rint(problem.points.known / 0.01) * 0.01
+        problem = replace(problem, points=replace(problem.points, known=known))
+        truth = compose(np.eye(3), np.rint(truth[:3, 3] / 0.01) * 0.01)
+    cost = EvaluationCost(problem, by)
+    grid = grid_around(truth, MANY, seed)
+    poses = grid.poses(np.arange(len(grid)))
+    every = cost.evaluate(inverse(poses))
+    if far == 0.0 or by.lookup == "trilinear":
+        # But at a border of cells or a jump of the cost, where rounding decides.
+        some = slice(None, None, 97)
+        close = np.isclose(every[some], brute_force(problem, poses[some], by), rtol=1e-9, atol=1e-9)
+        assert close.mean() > 0.99
+    limit = float(np.quantile(every, share))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(position_blocks, "_TOPS", tops)
+        module._blocks.cache_clear()
+        index, found = scan(cost, problem, grid, limit)
+    np.testing.assert_array_equal(index, np.flatnonzero(every < limit))
+    np.testing.assert_array_equal(found, every[index])
+    below = cost.evaluate(inverse(poses), limit=limit)
+    np.testing.assert_array_equal(below, np.where(every < limit, every, np.inf))
+
+
+def touched_box(*, free: bool = True) -> tuple[RegistrationProblem, FloatArray]:
+    """A box with contacts on five sides, in free space but for itself, or in the unknown."""
+    half = np.array([0.06, 0.09, 0.12])
+    problem, truth = scene(np.random.default_rng(3), box(half))
+    sides = np.array([[1, 0.3, 0], [-1, 0, 0.4], [0.2, 1, 0], [0, -1, 0.5], [0.1, 0.6, 1]])
+    contacts = apply(truth, sides * half)
+    nodes = np.stack(np.meshgrid(*[np.arange(-0.3, 0.3, 0.03)] * 3), axis=-1).reshape(-1, 3)
+    outside = apply(truth, nodes[(np.abs(nodes) > half + 0.005).any(axis=1)])
+    points = KnownPoints(free=outside if free else np.zeros((0, 3)), known=contacts)
+    return replace(problem, points=points), truth
+
+
+WIDE = replace(SMALL, rotations=300)
+BOX = PlausibleSettings(epsilon=0.01, cost=EvaluationCostSettings(lookup="trilinear"), grid=WIDE)
+
+
+def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_above_it() -> None:
+    problem, truth = touched_box()
+    found = plausible_set(problem, truth, BOX)
+    np.testing.assert_array_equal(found.truth, truth)
+    exact = brute_force(problem, found.world_from_object, BOX.cost)
+    np.testing.assert_allclose(found.cost, exact, atol=1e-12)
+    assert (found.cost < found.true_cost + BOX.epsilon).all()
+    assert len(found.cost) == BOX.fill_to
+    assert found.filled
+    assert len(found.index) == (~found.local).sum()  # the true pose itself is on this grid
+
+
+def test_threads_change_nothing() -> None:
+    problem, truth = touched_box()
+    by = replace(BOX, grid=replace(SMALL, rotations=1000), epsilon=0.03)
+    alone = plausible_set(problem, truth, by)
+    assert len(alone.index) > 50
+    with threads(2):
+        assert plausible_set(problem, truth, by).digest == alone.digest
+
+
+def test_the_set_shrinks_as_more_is_known_of_sums() -> None:
+    problem, truth = touched_box(free=False)
+    by = replace(
+        BOX, cost=replace(BOX.cost, combine="sums"), fill_to=0, epsilon=0.1, members=100_000
+    )
+    sizes, before = [], None
+    for count in (1, 3, 5):
+        points = replace(problem.points, known=problem.points.known[:count], known_sdf=None)
+        known = replace(problem, points=points)
+        found = plausible_set(known, truth, by)
+        if before is not None:
+            assert set(found.index) <= set(before.index)
+            pruned = plausible_set(known, truth, replace(by, rescan=False), survivors=before)
+            np.testing.assert_array_equal(pruned.index, found.index)
+            np.testing.assert_array_equal(pruned.index_cost, found.index_cost)
+        sizes.append(len(found.index))
+        before = found
+    assert sizes[0] > sizes[1] > sizes[2] > 0
+
+
+def test_survivors_of_another_grid_are_refused() -> None:
+    problem, truth = touched_box()
+    before = plausible_set(problem, truth, BOX)
+    other = replace(BOX, grid=SMALL, rescan=False)
+    with pytest.raises(EvaluationError, match="survivors are of another grid"):
+        plausible_set(problem, truth, other, survivors=before)
+
+
+def test_a_symmetry_of_the_object_is_found() -> None:
+    """A box turned by half a turn about an axis of its own is the same box."""
+    problem, truth = touched_box()
+    cost = EvaluationCost(problem, BOX.cost)
+    turned = truth @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    one, other = cost.evaluate(inverse(np.stack([truth, turned])))
+    assert other == pytest.approx(one, abs=1e-3)
+
+
+def test_what_the_true_pose_violates_is_allowed_to_others() -> None:
+    problem, truth = touched_box()
+    with_one = np.concatenate([problem.points.free, truth[None, :3, 3]])
+    violated = replace(problem, points=replace(problem.points, free=with_one))
+    strict = plausible_set(problem, truth, BOX)
+    lenient = plausible_set(violated, truth, BOX)
+    assert lenient.true_cost == pytest.approx(strict.true_cost + BOX.cost.violation / len(with_one))
+    assert len(lenient.index) >= len(strict.index) > 0
+
+
+def test_more_members_than_are_kept_are_a_random_subset_with_the_true_pose() -> None:
+    problem, truth = touched_box(free=False)
+    by = replace(BOX, epsilon=0.05, members=40)
+    found = plausible_set(problem, truth, by)
+    assert len(found.index) > 100
+    assert len(found.cost) in (39, 40)  # the grid holds the true pose, too
+    np.testing.assert_array_equal(found.truth, truth)
+    assert plausible_set(problem, truth, by).digest == found.digest
+    seeded = replace(problem, key=StreamKey(8, 2))
+    assert plausible_set(seeded, truth, by).digest != found.digest
+
+
+def test_the_rotations_are_the_same_at_every_step_of_a_session() -> None:
+    problem, truth = touched_box()
+    later = replace(problem, key=StreamKey(7, 9))
+    found = plausible_set(problem, truth, BOX)
+    assert plausible_set(later, truth, BOX).digest == found.digest
+
+
+def test_too_many_members_are_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_MEMBERS", 10)
+    problem, truth = touched_box()
+    with pytest.raises(EvaluationError, match="more than 10 poses cost less than"):
+        plausible_set(problem, truth, replace(BOX, epsilon=0.05))
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        KnownPoints(known=np.zeros((1, 3))),
+        KnownPoints(free=np.zeros((1, 3))),
+        KnownPoints(occupied=np.zeros((2, 3))),
+        KnownPoints(known=np.linspace(0.0, 0.2, 6)[:, None] * [1.0, 0.0, 0.0]),
+        KnownPoints(known=np.full((2, 3), 1e9), free=np.full((2, 3), -1e9)),
+    ],
+    ids=["one contact", "one free point", "occupied alone", "collinear", "far away"],
+)
+@pytest.mark.parametrize("definition", ["default", "paper", "reference"])
+def test_degenerate_points_give_finite_costs_or_one_error(
+    points: KnownPoints, definition: str
+) -> None:
+    problem = RegistrationProblem(ball(), points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(0, 0))
+    by = plausible_settings(definition, 0.001)
+    by = replace(by, grid=replace(by.grid, offsets=SMALL.offsets, rotations=150))
+    found = plausible_set(problem, np.eye(4), by)
+    assert np.isfinite(found.cost).all()
+    assert np.isfinite(found.true_cost)
+    assert len(found.cost) >= 1
+
+
+def test_the_definitions_have_the_grids_that_their_sources_name() -> None:
+    paper, reference, default = (
+        plausible_settings(name, 0.001) for name in ("paper", "reference", "default")
+    )
+    truth = np.eye(4)
+    assert len(grid_around(truth, paper.grid, 0)) == 33_750_000
+    assert len(grid_around(truth, default.grid, 0)) == 3375 * 10_101
+    grid = grid_around(truth, reference.grid, 5)
+    assert len(grid) == 3150 * 10_000
+    assert grid.positions.min(axis=0).tolist() == [-0.1, -0.2, 0.0]
+    assert grid.positions.max(axis=0).tolist() == [0.3, 0.2, 0.1]
+    np.testing.assert_allclose(rotation_angle(grid.rotations[100]), 0.0, atol=1e-9)
+    np.testing.assert_allclose(grid.rotations[:100, 2], [[0.0, 0.0, 1.0]] * 100, atol=1e-15)
+    other_seed = grid_around(truth, reference.grid, 6).rotations
+    assert paper.cost.combine == "sums"
+    assert paper.cost.tolerance == 0.0
+    np.testing.assert_array_equal(
+        plausible_rotation(reference, 5), plausible_rotation(reference, 6)
+    )
+    assert not (plausible_rotation(default, 5) == plausible_rotation(default, 6)).all()
+    assert (other_seed != grid.rotations).any()  # the function itself follows its seed
+
+
+def plausible_rotation(by: PlausibleSettings, seed: int) -> FloatArray:
+    """The first random rotation that a problem of that seed looks at."""
+    problem, truth = touched_box()
+    problem = replace(problem, key=StreamKey(seed, 0))
+    grid = grid_around(truth, by.grid, module.rotation_seed(problem, by))
+    return grid.rotations[200]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PlausibleSettings(epsilon=0.0), "epsilon is 0.0"),
+        (lambda: PlausibleSettings(fill_to=50, members=40), "fill_to is 50"),
+        (lambda: Offsets(x=()), "x has no piece"),
+        (lambda: Offsets(y=((0.0, np.inf, 3),)), "y has the piece"),
+        (lambda: Offsets(z=((0.0, 0.1, 0),)), "z has the piece"),
+        (lambda: Offsets(z=((0.0, 0.1, 10**6),)), "the number of offsets"),
+        (lambda: PoseGridSettings(rotations=50, extra="replaced"), "rotations is 50"),
+        (lambda: EvaluationCostSettings("medians"), "combine is 'medians'"),
+        (lambda: plausible_settings("mine", 0.001), "'mine'"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named(make: object, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        make()  # type: ignore[operator]
+
+
+def test_a_true_pose_that_is_not_rigid_is_named() -> None:
+    problem, truth = touched_box()
+    with pytest.raises(PoseError, match="world_from_object"):
+        plausible_set(problem, 2.0 * truth, BOX)
+
+
+def test_points_far_apart_are_each_the_farthest_from_those_before() -> None:
+    points = np.array([[0.0], [1.0], [10.0], [4.0]])
+    assert far_apart(points, 4).tolist() == [0, 2, 3, 1]
+    assert far_apart(points, 3, given=2).tolist() == [0, 1, 2]

@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
+from chsel.arrays import FloatArray
+from chsel.errors import ChselError, SettingError
+from chsel.evaluation.pose_error import pose_errors
+from chsel.methods.icp import Icp, IcpSettings, preset_icp
+from chsel.observer import NullObserver
+from chsel.pose import apply, axis_angle, compose, inverse, product, random_rotations
+from chsel.presets import PRESETS
+from chsel.streams import StreamKey
+from chsel.threads import threads
+
+MESH = trimesh.boolean.union(
+    [
+        trimesh.creation.box(bounds=[[0, 0, 0], [0.2, 0.06, 0.05]]),
+        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.14, 0.09]]),
+    ],
+    engine="manifold",
+)
+GRID = SdfGrid.from_mesh(MESH, 0.01)
+TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
+WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
+CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(MESH, 40, seed=1)[0]))
+
+DENSE = IcpSettings(surface_points=5000)
+
+
+def starts(count: int = 8, angle: float = 0.4, shift: float = 0.03) -> FloatArray:
+    """E_0 around the truth."""
+    random = np.random.default_rng(3)
+    axis = random.standard_normal((count, 3))
+    axis /= np.sqrt((axis**2).sum(axis=1, keepdims=True))
+    turn = product(axis_angle(axis, angle), TRUTH[:3, :3])
+    return inverse(compose(turn, TRUTH[:3, 3] + shift * random.standard_normal((count, 3))))
+
+
+def posed(
+    known: Any = CONTACTS,
+    initial_set: FloatArray | None = None,
+    key: StreamKey = StreamKey(5, 2),  # noqa: B008, which is frozen
+    **points: Any,
+) -> RegistrationProblem:
+    initial_set = starts() if initial_set is None else initial_set
+    return RegistrationProblem(
+        GRID, KnownPoints(known=known, **points), initial_set, WORKSPACE, 0.02, key
+    )
+
+
+def after(problem: RegistrationProblem, iterations: int) -> FloatArray:
+    """The transforms (B, 4, 4) after so many iterations, in the order of E_0."""
+    kept = _Last()
+    Icp(IcpSettings(iterations=iterations, stop_below=None)).register(problem, kept)
+    return kept.transforms
+
+
+class _Last(NullObserver):
+    """Keeps where each trace stands, and spoils what it is shown."""
+
+    def __init__(self) -> None:
+        self.iterations: list[int] = []
+        self.costs: list[FloatArray] = []
+        self.progressed: list[int] = []
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        assert stage == "icp"
+        rows = vectors[:, :6].reshape(-1, 2, 3)
+        third = np.cross(rows[:, 0], rows[:, 1])[:, None]
+        self.transforms = compose(np.concatenate([rows, third], axis=1), vectors[:, 6:].copy())
+        self.iterations.append(iteration)
+        self.costs.append(cost.copy())
+        vectors[:], cost[:] = np.nan, np.nan
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        self.progressed.append(iteration)
+
+
+def test_every_iteration_is_that_of_trimesh() -> None:
+    problem = posed()
+    model = Icp().surface(problem)
+    tree = cKDTree(model)
+    transforms = problem.initial_set
+    for iteration in range(1, 13):
+        matched = [model[tree.query(apply(transform, CONTACTS))[1]] for transform in transforms]
+        transforms = np.array(
+            [
+                trimesh.registration.procrustes(CONTACTS, q, reflection=False, scale=False)[0]
+                for q in matched
+            ]
+        )
+        np.testing.assert_allclose(after(problem, iteration), transforms, rtol=0, atol=1e-9)
+
+
+def test_where_it_converges_is_where_trimesh_does() -> None:
+    problem = posed()
+    model, kept = Icp().surface(problem), _Last()
+    found = Icp(IcpSettings(stop_below=0.0)).register(problem, kept)
+    theirs = [
+        trimesh.registration.icp(
+            CONTACTS, model, start, threshold=0.0, max_iterations=100, reflection=False, scale=False
+        )
+        for start in problem.initial_set
+    ]
+    expected = np.array([matrix for matrix, _, _ in theirs])
+    np.testing.assert_allclose(kept.transforms, expected, rtol=0, atol=1e-9)
+    costs = sorted(np.sqrt(cost) for _, _, cost in theirs)
+    np.testing.assert_allclose(found.cost, costs, rtol=1e-6)
+
+
+def test_the_object_is_found_where_it_was_touched_all_over() -> None:
+    method = Icp(DENSE)
+    found = method.register(posed())
+    position, rotation = pose_errors(found.object_from_world, TRUTH)
+    assert position[0] < 0.005
+    assert rotation[0] < 0.05
+    assert (np.diff(found.cost) >= 0.0).all()
+    assert found.archive is None
+    np.testing.assert_array_equal(found.elites, found.object_from_world)
+    model = cKDTree(method.surface(posed()))
+    for transform, cost in zip(found.object_from_world, found.cost, strict=True):
+        distances = model.query(apply(transform, CONTACTS))[0]
+        assert cost == pytest.approx(np.sqrt((distances**2).mean()), rel=1e-12)
+
+
+def test_it_stops_at_the_first_iteration_in_which_no_start_gains() -> None:
+    problem, kept = posed(), _Last()
+    Icp(IcpSettings(stop_below=1e-3)).register(problem, kept)
+    every = [after(problem, n) for n in range(1, kept.iterations[-1] + 1)]
+    model = cKDTree(Icp().surface(problem))
+    before = np.full(len(problem.initial_set), np.inf)
+    gains = []
+    poses = problem.initial_set
+    for aligned in every:
+        errors = []
+        for pose, new in zip(poses, aligned, strict=True):
+            matched = model.data[model.query(apply(pose, CONTACTS))[1]]
+            errors.append(np.sqrt(((apply(new, CONTACTS) - matched) ** 2).sum(axis=1).mean()))
+        gains.append((np.array(errors) < (1.0 - 1e-3) * before).any())
+        before, poses = np.array(errors), aligned
+    assert gains == [True] * (len(every) - 1) + [False]
+    np.testing.assert_allclose(kept.transforms, every[-1], rtol=0, atol=1e-12)
+    assert len(every) % 10 != 0  # so that the stop was within a block
+    assert kept.iterations == [0, *range(10, len(every), 10), len(every)]
+    assert kept.progressed == kept.iterations[1:]
+
+
+def test_nothing_but_the_problem_counts() -> None:
+    problem, method = posed(), Icp()
+    first = method.register(problem).digest
+    assert method.register(problem, _Last()).digest == first
+    with threads(2):
+        assert Icp().register(posed()).digest == first
+    free = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+    more = posed(free=free, occupied=free[:3])
+    assert method.register(more).digest == first
+    felt = np.concatenate([CONTACTS, free[:2]])
+    problem = posed(felt, known_sdf=np.append(np.zeros(len(CONTACTS)), [0.1, 0.2]))
+    assert method.register(problem).digest == first
+
+
+def test_surface_points_stay_or_change_as_the_preset_says() -> None:
+    first, later, other = (posed(key=StreamKey(*key)) for key in ((5, 2), (5, 3), (6, 2)))
+    for preset, stays in (("default", True), ("paper", False), ("reference", True)):
+        method = Icp(preset_icp(preset))
+        points = method.surface(first)
+        assert points.shape == (500, 3)
+        assert np.array_equal(points, method.surface(first))
+        assert np.array_equal(points, method.surface(later)) == stays
+        assert not np.array_equal(points, method.surface(other))
+    assert {preset_icp(preset).online.initial for preset in PRESETS} == {"so3", "upright"}
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        CONTACTS[:1],
+        CONTACTS[:2],
+        np.repeat(CONTACTS[:1], 3, axis=0),
+        [[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.4, 0.4, 0.4]],
+        CONTACTS[:3],
+        CONTACTS + 1e7,
+        np.concatenate([CONTACTS, [[1e100, 0.0, 0.0]]]),
+    ],
+    ids=["one", "two", "thrice the same", "in line", "three", "far off", "one out of the world"],
+)
+def test_few_or_odd_contacts_give_rigid_poses(known: Any) -> None:
+    problem = posed(known)
+    found = Icp().register(problem)
+    assert np.isfinite(found.cost).all()
+    rotations = found.object_from_world[:, :3, :3]
+    products = product(rotations, rotations.transpose(0, 2, 1))
+    np.testing.assert_allclose(products, np.tile(np.eye(3), (8, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-9)
+
+
+def test_what_contacts_leave_open_stays_as_it_was() -> None:
+    problem = posed(CONTACTS[:1])
+    np.testing.assert_allclose(
+        after(problem, 5)[:, :3, :3], problem.initial_set[:, :3, :3], atol=1e-12
+    )
+    # Two contacts: the least turn that brings their line onto that of the points matched.
+    problem = posed(CONTACTS[:2], starts(30))
+    model = Icp().surface(problem)
+    aligned = after(problem, 1)
+    for start, new in zip(problem.initial_set, aligned, strict=True):
+        moved = apply(start, CONTACTS[:2])
+        matched = model[cKDTree(model).query(moved)[1]]
+        old_line, new_line = np.diff(moved, axis=0)[0], np.diff(matched, axis=0)[0]
+        if np.sqrt((new_line**2).sum()) < 1e-9:
+            continue
+        cosine = old_line @ new_line / np.sqrt((old_line @ old_line) * (new_line @ new_line))
+        turn = new[:3, :3] @ start[:3, :3].T
+        assert np.trace(turn) == pytest.approx(1.0 + 2.0 * cosine, abs=1e-9)
+
+
+def test_contacts_matched_with_one_point_do_not_turn_the_object() -> None:
+    far = starts(30)
+    far[:, :3, 3] *= 1.0 + 2.0 * np.arange(30)[:, None]
+    problem = posed(initial_set=far)
+    tree = cKDTree(Icp().surface(problem))
+    alone = [len(set(tree.query(apply(start, CONTACTS))[1])) == 1 for start in far]
+    assert sum(alone) > 5
+    turned = after(problem, 1)[alone, :3, :3]
+    np.testing.assert_allclose(turned, far[alone, :3, :3], atol=1e-9)
+
+
+def test_mirrored_contacts_are_not_met_by_a_reflection() -> None:
+    mirrored = apply(TRUTH, apply(inverse(TRUTH), CONTACTS) * [1.0, 1.0, -1.0])
+    turns = random_rotations(np.random.default_rng(0), 20)
+    initial_set = inverse(compose(turns, np.tile(TRUTH[:3, 3], (20, 1))))
+    found = Icp(DENSE).register(posed(mirrored, initial_set))
+    np.testing.assert_allclose(np.linalg.det(found.object_from_world[:, :3, :3]), 1.0, atol=1e-9)
+    assert found.cost[0] > 2.0 * Icp(DENSE).register(posed()).cost[0]
+
+
+def test_without_contacts_the_initial_set_comes_back() -> None:
+    problem = posed(np.zeros((0, 3)), free=[[0.0, 0.0, 0.0]])
+    found = Icp().register(problem)
+    np.testing.assert_array_equal(found.object_from_world, problem.initial_set)
+    np.testing.assert_array_equal(found.cost, np.zeros(8))
+
+
+def test_contacts_beyond_all_numbers_are_one_clear_error() -> None:
+    with pytest.raises(ChselError, match="no contact is at a finite distance"):
+        Icp().register(posed(np.full((3, 3), 1e300)))
+
+
+def test_one_start_and_no_iteration_will_do() -> None:
+    problem = posed(initial_set=starts(1))
+    found = Icp(IcpSettings(iterations=0)).register(problem)
+    np.testing.assert_array_equal(found.object_from_world, problem.initial_set)
+    assert found.cost[0] > Icp().register(problem).cost[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("surface_points", 0),
+        ("surface_points", 10**9),
+        ("redraw", "never"),
+        ("iterations", -1),
+        ("iterations", 10**7),
+        ("stop_below", 1.0),
+        ("stop_below", float("nan")),
+    ],
+)
+def test_settings_out_of_bounds_are_refused(name: str, value: object) -> None:
+    with pytest.raises(SettingError, match=f"{name} is .*accepted"):
+        replace(IcpSettings(), **{name: value})

@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from chsel import KnownPoints, RegistrationProblem, RelaxedCost, SdfGrid, Workspace
+from chsel.arrays import FloatArray
+from chsel.errors import ChselError, SettingError
+from chsel.evaluation.pose_error import pose_errors
+from chsel.kernels import svgd as kernels
+from chsel.kernels.svgd import Particles, direct, particles_at
+from chsel.methods.svgd import Svgd, SvgdSettings, preset_svgd
+from chsel.observer import NullObserver
+from chsel.pose import apply, axis_angle, compose, encode_9d, inverse, product
+from chsel.presets import PRESETS
+from chsel.space import PlaneSettings, SE3Space
+from chsel.streams import StreamKey
+from chsel.threads import threads
+
+SIDES = np.array([0.2, 0.12, 0.08])
+MESH = trimesh.creation.box(SIDES)
+GRID = SdfGrid.from_mesh(MESH, 0.01)
+TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
+WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
+CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(MESH, 15, seed=1)[0]))
+ADAM = {"lr": 0.005, "betas": (0.9, 0.999), "eps": 1e-8}
+
+
+@numba.njit
+def _direct(particles, scale, median):  # type: ignore[no-untyped-def]
+    direct(particles, scale, median)
+
+
+def directions(
+    vectors: FloatArray, scores: FloatArray, scale: float = 0.01, *, median: bool = False
+) -> FloatArray:
+    """phi (B, d) of particles (B, d) with gradients of log p (B, d)."""
+    particles: Particles = particles_at(vectors)
+    particles.scores[:] = scores
+    _direct(particles, scale, median)
+    return particles.directions
+
+
+def directions_by_torch(
+    vectors: Tensor, scores: Tensor, scale: float, *, median: bool = False
+) -> Tensor:
+    """The same by a matrix product and the gradient of the summed kernel by its first argument."""
+    vectors = vectors.detach().requires_grad_()
+    squares = ((vectors[:, None] - vectors.detach()[None]) ** 2).sum(dim=2)
+    count = len(vectors)
+    square = scale**2
+    if median:
+        below = torch.tril_indices(count, count, -1)
+        pairs = squares.detach()[below[0], below[1]].numpy()
+        square = float(np.median(pairs)) / (2.0 * np.log(count + 1.0))
+    kernel = torch.exp(-squares / (2.0 * square + 1e-8))
+    (pull,) = torch.autograd.grad(kernel.sum(), vectors)
+    return (kernel.detach() @ scores - pull) / count
+
+
+def starts(count: int = 8, angle: float = 0.3, shift: float = 0.03) -> FloatArray:
+    """E_0 around the truth."""
+    random = np.random.default_rng(3)
+    axis = random.standard_normal((count, 3))
+    axis /= np.sqrt((axis**2).sum(axis=1, keepdims=True))
+    turn = product(axis_angle(axis, angle), TRUTH[:3, :3])
+    return inverse(compose(turn, TRUTH[:3, 3] + shift * random.standard_normal((count, 3))))
+
+
+def free_points() -> FloatArray:
+    lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.05)] * 3, indexing="ij"), -1)
+    free = lattice.reshape(-1, 3)
+    distance, _ = GRID.query(apply(inverse(TRUTH), free))
+    return free[distance.numpy() > 0.01]
+
+
+def posed(
+    points: KnownPoints | None = None, initial_set: FloatArray | None = None
+) -> RegistrationProblem:
+    points = points or KnownPoints(free=free_points(), known=CONTACTS)
+    initial_set = starts() if initial_set is None else initial_set
+    return RegistrationProblem(GRID, points, initial_set, WORKSPACE, 0.05, StreamKey(5, 2))
+
+
+class Traces(NullObserver):
+    """Keeps where the particles were, and spoils what it is shown."""
+
+    def __init__(self) -> None:
+        self.traced: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self.progressed: list[tuple[int, int]] = []
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        assert stage == "svgd"
+        self.traced[iteration] = vectors.copy(), cost.copy()
+        vectors[:], cost[:] = np.nan, np.nan
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        self.progressed.append((iteration, total))
+
+
+@pytest.mark.parametrize("median", [False, True])
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 30])
+def test_directions_are_those_of_torch(count: int, median: bool) -> None:
+    random = np.random.default_rng(count)
+    vectors = random.standard_normal((count, 9))
+    scores = 10.0 * random.standard_normal((count, 9))
+    expected = directions_by_torch(
+        torch.from_numpy(vectors), torch.from_numpy(scores), 2.0, median=median
+    )
+    ours = directions(vectors, scores, 2.0, median=median)
+    np.testing.assert_allclose(ours, expected, rtol=1e-12, atol=1e-12)
+    assert np.abs(ours - scores / count).max() > 0.1  # particles do act on each other
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 8, 30])
+def test_the_median_is_that_of_numpy_whatever_the_order(count: int) -> None:
+    """Seen by the direction of two close particles among `count` whose scores are zero."""
+    random = np.random.default_rng(count)
+    for _ in range(20):
+        vectors = np.round(random.standard_normal((count, 3)), 1)  # with ties
+        expected = directions_by_torch(
+            torch.from_numpy(vectors),
+            torch.zeros((count, 3), dtype=torch.float64),
+            1.0,
+            median=True,
+        )
+        ours = directions(vectors, np.zeros((count, 3)), median=True)
+        np.testing.assert_allclose(ours, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_on_a_flat_target_two_particles_part_along_their_difference() -> None:
+    h = 0.01
+    vectors = np.zeros((2, 9))
+    vectors[1, [0, 7]] = 0.006, -0.008
+    phi = directions(vectors, np.zeros((2, 9)), h)
+    apart = vectors[0] - vectors[1]
+    gamma = 1.0 / (2.0 * h**2 + 1e-8)
+    expected = gamma * np.exp(-gamma * (apart**2).sum()) * apart  # 2 gamma k apart / B
+    np.testing.assert_allclose(phi, [expected, -expected], rtol=1e-12)
+
+
+def test_a_particle_far_from_the_others_follows_its_own_score() -> None:
+    random = np.random.default_rng(0)
+    vectors, scores = np.zeros((2, 9)), random.standard_normal((2, 9))
+    vectors[1] = 0.5
+    np.testing.assert_array_equal(directions(vectors, scores), scores / 2.0)
+
+
+def test_particles_in_one_place_share_their_scores() -> None:
+    scores = np.arange(27.0).reshape(3, 9)
+    for median in (False, True):
+        phi = directions(np.ones((3, 9)), scores, median=median)
+        np.testing.assert_allclose(phi, np.tile(scores.mean(axis=0), (3, 1)), rtol=1e-14)
+
+
+@pytest.mark.parametrize("kernel", ["reference", "median"])
+def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
+    problem = posed(initial_set=starts(6, 0.02, 0.002))
+    settings = SvgdSettings(kernel=kernel, scale=0.05, iterations=60)
+    kept = Traces()
+    Svgd(settings).register(problem, kept)
+    cost, space = RelaxedCost.of(problem, settings.cost), SE3Space()
+    vectors = torch.from_numpy(encode_9d(problem.initial_set).copy()).requires_grad_()
+    adam = torch.optim.Adam([vectors], **ADAM)  # type: ignore[arg-type]
+    for iteration in range(60):
+        if iteration == 50:
+            np.testing.assert_allclose(kept.traced[50][0], vectors.detach(), atol=1e-8)
+        (gradient,) = torch.autograd.grad(cost(*space.decode(vectors)).sum(), vectors)
+        phi = directions_by_torch(
+            vectors, -settings.sharpness * gradient, settings.scale, median=kernel == "median"
+        )
+        vectors.grad = -phi
+        adam.step()
+    np.testing.assert_allclose(kept.traced[60][0], vectors.detach(), atol=1e-8)
+
+
+def test_the_object_is_found_where_it_was_touched_all_over() -> None:
+    problem = posed()
+    found = Svgd().register(problem)
+    position, rotation = pose_errors(found.object_from_world, TRUTH)
+    assert position[0] < 0.005
+    assert rotation[0] < 0.05
+    assert (np.diff(found.cost) >= 0.0).all()
+    costs = RelaxedCost.of(problem).evaluate(found.object_from_world)
+    np.testing.assert_allclose(found.cost, costs, rtol=1e-12)
+    assert found.elites.shape == (8, 4, 4)
+    assert found.archive is None
+
+
+def test_a_kernel_of_wide_reach_keeps_particles_apart() -> None:
+    problem = posed(initial_set=starts(8, 0.01, 0.001))
+    spreads = [
+        Svgd(SvgdSettings(scale=scale))
+        .register(problem)
+        .object_from_world[:, :3, 3]
+        .std(axis=0)
+        .max()
+        for scale in (1e-6, 0.05)
+    ]
+    assert spreads[1] > spreads[0] + 0.001
+
+
+def test_an_observer_sees_every_fifty_iterations_and_changes_nothing() -> None:
+    problem, kept = posed(), Traces()
+    method = Svgd(SvgdSettings(iterations=120))
+    assert method.register(problem, kept).digest == method.register(problem).digest
+    assert list(kept.traced) == [0, 50, 100, 120]
+    assert kept.progressed == [(50, 120), (100, 120), (120, 120)]
+    np.testing.assert_array_equal(kept.traced[0][0], encode_9d(problem.initial_set))
+    means = [float(cost.mean()) for _, cost in kept.traced.values()]
+    assert means[-1] < 0.5 * means[0]
+    with threads(2):
+        assert method.register(posed()).digest == method.register(problem).digest
+
+
+def test_a_particle_need_not_remember_what_is_around_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = posed()
+    first = Svgd().register(problem).digest
+    monkeypatch.setattr(kernels, "_MOST_REMEMBERED", 0)
+    assert Svgd().register(problem).digest == first
+
+
+@pytest.mark.parametrize("kernel", ["reference", "median"])
+@pytest.mark.parametrize(
+    "points",
+    [
+        KnownPoints(known=CONTACTS[:1]),
+        KnownPoints(free=CONTACTS),
+        KnownPoints(occupied=TRUTH[None, :3, 3]),
+        KnownPoints(known=CONTACTS + 1e8),
+    ],
+    ids=["one contact", "free alone", "occupied alone", "far off"],
+)
+@pytest.mark.parametrize("count", [1, 8])
+def test_odd_problems_have_results(points: KnownPoints, kernel: str, count: int) -> None:
+    settings = SvgdSettings(kernel=kernel, iterations=20)
+    found = Svgd(settings).register(posed(points, starts(count)))
+    assert np.isfinite(found.cost).all()
+    assert np.isfinite(found.object_from_world).all()
+    same = np.tile(starts(1), (3, 1, 1))
+    assert np.isfinite(Svgd(settings).register(posed(points, same)).cost).all()
+
+
+def test_points_beyond_all_numbers_are_one_clear_error() -> None:
+    points = KnownPoints(known=np.full((3, 3), 1e300))
+    with pytest.raises(ChselError, match="no hypothesis has a finite cost"):
+        Svgd(SvgdSettings(iterations=3)).register(posed(points))
+
+
+def test_more_particles_than_pairs_can_be_held_of_are_one_clear_error() -> None:
+    with pytest.raises(SettingError, match="number of poses in E_0 is 10001; accepted: at most"):
+        Svgd().register(posed(initial_set=np.tile(np.eye(4), (10_001, 1, 1))))
+
+
+def test_on_a_plane_every_hypothesis_stands_on_it() -> None:
+    settings = SvgdSettings(plane=PlaneSettings(plane_height=0.3), iterations=50)
+    found = Svgd(settings).register(posed())
+    world = inverse(found.object_from_world)
+    np.testing.assert_allclose(world[:, 2, 3] - SIDES[2] / 2.0, 0.3, atol=1e-3)
+    np.testing.assert_allclose(world[:, 2, 2], 1.0, atol=1e-12)
+
+
+def test_presets_have_the_values_that_were_published() -> None:
+    for preset in PRESETS:
+        settings = preset_svgd(preset)
+        values: Any = (settings.sharpness, settings.kernel, settings.scale)
+        assert values == (5.0, "reference", 0.01)
+        assert (settings.iterations, settings.rate) == (300, 0.005)
+    assert preset_svgd("reference").cost.free_term == "interior"
+    assert preset_svgd("paper").online.rotation_law == "axis_gauss"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("sharpness", 0.0),
+        ("kernel", "rbf"),
+        ("scale", -1.0),
+        ("rate", float("nan")),
+        ("iterations", -1),
+        ("iterations", 10**7),
+    ],
+)
+def test_settings_out_of_bounds_are_refused(name: str, value: object) -> None:
+    with pytest.raises(SettingError, match=f"{name} is .*accepted"):
+        replace(SvgdSettings(), **{name: value})

@@ -1,0 +1,211 @@
+"""CMA-ES on functions whose minimum is known, beside figures of the cma package."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import pytest
+
+import chsel.cma_es
+from chsel.arrays import FloatArray
+from chsel.cma_es import CmaEsSettings, evolved, run_all
+from chsel.errors import SettingError
+from chsel.kernels import cma_es as kernels
+from chsel.kernels.cma_es import BEST, GENERATIONS, STOPPED, Run
+from chsel.observer import NullObserver
+from chsel.streams import StreamKey
+
+SPHERE, ELLIPSOID, ROSENBROCK, FLAT, NOT_FINITE, NOISE = range(6)
+D = 9
+UNENDING = CmaEsSettings(population=10, sigma0=0.5, tolfun=0.0, tolfunhist=0.0)
+
+
+class Landscape(NamedTuple):
+    kind: int
+
+
+@numba.njit
+def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
+    total, size = 0.0, len(vector)
+    if model.kind == ROSENBROCK:
+        for j in range(size - 1):
+            total += 100.0 * (vector[j + 1] - vector[j] ** 2) ** 2 + (1.0 - vector[j]) ** 2
+        return total
+    for j in range(size):
+        scale = 10.0 ** (6.0 * j / (size - 1)) if model.kind == ELLIPSOID else 1.0
+        total += scale * vector[j] ** 2
+    if model.kind == FLAT:
+        return 4.0
+    if model.kind == NOISE:
+        return 1.0 + (1e6 * total) % 1.0
+    return np.inf if model.kind == NOT_FINITE else total
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _on_landscapes() -> Iterator[None]:
+    """Compiles the runs, as they are, around other functions instead of the cost."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "cost_of", cost_of)
+        loop: Any = kernels.evolve
+        patch.setattr(chsel.cma_es, "evolve", numba.njit(error_model="numpy")(loop.py_func))
+        yield
+
+
+def objective(kind: int) -> Any:
+    """What the runs ask of an objective."""
+    landscape = Landscape(kind)
+
+    def costs(vectors: FloatArray) -> FloatArray:
+        return np.array([cost_of(landscape, 0, vector, 0) for vector in vectors])
+
+    space = SimpleNamespace(encode=lambda starts: starts)
+    return SimpleNamespace(
+        model=landscape, space_arrays=0, space=space, costs=costs, work=lambda: 0
+    )
+
+
+def runs_on(kind: int, settings: CmaEsSettings, starts: FloatArray, seed: int = 0) -> list[Run]:
+    key = StreamKey(seed, 0)
+    return run_all(objective(kind), starts, len(starts), settings, key, NullObserver())
+
+
+# Median evaluations of cma 4.5.0 over 21 seeds, population 10 and positive weights, until a cost
+# of 1e-9; all of its runs got there.
+@pytest.mark.parametrize(
+    ("kind", "start", "sigma0", "theirs"),
+    [(SPHERE, 1.0, 0.5, 1320), (ELLIPSOID, 1.0, 0.5, 4800), (ROSENBROCK, 0.0, 0.1, 4930)],
+)
+def test_it_needs_about_as_many_evaluations_as_the_cma_package(
+    kind: int, start: float, sigma0: float, theirs: int
+) -> None:
+    settings = replace(UNENDING, sigma0=sigma0, generations=900)
+    runs = runs_on(kind, settings, np.full((21, D), start))
+    assert all(run.numbers[BEST] <= 1e-9 for run in runs)
+    evaluations = [10 * (1 + np.argmax(run.history[0] <= 1e-9)) for run in runs]
+    assert 0.8 * theirs < np.median(evaluations) < 1.25 * theirs
+
+
+def test_the_best_is_the_lowest_cost_met_and_the_start_counts() -> None:
+    (run,) = runs_on(SPHERE, replace(UNENDING, generations=30), np.ones((1, D)))
+    assert run.numbers[BEST] == min(run.history[0, :30])
+    assert run.numbers[BEST] == cost_of(Landscape(SPHERE), 0, run.best, 0)
+    (run,) = runs_on(SPHERE, replace(UNENDING, generations=3), np.zeros((1, D)))
+    np.testing.assert_array_equal(run.best, 0.0)
+    assert run.numbers[BEST] == 0.0
+
+
+def test_every_start_draws_from_a_stream_of_its_own() -> None:
+    settings, starts = replace(UNENDING, generations=120), np.tile(np.ones(D), (3, 1))
+    three = runs_on(SPHERE, settings, starts)
+    alone = runs_on(SPHERE, settings, starts[:1])
+    np.testing.assert_array_equal(three[0].best, alone[0].best)
+    assert len({tuple(run.best) for run in three}) == 3
+
+
+def test_blocks_of_any_length_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(UNENDING, generations=60)
+    expected = runs_on(SPHERE, settings, np.ones((1, D)))[0]
+    monkeypatch.setattr(chsel.cma_es, "_BLOCK", 7)
+    found = runs_on(SPHERE, settings, np.ones((1, D)))[0]
+    np.testing.assert_array_equal(found.best, expected.best)
+    np.testing.assert_array_equal(found.strategy.covariance, expected.strategy.covariance)
+
+
+def stopped_at(kind: int, **changes: Any) -> tuple[int, Run]:
+    (run,) = runs_on(kind, replace(UNENDING, **changes), np.ones((1, D)))
+    assert run.numbers[STOPPED] == 1.0
+    return int(run.numbers[GENERATIONS]), run
+
+
+def test_tolfun_ends_a_run_when_generation_and_recent_best_costs_are_level() -> None:
+    count, run = stopped_at(SPHERE, tolfun=1e-5)
+    recent = 10 + 30 * D // 10
+
+    def level(end: int) -> bool:
+        return bool(np.ptp(run.history[0, max(end - recent, 0) : end]) < 1e-5)
+
+    assert level(count)
+    assert -run.values[run.order[-1]] + run.values[run.order[0]] < 1e-5
+    assert count > recent
+    later, _ = stopped_at(SPHERE, tolfun=1e-7)
+    assert later > count
+
+
+def test_tolfunhist_ends_a_run_when_recent_best_costs_are_level() -> None:
+    count, run = stopped_at(SPHERE, tolfunhist=1e-3)
+    spreads = [np.ptp(run.history[0, max(end - 37, 0) : end]) for end in range(10, count + 1)]
+    assert spreads[-1] < 1e-3
+    assert min(spreads[:-1]) >= 1e-3
+
+
+def test_tolx_ends_a_run_when_steps_are_small() -> None:
+    _, run = stopped_at(SPHERE, tolx=1e-3)
+    deviations = run.strategy.numbers[0] * np.sqrt(np.diag(run.strategy.covariance))
+    assert 1e-5 < deviations.max() < 1e-3
+
+
+def test_generations_end_a_run_and_none_at_all_leaves_the_start() -> None:
+    assert stopped_at(ROSENBROCK, generations=17)[0] == 17
+    (run,) = runs_on(SPHERE, replace(UNENDING, generations=0), np.ones((1, D)))
+    np.testing.assert_array_equal(run.best, 1.0)
+
+
+@pytest.mark.parametrize("kind", [FLAT, NOT_FINITE])
+def test_costs_that_are_all_the_same_end_a_run_after_two_generations(kind: int) -> None:
+    count, run = stopped_at(kind)
+    assert count == 2
+    assert np.isfinite(run.best).all()
+
+
+def test_stagnation_ends_a_run_on_noise() -> None:
+    count, run = stopped_at(NOISE, sigma0=0.01, tolx=0.0)
+    assert D * (5 + 100 / 10) < count < 4043
+    width = max(37, count // 10)
+    for costs in run.history[:, :count]:
+        newer, older = costs[count - width : count], costs[count - 2 * width : count - width]
+        assert np.median(newer) >= np.median(older)
+
+
+def test_populations_and_generations_are_those_of_pycma() -> None:
+    assert CmaEsSettings().size(9, 30) == 10
+    assert CmaEsSettings().size(3, 30) == 7
+    single = CmaEsSettings(starts="single")
+    assert (single.size(9, 30), single.size(9, 1)) == (30, 10)
+    rules = single.rules(9, 30)
+    assert (rules.generations, rules.stagnation_window) == (4043, 19)
+
+
+def test_a_single_run_gives_samples_of_its_last_distribution() -> None:
+    settings = CmaEsSettings(starts="single", tolfun=1e-5, tolfunhist=1e-6)
+    starts = np.concatenate([np.ones((1, D)), np.full((29, D), 50.0)])
+    found = evolved(objective(SPHERE), starts, settings, StreamKey(0, 0), NullObserver())
+    assert found.shape == (30, D)
+    assert len(np.unique(found, axis=0)) == 30
+    assert (np.abs(found) < 0.05).all()
+
+
+def test_a_run_from_every_start_gives_the_best_of_each() -> None:
+    starts = np.concatenate([np.ones((2, D)), np.full((1, D), -1.0)])
+    key = StreamKey(0, 0)
+    found = evolved(objective(SPHERE), starts, CmaEsSettings(), key, NullObserver())
+    np.testing.assert_allclose(found, 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"starts": "many"}, "starts is 'many'; accepted: per_start, single"),
+        ({"population": 0}, "population is 0"),
+        ({"generations": 20_001}, "generations is 20001; accepted: at most 20_000"),
+        ({"sigma0": 0.0}, r"sigma0 is 0\.0"),
+        ({"tolfun": -1.0}, r"tolfun is -1\.0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        CmaEsSettings(**changes)

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel import KnownPoints, SdfGrid, rkhs_cloud, rkhs_field
+from chsel.arrays import FloatArray
+from chsel.engine import poses_of
+from chsel.errors import SettingError
+from chsel.kernels.cvo import Product, products, scratch
+from chsel.rkhs_cloud import blocks_of, cloud_norm, of_block
+from chsel.rkhs_field import Kernel, free_field, surface_field
+from tests.chsel.dense_cvo import DenseClouds, flows, nearby
+
+SDF = SdfGrid.from_mesh(trimesh.creation.box([0.12, 0.08, 0.06]), 0.01, padding=0.03)
+KERNEL = Kernel(0.1, 0.0064)
+CUT = Kernel.above(0.1, 0.0064, 6e-4)
+
+
+def scene(count: int = 60) -> KnownPoints:
+    stream = np.random.default_rng(1)
+    free = stream.uniform(-0.25, 0.25, (count, 3))
+    return KnownPoints(free=free, known=stream.uniform(-0.06, 0.06, (20, 3)))
+
+
+def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Product:
+    band = sdf.resolution
+    free, surface = free_field(sdf, kernel, band), surface_field(sdf, kernel, band)
+    nothing = free.term(np.zeros((0, 3)), 1.0)
+    return Product(free.term(points.free, 1.0), nothing, surface.term(points.contacts, 1.0))
+
+
+def values(product: Product, transforms: FloatArray) -> FloatArray:
+    out = np.full(len(transforms), np.nan)
+    products(product, poses_of(transforms), out, 0, len(out), scratch())
+    return out
+
+
+def flow(product: Product, transforms: FloatArray) -> FloatArray:
+    """Sums (B, 6) over x_i x h_i and h_i."""
+    out = np.full((len(transforms), 7), np.nan)
+    flows(product, poses_of(transforms), out, scratch())
+    np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
+    return out[:, 1:]
+
+
+@pytest.mark.parametrize("kernel", [KERNEL, CUT], ids=["whole", "cut"])
+def test_a_field_gives_what_the_sum_over_all_pairs_gives(kernel: Kernel) -> None:
+    points, transforms = scene(), nearby(6, 0)
+    dense = DenseClouds.of(SDF, points, SDF.resolution, threshold=6e-4 if kernel is CUT else 0.0)
+    product = product_of(points, kernel)
+    expected = np.array([dense.product(transform) for transform in transforms])
+    most = dense.product(np.eye(4))
+    np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
+    # The dense flow is of a, that of the field of grad f = sum a (z - p) / ell^2.
+    wanted = np.array([7.0 * dense.flow(transform) for transform in transforms])
+    found = flow(product, transforms) * kernel.ell**2
+    sizes = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(found / sizes, wanted / sizes, rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("kernel", [KERNEL, CUT], ids=["whole", "cut"])
+def test_at_the_nodes_a_field_is_the_sum_but_for_its_truncation(kernel: Kernel) -> None:
+    nodes = SDF.origin + np.array([[0, 0, 0], [8, 7, 5], [3, 11, 2]]) * SDF.resolution
+    points = KnownPoints(free=nodes, known=nodes)
+    dense = DenseClouds.of(SDF, points, SDF.resolution, threshold=6e-4 if kernel is CUT else 0.0)
+    expected = dense.product(np.eye(4))
+    assert values(product_of(points, kernel), np.eye(4)[None])[0] == pytest.approx(expected, 1e-6)
+
+
+def test_the_kernel_ends_where_its_product_with_the_labels_is_not_above_the_threshold() -> None:
+    assert CUT.radius == pytest.approx(0.21758, abs=5e-6)
+    values = np.full((11, 11, 11), 1.0)
+    values[5, 5, 5] = -0.01
+    lonely = SdfGrid(np.full(3, -0.1), 0.02, values, np.zeros((11, 11, 11, 3)))
+    field = surface_field(lonely, CUT, 0.02)
+    table = field.table.reshape(*(int(most) + 2 for most in field.box.most), 4)
+    at = np.indices(table.shape[:3]).reshape(3, -1).T * 0.02 + np.array(field.box.first)
+    distance = np.sqrt((at**2).sum(axis=1))
+    np.testing.assert_array_equal(table[..., 0].reshape(-1) > 0.0, distance < CUT.radius)
+
+
+def test_points_of_different_classes_have_a_kernel_of_zero() -> None:
+    points = KnownPoints(free=[[0.0, 0.0, 0.0]], known=[[0.0, 0.0, 0.0]])
+    dense = DenseClouds.of(SDF, points, SDF.resolution, threshold=6e-4)
+    a = dense.kernel(np.eye(4))
+    surface = dense.z_labels[:, 1] > 0.5
+    assert (a[0, surface] == 0.0).all()
+    assert (a[1, ~surface] == 0.0).all()
+    assert (a[1, surface] > 0.0).any()
+
+
+def test_a_coarser_field_stands_for_a_fine_grid_all_the_same() -> None:
+    fine = SdfGrid.from_mesh(trimesh.creation.box([0.06, 0.04, 0.03]), 0.004, padding=0.02)
+    points, transforms = scene(60), nearby(4, 5)
+    dense = DenseClouds.of(fine, points, fine.resolution)
+    product = product_of(points, KERNEL, fine)
+    assert product.free.box.inverse == pytest.approx(1.0 / 0.008)
+    expected = np.array([dense.product(transform) for transform in transforms])
+    most = dense.product(np.eye(4))
+    np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
+
+
+def test_a_field_is_made_once_for_a_grid() -> None:
+    sdf = SdfGrid(SDF.origin, SDF.resolution, SDF.values, SDF.gradients)
+    assert free_field(sdf, KERNEL, 0.01) is free_field(sdf, KERNEL, 0.01)
+    assert free_field(sdf, KERNEL, 0.01) is not free_field(sdf, KERNEL, 0.02)
+    assert free_field(sdf, KERNEL, 0.01) is not surface_field(sdf, KERNEL, 0.01)
+
+
+def test_a_field_too_large_for_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rkhs_field, "MOST_NODES", 1000)
+    with pytest.raises(SettingError, match="a smaller ell"):
+        surface_field(SDF, Kernel(0.02, 1.0), 0.0123)
+    with pytest.raises(SettingError, match="at most 100_000"):
+        surface_field(SDF, Kernel(1e6, 1.0), 0.0123)
+
+
+def pair_sum(points: FloatArray, kernel: Kernel) -> float:
+    total = 0.0
+    for point in points:
+        apart = np.minimum(np.abs(points - point), 1e3)
+        a = kernel.amplitude * np.exp(-(apart**2).sum(axis=1) / (2 * kernel.ell**2))
+        total += a[a > (6e-4 if kernel is CUT else 0.0)].sum()
+    return float(total)
+
+
+@pytest.mark.parametrize("kernel", [KERNEL, CUT], ids=["whole", "cut"])
+@pytest.mark.parametrize("count", [50, 2100])
+def test_the_norm_of_a_cloud_is_the_sum_over_its_pairs(kernel: Kernel, count: int) -> None:
+    points = np.random.default_rng(0).uniform(-0.2, 0.3, (count, 3))
+    expected = pair_sum(points, kernel)
+    tolerance = 1e-12 if count == 50 else 0.002 if kernel is KERNEL else 0.01
+    assert cloud_norm(points, kernel, 0.01) == pytest.approx(expected, tolerance)
+
+
+@pytest.mark.parametrize("kernel", [KERNEL, CUT], ids=["whole", "cut"])
+def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes(kernel: Kernel) -> None:
+    lattice = np.indices((14, 15, 16)).reshape(3, -1).T
+    points = (lattice * 0.0228)[np.random.default_rng(0).random(len(lattice)) < 0.9] + 0.1234
+    found = cloud_norm(points, kernel, 0.0228)
+    assert found == pytest.approx(pair_sum(points, kernel), 1e-3 if kernel is KERNEL else 1e-9)
+
+
+def test_points_all_over_the_world_are_summed_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (2100, 3))
+    for scale in (1.0, 1e300):
+        points[0] = scale * 1e6
+        assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points, KERNEL), 1e-9)
+    monkeypatch.setattr(rkhs_cloud, "_MANY", 2050)
+    with pytest.raises(SettingError, match="2100 points of one class are far apart"):
+        cloud_norm(points, KERNEL, 0.01)
+
+
+@pytest.mark.parametrize("spacing", [0.01, 0.0228])
+def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
+    lattice = (np.indices((20, 20, 20)).reshape(3, -1).T - 10.0) * spacing
+    points = lattice[~(np.abs(lattice) < 4.5 * spacing).all(axis=1)]
+    alone, centres, side = blocks_of(points, KERNEL.ell, spacing)
+    assert side == (5 if spacing == 0.01 else 2)
+    assert len(alone) + side**3 * len(centres) == len(points)
+    assert len(alone) < 0.6 * len(points)
+    field, wide = free_field(SDF, KERNEL, 0.01), of_block(KERNEL, spacing, side)
+    nothing = field.term(np.zeros((0, 3)), 1.0)
+    all_alone = Product(field.term(points, 1.0), nothing, nothing)
+    cubes = free_field(SDF, wide, 0.01).term(centres, 1.0)
+    with_cubes = Product(field.term(alone, 1.0), cubes, nothing)
+    transforms = nearby(5, 2)
+    expected, wanted = values(all_alone, transforms), flow(all_alone, transforms)
+    np.testing.assert_allclose(values(with_cubes, transforms), expected, rtol=1e-3)
+    size = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(flow(with_cubes, transforms) / size, wanted / size, atol=0.005)
+
+
+def test_cubes_are_made_of_full_lattices_alone() -> None:
+    off = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
+    for points in (off, off[:5], np.zeros((0, 3))):
+        alone, centres, _ = blocks_of(points, 0.1, 0.01)
+        np.testing.assert_array_equal(alone, points)
+        assert len(centres) == 0
+    twice = np.tile(np.indices((20, 20, 4)).reshape(3, -1).T * 0.02, (2, 1))
+    alone, centres, side = blocks_of(twice, 0.1, 0.02)
+    assert len(alone) + side**3 * len(centres) == len(twice)

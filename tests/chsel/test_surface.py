@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel import SdfGrid
+from chsel.arrays import FloatArray
+from chsel.errors import SdfError
+from chsel.sdf import mesh_sdf
+from chsel.streams import Purpose, StreamKey
+from chsel.surface import surface_points
+
+RADIUS, RESOLUTION = 0.05, 0.01
+SIDES = np.array([0.163, 0.107, 0.089])
+COUNT = 4000
+
+
+def stream(seed: int = 0) -> np.random.Generator:
+    return StreamKey(seed, 0).stream(Purpose.ICP_SURFACE)
+
+
+def sphere() -> SdfGrid:
+    """A sphere by its formula."""
+    origin = np.full(3, -0.1)
+    nodes = origin + np.indices((21, 21, 21)).transpose(1, 2, 3, 0) * RESOLUTION
+    length = np.sqrt((nodes**2).sum(axis=-1))
+    unit = nodes / np.maximum(length, 1e-12)[..., None]
+    return SdfGrid(origin, RESOLUTION, length - RADIUS, unit)
+
+
+def chi_square(counts: FloatArray, shares: FloatArray) -> float:
+    """How unlike counts are to shares: mean 1 per degree of freedom, here in deviations off it."""
+    expected = counts.sum() * shares / shares.sum()
+    total, freedom = (((counts - expected) ** 2) / expected).sum(), len(counts) - 1
+    return float((total - freedom) / np.sqrt(2.0 * freedom))
+
+
+def test_points_are_on_a_sphere_and_uniform_there() -> None:
+    points = surface_points(sphere(), COUNT, stream())
+    distance = np.sqrt((points**2).sum(axis=1)) - RADIUS
+    assert np.abs(distance).max() < 0.02 * RESOLUTION
+    # Bands of equal height have equal areas.
+    band = np.floor((points[:, 2] / RADIUS + 1.0) / 2.0 * 8).clip(0, 7)
+    sector = np.floor((np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) % 1.0) * 12)
+    counts = np.bincount((12 * band + sector).astype(int), minlength=96)
+    assert abs(chi_square(counts, np.ones(96))) < 3.0
+
+
+def test_points_are_on_a_box_and_uniform_there() -> None:
+    mesh = trimesh.creation.box(SIDES)
+    points = surface_points(SdfGrid.from_mesh(mesh, RESOLUTION), COUNT, stream())
+    distance = np.abs(mesh_sdf(mesh, points)[0])
+    assert distance.max() < 0.5 * RESOLUTION  # at corners, which a grid cannot show
+    assert distance.mean() < 0.02 * RESOLUTION
+    # Patches a centimetre off the edges, where the grid's surface is that of the box.
+    counts, areas = [], []
+    for axis in range(3):
+        u, v = (other for other in range(3) if other != axis)
+        half = SIDES[[u, v]] / 2.0 - 0.01
+        for side in (-1.0, 1.0):
+            on = np.abs(points[:, axis] - side * SIDES[axis] / 2.0) < 1e-6
+            place = (points[on][:, [u, v]] + half) / (2.0 * half) * 4
+            inner = ((place >= 0.0) & (place < 4.0)).all(axis=1)
+            cell = np.floor(place[inner]) @ [4, 1]
+            counts.append(np.bincount(cell.astype(int), minlength=16))
+            areas.append(np.full(16, half[0] * half[1]))
+    assert abs(chi_square(np.concatenate(counts), np.concatenate(areas))) < 3.0
+    assert np.concatenate(counts).sum() > 0.5 * COUNT
+
+
+def test_points_depend_on_the_stream_alone() -> None:
+    grid = sphere()
+    first = surface_points(grid, 50, stream())
+    np.testing.assert_array_equal(surface_points(grid, 50, stream()), first)
+    np.testing.assert_array_equal(surface_points(sphere(), 50, stream()), first)
+    assert np.abs(surface_points(grid, 50, stream(1)) - first).max() > 0.01
+
+
+def test_a_single_node_inside_has_a_surface() -> None:
+    values = np.full((4, 4, 4), 0.01)
+    values[1, 1, 1] = -0.004
+    grid = SdfGrid(np.zeros(3), 0.01, values, np.zeros((4, 4, 4, 3)))
+    points = surface_points(grid, 200, stream())
+    assert np.abs(points - 0.01).max() < 0.01
+    values[1, 1, 1] = -1e-320
+    grid = SdfGrid(np.zeros(3), 0.01, values, np.full((4, 4, 4, 3), 1e100))
+    np.testing.assert_allclose(surface_points(grid, 3, stream()), 0.01, atol=1e-12)
+
+
+def test_an_object_between_the_nodes_is_refused() -> None:
+    grid = SdfGrid(np.zeros(3), 0.01, np.full((4, 4, 4), 0.01), np.zeros((4, 4, 4, 3)))
+    with pytest.raises(SdfError, match="no node of the SDF grid is inside"):
+        surface_points(grid, 3, stream())

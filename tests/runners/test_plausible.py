@@ -1,0 +1,186 @@
+"""The command that makes plausible sets, as a user runs it."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.evaluation.plausible_file import load_plausible, read_plausible
+from chsel.evaluation.plausible_set import plausible_set
+from chsel.pose import apply, axis_angle, compose, inverse, rotation_vector
+from replay.mcap.reader import read_recording
+from runners import plausible, probe
+from runners.plausible import named_arguments
+
+POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
+SMALL = (
+    "definition.grid.rotations=200",
+    "definition.grid.upright=4",
+    "definition.grid.offsets.x=[[-0.01,0.01,3]]",
+    "definition.grid.offsets.y=[[0,0,1]]",
+    "definition.grid.offsets.z=[[0,0,1]]",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A box, points on it in two files, of which one says where it is, and a recording."""
+    folder = tmp_path_factory.mktemp("plausible")
+    box = trimesh.creation.box((0.1, 0.06, 0.2))
+    box.export(folder / "box.ply")
+    surface = apply(POSE, trimesh.sample.sample_surface(box, 30, seed=0)[0])
+    free = np.random.default_rng(0).uniform(0.3, 0.6, (40, 3))
+    points = {"surface": surface, "surface_step": np.arange(30) // 15, "free": free}
+    np.savez(folder / "box.npz", **points, world_from_object=POSE)
+    np.savez(folder / "unknown.npz", **points)
+    arguments = [
+        "session=points",
+        f"session.path={folder / 'box.npz'}",
+        "object=mesh",
+        f"object.path={folder / 'box.ply'}",
+        "object.epsilon=0.002",
+        "method=gradient_descent",
+        "recording=mcap",
+        f"logs={folder / 'logs'}",
+    ]
+    done = run(probe.main, *arguments)
+    assert done.returncode == 0, done.stderr
+    (recording,) = (folder / "logs").rglob("recording.mcap")
+    recording.rename(folder / "recording.mcap")
+    return folder
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command left behind."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run(program: Callable[[], None], *arguments: str) -> Done:
+    """Run a command in this process, which spares it the imports."""
+    out, errors, status = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
+        patch.setattr(sys, "argv", ["program", *arguments])
+        patch.setenv("COLUMNS", "160")
+        patch.setenv("HYDRA_FULL_ERROR", "0")
+        patch.setattr(warnings, "showwarning", warnings.showwarning)
+        try:
+            program()
+        except SystemExit as end:
+            status = int(end.code or 0)
+    return Done(status, out.getvalue(), errors.getvalue())
+
+
+def rows(output: str) -> list[list[str]]:
+    """The cells of the table's rows, as text."""
+    lines = [line.split() for line in output.splitlines()]
+    return [line for line in lines if line and line[0].isdigit()]
+
+
+def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder: Path) -> None:
+    path = folder / "recording.mcap"
+    command = [sys.executable, "-m", "runners.plausible", str(path), *SMALL]
+    environment = {**os.environ, "COLUMNS": "160"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "epsilon 2 mm" in done.stdout
+    assert [row[0] for row in rows(done.stdout)] == ["0", "1"]
+    files = sorted((folder / "plausible").iterdir())
+    assert len(files) == 2
+    recording = read_recording(path)
+    settings = read_plausible(files[0]).settings
+    assert settings.epsilon == 0.002
+    assert settings.grid.rotations == 200
+    for step in recording.steps:
+        problem = recording.problem(step)
+        stored = load_plausible(folder / "plausible", problem, settings, world_from_object=POSE)
+        assert stored is not None
+        assert stored.digest == plausible_set(problem, POSE, settings).digest
+        assert stored.filled
+        cells = rows(done.stdout)[step]
+        assert float(cells[9]) == pytest.approx(float(cells[7]) + float(cells[8]), abs=0.11)
+        assert float(cells[10]) == pytest.approx(float(cells[9]) ** 0.5, abs=0.06)
+    before = [file.stat().st_mtime_ns for file in files]
+    again = run(plausible.program, str(path), "--steps", "1", *SMALL, "threads=2")
+    assert [row[-1] for row in rows(again.stdout)] == ["found"]
+    assert rows(again.stdout)[0][:-1] == rows(done.stdout)[1][:-2]
+    assert [file.stat().st_mtime_ns for file in files] == before
+    os.replace(files[0], files[1])
+    refused = run(plausible.program, str(path), *SMALL)
+    assert refused.returncode == 2
+    assert "belongs to another known points" in refused.stderr
+    assert refused.stderr.count("\n") == 1
+
+
+def test_a_points_file_needs_its_object_and_the_true_pose_or_a_guess(folder: Path) -> None:
+    thing = ("object=mesh", f"object.path={folder / 'box.ply'}", f"out={folder / 'sets'}", *SMALL)
+    done = run(plausible.program, str(folder / "box.npz"), "1", *thing, "definition=paper")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "definition paper" in done.stdout
+    assert len(rows(done.stdout)) == 1
+    (path,) = (folder / "sets").iterdir()
+    assert read_plausible(path).settings.cost.combine == "sums"
+    np.testing.assert_array_equal(read_plausible(path).truth, POSE)
+    unknown = run(plausible.program, str(folder / "unknown.npz"), *thing)
+    assert unknown.returncode == 2
+    assert "has no true pose" in unknown.stderr
+    off = compose(rotation_vector(np.array([0.0, 0.0, 0.01])), np.array([0.02, -0.01, 0.01]))
+    guess = compose(off[:3, :3] @ POSE[:3, :3], POSE[:3, 3] + off[:3, 3])
+    found = run(plausible.program, str(folder / "unknown.npz"), *thing, f"guess={guess.tolist()}")
+    assert (found.returncode, found.stderr) == (0, "")
+    sets = [read_plausible(file) for file in (folder / "sets").iterdir() if file != path]
+    assert len(sets) == 2
+    for one in sets:
+        offset = (inverse(one.truth) @ guess)[:3, 3]
+        assert 0.01 < np.sqrt((offset**2).sum()) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nothing.mcap"], "recording nothing.mcap"),
+        ([], "file is missing"),
+        (["{recording}", "--steps", "7"], "there is no step 7; accepted: 0, 1"),
+        (["{recording}", "definition=mine"], "definition/mine"),
+        (["{recording}", "definition.epsilon=-1"], "epsilon is -1.0"),
+        (["{recording}", "metrics.quantile=2"], "quantile is 2.0"),
+        (["{recording}", "definition.cost.lookup=cubic"], "lookup is 'cubic'"),
+    ],
+    ids=["no file", "no name", "no step", "no definition", "epsilon", "quantile", "lookup"],
+)
+def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
+    given = [word.format(recording=folder / "recording.mcap") for word in arguments]
+    done = run(plausible.program, *given)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_arguments_may_stand_without_a_name() -> None:
+    assert named_arguments(["a b.mcap", "4..6", "9", "definition=paper"]) == [
+        "definition=paper",
+        "file='a b.mcap'",
+        "steps='4..6,9'",
+    ]
+    assert named_arguments(["file=x.mcap", "--steps=2", "--cfg", "job"]) == [
+        "file=x.mcap",
+        "--cfg",
+        "job",
+        "steps='2'",
+    ]
+    assert named_arguments(["it's"]) == ["file='it\\'s'"]
