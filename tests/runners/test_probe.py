@@ -17,7 +17,7 @@ import trimesh
 import yaml
 
 from chsel.errors import RecordingError
-from chsel.methods import build_method
+from chsel.methods import METHODS, build_method
 from chsel.pose import apply, axis_angle, compose
 from replay.mcap.reader import read_recording
 
