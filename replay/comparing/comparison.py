@@ -14,6 +14,7 @@ from chsel.evaluation.pose_error import pose_errors
 from chsel.presets import COST
 from chsel.problem import Hypotheses
 from replay.comparing.contenders import Contender, recorded_or_none
+from replay.comparing.plausible import PlausibleSets
 from replay.events import ProblemPosed, SessionStarted
 from replay.mcap.reader import Recording
 from replay.recorder import NullRecorder
@@ -68,19 +69,21 @@ def compared(
     methods: Sequence[Contender],
     steps: Sequence[int],
     cost: CommonCost,
+    plausible: PlausibleSets | None = None,
 ) -> Iterator[Outcome]:
     """Outcomes step by step: the recorded one, then one of each method in turn.
 
-    A registration that fails is an outcome, too. Before its first step a method registers once
-    uncounted, so that no time holds the compiling of kernels.
+    plausible: the sets that hypotheses are also measured by. A registration that fails is an
+    outcome, too. Before its first step a method registers once uncounted, so that no time holds
+    the compiling of kernels.
     """
     start, warm = recording.start, False
     for posed in _problems(recording, steps):
         recorded = recording.hypotheses(posed.step) if recording.has_result(posed.step) else None
         judge = CompiledCost.of(posed.problem, cost.settings)
-        yield _recorded(recording, posed.step, recorded, judge)
+        yield _recorded(recording, posed, recorded, judge, plausible)
         for method in methods:
-            yield _again(start, posed, method, recorded, judge, warm=warm)
+            yield _again(start, posed, method, recorded, judge, plausible, warm=warm)
         warm = True
 
 
@@ -127,12 +130,19 @@ def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPos
 
 
 def _recorded(
-    recording: Recording, step: int, found: Hypotheses | None, judge: CompiledCost
+    recording: Recording,
+    posed: ProblemPosed,
+    found: Hypotheses | None,
+    judge: CompiledCost,
+    plausible: PlausibleSets | None,
 ) -> Outcome:
     label = recorded_label(recording)
     if found is None:
-        return Outcome(step, label, None, failure="no result was recorded")
-    return Outcome(step, label, found, numbers_under(judge, found, recording.start))
+        return Outcome(posed.step, label, None, failure="no result was recorded")
+    numbers = numbers_under(judge, found, recording.start)
+    if plausible is not None:
+        numbers |= plausible.numbers(posed.problem, found)
+    return Outcome(posed.step, label, found, numbers)
 
 
 def _again(
@@ -141,6 +151,7 @@ def _again(
     method: Contender,
     recorded: Hypotheses | None,
     judge: CompiledCost,
+    plausible: PlausibleSets | None,
     *,
     warm: bool,
 ) -> Outcome:
@@ -151,6 +162,8 @@ def _again(
         registered = register_recorded(posed, method.named.method, NullRecorder(), None)
         found = registered.hypotheses
         numbers = numbers_under(judge, found, start) | {"seconds": registered.total_seconds}
+        if plausible is not None:
+            numbers |= plausible.numbers(posed.problem, found)
     except Exception as error:
         known = isinstance(error, ChselError)
         failure = str(error) if known else f"{type(error).__name__}: {error}"

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from chsel.errors import RecordingError, SettingError
+from chsel.evaluation.plausible_settings import DEFINITIONS
 from chsel.problem import Hypotheses
 from chsel.threads import threads
 from replay.comparing.columns import Column, columns_in_table
@@ -30,6 +31,7 @@ from replay.comparing.comparison import (
 )
 from replay.comparing.contenders import METHODS_HELP, Contender, contenders
 from replay.comparing.csv_file import write_csv
+from replay.comparing.plausible import PlausibleSets
 from replay.mcap.reader import Recording, read_recording
 from replay.step_ranges import STEPS_HELP, chosen_steps
 
@@ -49,6 +51,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--steps", metavar="STEPS", help=STEPS_HELP)
     parser.add_argument("--each", action="store_true", help="show every step, not medians alone")
+    parser.add_argument(
+        "--plausible",
+        type=Path,
+        metavar="FOLDER",
+        help="plausible sets of `runners.plausible`; by default those beside the recording",
+    )
+    parser.add_argument(
+        "--definition",
+        default="default",
+        metavar="NAME",
+        help=f"which of them: {', '.join(DEFINITIONS)}",
+    )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads, 1 by default")
     parser.add_argument("--save-csv", type=Path, metavar="OUT", help="all numbers")
     parser.add_argument("--save-plot", type=Path, metavar="OUT", help="a png, svg or pdf")
@@ -68,8 +82,9 @@ def run(given: argparse.Namespace) -> int:
     changes = [word for word in given.methods if "=" in word]
     methods = contenders(recording, labels, changes)
     cost = common_cost(recording)
+    sets = PlausibleSets(recording, given.plausible, given.definition)
     with threads(given.threads):
-        outcomes = _compared(recording, methods, steps, cost)
+        outcomes = _compared(recording, methods, steps, cost, sets)
     console = Console(highlight=False)
     each = given.each or len(steps) <= _FEW_STEPS
     _tell(console, recording, methods, outcomes, cost, each=each, count=given.threads)
@@ -98,7 +113,11 @@ def _check_outputs(given: argparse.Namespace) -> None:
 
 
 def _compared(
-    recording: Recording, methods: Sequence[Contender], steps: Sequence[int], cost: CommonCost
+    recording: Recording,
+    methods: Sequence[Contender],
+    steps: Sequence[int],
+    cost: CommonCost,
+    plausible: PlausibleSets,
 ) -> list[Outcome]:
     waiting = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
@@ -107,7 +126,7 @@ def _compared(
         *columns, console=waiting, transient=True, disable=not waiting.is_terminal
     ) as progress:
         task = progress.add_task("registering", total=len(steps) * (len(methods) + 1))
-        for outcome in compared(recording, methods, steps, cost):
+        for outcome in compared(recording, methods, steps, cost, plausible):
             outcomes.append(outcome)
             progress.update(task, advance=1, description=f"step {outcome.step}")
     return outcomes

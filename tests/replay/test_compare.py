@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import math
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,11 @@ from rerun.chunk import RrdReader
 
 from chsel.engine import CompiledCost
 from chsel.errors import EngineError, RecordingError, SettingError
+from chsel.evaluation.plausible_diversity import plausible_diversity
+from chsel.evaluation.plausible_file import save_plausible
+from chsel.evaluation.plausible_set import plausible_set
+from chsel.evaluation.plausible_settings import plausible_settings
+from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
 from chsel.methods import build_method
 from chsel.online import pose_problem
 from chsel.points import KnownPoints, Workspace
@@ -29,6 +35,8 @@ from replay.events import Probe, ProblemPosed, SessionEnded, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from replay.registration import register_recorded
+
+REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 
 SETTINGS = {
     "cost": {"free_scale": 30.0},
@@ -356,3 +364,32 @@ def test_svg_and_pdf_are_the_same_file_each_time(path, tmp_path):
         first, second = (name.read_bytes() for name in names)
         assert first.startswith(head)
         assert first == second
+
+
+def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = Path(shutil.copy(REPLAYS / "cracker_box_chsel.mcap", tmp_path))
+    recording = read_recording(path)
+    start, problem, found = recording.start, recording.problem(9), recording.hypotheses(9)
+    assert start.world_from_object is not None
+    members = plausible_set(problem, start.world_from_object, plausible_settings("default", 0.001))
+    (tmp_path / "plausible").mkdir()
+    save_plausible(tmp_path / "plausible", members)
+    arguments = ["compare", str(path), "--steps", "8,9", "--methods", "icp"]
+    assert main([*arguments, "--save-csv", str(tmp_path / "out.csv")]) == 0
+    assert "PD" in capsys.readouterr().out
+    rows = list(csv.DictReader((tmp_path / "out.csv").open()))
+    (recorded,) = (row for row in rows if row["step"] == "9" and row["label"] != "icp")
+    points = surface_points(start.mesh, 500, StreamKey(start.seed, 0))
+    exact = SurfaceDistance(start.sdf, start.mesh, points, DistanceSettings(method="exact"))
+    expected = plausible_diversity(
+        exact.between(found.object_from_world, members.world_from_object)
+    )
+    assert float(recorded["diversity_mm2"]) == pytest.approx(expected.diversity, rel=1e-6)
+    assert float(recorded["coverage_mm2"]) == pytest.approx(expected.coverage, rel=1e-6)
+    assert {row["diversity_mm2"] for row in rows if row["step"] == "8"} == {""}
+    assert main([*arguments, "--definition", "paper", "--each"]) == 0
+    assert "PD" not in capsys.readouterr().out
+    assert main([*arguments, "--plausible", str(tmp_path / "nowhere")]) == 2
+    assert "nowhere is no folder" in capsys.readouterr().err

@@ -1,0 +1,60 @@
+"""How far hypotheses are from the plausible sets that lie beside a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from chsel.errors import RecordingError, require_choice
+from chsel.evaluation.plausible_diversity import plausible_diversity
+from chsel.evaluation.plausible_file import read_plausible
+from chsel.evaluation.plausible_set import PlausibleSet
+from chsel.evaluation.plausible_settings import DEFINITIONS, plausible_settings
+from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.streams import StreamKey
+from replay.mcap.reader import Recording
+
+
+class PlausibleSets:
+    """The sets of a recording's steps by one definition, as `runners.plausible` keeps them.
+
+    folder: by default `plausible` beside the recording. Raises RecordingError for a folder that
+    does not exist, unless it is the default, and SettingError for an unknown definition.
+    """
+
+    def __init__(
+        self, recording: Recording, folder: Path | None = None, definition: str = "default"
+    ) -> None:
+        require_choice("definition", definition, DEFINITIONS)
+        if folder is not None and not folder.is_dir():
+            raise RecordingError(f"{folder} is no folder; accepted: one with plausible sets")
+        self._folder = folder or recording.path.parent / "plausible"
+        self._definition = definition
+        start = recording.start
+        points = surface_points(start.mesh, DistanceSettings().points, StreamKey(start.seed, 0))
+        self._distance = SurfaceDistance(start.sdf, start.mesh, points)
+
+    def numbers(self, problem: RegistrationProblem, hypotheses: Hypotheses) -> dict[str, float]:
+        """Coverage, plausibility and PD in mm^2 (CHSEL, Sec. V); none without a set of the problem.
+
+        Raises EvaluationError for a set that is damaged.
+        """
+        members = self._members(problem)
+        if members is None or len(hypotheses.object_from_world) == 0:
+            return {}
+        poses = hypotheses.object_from_world
+        found = plausible_diversity(self._distance.between(poses, members.world_from_object))
+        return {
+            "coverage": found.coverage,
+            "plausibility": found.plausibility,
+            "diversity": found.diversity,
+        }
+
+    def _members(self, problem: RegistrationProblem) -> PlausibleSet | None:
+        """The set of these points and this object by the definition, whatever its eps."""
+        for path in sorted(self._folder.glob(f"{problem.points.digest}_*.npz")):
+            found = read_plausible(path)
+            usual = plausible_settings(self._definition, found.settings.epsilon)
+            if found.settings == usual and found.sdf_digest == problem.sdf.digest:
+                return found
+        return None
