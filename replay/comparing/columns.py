@@ -60,12 +60,16 @@ COLUMNS = (
         _DEGREES,
         ".1f",
     ),
-    Column("coverage", "mm2", "cover\nmm²", "coverage, mm²", form=".3g", log=True),
-    Column("plausibility", "mm2", "plaus\nmm²", "plausibility, mm²", form=".3g", log=True),
+    Column("coverage", "mm2", "coverage\nmm²", "coverage, mm²", form=".3g", log=True),
+    Column("plausibility", "mm2", "plausibility\nmm²", "plausibility, mm²", form=".3g", log=True),
     Column("diversity", "mm2", "PD\nmm²", "plausible diversity, mm²", form=".3g", log=True),
     Column("seconds", "s", "ms", "time, ms", 1e3, ".1f"),
 )
 """All numbers, in the order in which they are shown."""
+
+
+PLAUSIBLE = ("coverage", "plausibility", "diversity")
+"""Numbers about the distance to plausible sets, which have tables of their own."""
 
 
 def columns_in_table(names: Collection[str]) -> tuple[Column, ...]:

@@ -20,7 +20,7 @@ from chsel.errors import RecordingError, SettingError
 from chsel.evaluation.plausible_settings import DEFINITIONS
 from chsel.problem import Hypotheses
 from chsel.threads import threads
-from replay.comparing.columns import Column, columns_in_table
+from replay.comparing.columns import PLAUSIBLE, Column, columns_in_table
 from replay.comparing.comparison import (
     CommonCost,
     Outcome,
@@ -143,36 +143,51 @@ def _tell(
     count: int,
 ) -> None:
     columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
-    labels = [recorded_label(recording), *(method.label for method in methods)]
-    steps = list(dict.fromkeys(outcome.step for outcome in outcomes))
-    of_label = {label: [o for o in outcomes if o.label == label] for label in labels}
-    if each:
-        table = _table(f"each step, {_costs(cost)}", ["step", "method"], columns)
-        for step in steps:
-            for outcome in (outcome for outcome in outcomes if outcome.step == step):
-                _add(table, [str(step), outcome.label], columns, outcome)
-            table.add_section()
-        console.print(table, "")
-    if len(steps) > 1:
-        title = f"medians over {len(steps)} steps, {_costs(cost)}"
-        some_failed = any(outcome.failure for outcome in outcomes)
-        table = _table(title, ["method", "steps"] if some_failed else ["method"], columns)
-        for label in labels:
-            found = [outcome for outcome in of_label[label] if not outcome.failure]
-            texts = [label, str(len(found))] if some_failed else [label]
-            _add(table, texts, columns, Outcome(0, label, None, medians(found)))
-        console.print(table, "")
+    of_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
+    of_all = tuple(column for column in columns if column.name not in PLAUSIBLE)
+    _tell_tables(console, _costs(cost), of_all, outcomes, each=each)
+    if of_sets:
+        _tell_tables(console, "plausible sets", of_sets, outcomes, each=each)
     console.print(_legend(columns, count))
     for method in methods:
         if method.changes:
             console.print(
                 f"{method.label} with {', '.join(method.changes)}", markup=False, soft_wrap=True
             )
-        _tell_bits(console, method, of_label[method.label])
+        _tell_bits(console, method, [o for o in outcomes if o.label == method.label])
     for outcome in outcomes:
         if outcome.failure:
             what = f"step {outcome.step}, {outcome.label}: {outcome.failure}"
             console.print(what, markup=False, soft_wrap=True)
+
+
+def _tell_tables(
+    console: Console,
+    what: str,
+    columns: Sequence[Column],
+    outcomes: Sequence[Outcome],
+    *,
+    each: bool,
+) -> None:
+    """A row for each step and method if wanted, and the medians over several steps."""
+    labels = list(dict.fromkeys(outcome.label for outcome in outcomes))
+    steps = list(dict.fromkeys(outcome.step for outcome in outcomes))
+    if each:
+        table = _table(f"each step, {what}", ["step", "method"], columns)
+        for step in steps:
+            for outcome in (outcome for outcome in outcomes if outcome.step == step):
+                _add(table, [str(step), outcome.label], columns, outcome)
+            table.add_section()
+        console.print(table, "")
+    if len(steps) > 1:
+        some_failed = any(outcome.failure for outcome in outcomes)
+        texts = ["method", "steps"] if some_failed else ["method"]
+        table = _table(f"medians over {len(steps)} steps, {what}", texts, columns)
+        for label in labels:
+            found = [o for o in outcomes if o.label == label and not o.failure]
+            cells = [label, str(len(found))] if some_failed else [label]
+            _add(table, cells, columns, Outcome(0, label, None, medians(found)))
+        console.print(table, "")
 
 
 def _legend(columns: Sequence[Column], count: int) -> str:
