@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from chsel.arrays import FloatArray, IntArray
 from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.kernels import emitters as kernels
 from chsel.kernels.emitters import me_search, mega_search
+from chsel.measures import Measure
 from chsel.objective import Objective
 from chsel.observer import Observer
 from chsel.streams import Purpose, StreamKey, normals
@@ -75,9 +76,25 @@ class Draws:
         return self.key.stream(Purpose.RESTART, self.refinement).random(iterations)
 
 
+class Searched(Protocol):
+    """What a search goes through: costs and measures of vectors, and what its kernel takes."""
+
+    model: Any
+    space_arrays: Any
+
+    def work(self) -> Any:
+        """Scratch for one thread."""
+
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        """Costs (B,) of vectors (B, d)."""
+
+    def measures(self, measure: Measure, vectors: FloatArray) -> FloatArray:
+        """Measures (B, k) of vectors (B, d)."""
+
+
 def update_cells(
     archive: GridArchive,
-    objective: Objective,
+    objective: Searched,
     vectors: FloatArray,
     costs: FloatArray | None = None,
 ) -> tuple[IntArray, FloatArray]:
@@ -103,10 +120,7 @@ def cma_mega(
     start (d,): the first theta. An iteration evaluates theta with its gradients, and count - 1
     branches around it.
     """
-    batch, measures, total = max(count - 1, 1), archive.measure.count, settings.iterations
-    problem = _problem(objective, archive)
-    normals, elites = draws.blocks(total, batch, measures + 1), draws.elites(total)
-    size = draws.block(batch, measures + 1)
+    batch, measures = max(count - 1, 1), archive.measure.count
     search = mega_search(
         start,
         measures,
@@ -115,31 +129,25 @@ def cma_mega(
         rate=settings.rate,
         ribs_parity=settings.ribs_parity,
     )
-    for first, last in watch.segments(total):
-        if first % size == 0:
-            drawn, uniform = next(normals), elites[first : first + size]
-        place = first % size, last - first // size * size
-        kernels.cma_mega(*problem, archive.cells, search, drawn, uniform, *place)
-        watch.after(last, total, archive)
+    shape = settings.iterations, batch, measures + 1
+    _iterate(kernels.cma_mega, objective, archive, search, shape, draws, watch)
 
 
 def cma_me(
-    objective: Objective,
+    objective: Searched,
     archive: GridArchive,
     start: FloatArray,
     count: int,
     settings: EmitterSettings,
     draws: Draws,
     watch: ArchiveWatch,
+    iterations: Callable[..., None] | None = None,
 ) -> None:
     """Fill the archive by an evolution strategy on the search vectors (Fontaine et al., 2020).
 
-    start (d,): the first mean. An iteration evaluates count samples.
+    start (d,): the first mean. An iteration evaluates count samples. iterations: the kernel, of
+    an objective that is not the relaxed cost.
     """
-    total = settings.iterations
-    problem = _problem(objective, archive)
-    normals, elites = draws.blocks(total, count, len(start)), draws.elites(total)
-    size = draws.block(count, len(start))
     search = me_search(
         start,
         archive.measure.count,
@@ -147,17 +155,30 @@ def cma_me(
         sigma0=settings.sigma0,
         ribs_parity=settings.ribs_parity,
     )
+    shape = settings.iterations, count, len(start)
+    _iterate(iterations or kernels.cma_me, objective, archive, search, shape, draws, watch)
+
+
+def _iterate(
+    iterations: Callable[..., None],
+    objective: Searched,
+    archive: GridArchive,
+    search: Any,
+    shape: tuple[int, int, int],
+    draws: Draws,
+    watch: ArchiveWatch,
+) -> None:
+    """Run the iterations of a kernel with normal draws of a shape, segment by segment."""
+    total, batch, dimension = shape
+    problem = objective.model, objective.space_arrays, archive.measure.code, objective.work()
+    normals, elites = draws.blocks(total, batch, dimension), draws.elites(total)
+    size = draws.block(batch, dimension)
     for first, last in watch.segments(total):
         if first % size == 0:
             drawn, uniform = next(normals), elites[first : first + size]
         place = first % size, last - first // size * size
-        kernels.cma_me(*problem, archive.cells, search, drawn, uniform, *place)
+        iterations(*problem, archive.cells, search, drawn, uniform, *place)
         watch.after(last, total, archive)
-
-
-def _problem(objective: Objective, archive: GridArchive) -> tuple[Any, Any, Any, Any]:
-    """What the kernels evaluate: the cost's model, the space, the measure, and scratch."""
-    return objective.model, objective.space_arrays, archive.measure.code, objective.work()
 
 
 class ArchiveWatch:

@@ -154,6 +154,20 @@ def ranked_hypotheses(
 ) -> Hypotheses:
     """Poses (B, 4, 4) from archive cells (B,), costed as they are and put in order of cost."""
     cost = objective.costs(objective.space.encode(object_from_world))
+    return ranked(object_from_world, cost, cells, elites, archive)
+
+
+def ranked(
+    object_from_world: FloatArray,
+    cost: FloatArray,
+    cells: IntArray | None = None,
+    elites: FloatArray | None = None,
+    archive: ArchiveSnapshot | None = None,
+) -> Hypotheses:
+    """Poses (B, 4, 4) in order of their costs (B,).
+
+    Without cells they are of none; without elites the poses themselves are all that is kept.
+    """
     if not np.isfinite(cost).any():
         raise ChselError(
             "no hypothesis has a finite cost; accepted: points, SDF and scales by which the cost "
@@ -161,4 +175,6 @@ def ranked_hypotheses(
         )
     order = np.argsort(cost, kind="stable")
     poses = object_from_world[order]
-    return Hypotheses(poses, cost[order], repeated(poses), cells[order], elites, archive)
+    cells = np.full(len(poses), -1, dtype=np.int64) if cells is None else cells[order]
+    elites = poses if elites is None else elites
+    return Hypotheses(poses, cost[order], repeated(poses), cells, elites, archive)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from chsel.evaluation.pose_error import pose_errors
 from chsel.online import pose_problem
 from chsel.pose import inverse
 from chsel.problem import Hypotheses
+from replay.comparing.plausible import PlausibleSets
 from replay.differences import apart
 from replay.environment import environment
 from replay.events import (
@@ -42,8 +43,9 @@ class Change:
 
     equal: to the bit, with all stages on the way. ulps: the most between two of the costs or
     poses, if there are as many. Pairs are recorded and new. position, rotation: from the recorded
-    best pose to the new one, metres and radians. position_error, rotation_error: of the best,
-    where the truth is known.
+    best pose to the new one, metres and radians, NaN if a result has no pose. position_error,
+    rotation_error: of the best, where the truth is known. diversity: PD in mm^2, where the
+    plausible set of the step lies beside the recording.
     """
 
     step: int
@@ -55,6 +57,7 @@ class Change:
     rotation: float
     position_error: tuple[float, float] | None
     rotation_error: tuple[float, float] | None
+    diversity: tuple[float, float] | None
 
 
 def write_blessed(recording: Recording, path: Path) -> Recording:
@@ -81,19 +84,17 @@ def write_blessed(recording: Recording, path: Path) -> Recording:
 
 def changes(recorded: Recording, new: Recording) -> list[Change]:
     """What differs, step by step, between results that are there in both."""
-    truth = recorded.start.world_from_object
+    sets, truth = PlausibleSets(recorded), recorded.start.world_from_object
     before, after = _outputs(recorded), _outputs(new)
-    return [
-        _change(
-            step,
-            recorded.hypotheses(step),
-            new.hypotheses(step),
-            truth,
-            equal=before[step] == after[step],
-        )
-        for step in recorded.steps
-        if recorded.has_result(step)
-    ]
+    found = []
+    for event in recorded.events():
+        if isinstance(event, ProblemPosed) and recorded.has_result(event.step):
+            step = event.step
+            pair = recorded.hypotheses(step), new.hypotheses(step)
+            numbers = [sets.numbers(event.problem, result) for result in pair]
+            change = _change(step, *pair, truth, numbers, equal=before[step] == after[step])
+            found.append(change)
+    return found
 
 
 def _outputs(recording: Recording) -> dict[int, list[object]]:
@@ -150,13 +151,26 @@ def _todays_events(recording: Recording) -> Iterator[Event]:
 
 
 def _change(
-    step: int, recorded: Hypotheses, new: Hypotheses, truth: FloatArray | None, *, equal: bool
+    step: int,
+    recorded: Hypotheses,
+    new: Hypotheses,
+    truth: FloatArray | None,
+    numbers: Sequence[Mapping[str, float]],
+    *,
+    equal: bool,
 ) -> Change:
-    shift, turn = pose_errors(new.object_from_world[:1], inverse(recorded.object_from_world[0]))
+    position = rotation = float("nan")
     errors: list[tuple[float, float]] | None = None  # of position, of rotation
-    if truth is not None:
-        before, after = (pose_errors(h.object_from_world[:1], truth) for h in (recorded, new))
-        errors = [(float(old[0]), float(now[0])) for old, now in zip(before, after, strict=True)]
+    if len(recorded.cost) > 0 and len(new.cost) > 0:
+        world_from_recorded = inverse(recorded.object_from_world[0])
+        shift, turn = pose_errors(new.object_from_world[:1], world_from_recorded)
+        position, rotation = float(shift[0]), float(turn[0])
+        if truth is not None:
+            before, after = (pose_errors(h.object_from_world[:1], truth) for h in (recorded, new))
+            errors = [
+                (float(old[0]), float(now[0])) for old, now in zip(before, after, strict=True)
+            ]
+    diversity = [values["diversity"] for values in numbers if "diversity" in values]
     return Change(
         step=step,
         equal=equal,
@@ -164,10 +178,15 @@ def _change(
             apart(recorded.cost, new.cost),
             apart(recorded.object_from_world, new.object_from_world),
         ),
-        best_cost=(float(recorded.cost[0]), float(new.cost[0])),
+        best_cost=(_best(recorded), _best(new)),
         distinct=(recorded.distinct, new.distinct),
-        position=float(shift[0]),
-        rotation=float(turn[0]),
+        position=position,
+        rotation=rotation,
         position_error=errors[0] if errors else None,
         rotation_error=errors[1] if errors else None,
+        diversity=(diversity[0], diversity[1]) if len(diversity) == 2 else None,
     )
+
+
+def _best(hypotheses: Hypotheses) -> float:
+    return float(hypotheses.cost[0]) if len(hypotheses.cost) > 0 else float("nan")

@@ -241,36 +241,35 @@ def _title(
 
 _COLUMNS = {
     "step": ("step", "d"),
-    "contacts": ("contacts", "d"),
+    "contacts": ("con-\ntacts", "d"),
     "free_points": ("free", "d"),
-    "true_cost": ("C(X*)", ".4g"),
-    "members": ("members", "d"),
-    "local": ("off grid", "d"),
-    "distinct": ("distinct", "d"),
-    "coverage": ("coverage mm²", ".1f"),
-    "plausibility": ("plausibility mm²", ".1f"),
-    "diversity": ("PD mm²", ".1f"),
-    "root": ("√PD mm", ".1f"),
+    "true_cost": ("C(X*)", ".2g"),
+    "members": ("mem-\nbers", "d"),
+    "local": ("off\ngrid", "d"),
+    "distinct": ("dis-\ntinct", "d"),
+    "coverage": ("cover-\nage", ".1f"),
+    "plausibility": ("plausi-\nbility", ".1f"),
+    "diversity": ("PD\nmm²", ".1f"),
+    "root": ("√PD\nmm", ".1f"),
     "rank": ("rank", ".2f"),
-    "seconds": ("time", ".2f"),
+    "seconds": ("time\ns", ".2f"),
 }
 
 
 def _table(rows: list[Row]) -> Table:
-    table = Table(box=SIMPLE_HEAD, collapse_padding=True)
+    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 0))
     shown = [key for key in _COLUMNS if any(key in row for row in rows)]
     for key in shown:
-        table.add_column(_COLUMNS[key][0], justify="right")
+        table.add_column(_COLUMNS[key][0], justify="right", no_wrap=True)
     for row in rows:
-        cells = [
-            format(row[key], _COLUMNS[key][1]) if row.get(key) is not None else "" for key in shown
-        ]
-        if row["seconds"] is None:
-            cells[-1] = "found"
-        elif "seconds" in row:
-            cells[-1] += " s"
-        table.add_row(*cells)
+        table.add_row(*(_cell(row, key) for key in shown))
     return table
+
+
+def _cell(row: Row, key: str) -> str:
+    if key == "seconds" and row[key] is None:
+        return "found"
+    return format(row[key], _COLUMNS[key][1]) if row.get(key) is not None else ""
 
 
 def named_arguments(arguments: list[str]) -> list[str]:

@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+settings.register_profile("random", deadline=None)  # --hypothesis-profile=random: other examples
+settings.register_profile("fixed", deadline=None, derandomize=True)
+settings.load_profile("fixed")
 torch.set_num_threads(1)  # two threads on two busy cores are many times slower
 
 

@@ -135,7 +135,7 @@ def cma_mega(
         parents = rank(branches.status, branches.value, branches.order)
         tell(strategy, coefficients, branches.order, parents)
         if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
-            _move_to_elite(archive, elites[iteration], theta)
+            move_to_elite(archive, elites[iteration], theta)
             _forget(search.adam)
             reset(strategy)
             strategy.mean[:] = 0.0
@@ -169,7 +169,7 @@ def cma_me(
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            _move_to_elite(archive, elites[iteration], strategy.mean)
+            move_to_elite(archive, elites[iteration], strategy.mean)
             reset(strategy)
 
 
@@ -211,7 +211,7 @@ def _branch(
 
 
 @inner
-def _move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
+def move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
     """Make a vector (d,) that of an elite, chosen by a number from [0, 1), if there is any."""
     cell = sampled_cell(archive.objectives, uniform)
     if cell >= 0:

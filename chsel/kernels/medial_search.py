@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from chsel.arrays import FloatArray
-from chsel.kernels.archive import Batch, Cells, all_finite, insert, rank, sampled_cell
-from chsel.kernels.compiler import compiled, inner, spliced
-from chsel.kernels.emitters import MeSearch
+from chsel.kernels.archive import Batch, Cells, all_finite, insert, rank
+from chsel.kernels.compiler import compiled, spliced
+from chsel.kernels.emitters import MeSearch, move_to_elite
 from chsel.kernels.evolution import ask, reset, stopped, tell
 from chsel.kernels.measures import measures_of
 from chsel.kernels.medial import cost_of
@@ -40,7 +40,7 @@ def medial_cma_me(
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            _move_to_elite(archive, elites[iteration], strategy.mean)
+            move_to_elite(archive, elites[iteration], strategy.mean)
             reset(strategy)
 
 
@@ -55,12 +55,3 @@ def _evaluate(model: Any, space: Any, measure: Any, batch: Batch, work: Any) -> 
             measures_of(space, measure, vector, measures[i])
         else:
             objectives[i] = -np.inf
-
-
-@inner
-def _move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
-    """Make a vector (d,) that of an elite, chosen by a number from [0, 1), if there is any."""
-    cell = sampled_cell(archive.objectives, uniform)
-    if cell >= 0:
-        for j in range(len(vector)):
-            vector[j] = archive.solutions[cell, j]

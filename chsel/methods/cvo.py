@@ -25,7 +25,7 @@ from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.rkhs_cloud import blocks_of, cloud_norm, of_block
 from chsel.rkhs_field import Kernel, free_field, surface_field
 from chsel.sdf import COARSEST, FINEST
-from chsel.selection import repeated
+from chsel.selection import ranked
 from chsel.threads import spread
 
 MOST_ITERATIONS = 1_000_000
@@ -197,7 +197,7 @@ class Cvo:
         if len(points.contacts) == 0 and not (settings.free_space and len(points.free)):
             costs = np.ones(len(estimates))
             observer.trace("ascent", 0, encode_9d(estimates), costs.copy())
-            return _ranked(estimates, costs)
+            return ranked(estimates, costs)
         centre = np.zeros(3)
         if settings.origin == "workspace":
             centre = (problem.workspace.bounds[0] + problem.workspace.bounds[1]) / 2.0
@@ -220,7 +220,7 @@ class Cvo:
                 if (states[:, DONE] > 0.0).all():
                     break
             done = (level + 1) * settings.max_iterations
-        return _ranked(estimates, clouds.costs(states[:, VALUE]))
+        return ranked(estimates, clouds.costs(states[:, VALUE]))
 
     def _blocks(self) -> list[int]:
         """How many iterations each block has."""
@@ -283,11 +283,3 @@ def _placed(
     """Transforms (B, 4, 4) of poses (B, 12) seen from `centre`; of E_0 those that never moved."""
     seen = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
     return np.where(moved[:, None, None], _seen_from(-centre, seen), initial_set)
-
-
-def _ranked(object_from_world: FloatArray, cost: FloatArray) -> Hypotheses:
-    """Poses (B, 4, 4) in the order of their costs (B,)."""
-    order = np.argsort(cost, kind="stable")
-    poses = object_from_world[order]
-    no_cells = np.full(len(poses), -1, dtype=np.int64)
-    return Hypotheses(poses, cost[order], repeated(poses), no_cells, poses)

@@ -11,7 +11,6 @@ from chsel import presets
 from chsel.arrays import BoolArray, FloatArray
 from chsel.engine import poses_of
 from chsel.errors import (
-    ChselError,
     SettingError,
     require_at_most,
     require_choice,
@@ -24,7 +23,7 @@ from chsel.online import OnlineSettings
 from chsel.pose import compose, encode_9d
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
-from chsel.selection import repeated
+from chsel.selection import ranked
 from chsel.streams import Purpose, StreamKey
 from chsel.surface import surface_points
 from chsel.threads import spread
@@ -97,11 +96,11 @@ class Icp:
         observer = observer or NullObserver()
         contacts, poses = problem.points.contacts, poses_of(problem.initial_set)
         if len(contacts) == 0:
-            return _ranked(poses, np.zeros(len(poses)))
+            return ranked(problem.initial_set, np.zeros(len(poses)))
         cloud = _Cloud(contacts, self.surface(problem))
         observer.trace("icp", 0, encode_9d(_transforms(poses)), cloud.distances(poses))
         poses = self._iterated(cloud, poses, observer)
-        return _ranked(poses, cloud.distances(poses))
+        return ranked(_transforms(poses), cloud.distances(poses))
 
     def surface(self, problem: RegistrationProblem) -> FloatArray:
         """The points (Q, 3) of the object, in its frame, that a registration goes by."""
@@ -172,16 +171,3 @@ def _drawn(sdf: SdfGrid, count: int, key: StreamKey) -> FloatArray:
 def _transforms(poses: FloatArray) -> FloatArray:
     """Transforms (B, 4, 4) of poses (B, 12)."""
     return compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
-
-
-def _ranked(poses: FloatArray, cost: FloatArray) -> Hypotheses:
-    """Hypotheses at poses (B, 12) with costs (B,), in order of cost."""
-    if not np.isfinite(cost).any():
-        raise ChselError(
-            "no contact is at a finite distance from the object; accepted: contacts and poses "
-            "whose squared distances are finite"
-        )
-    order = np.argsort(cost, kind="stable")
-    transforms = _transforms(poses[order])
-    no_cells = np.full(len(order), -1, dtype=np.int64)
-    return Hypotheses(transforms, cost[order], repeated(transforms), no_cells, transforms)

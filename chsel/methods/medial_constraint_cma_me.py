@@ -8,10 +8,10 @@ from chsel import presets
 from chsel.archive import GridArchive
 from chsel.arrays import FloatArray
 from chsel.cma_es import CmaEsSettings, evolved
-from chsel.emitters import ArchiveWatch, Draws, EmitterSettings
+from chsel.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me, update_cells
+from chsel.kernels.medial_search import medial_cma_me
 from chsel.measures import measure_named
 from chsel.medial_cost import MedialCost, MedialCostSettings, MedialObjective
-from chsel.medial_search import medial_cma_me
 from chsel.methods.medial_constraint import CMA_ES, MEDIAL_COST
 from chsel.observer import NullObserver, Observer
 from chsel.online import OnlineSettings
@@ -96,7 +96,7 @@ class MedialConstraintCmaMe:
         start = first if settings.emitter.start == "initial" else best
         draws, watch = Draws(key), ArchiveWatch(observer, 0, "cma_me")
         watch.start(archive)
-        medial_cma_me(objective, archive, start, count, settings.emitter, draws, watch)
+        cma_me(objective, archive, start, count, settings.emitter, draws, watch, medial_cma_me)
         # E <- cells of M with the |E_0| lowest costs
         stream, known_count = key.stream(Purpose.RESAMPLE), len(problem.points.known)
         chosen = select_elites(archive.costs, count, settings.output, known_count, stream)
@@ -113,8 +113,6 @@ class MedialConstraintCmaMe:
         costs, measures = objective.costs(vectors), objective.measures(measure, vectors)
         known_count = len(problem.points.known)
         archive = sized_archive(measure, measures, costs, settings, known_count, space.dimension)
-        archive.add(vectors, -costs, measures)
-        low_cost = space.encode(problem.low_cost_set)
-        low_costs = objective.costs(low_cost)
-        archive.add(low_cost, -low_costs, objective.measures(measure, low_cost))
+        update_cells(archive, objective, vectors, costs)
+        update_cells(archive, objective, space.encode(problem.low_cost_set))
         return archive

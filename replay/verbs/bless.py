@@ -62,6 +62,8 @@ def _table(path: Path, differing: list[Change], count: int) -> Table:
     names = ["step", "up to", "best cost", "distinct", "best pose moves"]
     if differing[0].position_error is not None:
         names.append("its error to the true pose")
+    if any(change.diversity for change in differing):
+        names.append("PD, mm²")
     for name in names:
         table.add_column(name, justify="right")
     for change in differing:
@@ -72,6 +74,8 @@ def _table(path: Path, differing: list[Change], count: int) -> Table:
         if change.position_error and change.rotation_error:
             errors = zip(change.position_error, change.rotation_error, strict=True)
             cells.append(_pair(*(_moved(*error) for error in errors)))
+        if change.diversity:
+            cells.append(_pair(*(f"{number:.4g}" for number in change.diversity)))
         table.add_row(*cells)
     return table
 

@@ -11,7 +11,12 @@ import numpy as np
 import pytest
 
 from chsel import online
+from chsel.evaluation.plausible_file import save_plausible
+from chsel.evaluation.plausible_set import plausible_set
+from chsel.evaluation.plausible_settings import plausible_settings
+from chsel.problem import Hypotheses
 from replay.__main__ import main
+from replay.blessing import _change
 from replay.mcap.reader import read_recording
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
@@ -59,6 +64,44 @@ def test_todays_results_are_those_that_verify_then_expects(
         assert points[0].digest == points[1].digest
     assert not np.array_equal(blessed.problem(9).initial_set, recorded.problem(9).initial_set)
     assert list(stored.parent.iterdir()) == [stored]
+
+
+@pytest.mark.usefixtures("other_code")
+def test_diversity_is_told_where_plausible_sets_lie_beside_it(
+    stored: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "140")
+    recording = read_recording(stored)
+    truth = recording.start.world_from_object
+    assert truth is not None
+    members = plausible_set(recording.problem(9), truth, plausible_settings("default", 0.002))
+    save_plausible(stored.parent / "plausible", members)
+    assert main(["bless", str(stored), "--yes"]) == 0
+    shown = capsys.readouterr().out
+    assert "PD, mm²" in shown
+    (row,) = (line for line in shown.splitlines() if line.split()[:1] == ["9"])
+    before, after = (float(number) for number in row.split()[-3::2])
+    assert before != after
+    assert before > 0.0
+
+
+def test_results_without_poses_are_compared_as_well(stored: Path) -> None:
+    recording = read_recording(stored)
+    found = recording.hypotheses(9)
+    nothing = Hypotheses(
+        found.object_from_world[:0],
+        found.cost[:0],
+        found.duplicate[:0],
+        found.cell[:0],
+        found.elites[:0],
+        None,
+    )
+    truth = recording.start.world_from_object
+    for pair in [(found, nothing), (nothing, found), (nothing, nothing)]:
+        change = _change(9, *pair, truth, [{}, {}], equal=False)
+        assert np.isnan(change.position)
+        assert change.position_error is None
+        assert change.distinct == tuple(one.distinct for one in pair)
 
 
 class Terminal(io.StringIO):
