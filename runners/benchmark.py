@@ -18,13 +18,14 @@ from chsel.errors import require_choice, require_positive
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
 from runners.benchmarks import report
-from runners.benchmarks.alone import MEASURES, Scope
+from runners.benchmarks.alone import MEASURES
 from runners.benchmarks.comparison import WHAT, compare
 from runners.benchmarks.machine import load, machine
 from runners.benchmarks.ours import Steps
 from runners.benchmarks.plot import draw
 from runners.benchmarks.problems import PROBLEMS
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
+from runners.benchmarks.scope import Scope
 from runners.cli import command, plain
 from runners.recording import make_run_folder
 
@@ -74,7 +75,7 @@ class BenchmarkConfig:
         return replace(
             self,
             problems=("real_20",),
-            alone=tuple(name for name in self.alone if name != "start"),
+            alone=tuple(name for name in self.alone if name not in ("methods", "start")),
             free_points=(5000, 20_000),
             hypotheses=(10, 30),
             repeats=2,

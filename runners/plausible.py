@@ -19,9 +19,7 @@ from rich.table import Table
 
 from chsel.arrays import FloatArray
 from chsel.errors import SettingError, require_positive
-from chsel.evaluation.calibration import calibration
 from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.plausible_diversity import cheapest, plausible_diversity
 from chsel.evaluation.plausible_file import load_plausible, save_plausible
 from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
 from chsel.evaluation.plausible_settings import (
@@ -29,39 +27,20 @@ from chsel.evaluation.plausible_settings import (
     PlausibleSettings,
     plausible_settings,
 )
-from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
 from chsel.evaluation.true_pose import find_true_pose
-from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.problem import RegistrationProblem
 from chsel.settings import build_settings, settings_mapping
 from chsel.streams import StreamKey
 from chsel.threads import threads
 from replay.step_ranges import chosen_steps
 from runners.cli import command, plain
+from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig
 from runners.plausible_source import Source, open_source
 
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 _OVERRIDE = re.compile(r"[~+]{0,2}[\w.@/:]+=")
 Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class MetricsConfig:
-    """How distances are measured, see DistanceSettings; quantile: of the hypotheses by cost."""
-
-    points: int = 500
-    method: str = "nearest"
-    bidirectional: bool = False
-    quantile: float = 1.0
-
-    def __post_init__(self) -> None:
-        DistanceSettings(self.points, self.method, self.bidirectional)
-        cheapest(np.zeros(1), self.quantile)
-
-    @property
-    def distance(self) -> DistanceSettings:
-        """The part that concerns distances."""
-        return DistanceSettings(self.points, self.method, self.bidirectional)
 
 
 @dataclass(frozen=True)
@@ -162,7 +141,7 @@ def _rows(
     rows: list[Row] = []
     failures: list[str] = []
     before: PlausibleSet | None = None
-    measure = _Measure(config.metrics, source, truth)
+    measure = Measure(config.metrics, source.mesh, truth)
     waiting = Console(stderr=True)
     with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress:
         for step in progress.track(steps, description="plausible sets"):
@@ -194,38 +173,6 @@ def _row(problem: RegistrationProblem, found: PlausibleSet, seconds: float | Non
         "true_cost": found.true_cost,
         "seconds": seconds,
     }
-
-
-class _Measure:
-    """The metrics of hypotheses; the same points on the surface for all steps of a session."""
-
-    def __init__(self, config: MetricsConfig, source: Source, truth: FloatArray) -> None:
-        self._config, self._source, self._truth = config, source, truth
-        self._distance: SurfaceDistance | None = None
-
-    def of(
-        self, problem: RegistrationProblem, members: PlausibleSet, found: Hypotheses | None
-    ) -> Row:
-        """Coverage, plausibility and diversity in mm^2, its root, and the rank of the truth."""
-        if found is None or len(found.cost) == 0:
-            return {}
-        if self._distance is None:
-            mesh, key = self._source.mesh, StreamKey(problem.key.seed, 0)
-            points = surface_points(mesh, self._config.points, key)
-            self._distance = SurfaceDistance(problem.sdf, mesh, points, self._config.distance)
-        chosen = found.object_from_world[cheapest(found.cost, self._config.quantile)]
-        distances = self._distance.between(chosen, members.world_from_object)
-        metrics = plausible_diversity(distances)
-        row: Row = {
-            "distinct": found.distinct,
-            "coverage": metrics.coverage,
-            "plausibility": metrics.plausibility,
-            "diversity": metrics.diversity,
-            "root": metrics.root,
-        }
-        if len(chosen) > 1:
-            row["rank"] = calibration(self._distance, chosen, self._truth).rank
-        return row
 
 
 def _title(

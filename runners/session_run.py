@@ -8,7 +8,7 @@ from typing import Any
 
 from chsel.methods.method import Method
 from chsel.online import pose_problem
-from chsel.problem import Hypotheses
+from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
 from replay.events import (
@@ -86,15 +86,7 @@ class SessionRun:
 
     def _register(self, step: int, seconds: dict[str, float]) -> Row:
         """Pose the problem, register, and record both; numbers about the result."""
-        problem = pose_problem(
-            self._sdf,
-            self.points,
-            self._session.workspace,
-            self._session.free_resolution,
-            StreamKey(self._seed, step),
-            self._method.online,
-            self.previous,
-        )
+        problem = self._pose(step, self.previous)
         registered = register_recorded(
             ProblemPosed(step, problem),
             self._method,
@@ -107,6 +99,18 @@ class SessionRun:
         found = self.previous = registered.hypotheses
         row = {"best_cost": float(found.cost[0]), "distinct": found.distinct}
         return row | {"digest": found.digest} | dict(registered.numbers)
+
+    def _pose(self, step: int, previous: Hypotheses | None) -> RegistrationProblem:
+        """What is to be registered at a step, after the result of the one before."""
+        return pose_problem(
+            self._sdf,
+            self.points,
+            self._session.workspace,
+            self._session.free_resolution,
+            StreamKey(self._seed, step),
+            self._method.online,
+            previous,
+        )
 
 
 def _line(row: Row) -> str:

@@ -1,4 +1,4 @@
-"""The registration methods, by name."""
+"""The registration methods, by name: ours, and those of installed packages."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from chsel import presets
-from chsel.errors import require_choice
+from chsel.errors import SettingError, require_choice
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
 from chsel.methods.icp import Icp, preset_icp
+from chsel.methods.installed import installed_method, installed_names, offering_packages
 from chsel.methods.medial_constraint import MedialConstraint, preset_medial_constraint
 from chsel.methods.medial_constraint_cma_me import (
     MedialConstraintCmaMe,
@@ -43,7 +44,7 @@ def _gradient_descent(preset: str) -> GradientDescentSettings:
     )
 
 
-_METHODS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
+_OURS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
     "chsel": (Chsel, _chsel),
     "chsel_cma_me": (Chsel, _chsel_cma_me),
     "gradient_descent": (GradientDescent, _gradient_descent),
@@ -54,27 +55,36 @@ _METHODS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
     "medial_constraint": (MedialConstraint, preset_medial_constraint),
     "medial_constraint_cma_me": (MedialConstraintCmaMe, preset_medial_constraint_cma_me),
 }
-METHODS = tuple(_METHODS)
+OURS = tuple(_OURS)
+METHODS = (*OURS, *(name for name in installed_names() if name not in OURS))
 
 
 def preset_settings(name: str, preset: str = "default") -> Any:
     """The settings of a method by name, as a preset has them."""
-    require_choice("method", name, METHODS)
+    _, of_preset = _entry(name)
     require_choice("preset", preset, presets.PRESETS)
-    return _METHODS[name][1](preset)
+    return of_preset(preset)
 
 
 def build_method(name: str, settings: Any = None) -> Method:
     """A method by name.
 
     settings: its settings, a mapping of them (unnamed ones keep their default), or None for the
-    default preset. Raises SettingError for names and values that do not exist.
+    default preset. Raises SettingError for names and values that do not exist, and for a name of
+    ours that an installed package gives to a method, too.
     """
-    require_choice("method", name, METHODS)
-    make, preset = _METHODS[name]
+    make, preset = _entry(name)
+    if name in OURS and (offering := offering_packages(name)):
+        raise SettingError(f"method {name} is of package {offering[0]}, too; accepted: one of them")
     default = preset("default")
     if settings is None:
         settings = default
     elif isinstance(settings, Mapping):
         settings = build_settings(type(default), settings, "method")
     return make(settings)
+
+
+def _entry(name: str) -> tuple[Callable[[Any], Method], Callable[[str], Any]]:
+    """What makes a method of its settings, and its settings by preset."""
+    require_choice("method", name, METHODS)
+    return _OURS[name] if name in OURS else installed_method(name)

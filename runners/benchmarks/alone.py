@@ -6,7 +6,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -20,9 +19,12 @@ from chsel.presets import COST
 from chsel.streams import StreamKey
 from chsel.threads import threads as use_threads
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
-from runners.benchmarks.ours import PRESETS, StageTimer, Steps, register
+from runners.benchmarks.methods import methods
+from runners.benchmarks.ours import PRESETS, StageTimer, register
+from runners.benchmarks.plausible import plausible_sets
 from runners.benchmarks.problems import PROBLEMS, PosedProblem, Problem, pose
 from runners.benchmarks.recorded import recorded_registrations
+from runners.benchmarks.scope import Scope
 from runners.benchmarks.timing import Row, in_turn
 
 _PROBLEM = "real_20"
@@ -32,28 +34,6 @@ _POSES = 100_000
 _POSES_AT_ONCE = 1000
 _POSES_ON_GPU = (100_000, 1_000_000, 10_000_000)
 _LONGEST = 3.0  # seconds
-
-
-@dataclass(frozen=True)
-class Scope:
-    """How much is measured, and where evaluation is."""
-
-    steps: Steps
-    repeats: int
-    seed: int
-    free_points: tuple[int, ...]
-    hypotheses: tuple[int, ...]
-    gpu: bool = False
-
-    def timed(self, problem: Problem, preset: str) -> tuple[float, ...]:
-        """Milliseconds of repeated registrations of a problem, after one that is not counted."""
-        posed = pose(problem, self.seed)
-        self.seconds(posed, preset)
-        return tuple(1000.0 * self.seconds(posed, preset) for _ in range(self.repeats))
-
-    def seconds(self, posed: PosedProblem, preset: str) -> float:
-        """Seconds of one registration."""
-        return register(posed, preset, self.steps, self.steps.search)[0]
 
 
 def stages(scope: Scope) -> Iterator[Row]:
@@ -186,6 +166,8 @@ MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
     "threads": threads,
     "free_points": free_points,
     "hypotheses": hypotheses,
+    "methods": methods,
+    "plausible_sets": plausible_sets,
     "evaluation": evaluation,
     "recording": recording,
     "memory": memory,

@@ -17,11 +17,14 @@ import torch
 from chsel.pose import apply, inverse
 from chsel.sdf import mesh_sdf
 from runners.benchmarks.comparison import require_equal
-from runners.benchmarks.ours import PRESETS
+from runners.benchmarks.methods import methods
+from runners.benchmarks.ours import PRESETS, Steps
+from runners.benchmarks.plausible import plausible_sets
 from runners.benchmarks.problems import PROBLEMS, WORKSPACE, PosedProblem, Problem, drill, pose
 from runners.benchmarks.published import BenchmarkError, PublishedPackage
 from runners.benchmarks.published_worker import GridSdf
 from runners.benchmarks.report import number, ratios
+from runners.benchmarks.scope import Scope
 from runners.benchmarks.timing import Row, in_turn
 
 PUBLISHED_PYTHON = "CHSEL_PUBLISHED_PYTHON"
@@ -224,6 +227,35 @@ def test_the_worker_does_all_steps_of_the_package_and_counts_them(
         with pytest.raises(BenchmarkError, match=r"FileNotFoundError.*nothing\.npz"):
             package.ask("load", problem="nothing.npz")
         package.ask("load", problem=str(tmp_path / "problem.npz"))  # an error ends nothing
+
+
+def scope(repeats: int) -> Scope:
+    return Scope(Steps(), repeats, 0, (), ())
+
+
+def test_methods_are_measured_in_turn_and_beside_chsel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runners.benchmarks.methods.METHODS", ("icp", "chsel", "gradient_descent"))
+    rows = list(methods(scope(repeats=3)))
+    taken = {row.case: row.samples for row in rows if row.measure == "method"}
+    times = {row.case: row.samples for row in rows if row.measure == "method, chsel = 1"}
+    assert list(taken) == list(times) == ["icp", "chsel", "gradient_descent"]
+    assert times["chsel"] == (1.0, 1.0, 1.0)
+    expected = np.array(taken["gradient_descent"]) / taken["chsel"]
+    np.testing.assert_array_equal(times["gradient_descent"], expected)
+    assert all(min(samples) > 0.0 for samples in taken.values())
+
+
+def test_plausible_sets_of_34_million_poses_are_measured() -> None:
+    rows = list(plausible_sets(scope(repeats=2)))
+    taken = [row for row in rows if row.unit == "ms"]
+    cases = [row.case.rpartition(", ") for row in taken]
+    contacts = [int(name.rpartition("_")[2]) for name, _, _ in cases]
+    assert [count for _, _, count in cases] == ["1", "2"] * 3
+    assert 4 <= contacts[0] <= 20  # of the session
+    assert contacts[2:] == [20, 20, 150, 150]
+    assert all(len(row.samples) == 2 and min(row.samples) > 0.0 for row in taken)
+    poses = [row.median for row in rows if row.unit == "poses"]
+    assert poses == [15**3 * 10_101] * 3
 
 
 def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> None:

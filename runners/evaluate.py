@@ -1,0 +1,192 @@
+"""`python -m runners.evaluate`: sessions, all methods on each, one table of how they measure up."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from chsel.errors import SettingError, require_choice, require_positive
+from chsel.methods import METHODS
+from chsel.settings import build_settings
+from runners.cli import command, plain
+from runners.evaluation.contenders import chosen_contenders, require_label
+from runners.evaluation.display import Display
+from runners.evaluation.experiment import join_experiment, read_experiment
+from runners.evaluation.gathering import gather
+from runners.evaluation.measure import MetricsConfig
+from runners.evaluation.outside import outside_file, read_outside
+from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
+from runners.evaluation.schedule import Progress, Schedule
+from runners.evaluation.selection import chosen_configurations, chosen_seeds
+from runners.objects.scans import AssetsConfig, scan_file
+from runners.plausible import store_definitions
+from runners.probe import PresetName
+
+_GATHER = 300.0  # s between tables of what is finished so far
+_OPEN_GROUPS = ("settings.", "outside.")
+
+
+@dataclass(frozen=True)
+class IterationsConfig:
+    """every: iterations of the search between measures of it; None: none but of the result."""
+
+    every: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.every is not None:
+            require_positive("every", self.every)
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """conf/evaluate.yaml, checked. What is Any is checked by whoever it concerns."""
+
+    name: str
+    out: str
+    configurations: Any
+    seeds: Any
+    methods: Any
+    settings: Any
+    outside: Any
+    session: Any
+    definition: Any
+    preset: PresetName
+    metrics: MetricsConfig
+    iterations: IterationsConfig
+    assets: AssetsConfig
+    objects: str = "models"
+    steps: str | None = None
+    starts: str = OWN
+    recordings: bool = True
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers is not None:
+            require_positive("workers", self.workers)
+        require_choice("objects", self.objects, OBJECTS)
+        require_choice("starts", self.starts, (OWN, *METHODS))
+        if not self.name or not self.out:
+            raise SettingError("name or out is empty; accepted: a name, a folder")
+
+
+@command("evaluate")
+def main(config: DictConfig) -> None:
+    """Do what is not done yet, and gather all that is there."""
+    values = plain(config)
+    if values["steps"] is not None:
+        values["steps"] = str(values["steps"])
+    checked = build_settings(EvaluateConfig, values, "evaluate")
+    configurations = chosen_configurations(checked.configurations)
+    seeds = chosen_seeds(checked.seeds)
+    plan = _plan(checked)
+    trials = [Trial(seed, name) for seed in seeds for name in configurations]
+    _check(plan, trials)
+    join_experiment(plan, checked.name, configurations, seeds)
+    failed = evaluate(plan, trials, checked.workers or _cores())
+    if failed and HydraConfig.get().mode is not RunMode.MULTIRUN:  # the other jobs must go on
+        sys.exit(1)
+
+
+def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
+    """Run the schedule and write the tables; whether anything failed."""
+    display = Display()
+    gathered = time.monotonic()
+
+    def show(progress: Progress) -> None:
+        nonlocal gathered
+        display.progress(progress)
+        if time.monotonic() - gathered > _GATHER:
+            gather(plan.folder)
+            gathered = time.monotonic()
+
+    schedule = Schedule(plan, trials, workers, show)
+    before = schedule.progress
+    display.say(
+        f"evaluation in {plan.folder}: {len(trials)} trials, {len(plan.contenders)} methods, "
+        f"{before.total} units, of which {before.finished} are finished"
+    )
+    try:
+        schedule.run()
+    finally:
+        display.close()
+        results = gather(plan.folder)
+        display.failures(schedule.progress)
+        if sys.exc_info()[0] is KeyboardInterrupt:
+            display.say("interrupted: what is finished stays, and the same command goes on")
+    display.summary(results, _labels(plan.folder))
+    display.written(plan.folder, results)
+    return any(text.startswith("failed") for text in results["status"].to_pylist())
+
+
+def _plan(config: EvaluateConfig) -> Plan:
+    outside = {str(name): Path(folder).expanduser() for name, folder in config.outside.items()}
+    chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
+    return Plan(
+        folder=Path(config.out).expanduser(),
+        preset=config.preset.name,
+        session={key: value for key, value in config.session.items() if key != "configuration"},
+        objects=config.objects,
+        definition=config.definition,
+        metrics=config.metrics,
+        steps=config.steps,
+        starts=config.starts,
+        every=config.iterations.every,
+        recordings=config.recordings,
+        assets=config.assets.folder,
+        contenders={contender.label: contender for contender in chosen},
+        outside=outside,
+    )
+
+
+def _check(plan: Plan, trials: list[Trial]) -> None:
+    """What would fail everywhere fails here, before any work."""
+    for trial in trials:
+        plan.session_settings(trial.configuration)
+        plan.plausible_settings(plan.object_config(trial.configuration).epsilon)
+        plan.steps_of(trial.configuration)
+    for scan in {plan.object_config(trial.configuration).scan for trial in trials}:
+        if scan is not None:
+            scan_file(plan.assets, scan)
+    if plan.session["kind"] == "simulated" and importlib.util.find_spec("pybullet") is None:
+        raise SettingError("session=simulated needs PyBullet; accepted here: session=kinematic")
+    for label, folder in plan.outside.items():
+        require_label(label)
+        if label in plan.contenders:
+            raise SettingError(f"outside has {label}, as methods has; accepted: another name")
+        if not folder.is_dir():
+            raise SettingError(f"outside.{label} is {folder}; accepted: a folder")
+        for trial in trials:
+            path = outside_file(folder, trial)
+            if path is not None:
+                read_outside(path, trial)
+
+
+def _labels(folder: Path) -> list[str]:
+    experiment = read_experiment(folder)
+    return [*experiment["methods"], *experiment["outside"]]
+
+
+def _cores() -> int:
+    """How many processes this one may use at a time."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def program() -> None:
+    """The command, from the arguments of this process."""
+    store_definitions()
+    # Names of methods and of outside sets are no keys that the configuration could have already.
+    sys.argv[1:] = [f"++{word}" if word.startswith(_OPEN_GROUPS) else word for word in sys.argv[1:]]
+    main()
+
+
+if __name__ == "__main__":
+    program()

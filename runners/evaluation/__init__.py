@@ -1,0 +1,1 @@
+"""Evaluations: many sessions, all methods on each, one table."""

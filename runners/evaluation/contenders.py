@@ -1,0 +1,127 @@
+"""The methods of an evaluation, with the settings and the labels under which they take part."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from chsel.errors import SettingError, require_choice
+from chsel.methods import METHODS, build_method, preset_settings
+from chsel.methods.method import Method
+from chsel.presets import PRESETS
+from chsel.settings import build_settings, settings_mapping
+from replay.comparing.contenders import METHODS_HELP
+
+_LABEL = re.compile(r"(?P<name>\w+)(@(?P<preset>\w+))?(#(?P<mark>[\w+-]+))?")
+_FILE_NAME = re.compile(r"[\w@#+-]{1,80}")
+TAKEN = ("session",)
+"""Labels that would be files of something else."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """A registered method with all of its settings. label: what the table calls it."""
+
+    label: str
+    name: str
+    preset: str
+    settings: Mapping[str, Any]
+
+    def method(self) -> Method:
+        """The method itself."""
+        return build_method(self.name, self.settings)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """As experiment.json has it."""
+        return {"name": self.name, "preset": self.preset, "settings": dict(self.settings)}
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A contender as a configuration writes it down."""
+
+    name: str
+    label: str | None = None
+    preset: str | None = None
+    settings: Any = None
+
+
+def chosen_contenders(
+    methods: Any, settings: Mapping[str, Any], preset: str
+) -> tuple[Contender, ...]:
+    """Contenders of a configuration's list, or of "all".
+
+    An entry is a label as `replay compare` takes it, NAME, NAME@PRESET or NAME@PRESET#MARK, or a
+    mapping with name and, where wanted, label, preset and settings. settings: changes by method or
+    by label, for all entries that these fit; an entry's own come last. preset: where an entry has
+    none. Raises SettingError for what does not exist, and for a label that is taken.
+    """
+    entries = [_entry(value) for value in _listed(methods)]
+    labels = [entry.label or entry.name for entry in entries]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise SettingError(f"methods has {label} twice; accepted: {METHODS_HELP}")
+        require_label(label)
+    for key in settings:
+        require_choice("settings of a method", key, dict.fromkeys([*METHODS, *labels]))
+    return tuple(
+        _contender(entry, label, settings, preset)
+        for entry, label in zip(entries, labels, strict=True)
+    )
+
+
+def require_label(label: str) -> None:
+    """Raise SettingError for a label that cannot be the name of a file here."""
+    if not _FILE_NAME.fullmatch(label) or label in TAKEN:
+        raise SettingError(
+            f"{label!r} is no label; accepted: letters, digits and any of _ @ # + -, "
+            f"other than {', '.join(TAKEN)}"
+        )
+
+
+def _listed(methods: Any) -> Sequence[Any]:
+    if isinstance(methods, str):
+        return METHODS if methods == "all" else [text.strip() for text in methods.split(",")]
+    if isinstance(methods, Mapping):
+        return [methods]
+    if not isinstance(methods, list | tuple):
+        raise SettingError(f"methods is {methods!r}; accepted: all, or a list of {METHODS_HELP}")
+    return methods
+
+
+def _entry(value: Any) -> _Entry:
+    if isinstance(value, Mapping):
+        return build_settings(_Entry, value, "methods")
+    match = _LABEL.fullmatch(str(value))
+    if match is None:
+        raise SettingError(f"methods has {value!r}; accepted: {METHODS_HELP}")
+    return _Entry(match["name"], str(value), match["preset"])
+
+
+def _contender(entry: _Entry, label: str, settings: Mapping[str, Any], preset: str) -> Contender:
+    preset = entry.preset or preset
+    require_choice("method", entry.name, METHODS)
+    require_choice("preset", preset, PRESETS)
+    chosen: Mapping[str, Any] = settings_mapping(preset_settings(entry.name, preset))
+    for key in dict.fromkeys([entry.name, label]):
+        chosen = _changed(chosen, settings.get(key) or {}, f"settings.{key}")
+    chosen = _changed(chosen, entry.settings or {}, f"methods: settings of {label}")
+    method = build_method(entry.name, chosen)
+    return Contender(label, entry.name, preset, settings_mapping(method.settings))
+
+
+def _changed(settings: Mapping[str, Any], changes: Any, where: str) -> dict[str, Any]:
+    """Settings with changes, group by group."""
+    if not isinstance(changes, Mapping):
+        raise SettingError(f"{where} is {changes!r}; accepted: a group of settings")
+    changed = dict(settings)
+    for key, value in changes.items():
+        if key not in changed:
+            raise SettingError(f"{where}.{key} does not exist; accepted: {', '.join(settings)}")
+        inner = changed[key]
+        both = isinstance(inner, Mapping) and isinstance(value, Mapping)
+        changed[key] = _changed(inner, value, f"{where}.{key}") if both else value
+    return changed

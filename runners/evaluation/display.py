@@ -1,0 +1,127 @@
+"""What an evaluation says on the terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from runners.evaluation import schedule
+
+_SPARSE = 60.0  # s between lines where there is no terminal
+_MOST_SHOWN = 3  # units at work, failures
+
+
+class Display:
+    """A bar with what is at work, or a line a minute where there is no terminal; then a table."""
+
+    def __init__(self) -> None:
+        self._console = Console(highlight=False)
+        terminal = self._console.is_terminal
+        self._bar = Progress(
+            TextColumn("{task.completed}/{task.total} units"),
+            BarColumn(bar_width=20),
+            TextColumn("{task.description}"),
+            console=self._console,
+            transient=True,
+            disable=not terminal,
+        )
+        self._task: Any = None
+        self._said = time.monotonic()
+
+    def say(self, text: str) -> None:
+        """A line of its own."""
+        self._console.print(text, soft_wrap=True, markup=False)
+
+    def progress(self, state: schedule.Progress) -> None:
+        """Show how far it is."""
+        finished = state.finished + state.done + len(state.failed)
+        if self._task is None:
+            self._bar.start()
+            self._task = self._bar.add_task("", total=state.total)
+        self._bar.update(self._task, description=_doing(state), completed=finished)
+        if not self._console.is_terminal and time.monotonic() - self._said >= _SPARSE:
+            self._said = time.monotonic()
+            self.say(f"{finished}/{state.total} units  {_doing(state)}")
+
+    def close(self) -> None:
+        """Give the terminal back."""
+        self._bar.stop()
+
+    def failures(self, state: schedule.Progress) -> None:
+        """Which units failed, and why."""
+        shown = list(state.failed.items())[: 4 * _MOST_SHOWN]
+        for unit, reason in shown:
+            self.say(f"failed: {unit}: {reason}")
+        if len(shown) < len(state.failed):
+            self.say(f"and {len(state.failed) - len(shown)} more, see the table")
+
+    def summary(self, results: pa.Table, methods: Sequence[str]) -> None:
+        """Median PD by object and method, and milliseconds a registration."""
+        names = np.array(results["object"].to_pylist(), dtype=object)
+        labels = np.array(results["method"].to_pylist(), dtype=object)
+        there = [label for label in methods if (labels == label).any()]
+        if not there:
+            return
+        diversity, seconds = (
+            np.array(results[name].to_pylist(), dtype=float) for name in ("diversity", "seconds")
+        )
+        objects = list(dict.fromkeys(names))
+        columns = [["", *objects, "ms a registration"]]
+        for label in there:
+            own = labels == label
+            cells = [_median(diversity[own & (names == name)]) for name in objects]
+            columns.append([label, *cells, _median(1000.0 * seconds[own])])
+        self.say("median PD in mm² over all steps of all trials")
+        self._console.print(_table(columns, self._console.width))
+
+    def written(self, folder: Path, results: pa.Table) -> None:
+        """Where the tables are."""
+        failed = sum(text.startswith("failed") for text in results["status"].to_pylist())
+        without = sum(text.startswith("no plaus") for text in results["status"].to_pylist())
+        text = f"{folder / 'results.parquet'}, results.csv: {results.num_rows} rows"
+        text += f", {failed} failed" if failed else ""
+        self.say(text + (f", {without} without a plausible set" if without else ""))
+
+
+def _table(columns: list[list[str]], width: int) -> Table:
+    """Methods beside each other, or, where there is no room for that, below each other."""
+    needed = sum(max(map(len, column)) + 2 for column in columns)
+    rows = list(zip(*columns, strict=True)) if needed <= width else columns
+    table = Table(box=SIMPLE_HEAD, collapse_padding=True)
+    for index, name in enumerate(rows[0]):
+        table.add_column(name, justify="right" if index else "left")
+    for row in rows[1:]:
+        table.add_row(*row)
+    return table
+
+
+def _median(values: np.ndarray) -> str:
+    values = values[~np.isnan(values)]
+    return f"{np.median(values):.4g}" if len(values) else ""
+
+
+def _doing(state: schedule.Progress) -> str:
+    text = ", ".join(str(unit) for unit in state.running[:_MOST_SHOWN])
+    more = len(state.running) - _MOST_SHOWN
+    text += f" and {more} more" if more > 0 else ""
+    if state.failed:
+        text += f"; {len(state.failed)} failed"
+    if state.seconds_left is not None:
+        text += f"; about {_duration(state.seconds_left)} left"
+    return text
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60.0)
+    if minutes < 1:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 90 else f"{seconds / 3600.0:.1f} h"

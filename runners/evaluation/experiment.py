@@ -1,0 +1,144 @@
+"""experiment.json: what the folder of an evaluation holds, and whether more of it fits."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from chsel.errors import RecordingError, SettingError
+from chsel.settings import settings_mapping
+from replay.environment import environment
+from runners.evaluation.claims import claimed
+from runners.evaluation.plan import Plan
+from runners.evaluation.whole_file import whole_file
+from runners.sessions.configurations import CONFIGURATIONS
+
+FILE = "experiment.json"
+FORMAT = 1
+_FIXED = (
+    "format",
+    "preset",
+    "session",
+    "objects",
+    "definition",
+    "metrics",
+    "steps",
+    "starts",
+    "iterations",
+)
+
+
+def join_experiment(
+    plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
+) -> None:
+    """Make the folder of an evaluation, or add to what is planned in it.
+
+    Configurations, seeds and methods may become more. Raises SettingError, naming what differs, if
+    the folder was made with other settings, or is not of an evaluation.
+    """
+    path = plan.folder / FILE
+    ours = _described(plan, name, configurations, seeds)
+    with claimed(plan.folder, "experiment", wait=True):
+        if path.exists():
+            theirs = read_experiment(plan.folder)
+            _check_same(plan.folder, theirs, ours)
+            ours = _united(theirs, ours)
+        elif (plan.folder / "trials").exists():
+            raise SettingError(f"{plan.folder} has trials but no {FILE}; accepted: another out=DIR")
+        with whole_file(path) as beside:
+            beside.write_text(json.dumps(ours, indent=2) + "\n")
+
+
+def read_experiment(folder: Path) -> dict[str, Any]:
+    """What experiment.json says. Raises RecordingError if it is damaged or missing."""
+    path = folder / FILE
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path} cannot be read ({error})") from None
+    if not isinstance(values, Mapping):
+        raise RecordingError(f"{path} is not the description of an evaluation")
+    return dict(values)
+
+
+def _described(
+    plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
+) -> dict[str, Any]:
+    values = {
+        "format": FORMAT,
+        "name": name,
+        "preset": plan.preset,
+        "configurations": list(configurations),
+        "seeds": list(seeds),
+        "methods": {label: one.config for label, one in plan.contenders.items()},
+        "outside": {label: str(folder) for label, folder in plan.outside.items()},
+        "session": dict(plan.session),
+        "objects": plan.objects,
+        "definition": dict(plan.definition),
+        "metrics": settings_mapping(plan.metrics),
+        "steps": plan.steps,
+        "starts": plan.starts,
+        "iterations": {"every": plan.every},
+        "commands": [_command()],
+        "environment": environment(),
+        "other_environments": [],
+    }
+    return json.loads(json.dumps(values))  # as it will be read: lists for tuples
+
+
+def _command() -> str:
+    """The command line that this process was started with, its interpreter left out."""
+    name = getattr(getattr(sys.modules.get("__main__"), "__spec__", None), "name", None)
+    program = f"python -m {name}" if name else Path(sys.argv[0]).name
+    return " ".join([program, *(shlex.quote(argument) for argument in sys.argv[1:])])
+
+
+def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+    differing = [text for key in _FIXED for text in _differences(key, theirs.get(key), ours[key])]
+    for kind in ("methods", "outside"):
+        known = theirs.get(kind) or {}
+        for label in known:
+            if label in ours[kind]:
+                what = f"{kind}.{label}"
+                differing += _differences(what, known[label], ours[kind][label])
+    if differing:
+        more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+        raise SettingError(
+            f"{folder} was made with other settings: {'; '.join(differing[:3])}{more}; accepted: "
+            "the same ones, or another out=DIR"
+        )
+
+
+def _differences(path: str, theirs: Any, ours: Any) -> list[str]:
+    """Where two values differ, as "PATH is OURS, was THEIRS"."""
+    if isinstance(theirs, Mapping) and isinstance(ours, Mapping):
+        keys = dict.fromkeys([*theirs, *ours])
+        return [
+            text
+            for key in keys
+            for text in _differences(f"{path}.{key}", theirs.get(key), ours.get(key))
+        ]
+    return [] if theirs == ours else [f"{path} is {ours!r}, was {theirs!r}"]
+
+
+def _united(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> dict[str, Any]:
+    both = {*theirs.get("configurations", ()), *ours["configurations"]}
+    seeds = {*theirs.get("seeds", ()), *ours["seeds"]}
+    known = [theirs.get("environment"), *theirs.get("other_environments", ())]
+    here = ours["environment"]
+    commands = [*theirs.get("commands", ()), *ours["commands"]]
+    return {
+        **ours,
+        "name": theirs.get("name", ours["name"]),
+        "configurations": [name for name in CONFIGURATIONS if name in both],
+        "seeds": sorted(seeds),
+        "methods": {**theirs.get("methods", {}), **ours["methods"]},
+        "outside": {**theirs.get("outside", {}), **ours["outside"]},
+        "commands": list(dict.fromkeys(commands)),
+        "environment": known[0],
+        "other_environments": known[1:] + [here] * (here not in known),
+    }

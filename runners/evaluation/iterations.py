@@ -1,0 +1,26 @@
+"""What a search over an archive would give if it ended at a snapshot (CHSEL, Alg. 1, line 7)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.selection import ranked, select_elites
+from chsel.space import search_space, transforms_of
+from chsel.streams import Purpose
+
+
+def hypotheses_of(
+    snapshot: ArchiveSnapshot, problem: RegistrationProblem, settings: Any
+) -> Hypotheses:
+    """The cells with the |E_0| lowest costs, chosen as the method with these settings does.
+
+    settings: with `output` and `plane`, as every method that keeps an archive has them.
+    """
+    space = search_space(settings.plane, problem.sdf)
+    count, known_count = len(problem.initial_set), len(problem.points.known)
+    stream = problem.key.stream(Purpose.RESAMPLE, snapshot.refinement)
+    costs = -snapshot.objectives
+    chosen = select_elites(costs, count, settings.output, known_count, stream)
+    poses = transforms_of(space, snapshot.solutions)
+    return ranked(poses[chosen], costs[chosen], snapshot.cells[chosen], poses)

@@ -1,0 +1,132 @@
+"""What was found at a step of a trial, as rows of the table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from chsel.errors import ChselError
+from chsel.evaluation.error import EvaluationError
+from chsel.evaluation.evaluation_cost import EvaluationCost
+from chsel.evaluation.plausible_set import PlausibleSet
+from chsel.evaluation.pose_error import pose_errors
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from runners.evaluation.iterations import hypotheses_of
+from runners.evaluation.measure import Measure
+from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.table import Row
+from runners.evaluation.trial_session import load_members, plausible_settings_of, read_session
+from runners.sessions.recorded import RecordedSession
+
+
+class Judge:
+    """Makes rows of the table of what was found at the steps of a trial."""
+
+    def __init__(
+        self, plan: Plan, trial: Trial, session: RecordedSession, label: str, preset: str
+    ) -> None:
+        assert session.world_from_object is not None
+        self._plan, self._trial, self._session = plan, trial, session
+        self._label, self._preset = label, preset
+        self._told = read_session(plan, trial)
+        self._settings = plausible_settings_of(plan, session)
+        mesh, truth = session.recorded.mesh, session.world_from_object
+        self._measure, self._truth = Measure(plan.metrics, mesh, truth), truth
+
+    def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
+        """The plausible set of a problem; else why there is none, as a status."""
+        missing = self._told.failures.get(problem.key.step)
+        if missing is not None:
+            return None, f"no plausible set: {missing}"
+        try:
+            return load_members(self._plan, self._trial, self._session, problem), ""
+        except EvaluationError as error:
+            return None, f"no plausible set: {one_line(error)}"
+
+    def row(
+        self,
+        problem: RegistrationProblem,
+        found: Hypotheses | None,
+        members: PlausibleSet | None,
+        status: str,
+    ) -> dict[str, Any]:
+        """The row of a step. found: None if the registration failed, for the reason in status."""
+        points = problem.points
+        row: dict[str, Any] = {
+            "object": self._session.recorded.object,
+            "configuration": self._trial.configuration,
+            "seed": self._trial.seed,
+            "method": self._label,
+            "preset": self._preset,
+            "step": problem.key.step,
+            "contacts": len(points.contacts),
+            "free_points": len(points.free),
+            "occupied_points": len(points.occupied),
+            "status": status or "ok",
+            "problem_digest": problem.digest,
+        }
+        if members is not None:
+            row |= {
+                "members": len(members.index),
+                "kept": len(members.cost),
+                "local": int(members.local.sum()),
+                "true_cost": members.true_cost,
+            }
+        if found is None:
+            return row | {"status": f"failed: {status}"}
+        row |= self._numbers(found)
+        if members is None:
+            return row
+        limit = members.true_cost + self._settings.epsilon
+        cost = EvaluationCost(problem, self._settings.cost)
+        below = cost.evaluate(found.object_from_world, limit=limit) < limit
+        exact = {"exact_members": float(below.mean())} if len(below) else {}
+        return row | self._measure.of(problem, members, found) | exact
+
+    def _numbers(self, found: Hypotheses) -> dict[str, Any]:
+        """What hypotheses tell by themselves."""
+        row: dict[str, Any] = {
+            "hypotheses": len(found.cost),
+            "distinct": found.distinct,
+            "digest": found.digest,
+        }
+        if len(found.cost) == 0:
+            return row
+        position, rotation = pose_errors(found.object_from_world[:1], self._truth)
+        return row | {
+            "best_cost": float(found.cost[0]),
+            "mean_cost": float(found.cost.mean()),
+            "position_error": float(position[0]),
+            "rotation_error": float(rotation[0]),
+        }
+
+    def iterations(
+        self,
+        problem: RegistrationProblem,
+        snapshots: Sequence[ArchiveSnapshot],
+        settings: Any,
+        members: PlausibleSet,
+    ) -> Iterator[Row]:
+        """The rows of a step's search, of a method with these settings."""
+        for snapshot in snapshots:
+            found = hypotheses_of(snapshot, problem, settings)
+            metrics = self._measure.of(problem, members, found, ranked=False)
+            metrics.pop("distinct", None)
+            yield {
+                "configuration": self._trial.configuration,
+                "seed": self._trial.seed,
+                "method": self._label,
+                "step": problem.key.step,
+                "iteration": snapshot.iteration,
+                "filled": len(snapshot.cells),
+                "best_cost": float(found.cost[0]),
+                "mean_cost": float(found.cost.mean()),
+                "qd_score": snapshot.qd_score,
+                **metrics,
+            }
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, with its kind if it is none of ours."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"

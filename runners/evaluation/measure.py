@@ -1,0 +1,78 @@
+"""The metrics of hypotheses beside a plausible set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.evaluation.calibration import calibration
+from chsel.evaluation.plausible_diversity import cheapest, plausible_diversity
+from chsel.evaluation.plausible_set import PlausibleSet
+from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.streams import StreamKey
+
+
+@dataclass(frozen=True)
+class MetricsConfig:
+    """How distances are measured, see DistanceSettings; quantile: of the hypotheses by cost."""
+
+    points: int = 500
+    method: str = "nearest"
+    bidirectional: bool = False
+    quantile: float = 1.0
+
+    def __post_init__(self) -> None:
+        DistanceSettings(self.points, self.method, self.bidirectional)
+        cheapest(np.zeros(1), self.quantile)
+
+    @property
+    def distance(self) -> DistanceSettings:
+        """The part that concerns distances."""
+        return DistanceSettings(self.points, self.method, self.bidirectional)
+
+
+class Measure:
+    """The metrics of hypotheses; the same points on the surface for all steps of a session."""
+
+    def __init__(
+        self, config: MetricsConfig, mesh: trimesh.Trimesh, world_from_object: FloatArray
+    ) -> None:
+        """mesh: in metres. world_from_object (4, 4): the true pose."""
+        self._config, self._mesh, self._truth = config, mesh, world_from_object
+        self._distance: SurfaceDistance | None = None
+
+    def of(
+        self,
+        problem: RegistrationProblem,
+        members: PlausibleSet,
+        found: Hypotheses | None,
+        *,
+        ranked: bool = True,
+    ) -> dict[str, float]:
+        """Coverage, plausibility and diversity in mm^2, its root, and the rank of the truth.
+
+        ranked: False leaves the rank out, which takes distances of its own.
+        """
+        if found is None or len(found.cost) == 0:
+            return {}
+        if self._distance is None:
+            key = StreamKey(problem.key.seed, 0)
+            points = surface_points(self._mesh, self._config.points, key)
+            self._distance = SurfaceDistance(problem.sdf, self._mesh, points, self._config.distance)
+        chosen = found.object_from_world[cheapest(found.cost, self._config.quantile)]
+        distances = self._distance.between(chosen, members.world_from_object)
+        metrics = plausible_diversity(distances)
+        row: dict[str, float] = {
+            "distinct": found.distinct,
+            "coverage": metrics.coverage,
+            "plausibility": metrics.plausibility,
+            "diversity": metrics.diversity,
+            "root": metrics.root,
+        }
+        if ranked and len(chosen) > 1:
+            row["rank"] = calibration(self._distance, chosen, self._truth).rank
+        return row

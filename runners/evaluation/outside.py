@@ -1,0 +1,171 @@
+"""Hypothesis sets that were made elsewhere, from files with transforms per step."""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chsel.arrays import FloatArray, frozen
+from chsel.errors import ChselError
+from chsel.pose import inverse
+from chsel.problem import Hypotheses
+from chsel.selection import repeated
+from replay.file_digest import file_digest
+from runners.evaluation.judge import Judge
+from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.table import RESULTS, Row, write_part
+from runners.evaluation.trial_session import open_recorded, problems
+from runners.sessions.configurations import CONFIGURATIONS
+
+PRESET = "outside"
+"""What the table has for a preset."""
+SUFFIXES = (".npz", ".json")
+_TOLERANCE = 1e-5  # of the entries of R^T R - 1: transforms may have been written as text
+_KEY = re.compile(r"(step|cost|seconds)_(\d{1,10})")
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+class OutsideError(ChselError):
+    """A file of hypothesis sets from elsewhere cannot be used."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutsideSet:
+    """The hypotheses of one step.
+
+    world_from_object (B, 4, 4): poses of the object's mesh frame in the world, best first. cost
+    (B,): where given, they are put in its order. seconds: where given.
+    """
+
+    world_from_object: FloatArray
+    cost: FloatArray | None
+    seconds: float | None
+
+    def hypotheses(self) -> Hypotheses:
+        """As those of a method; without costs all are 0."""
+        cost = np.zeros(len(self.world_from_object)) if self.cost is None else self.cost
+        order = np.argsort(cost, kind="stable")
+        poses = inverse(self.world_from_object)[order]
+        cells = np.full(len(poses), -1, dtype=np.int64)
+        return Hypotheses(poses, cost[order], repeated(poses), cells, poses)
+
+
+def outside_file(folder: Path, trial: Trial) -> Path | None:
+    """FOLDER/CONFIGURATION/seed_S.npz, or .json; None if there is neither."""
+    for suffix in SUFFIXES:
+        path = folder / trial.configuration / f"seed_{trial.seed}{suffix}"
+        if path.is_file():
+            return path
+    return None
+
+
+def outside_digest(path: Path | None) -> str:
+    """Digest of a file; "none" without one."""
+    return "none" if path is None else file_digest(path)
+
+
+def read_outside(path: Path, trial: Trial) -> dict[int, OutsideSet]:
+    """The sets of a trial by step.
+
+    npz: arrays `step_K` (B, 4, 4), world_from_object of step K; where known `cost_K` (B,) and
+    `seconds_K`. json: an object with the same names, and lists. Raises OutsideError for anything
+    else: other names, steps that do not exist, shapes, numbers, rotations.
+    """
+    values = _values(path)
+    steps = range(len(CONFIGURATIONS[trial.configuration].grid))
+    for key in values:
+        match = _KEY.fullmatch(key)
+        if match is None:
+            raise OutsideError(f"{path} has {key!r}; accepted: step_K, cost_K and seconds_K")
+        if int(match[2]) not in steps:
+            raise OutsideError(
+                f"{path} has {key}; accepted: steps 0 to {steps[-1]} of {trial.configuration}"
+            )
+        if f"step_{int(match[2])}" not in values:
+            raise OutsideError(f"{path} has {key}; accepted: only with step_{int(match[2])}")
+    names = [key for key in values if key.startswith("step_")]
+    return {int(name[5:]): _set_of(path, int(name[5:]), values) for name in names}
+
+
+def rank_outside(plan: Plan, trial: Trial, label: str) -> None:
+    """Write the part of the table about the sets of a folder, of one trial."""
+    path = outside_file(plan.outside[label], trial)
+    about = outside_digest(path)
+    sets = {} if path is None else read_outside(path, trial)
+    reason = f"{path} has no set of this step"
+    if path is None:
+        reason = f"there is no {_wanted(plan, trial, label)}"
+    session = open_recorded(plan, trial)
+    judge = Judge(plan, trial, session, label, PRESET)
+    rows: list[Row] = []
+    for problem in problems(plan, trial, session):
+        members, missing = judge.members(problem)
+        given = sets.get(problem.key.step)
+        if given is None:
+            row = judge.row(problem, None, members, reason)
+        else:
+            row = judge.row(problem, given.hypotheses(), members, missing)
+            row["seconds"] = given.seconds
+            if given.cost is None:
+                row |= {"best_cost": None, "mean_cost": None}
+        rows.append(row | {"problem_digest": None})  # a problem has an E_0, which is not known
+    write_part(trial.folder(plan) / f"{label}.parquet", rows, RESULTS, about)
+
+
+def _wanted(plan: Plan, trial: Trial, label: str) -> Path:
+    """Where a trial's file is looked for first."""
+    folder = plan.outside[label] / trial.configuration
+    return folder / f"seed_{trial.seed}{SUFFIXES[0]}"
+
+
+def _values(path: Path) -> Mapping[str, Any]:
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+        values = json.loads(path.read_text())
+    except _UNREADABLE as error:
+        reason = " ".join(str(error).split())
+        raise OutsideError(f"{path} cannot be read ({reason})") from None
+    if not isinstance(values, Mapping):
+        raise OutsideError(f"{path} is no object; accepted: step_K, cost_K and seconds_K")
+    return values
+
+
+def _set_of(path: Path, step: int, values: Mapping[str, Any]) -> OutsideSet:
+    name = f"{path}: step_{step}"
+    poses = frozen(name, values[f"step_{step}"], (None, 4, 4), error=OutsideError)
+    if len(poses) == 0:
+        raise OutsideError(f"{name} is empty; accepted: at least one transform")
+    _check_rigid(name, poses)
+    cost = values.get(f"cost_{step}")
+    if cost is not None:
+        cost = frozen(f"{path}: cost_{step}", cost, (len(poses),), error=OutsideError)
+    seconds = values.get(f"seconds_{step}")
+    if seconds is not None:
+        seconds = float(frozen(f"{path}: seconds_{step}", seconds, (), error=OutsideError))
+    return OutsideSet(poses, cost, seconds)
+
+
+def _check_rigid(name: str, poses: FloatArray) -> None:
+    """Raise OutsideError unless all (B, 4, 4) are rigid to what text files keep of a number."""
+    rotation = poses[:, :3, :3]
+    off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
+    off = np.maximum(off, np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1))
+    mirrored = np.linalg.det(rotation) < 0.0
+    wrong = (off > _TOLERANCE) | mirrored
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        what = "mirrors" if mirrored[row] and off[row] <= _TOLERANCE else "is not rigid"
+        raise OutsideError(
+            f"{name}[{row}] {what}; accepted: [R t; 0 0 0 1] with R^T R = 1 to {_TOLERANCE:g} and "
+            "det R = 1"
+        )

@@ -1,0 +1,95 @@
+"""The table of an evaluation: its columns, its finished parts, and both put together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from chsel.errors import RecordingError
+from runners.evaluation.whole_file import whole_file
+
+Row = Mapping[str, Any]
+
+_KEYS = [("object", pa.string()), ("configuration", pa.string()), ("seed", pa.int64())]
+_KEYS += [("method", pa.string())]
+_INTEGERS = ("contacts", "free_points", "occupied_points")
+_METRICS = ("coverage", "plausibility", "diversity", "root")
+RESULTS = pa.schema(
+    [
+        *_KEYS,
+        ("preset", pa.string()),
+        ("step", pa.int64()),
+        *((name, pa.int64()) for name in _INTEGERS),
+        ("status", pa.string()),
+        *((name, pa.int64()) for name in ("members", "kept", "local")),
+        ("true_cost", pa.float64()),
+        *((name, pa.int64()) for name in ("hypotheses", "distinct")),
+        *((name, pa.float64()) for name in ("best_cost", "mean_cost", *_METRICS)),
+        *((name, pa.float64()) for name in ("position_error", "rotation_error", "rank")),
+        *((name, pa.float64()) for name in ("exact_members", "seconds")),
+        ("digest", pa.string()),
+        ("problem_digest", pa.string()),
+    ]
+)
+"""A row a (configuration, seed, method, step). Lengths in metres, angles in radians, but coverage,
+plausibility and diversity (PD) in mm^2 and root, of PD, in mm. status: "ok", "failed: REASON" or
+"no plausible set: REASON"; what a row does not have is null."""
+ITERATIONS = pa.schema(
+    [
+        *_KEYS[1:],
+        ("step", pa.int64()),
+        ("iteration", pa.int64()),
+        ("filled", pa.int64()),
+        *((name, pa.float64()) for name in ("best_cost", "mean_cost", "qd_score", *_METRICS)),
+    ]
+)
+"""A row a (configuration, seed, method, step, iteration) of a search over an archive. Costs and
+metrics are of the hypotheses that the method would give if it ended there."""
+RESULTS_ORDER = ("object", "configuration", "seed", "method", "step")
+ITERATIONS_ORDER = ("configuration", "seed", "method", "step", "iteration")
+
+
+def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, about: str = "") -> None:
+    """Write a finished part of a table. about: kept with it, see `about_part`."""
+    table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
+    with whole_file(path) as beside:
+        pa.parquet.write_table(table.replace_schema_metadata({"about": about}), beside)
+
+
+def read_part(path: Path, schema: pa.Schema) -> pa.Table:
+    """A part. Raises RecordingError if it is damaged or of another version."""
+    try:
+        return pa.parquet.read_table(path).replace_schema_metadata().cast(schema)
+    except (pa.ArrowException, ValueError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise RecordingError(
+            f"{path} cannot be read ({reason}); remove it to have it made again"
+        ) from None
+
+
+def about_part(path: Path) -> str:
+    """What was kept with a part; empty if there is no such part."""
+    try:
+        metadata = pa.parquet.read_schema(path).metadata or {}
+    except (pa.ArrowException, ValueError, OSError):
+        return ""
+    return metadata.get(b"about", b"").decode()
+
+
+def write_table(
+    folder: Path, name: str, parts: Sequence[Path], schema: pa.Schema, order: Sequence[str]
+) -> pa.Table:
+    """Put parts together in order, as NAME.parquet and NAME.csv."""
+    tables = [read_part(path, schema) for path in parts]
+    table = pa.concat_tables([schema.empty_table(), *tables])
+    table = table.sort_by([(key, "ascending") for key in order]).combine_chunks()
+    with whole_file(folder / f"{name}.parquet") as beside:
+        pa.parquet.write_table(table, beside)
+    with whole_file(folder / f"{name}.csv") as beside:
+        pa.csv.write_csv(table, beside)
+    return table

@@ -1,0 +1,185 @@
+"""The session of a trial: probed once, recorded, with its plausible sets beside it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from chsel.errors import RecordingError
+from chsel.evaluation.error import EvaluationError
+from chsel.evaluation.plausible_file import load_plausible, save_plausible
+from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
+from chsel.evaluation.plausible_settings import PlausibleSettings
+from chsel.online import OnlineSettings, pose_problem
+from chsel.problem import RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.environment import environment
+from replay.events import Logged, SessionEnded, SessionStarted
+from replay.mcap.writer import McapRecorder
+from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.whole_file import WritingError, whole_file
+from runners.objects.loader import load_object
+from runners.sessions import open_session
+from runners.sessions.recorded import RecordedSession, RecordedSettings
+
+METHOD = "none"
+"""The method that the recording of a session alone names."""
+_ONE = OnlineSettings(hypotheses=1)
+
+
+@dataclass(frozen=True)
+class TrialSession:
+    """What session.json tells: steps with a registration, and why some have no plausible set.
+
+    seconds: of probing and of making the sets.
+    """
+
+    steps: tuple[int, ...]
+    failures: Mapping[int, str]
+    seconds: Mapping[str, float]
+
+
+def make_session(plan: Plan, trial: Trial) -> None:
+    """Probe, and make the plausible sets of all steps at which methods will register."""
+    folder, begun = trial.folder(plan), time.perf_counter()
+    if not (folder / "session.mcap").exists():
+        with whole_file(folder / "session.mcap") as beside:
+            _record(plan, trial, McapRecorder(beside))
+    probed = time.perf_counter()
+    session = open_recorded(plan, trial)
+    settings = plausible_settings_of(plan, session)
+    steps, failures = [], {}
+    before: PlausibleSet | None = None
+    for problem in problems(plan, trial, session):
+        step = problem.key.step
+        steps.append(step)
+        try:
+            before = _made(plan, trial, session, problem, settings, before)
+        except EvaluationError as error:
+            failures[str(step)] = " ".join(str(error).split())
+    seconds = {"session": probed - begun, "plausible sets": time.perf_counter() - probed}
+    told = {"steps": steps, "no_plausible_set": failures, "seconds": seconds}
+    with whole_file(folder / "session.json") as beside:
+        beside.write_text(json.dumps(told, indent=2) + "\n")
+
+
+def read_session(plan: Plan, trial: Trial) -> TrialSession:
+    """What `make_session` wrote down. Raises RecordingError if the file is damaged."""
+    path = trial.folder(plan) / "session.json"
+    try:
+        told = json.loads(path.read_text())
+        failures = {int(step): str(text) for step, text in told["no_plausible_set"].items()}
+        steps = tuple(int(step) for step in told["steps"])
+        return TrialSession(steps, failures, dict(told["seconds"]))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RecordingError(f"{path} is damaged ({error}); remove it") from None
+
+
+def open_recorded(plan: Plan, trial: Trial) -> RecordedSession:
+    """The session of a trial, from its recording."""
+    path = trial.folder(plan) / "session.mcap"
+    settings = plan.session_settings(trial.configuration)
+    start = settings.start_contacts, settings.start_probe
+    return RecordedSession(RecordedSettings(str(path), *start))
+
+
+def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSettings:
+    """The definition of the plausible sets of a session."""
+    config = session.recorded.config["object"]
+    return plan.plausible_settings(float(config["epsilon"]))
+
+
+def problems(plan: Plan, trial: Trial, session: RecordedSession) -> Iterator[RegistrationProblem]:
+    """What is known at every step with a registration; E_0 is one pose that stands for any."""
+    contacts, first = session.start
+    chosen = plan.steps_of(trial.configuration)
+    points = session.initial_points
+    for probe in session.probes():
+        points = points.merged(probe.new_points)
+        enough = len(points.contacts) >= contacts and probe.step >= first and points.count > 0
+        if enough and probe.step in chosen:
+            key = StreamKey(trial.seed, probe.step)
+            sdf, resolution = session.recorded.sdf, session.free_resolution
+            yield pose_problem(sdf, points, session.workspace, resolution, key, _ONE, None)
+
+
+def load_members(
+    plan: Plan, trial: Trial, session: RecordedSession, problem: RegistrationProblem
+) -> PlausibleSet:
+    """The plausible set of a step, which `make_session` made."""
+    folder = trial.folder(plan) / "plausible"
+    settings = plausible_settings_of(plan, session)
+    found = load_plausible(folder, problem, settings, world_from_object=session.world_from_object)
+    if found is None:
+        raise EvaluationError(
+            f"{folder} has no set of step {problem.key.step}; remove session.json"
+        )
+    return found
+
+
+def _record(plan: Plan, trial: Trial, recorder: McapRecorder) -> None:
+    object_config = plan.object_config(trial.configuration)
+    model = load_object(object_config, plan.assets)
+    settings = plan.session_settings(trial.configuration)
+    kind = str(plan.session["kind"])
+    session = open_session(kind, settings, model, trial.seed)
+    try:
+        sdf = SdfGrid.from_mesh(
+            model.mesh, settings.object_resolution, padding=settings.object_padding
+        )
+        recorder.record(
+            SessionStarted(
+                runner="evaluate",
+                object=model.name,
+                session=kind,
+                method=METHOD,
+                seed=trial.seed,
+                config={
+                    "object": vars(object_config),
+                    "session": plan.session_config(trial.configuration),
+                    "preset": {"name": plan.preset},
+                    "seed": trial.seed,
+                    "configuration": trial.configuration,
+                },
+                mesh=model.mesh,
+                sdf=sdf,
+                workspace=session.workspace,
+                free_resolution=session.free_resolution,
+                initial_points=session.initial_points,
+                world_from_object=session.world_from_object,
+                environment=environment(),
+            )
+        )
+        step = 0
+        for probe in session.probes():
+            step = probe.step
+            recorder.record(probe)
+            recorder.flush()
+        recorder.record(Logged(step, "info", "session finished"))
+        recorder.record(SessionEnded(step, "finished"))
+    finally:
+        session.close()
+        recorder.close()
+
+
+def _made(
+    plan: Plan,
+    trial: Trial,
+    session: RecordedSession,
+    problem: RegistrationProblem,
+    settings: PlausibleSettings,
+    before: PlausibleSet | None,
+) -> PlausibleSet:
+    folder, truth = trial.folder(plan) / "plausible", session.world_from_object
+    assert truth is not None
+    found = load_plausible(folder, problem, settings, world_from_object=truth)
+    if found is None:
+        found = plausible_set(problem, truth, settings, survivors=before)
+        try:
+            save_plausible(folder, found)
+        except EvaluationError as error:
+            raise WritingError(str(error)) from error
+    return found

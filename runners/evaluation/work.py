@@ -1,0 +1,106 @@
+"""What a worker process does: one unit after the other, each on its own thread alone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from dataclasses import dataclass
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection
+
+import torch
+
+from runners.evaluation.claims import ClaimedError, claimed
+from runners.evaluation.judge import one_line
+from runners.evaluation.outside import outside_digest, outside_file, rank_outside
+from runners.evaluation.plan import Plan, Unit
+from runners.evaluation.registering import register_trial
+from runners.evaluation.table import about_part
+from runners.evaluation.trial_session import make_session
+from runners.evaluation.whole_file import WritingError
+
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
+"""What the environment must have before a worker imports anything."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a unit ended: "done", "elsewhere" (another run does it), "failed", or "stop", a failure
+    that all others would share.
+    """
+
+    kind: str
+    seconds: float = 0.0
+    reason: str = ""
+
+
+def is_finished(plan: Plan, unit: Unit) -> bool:
+    """Whether there is nothing left to do. Sets from outside may have changed since."""
+    finished = unit.finished(plan)
+    if unit.label in plan.outside:
+        path = outside_file(plan.outside[unit.label], unit.trial)
+        return finished.exists() and about_part(finished) == outside_digest(path)
+    return finished.exists()
+
+
+def do_unit(plan: Plan, unit: Unit, warm: set[str]) -> Outcome:
+    """Do a unit, unless it is finished or claimed."""
+    begun = time.perf_counter()
+    name = f"{unit.trial.configuration}.{unit.trial.seed}.{unit.label or 'session'}"
+    try:
+        with claimed(plan.folder, name) as alone:
+            if not is_finished(plan, unit):
+                if alone:
+                    _clear(plan, unit)
+                _do(plan, unit, warm)
+            if unit.label:
+                unit.failed(plan).unlink(missing_ok=True)
+    except ClaimedError:
+        return Outcome("elsewhere")
+    except WritingError as error:
+        return Outcome("stop", reason=one_line(error))
+    except Exception as error:
+        return Outcome("failed", reason=one_line(error))
+    return Outcome("done", time.perf_counter() - begun)
+
+
+def work(connection: Connection, plan: Plan) -> None:
+    """Take units from a connection, and answer with outcomes, until it is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that waits
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)
+    warm: set[str] = set()
+    while True:
+        try:
+            unit = connection.recv()
+        except EOFError:
+            return
+        connection.send(do_unit(plan, unit, warm))
+
+
+def _do(plan: Plan, unit: Unit, warm: set[str]) -> None:
+    if not unit.label:
+        make_session(plan, unit.trial)
+    elif unit.label in plan.outside:
+        rank_outside(plan, unit.trial, unit.label)
+    else:
+        register_trial(plan, unit.trial, plan.contenders[unit.label], warm)
+
+
+def _clear(plan: Plan, unit: Unit) -> None:
+    """Remove what was half written by a process that is no more."""
+    folder = unit.trial.folder(plan)
+    for path in folder.glob(f".{unit.label or 'session'}.*"):
+        path.unlink(missing_ok=True)
+    for path in [] if unit.label else (folder / "plausible").glob(".*"):
+        path.unlink(missing_ok=True)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

@@ -1,0 +1,125 @@
+"""`python -m runners.report DIR`: the figures and tables of an evaluation, as a page."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+
+from chsel.errors import SettingError
+from chsel.settings import build_settings, settings_mapping
+from runners.cli import command, plain
+from runners.evaluation.whole_file import whole_file
+from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.page import Page, as_html, as_markdown, page_of
+from runners.reporting.sections import SequenceConfig, sections_of
+
+HTML, MARKDOWN = "report.html", "report.md"
+_TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
+_OVERRIDE = re.compile(r"[~+]{0,2}[\w.@/:]+=")
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """conf/report.yaml, checked."""
+
+    sequence: SequenceConfig
+    dir: str | None = None
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.dir:
+            raise SettingError("dir is missing; pass the folder of an evaluation")
+
+
+@command("report")
+def main(config: DictConfig) -> None:
+    """Draw all figures, and write the page, the Markdown and the pictures."""
+    checked = build_settings(ReportConfig, plain(config), "report")
+    folder = Path(checked.dir or "").expanduser()
+    out = Path(checked.out).expanduser() if checked.out else folder / "report"
+    evaluation = open_evaluation(folder)
+    console, waiting = Console(highlight=False), Console(stderr=True)
+    if waiting.is_terminal:
+        with waiting.status("drawing"):
+            sections = sections_of(evaluation, checked.sequence)
+    else:
+        sections = sections_of(evaluation, checked.sequence)
+    _write(out, page_of(evaluation, sections, _command(checked)))
+    for section in sections:
+        if section.missing:
+            line = f"no picture of {section.title}: {section.missing}"
+            console.print(line, soft_wrap=True, markup=False)
+    for name in (HTML, MARKDOWN):
+        console.print(str(out / name), soft_wrap=True, markup=False)
+
+
+def named_arguments(arguments: Sequence[str]) -> list[str]:
+    """Arguments as Hydra takes them: the folder may stand without a name.
+
+    Raises SettingError for a second folder.
+    """
+    kept: list[str] = []
+    folders: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        if argument in _TAKES_VALUE or argument.startswith("--config-"):
+            kept.append(argument)
+            kept += [] if "=" in argument else [value for value in [next(rest, None)] if value]
+        elif argument.startswith("-") or _OVERRIDE.match(argument):
+            kept.append(argument)
+        else:
+            folders.append(argument)
+    if len(folders) > 1:
+        raise SettingError(f"{folders[1]!r} is one folder too many; accepted: DIR KEY=VALUE ...")
+    return [*kept, *(f"dir={_quoted(path)}" for path in folders)]
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
+    return f"'{escaped}'"
+
+
+def _write(out: Path, page: Page) -> None:
+    """The files, each in the place of that of an earlier report."""
+    for section in page.sections:
+        if section.picture is not None:
+            with whole_file(out / section.picture.name) as beside:
+                beside.write_bytes(section.picture.png)
+    for name, text in ((MARKDOWN, as_markdown(page)), (HTML, as_html(page))):
+        with whole_file(out / name) as beside:
+            beside.write_text(text, encoding="utf-8")
+
+
+def _command(config: ReportConfig) -> str:
+    """What makes these bytes again, wherever they go."""
+    usual = settings_mapping(SequenceConfig())
+    chosen = settings_mapping(config.sequence)
+    changed = {name: value for name, value in chosen.items() if value != usual[name]}
+    settings = [f"sequence.{name}={_value(value)}" for name, value in changed.items()]
+    return shlex.join(["python", "-m", "runners.report", str(config.dir), *settings])
+
+
+def _value(value: Any) -> str:
+    return f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else str(value)
+
+
+def program() -> None:
+    """The command, from the arguments of this process."""
+    try:
+        sys.argv[1:] = named_arguments(sys.argv[1:])
+    except SettingError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    main()
+
+
+if __name__ == "__main__":
+    program()

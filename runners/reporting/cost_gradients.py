@@ -1,0 +1,148 @@
+"""Where the relaxed cost pushes points, on a cross-section of the object."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from chsel.arrays import FloatArray
+from chsel.cost import RelaxedCost
+from chsel.cost_settings import CostSettings
+from chsel.errors import ChselError
+from chsel.points import KnownPoints
+from chsel.sdf import SdfGrid
+from chsel.settings import build_settings
+from replay.mcap.reader import read_recording
+from runners.reporting.panels import drawn, new_figure
+from runners.reporting.section import NotDrawn, Picture
+
+_ALONG = 22  # samples along the longer side of the picture
+_MARGIN = 0.04  # metres around the object
+_KINDS = {
+    "free": ("free points leave the object", "#c1272d"),
+    "occupied": ("occupied points enter it", "#7b3fa0"),
+    "known": ("surface points go to its surface", "#111111"),
+}
+
+
+def picture_of_gradients(path: Path, name: str) -> Picture:
+    """The picture from a recording's SDF and cost settings; NotDrawn where it has no cost."""
+    try:
+        start = read_recording(path).start
+    except ChselError as error:
+        raise NotDrawn(str(error)) from None
+    settings = recorded_cost(start.config, start.method)
+    alt = (
+        f"Three cross-sections of the object {start.object} with arrows: free points inside of it "
+        "are pushed outwards, occupied points outside of it inwards, and known points to the "
+        "surface from both sides."
+    )
+    return Picture(name, alt, drawn(lambda: _figure(start.sdf, settings)))
+
+
+def recorded_cost(config: Mapping[str, object], method: str) -> CostSettings:
+    """The settings of the relaxed cost in a recording's configuration."""
+    method_config = config.get("method")
+    cost = method_config.get("cost") if isinstance(method_config, Mapping) else None
+    if not isinstance(cost, Mapping):
+        raise NotDrawn(f"the recorded method, {method}, has no relaxed cost")
+    try:
+        return build_settings(CostSettings, cost, "method.cost")
+    except ChselError as error:
+        raise NotDrawn(f"the cost that the recording tells is none: {error}") from None
+
+
+def point_gradients(
+    sdf: SdfGrid, settings: CostSettings, points: FloatArray, kind: str
+) -> FloatArray:
+    """Gradient (P, 3) of the cost by each of the points (P, 3) alone, in the object's frame.
+
+    A point at the world's origin is moved to x~ by the translation t = x~, so that the gradient
+    by t is that by the point. Free points are each one of the sum of Eq. 8 here.
+    """
+    origin = np.zeros((1, 3))
+    settings = replace(settings, free_term="direct")
+    with warnings.catch_warnings():  # an object too thin for the tolerance has no free gradients
+        warnings.simplefilter("ignore")
+        cost = RelaxedCost(sdf, KnownPoints(**{kind: origin}), settings)
+    rotations = torch.eye(3, dtype=torch.float64).expand(len(points), 3, 3)
+    terms = cost.terms(rotations, torch.from_numpy(points))
+    return terms[kind].by_translation.numpy()
+
+
+def section_plane(sdf: SdfGrid) -> int:
+    """The index along y of the grid's nodes where most of them are inside of the object."""
+    return int(np.argmax((sdf.values < 0.0).sum(axis=(0, 2))))
+
+
+def _figure(sdf: SdfGrid, settings: CostSettings) -> Figure:
+    j = section_plane(sdf)
+    nodes = [sdf.origin[axis] + sdf.resolution * np.arange(sdf.shape[axis]) for axis in range(3)]
+    inside = np.argwhere(sdf.values[:, j, :] < 0.0)
+    margin = _MARGIN + sdf.resolution
+    lower = sdf.origin[[0, 2]] + inside.min(axis=0) * sdf.resolution - margin
+    upper = sdf.origin[[0, 2]] + inside.max(axis=0) * sdf.resolution + margin
+    spacing = float((upper - lower).max()) / _ALONG
+    x, z = np.meshgrid(
+        *(np.arange(lower[i] + 0.5 * spacing, upper[i], spacing) for i in range(2)), indexing="ij"
+    )
+    points = np.stack([x.ravel(), np.full(x.size, nodes[1][j]), z.ravel()], axis=1)
+    width, height = upper - lower
+    figure = new_figure(float(np.clip(0.9 + 3.3 * height / width, 3.0, 8.0)))
+    for place, (kind, (title, color)) in enumerate(_KINDS.items()):
+        axes = figure.add_subplot(1, 3, place + 1)
+        gradients = point_gradients(sdf, settings, points, kind)
+        _draw_arrows(axes, points, -gradients, spacing, color)
+        section = sdf.values[:, j, :].T
+        axes.contour(nodes[0], nodes[2], section, [0.0], colors="#1f6f8b", linewidths=2.0)
+        if kind != "known":
+            level = settings.penetration_tolerance * (1.0 if kind == "free" else -1.0)
+            style: Any = {"colors": "#1f6f8b", "linewidths": 1.0, "linestyles": "dashed"}
+            if section.min() < level < section.max():
+                axes.contour(nodes[0], nodes[2], section, [level], **style)
+        axes.set_title(title)
+        axes.set_xlabel("x in m")
+        if place == 0:
+            axes.set_ylabel("z in m")
+        axes.set_xlim(lower[0], upper[0])
+        axes.set_ylim(lower[1], upper[1])
+        axes.set_aspect("equal")
+        axes.grid(visible=False)
+    return figure
+
+
+def _draw_arrows(
+    axes: Axes, points: FloatArray, push: FloatArray, spacing: float, color: str
+) -> None:
+    """Arrows of 0.4 to 1.3 spacings; dots where nothing pushes."""
+    x, z = points[:, 0], points[:, 2]
+    length = np.sqrt(push[:, 0] ** 2 + push[:, 2] ** 2)
+    pushed = length > 1e-12
+    axes.scatter(x[~pushed], z[~pushed], s=3.0, color="#bbbbbb", linewidths=0)
+    if not pushed.any():
+        axes.text(0.5, 0.02, "nothing pushes here", transform=axes.transAxes, ha="center")
+        return
+    shown = spacing * (0.4 + 0.9 * length[pushed] / length.max()) / length[pushed]
+    axes.scatter(x[pushed], z[pushed], s=5.0, color=color, linewidths=0)
+    axes.quiver(
+        x[pushed],
+        z[pushed],
+        push[pushed, 0] * shown,
+        push[pushed, 2] * shown,
+        color=color,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        width=0.005,
+        headwidth=4.0,
+        headlength=4.0,
+        headaxislength=3.6,
+    )

@@ -1,0 +1,120 @@
+"""docs/writing_a_method.md: what stands there is what a user does, and it replays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chsel import CompiledCost
+from replay.mcap.reader import read_recording
+from tests.docs.page import commands, shell, write_files
+
+PAGE = "writing_a_method.md"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which everything on the page was done."""
+    folder = tmp_path_factory.mktemp("method")
+    write_files(PAGE, folder)
+    for command in commands(PAGE):
+        done = shell(command, folder)
+        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    return folder
+
+
+def recording(folder: Path, rounds: int) -> Path:
+    for file in folder.glob("logs/probe/*/recording.mcap"):
+        if read_recording(file).start.config["method"]["rounds"] == rounds:
+            return file
+    raise AssertionError(f"no recording of {rounds} rounds")
+
+
+def test_the_page_has_files_and_commands(folder: Path) -> None:
+    assert {file.name for file in write_files(PAGE, folder)} == {
+        "hill_climb.py",
+        "pyproject.toml",
+        "hasty.yaml",
+    }
+    assert [line.split()[2] for line in commands(PAGE)[1:]] == [
+        "runners.probe",
+        "replay",
+        "replay",
+        "runners.probe",
+    ]
+
+
+def test_a_session_is_recorded_with_the_method_and_its_settings(folder: Path) -> None:
+    read = read_recording(recording(folder, 50))
+    assert read.start.method == "hill_climb"
+    assert read.start.config["method"]["rotation"] == 0.3
+    first, *_, last = read.steps
+    problem, found = read.problem(last), read.hypotheses(last)
+    assert last > first
+    assert len(found.cost) == len(problem.initial_set) == 30
+    assert found.cost[0] < read.hypotheses(first).cost[-1]
+
+
+def test_no_start_ends_at_a_higher_cost(folder: Path) -> None:
+    read = read_recording(recording(folder, 50))
+    for step in read.steps:
+        problem, found = read.problem(step), read.hypotheses(step)
+        before = np.sort(CompiledCost.of(problem).evaluate(problem.initial_set))
+        assert (found.cost <= before).all()
+        assert found.cost.sum() < before.sum()
+
+
+def test_a_named_set_of_settings_is_a_file(folder: Path) -> None:
+    config = read_recording(recording(folder, 10)).start.config["method"]
+    assert (config["name"], config["rotation"], config["translation"]) == ("hill_climb", 0.6, 0.03)
+
+
+def test_verify_finds_a_method_that_was_changed(folder: Path) -> None:
+    path = recording(folder, 10)
+    installed = folder / "site" / "hill_climb.py"
+    source = installed.read_text()
+    try:
+        installed.write_text(source.replace("cost < costs", "cost <= costs + 1e-3"))
+        done = shell(f"python -m replay verify {path}", folder)
+    finally:
+        installed.write_text(source)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "first difference: climb, iteration 10" in done.stdout
+
+
+def test_without_the_package_the_recording_can_still_be_read(folder: Path, tmp_path: Path) -> None:
+    path = recording(folder, 10)
+    for verb in ("info --check", "export --what hypotheses --format json -o out"):
+        done = shell(f"python -m replay {verb.replace(' ', f' {path} ', 1)}", tmp_path)
+        assert done.returncode == 0, done.stderr
+    done = shell(f"python -m replay verify {path}", tmp_path)
+    assert done.returncode == 2
+    assert "method is 'hill_climb'; accepted: chsel," in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "message"),
+    [
+        ("mine = 'mine:Mine'", "import nothing_of_this_name", "ModuleNotFoundError: No module"),
+        ("mine = 'mine:Mine'", "Mine = dict", "has settings None; accepted: a frozen dataclass"),
+        ("icp = 'mine:Mine'", "", "method icp is of package mine, too; accepted: one of"),
+    ],
+)
+def test_what_is_no_method_is_one_line(tmp_path: Path, line: str, code: str, message: str) -> None:
+    (tmp_path / "pyproject.toml").write_text(
+        '[project]\nname = "mine"\nversion = "1"\n[tool.setuptools]\npy-modules = ["mine"]\n'
+        f'[project.entry-points."chsel.methods"]\n{line}\n'
+    )
+    (tmp_path / "mine.py").write_text(code)
+    done = shell("pip install .", tmp_path)
+    assert done.returncode == 0, done.stderr
+    name = line.split()[0]
+    done = shell(f"python -m runners.probe method={name} session=kinematic", tmp_path)
+    assert done.returncode == 2, done.stdout
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    other = shell("python -m runners.probe method=svgd --cfg job", tmp_path)
+    assert (other.returncode, other.stderr) == (0, "")  # other methods go on as ever

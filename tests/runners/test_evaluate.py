@@ -1,0 +1,239 @@
+"""The command that evaluates methods, as a user runs it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+from replay.mcap.reader import read_recording
+from replay.verification import EQUAL, verify
+from runners import evaluate, plausible, probe
+from runners.evaluation.claims import ClaimedError, claimed
+from tests.runners.test_plausible import Done, rows, run
+
+SMALL = (
+    "session=kinematic",
+    "configurations=mustard",
+    "seeds=0",
+    "steps=4..5",
+    "settings.chsel.descent.restarts=1",
+    "settings.chsel.emitter.iterations=10",
+    "definition.grid.rotations=300",
+    "definition.grid.upright=4",
+    "metrics.points=50",
+)
+METHODS = "methods=[chsel,icp]"
+TRIAL = Path("trials") / "mustard" / "seed_0"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished evaluation of two methods."""
+    folder = tmp_path_factory.mktemp("evaluate") / "out"
+    done = evaluated(folder, METHODS)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "1 trials, 2 methods, 3 units, of which 0 are finished" in done.stdout
+    return folder
+
+
+def evaluated(folder: Path, *arguments: str) -> Done:
+    """Run the command in this process, with one worker."""
+    switches = [word for word in arguments if word.startswith("-")]
+    rest = [word for word in arguments if word not in switches]
+    return run(evaluate.program, *switches, *SMALL, f"out={folder}", "workers=1", *rest)
+
+
+def table(folder: Path, name: str = "results") -> list[dict[str, object]]:
+    return pa.parquet.read_table(folder / f"{name}.parquet").to_pylist()
+
+
+def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder: Path) -> None:
+    results = table(folder)
+    assert [(row["method"], row["step"]) for row in results] == [
+        ("chsel", 4),
+        ("chsel", 5),
+        ("icp", 4),
+        ("icp", 5),
+    ]
+    for row in results:
+        assert row["status"] == "ok"
+        assert (row["object"], row["configuration"], row["seed"]) == ("mustard", "mustard", 0)
+        assert row["diversity"] == pytest.approx(row["coverage"] + row["plausibility"])
+        assert row["root"] == pytest.approx(row["diversity"] ** 0.5)
+        assert row["seconds"] > 0.0
+        assert 0.0 <= row["exact_members"] <= 1.0
+        recording = read_recording(folder / TRIAL / f"{row['method']}.mcap")
+        step = row["step"]
+        assert row["digest"] == recording.hypotheses(step).digest
+        assert row["problem_digest"] == recording.problem(step).digest
+        assert row["best_cost"] == recording.hypotheses(step).cost[0]
+    for method in ("chsel", "icp"):
+        verdicts = list(verify(read_recording(folder / TRIAL / f"{method}.mcap")))
+        assert [verdict.outcome for verdict in verdicts] == [EQUAL, EQUAL]
+
+
+def test_csv_and_parquet_are_the_same_table(folder: Path) -> None:
+    results = table(folder)
+    with (folder / "results.csv").open(newline="") as file:
+        texts = list(csv.DictReader(file))
+    assert list(texts[0]) == list(results[0])
+    for text, row in zip(texts, results, strict=True):
+        for name, value in row.items():
+            if value is None:
+                assert text[name] == ""
+            else:
+                assert type(value)(text[name]) == value
+
+
+def test_metrics_are_those_of_runners_plausible(folder: Path) -> None:
+    small = [word for word in SMALL if word.startswith(("definition", "metrics"))]
+    done = run(plausible.program, str(folder / TRIAL / "icp.mcap"), *small)
+    assert (done.returncode, done.stderr) == (0, "")
+    mine = [row for row in table(folder) if row["method"] == "icp"]
+    for cells, row in zip(rows(done.stdout), mine, strict=True):
+        assert cells[-1] == "found"
+        text = " ".join(cells)
+        for name, form in (("coverage", ".1f"), ("plausibility", ".1f"), ("rank", ".2f")):
+            assert format(row[name], form) in text
+
+
+def test_registrations_are_those_of_runners_probe(folder: Path, tmp_path: Path) -> None:
+    session = ("session=recorded", f"session.path={folder / TRIAL / 'session.mcap'}")
+    done = run(probe.main, *session, "method=icp", "recording=mcap", f"logs={tmp_path}")
+    assert (done.returncode, done.stderr) == (0, "")
+    (path,) = tmp_path.rglob("recording.mcap")
+    recording = read_recording(path)
+    for row in table(folder):
+        if row["method"] == "icp":
+            assert recording.hypotheses(row["step"]).digest == row["digest"]
+
+
+def test_what_is_finished_is_not_done_again(folder: Path) -> None:
+    before = stamps(folder)
+    again = evaluated(folder, METHODS)
+    assert "3 units, of which 3 are finished" in again.stdout
+    assert stamps(folder) == before
+    more = evaluated(folder, "methods=[icp,svgd]", "settings.svgd.iterations=5")
+    assert (more.returncode, more.stderr) == (0, "")
+    assert "3 units, of which 2 are finished" in more.stdout
+    after = stamps(folder)
+    assert {name: after[name] for name in before} == before
+    new = {Path(name).name for name in after if name not in before}
+    assert new == {"svgd.mcap", "svgd.parquet"}
+    assert {row["method"] for row in table(folder)} == {"chsel", "icp", "svgd"}
+    told = json.loads((folder / "experiment.json").read_text())
+    assert list(told["methods"]) == ["chsel", "icp", "svgd"]
+    assert told["methods"]["svgd"]["settings"]["iterations"] == 5
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    """When each file of the trials was written."""
+    files = [path for path in (folder / "trials").rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in files}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["metrics.points=60"], "metrics.points is 60, was 50"),
+        (["settings.chsel.emitter.iterations=11"], "emitter.iterations is 11, was 10"),
+        (["configurations=[mustard,teapot]"], "configurations names 'teapot'; accepted: all"),
+        (["seeds=a"], "seeds names 'a'"),
+        (["seeds=9..0"], "seeds names '9..0'"),
+        (["methods=[chsel,chsell]"], "method is 'chsell'"),
+        (["methods=[chsel,chsel]"], "methods has chsel twice"),
+        (["methods=[{name:chsel,label:a/b}]"], "'a/b' is no label"),
+        (["methods=[{name:chsel,label:chsel.iterations}]"], "'chsel.iterations' is no label"),
+        (["methods=[{name:chsel,setings:{}}]"], "did you mean settings?"),
+        (["methods=[chsel@papper]"], "preset is 'papper'"),
+        (["settings.icp.itterations=1"], "settings.icp.itterations does not exist"),
+        (["settings.cpd.iterations=1"], "settings of a method is 'cpd'"),
+        (["steps=x"], "'x' names no steps"),
+        (["session=recorded"], "session is 'recorded'; accepted: simulated, kinematic"),
+        (["session.noise=-1"], "noise is -1"),
+        (["metrics.method=fast"], "method is 'fast'"),
+        (["workers=0"], "workers is 0"),
+        (["experiment=smok"], "did you mean smoke?"),
+        (["objects=ycb"], "objects is 'ycb'; accepted: models, scans"),
+        (["objects=scans", "assets.dir=nowhere"], "mustard_bottle"),
+        (["outside.mine=nowhere"], "outside.mine is nowhere; accepted: a folder"),
+        (["outside.icp=."], "outside has icp, as methods has"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
+    before = stamps(folder)
+    done = run(evaluate.program, *SMALL, METHODS, f"out={folder}", *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert stamps(folder) == before
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = evaluated(tmp_path / "file" / "out", METHODS)
+    assert done.returncode == 2
+    assert "cannot be written" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_jobs_of_a_sweep_share_a_folder(tmp_path: Path) -> None:
+    done = evaluated(tmp_path, "-m", "methods=icp", "configurations=can,box", "steps='4'")
+    assert (done.returncode, done.stderr) == (0, "")
+    results = table(tmp_path)
+    assert [row["configuration"] for row in results] == ["box", "can"]
+    told = json.loads((tmp_path / "experiment.json").read_text())
+    assert told["configurations"] == ["box", "can"]
+
+
+def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_path: Path) -> None:
+    slow = ("settings.chsel.emitter.iterations=1000000", "methods=chsel", "workers=1")
+    command = [sys.executable, "-m", "runners.evaluate", *SMALL, f"out={tmp_path}", *slow]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        wait_until_claimed(tmp_path, "mustard.0.chsel", process)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted: what is finished stays" in out
+    assert table(tmp_path) == []
+    told = json.loads((tmp_path / "experiment.json").read_text())
+    assert told["commands"][0].startswith("python -m runners.evaluate session=kinematic")
+    kept = {name: time for name, time in stamps(tmp_path).items() if "/." not in name}
+    assert len(kept) == 4  # the session's recording, what it tells, two plausible sets
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        wait_until_claimed(tmp_path, "mustard.0.chsel", process)
+        process.kill()
+        out, _ = process.communicate(timeout=60)
+    assert "2 units, of which 1 are finished" in out
+    left = time.monotonic() + 30.0
+    while is_claimed(tmp_path, "mustard.0.chsel"):
+        assert time.monotonic() < left
+        time.sleep(0.1)
+    after = stamps(tmp_path)
+    assert {name: after[name] for name in kept} == kept
+    assert not (tmp_path / TRIAL / "chsel.parquet").exists()
+
+
+def wait_until_claimed(folder: Path, name: str, process: subprocess.Popen[str]) -> None:
+    while not (folder / TRIAL / "session.json").exists() or not is_claimed(folder, name):
+        assert process.poll() is None
+        time.sleep(0.1)
+
+
+def is_claimed(folder: Path, name: str) -> bool:
+    try:
+        with claimed(folder, name):
+            return False
+    except ClaimedError:
+        return True

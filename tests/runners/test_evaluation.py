@@ -1,0 +1,387 @@
+"""The parts of an evaluation: units, their failures, sets from outside, iterations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+from chsel.errors import ChselError, RecordingError
+from chsel.evaluation.plausible_file import read_plausible
+from chsel.evaluation.plausible_settings import plausible_settings
+from chsel.methods.icp import Icp
+from chsel.pose import axis_angle
+from chsel.problem import Hypotheses
+from chsel.settings import settings_mapping
+from replay.mcap.reader import read_recording
+from replay.verification import EQUAL, NO_RESULT, verify
+from runners.evaluation import registering, work
+from runners.evaluation.claims import claimed
+from runners.evaluation.contenders import Contender, chosen_contenders
+from runners.evaluation.experiment import join_experiment
+from runners.evaluation.gathering import gather
+from runners.evaluation.measure import MetricsConfig
+from runners.evaluation.outside import OutsideError, read_outside
+from runners.evaluation.plan import OWN, Plan, Trial, Unit
+from runners.evaluation.schedule import Schedule
+from runners.evaluation.selection import chosen_configurations, chosen_seeds
+from runners.evaluation.trial_session import open_recorded, problems
+from runners.evaluation.whole_file import WritingError, whole_file
+from runners.evaluation.work import do_unit
+from runners.sessions.probing import PROBING_PRESETS
+
+TRIAL = Trial(0, "mustard")
+FAST = {"chsel": {"descent": {"restarts": 1}, "emitter": {"iterations": 20}}}
+FAST["chsel_cma_me"] = FAST["chsel"]
+
+
+def plan_in(folder: Path, methods: Any = ("icp",), **changes: Any) -> Plan:
+    """A plan of two steps of a kinematic session, with a small grid of plausible poses."""
+    definition = settings_mapping(plausible_settings("default", 1.0))
+    definition["grid"] |= {"rotations": 300, "upright": 4}
+    plan = Plan(
+        folder=folder,
+        preset="default",
+        session={"kind": "kinematic", **settings_mapping(PROBING_PRESETS["default"])},
+        objects="models",
+        definition={**definition, "epsilon": None},
+        metrics=MetricsConfig(points=50),
+        steps="4..5",
+        starts=OWN,
+        every=None,
+        recordings=True,
+        assets=folder,
+        contenders={one.label: one for one in chosen_contenders(list(methods), FAST, "default")},
+        outside={},
+    )
+    return replace(plan, **changes)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trial's folder with its session and plausible sets."""
+    plan = plan_in(tmp_path_factory.mktemp("session"))
+    assert do_unit(plan, Unit(TRIAL), set()).kind == "done"
+    return TRIAL.folder(plan)
+
+
+MakePlan = Callable[..., Plan]
+
+
+@pytest.fixture
+def make_plan(session: Path, tmp_path: Path) -> MakePlan:
+    """Makes a plan in a folder of its own, whose session is there already."""
+
+    def make(methods: Any = ("icp",), **changes: Any) -> Plan:
+        plan = plan_in(tmp_path / "out", methods, **changes)
+        join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
+        there = TRIAL.folder(plan)
+        (there / "plausible").mkdir(parents=True)
+        for path in [*session.glob("session.*"), *session.glob("plausible/*")]:
+            (there / path.relative_to(session)).hardlink_to(path)
+        return plan
+
+    return make
+
+
+def results(plan: Plan) -> list[dict[str, Any]]:
+    return gather(plan.folder).to_pylist()
+
+
+@pytest.mark.parametrize(
+    ("value", "names"),
+    [
+        ("drill", ["drill"]),
+        ("drill*", ["drill", "drill_opposite", "drill_slanted", "drill_fallen"]),
+        ("cracker_box", ["box", "box_fallen"]),
+        (["can", "box"], ["box", "can"]),
+        ("clamp*,can", ["can", "clamp", "clamp_sideways"]),
+    ],
+)
+def test_configurations_are_named_alone_by_patterns_or_by_object(
+    value: Any, names: list[str]
+) -> None:
+    assert list(chosen_configurations(value)) == names
+    assert len(chosen_configurations("all")) == 17
+
+
+def test_seeds_are_named_alone_in_lists_or_as_ranges() -> None:
+    assert chosen_seeds(3) == (3,)
+    assert chosen_seeds([1, 0, 1]) == (0, 1)
+    assert chosen_seeds("2..4") == (2, 3, 4)
+    assert chosen_seeds("7,0..1") == (0, 1, 7)
+
+
+def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry() -> None:
+    entries = [
+        "chsel",
+        "chsel@paper#bins",
+        {"name": "chsel", "label": "small", "settings": {"archive": {"bins": 8}}},
+    ]
+    settings = {"chsel": {"passes": 2}, "chsel@paper#bins": {"archive": {"bins": 9}}}
+    plain, marked, small = chosen_contenders(entries, settings, "default")
+    assert [one.label for one in (plain, marked, small)] == ["chsel", "chsel@paper#bins", "small"]
+    assert [one.settings["archive"]["bins"] for one in (plain, marked, small)] == [40, 9, 8]
+    assert [one.settings["passes"] for one in (plain, marked, small)] == [2, 2, 2]
+    assert [one.preset for one in (plain, marked, small)] == ["default", "paper", "default"]
+    assert marked.settings["cost"]["lookup"] == "nearest"
+
+
+DYING = """
+import os, signal
+from pathlib import Path
+from runners.evaluation import work
+
+real = work.do_unit
+
+def do_unit(plan, unit, warm):
+    mark = Path(plan.folder) / f"tried_{unit.label}"
+    if unit.label == "always" or unit.label == "once" and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return real(plan, unit, warm)
+
+def job(connection, plan):
+    work.do_unit = do_unit
+    work.work(connection, plan)
+"""
+
+
+def test_a_worker_that_dies_once_costs_nothing_and_twice_its_unit_alone(
+    make_plan: MakePlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "dying_worker.py").write_text(DYING)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    from dying_worker import job
+
+    entries = [{"name": "icp", "label": label} for label in ("always", "once", "fine")]
+    plan = make_plan(entries)
+    schedule = Schedule(plan, [TRIAL], 1, lambda _: None, job)
+    progress = schedule.run()
+    assert {unit.label for unit in progress.failed} == {"always"}
+    assert (progress.finished, progress.done) == (1, 2)
+    status = {row["method"]: row["status"] for row in results(plan)}
+    assert status["once"] == status["fine"] == "ok"
+    assert status["always"].startswith("failed: its process died 2 times, SIGKILL")
+    failed = [row for row in results(plan) if row["method"] == "always"]
+    assert [row["step"] for row in failed] == [4, 5]
+    assert {row["diversity"] for row in failed} == {None}
+    assert do_unit(plan, Unit(TRIAL, "always"), set()).kind == "done"
+    assert {row["status"] for row in results(plan)} == {"ok"}
+    assert not list(TRIAL.folder(plan).glob("*failed*"))
+
+
+class _FailsAtFour(Icp):
+    def register(self, problem: Any, observer: Any = None) -> Hypotheses:
+        if problem.key.step == 4:
+            raise ChselError("nothing\nto see")
+        return super().register(problem, observer)
+
+
+def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(
+    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = make_plan()
+    monkeypatch.setattr(Contender, "method", lambda self: _FailsAtFour())
+    assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "done"
+    first, second = results(plan)
+    assert first["status"] == "failed: nothing to see"
+    assert first["members"] > 0
+    assert first["seconds"] is first["digest"] is first["diversity"] is None
+    assert second["status"] == "ok"
+    verdicts = verify(read_recording(TRIAL.folder(plan) / "icp.mcap"))
+    assert [verdict.outcome for verdict in verdicts] == [NO_RESULT, EQUAL]
+
+
+def test_a_session_that_fails_fails_its_methods_and_no_others(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, objects="scans", assets=tmp_path / "nowhere")
+    join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
+    progress = Schedule(plan, [TRIAL], 1, lambda _: None).run()
+    assert {unit.label for unit in progress.failed} == {"", "icp"}
+    (row,) = results(plan)
+    assert row["step"] is None
+    assert row["status"].startswith("failed: session: ")
+
+
+def test_a_unit_that_another_run_has_claimed_is_left_to_it(make_plan: MakePlan) -> None:
+    plan = make_plan()
+    with claimed(plan.folder, "mustard.0.icp"):
+        assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "elsewhere"
+    assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "done"
+
+
+def test_what_cannot_be_written_stops_everything_and_leaves_no_file(
+    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(table: Any, path: Path) -> None:
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    plan = make_plan()
+    monkeypatch.setattr(pa.parquet, "write_table", full)
+    outcome = do_unit(plan, Unit(TRIAL, "icp"), set())
+    assert outcome.kind == "stop"
+    assert "icp.parquet cannot be written (No space left on device)" in outcome.reason
+    assert not [path for path in TRIAL.folder(plan).iterdir() if "parquet" in path.name]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device here")
+def test_a_full_disk_under_a_recording_stops_everything(make_plan: MakePlan) -> None:
+    plan = make_plan()
+    path = TRIAL.folder(plan) / "icp.mcap"
+    with pytest.raises(WritingError, match="No space left on device"), whole_file(path) as beside:
+        _record_on_full_disk(beside)
+    assert not list(TRIAL.folder(plan).glob("*icp*"))
+
+
+def _record_on_full_disk(path: Path) -> None:
+    path.symlink_to("/dev/full")
+    try:
+        path.write_bytes(bytes(100_000))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror})") from None
+
+
+def test_what_cannot_be_recorded_is_a_failure_of_its_unit_alone(
+    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(self: Any, event: Any) -> None:
+        raise RecordingError("not finite")
+
+    plan = make_plan()
+    monkeypatch.setattr(registering.McapRecorder, "record", refused)
+    outcome = do_unit(plan, Unit(TRIAL, "icp"), set())
+    assert (outcome.kind, outcome.reason) == ("failed", "not finite")
+
+
+def test_what_a_dead_process_left_half_written_is_removed(make_plan: MakePlan) -> None:
+    plan = make_plan(["icp", "svgd"])
+    folder = TRIAL.folder(plan)
+    left, other = folder / ".icp.mcap.01234567", folder / ".svgd.mcap.01234567"
+    for path in (left, other):
+        path.write_text("half")
+    assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "done"
+    assert not left.exists()
+    assert other.exists()
+
+
+def _half_written(path: Path) -> None:
+    path.write_text("half")
+    raise ZeroDivisionError
+
+
+def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "file"
+    with pytest.raises(ZeroDivisionError), whole_file(path) as beside:
+        _half_written(beside)
+    assert list(path.parent.iterdir()) == []
+    with whole_file(path) as beside:
+        beside.write_text("whole")
+        assert not path.exists()
+    assert path.read_text() == "whole"
+    with pytest.raises(WritingError, match="cannot be written"), whole_file(path / "x"):
+        pass
+
+
+def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Path) -> None:
+    folders = {name: tmp_path / name for name in ("perfect", "text", "absent")}
+    for folder in folders.values():
+        (folder / "mustard").mkdir(parents=True)
+    plan = make_plan(outside=folders)
+    sets = {}
+    for path in (TRIAL.folder(plan) / "plausible").iterdir():
+        found = read_plausible(path)
+        sets[f"step_{step_of(plan, found.points_digest)}"] = found.world_from_object
+    np.savez(folders["perfect"] / "mustard" / "seed_0.npz", **sets, seconds_4=0.5)
+    shifted = sets["step_5"].copy()
+    shifted[:, 0, 3] += 0.3
+    listed = {"step_5": shifted.tolist(), "cost_5": list(range(len(shifted)))[::-1]}
+    (folders["text"] / "mustard" / "seed_0.json").write_text(json.dumps(listed))
+    for label in ("icp", *folders):
+        assert do_unit(plan, Unit(TRIAL, label), set()).kind == "done"
+    by = {(row["method"], row["step"]): row for row in results(plan)}
+    for step in (4, 5):
+        own = by["perfect", step]
+        assert own["status"] == "ok"
+        assert own["preset"] == "outside"
+        assert own["diversity"] < 1e-6  # mm^2
+        assert own["exact_members"] == 1.0
+        assert own["best_cost"] is own["problem_digest"] is None
+        assert own["diversity"] < 1e-3 * by["icp", step]["diversity"]
+        assert by["absent", step]["status"].startswith("failed: there is no ")
+    assert (by["perfect", 4]["seconds"], by["perfect", 5]["seconds"]) == (0.5, None)
+    assert by["text", 4]["status"].endswith("seed_0.json has no set of this step")
+    assert by["text", 5]["best_cost"] == 0.0
+    assert by["text", 5]["diversity"] > 1e4
+    assert by["text", 5]["exact_members"] == 0.0
+    unit = Unit(TRIAL, "text")
+    assert work.is_finished(plan, unit)
+    listed["step_4"] = sets["step_4"].tolist()
+    (folders["text"] / "mustard" / "seed_0.json").write_text(json.dumps(listed))
+    assert not work.is_finished(plan, unit)
+
+
+def step_of(plan: Plan, points_digest: str) -> int:
+    """The step whose known points have a digest."""
+    found = problems(plan, TRIAL, open_recorded(plan, TRIAL))
+    return next(one.key.step for one in found if one.points.digest == points_digest)
+
+
+POSE = np.eye(4)
+TURN = np.eye(4)
+TURN[:3, :3] = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(1.0))
+SCALED = np.diag([1.1, 1.0, 1.0, 1.0])
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"step_3": [POSE, SCALED]}, r"step_3\[1\] is not rigid"),
+        ({"step_3": [MIRROR]}, r"step_3\[0\] mirrors"),
+        ({"step_3": [POSE[:3]]}, r"step_3 has shape \(1, 3, 4\)"),
+        ({"step_3": [POSE * np.nan]}, r"step_3\[0\] is not finite"),
+        ({"step_3": np.zeros((0, 4, 4))}, "step_3 is empty"),
+        ({"step_99": [POSE]}, "has step_99; accepted: steps 0 to 15 of mustard"),
+        ({"poses": [POSE]}, "has 'poses'; accepted: step_K, cost_K and seconds_K"),
+        ({"step_3": [POSE, TURN], "cost_3": [1.0]}, r"cost_3 has shape \(1,\)"),
+        ({"cost_3": [1.0]}, "has cost_3; accepted: only with step_3"),
+    ],
+)
+def test_a_set_from_outside_that_is_wrong_is_told(
+    tmp_path: Path, values: dict[str, Any], message: str
+) -> None:
+    path = tmp_path / "seed_0.npz"
+    np.savez(path, **values)
+    with pytest.raises(OutsideError, match=message):
+        read_outside(path, TRIAL)
+
+
+def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None:
+    plan = make_plan(["chsel", "chsel_cma_me"], starts="gradient_descent", every=5)
+    for label in plan.contenders:
+        assert do_unit(plan, Unit(TRIAL, label), set()).kind == "done"
+    rows = results(plan)
+    starts = {(row["step"], row["problem_digest"]) for row in rows}
+    assert len(starts) == 2  # one a step, whatever the method
+    measured = pa.parquet.read_table(plan.folder / "iterations.parquet").to_pylist()
+    assert [row["iteration"] for row in measured] == [0, 5, 10, 15, 20] * 4
+    for row in rows:
+        own = [m for m in measured if (m["method"], m["step"]) == (row["method"], row["step"])]
+        for name in ("coverage", "plausibility", "diversity"):
+            assert own[-1][name] == pytest.approx(row[name], rel=1e-9)
+        assert own[-1]["mean_cost"] == pytest.approx(row["mean_cost"], rel=1e-6)
+        costs = [one["best_cost"] for one in own]
+        assert costs == sorted(costs, reverse=True)
+        assert own[-1]["filled"] > own[0]["filled"]
+    for label in plan.contenders:
+        recording = read_recording(TRIAL.folder(plan) / f"{label}.mcap")
+        assert {verdict.outcome for verdict in verify(recording)} == {EQUAL}
+        assert [snapshot.iteration for snapshot in recording.snapshots(4)] == [0, 20]

@@ -1,0 +1,316 @@
+"""The report on an evaluation, as a user makes it."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from runners import report
+from runners.reporting.evaluation_folder import open_evaluation
+from tests.runners.made_up_evaluations import (
+    METHODS,
+    add_recording,
+    made_up_iterations,
+    made_up_rows,
+    row,
+    write_evaluation,
+    write_table,
+)
+
+PICTURES = [
+    "cvo.png",
+    "gradients.png",
+    "medial.png",
+    "over_iterations.png",
+    "pd_boxes.png",
+    "pd_over_probes.png",
+    "sequence.png",
+    "times.png",
+]
+_VOID = ("meta", "img", "link", "br")
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command left behind."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run(*arguments: str) -> Done:
+    """Run the command in this process, which spares it the imports."""
+    out, errors, status = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
+        patch.setattr(sys, "argv", ["report", *arguments])
+        patch.setenv("HYDRA_FULL_ERROR", "0")
+        patch.setattr(warnings, "showwarning", warnings.showwarning)
+        try:
+            report.program()
+        except SystemExit as end:
+            status = int(end.code or 0)
+    return Done(status, out.getvalue(), errors.getvalue())
+
+
+class Page(HTMLParser):
+    """A page in short: its tags as they were opened, and its tables. Fails for tags left open."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.tables: dict[str, list[list[str]]] = {}
+        self._open: list[str] = []
+        self._name = ""
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in _VOID:
+            self._open.append(tag)
+        if tag == "tr":
+            self._cells: list[str] = []
+        if tag in ("td", "th"):
+            self._cells.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+        if tag == "tr":
+            self.tables.setdefault(self._name, []).append(self._cells)
+
+    def handle_data(self, data: str) -> None:
+        if "caption" in self._open or "summary" in self._open:
+            self._name = data.strip()
+        elif {"td", "th"} & set(self._open):
+            self._cells[-1] += (" " if self._open[-1] == "small" else "") + data.strip()
+
+
+def page_of(folder: Path) -> Page:
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An evaluation with everything in it."""
+    folder = tmp_path_factory.mktemp("evaluation")
+    rows = made_up_rows(["clamp", "mustard", "mustard_fallen"], [0, 1], 3, METHODS)
+    moments = made_up_iterations("clamp", [0, 1], [9], ["chsel", "chsel_cma_me"])
+    planned = {"configurations": ["clamp", "mustard", "mustard_fallen"], "seeds": [0, 1]}
+    methods = {method: {"name": method} for method in METHODS}
+    write_evaluation(folder, rows, moments, **planned, methods=methods)
+    for method in ("chsel", "icp", "medial_constraint"):
+        add_recording(folder, "clamp", 1, method, f"clamp_{method}")
+    done = run(str(folder))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "no picture" not in done.stdout
+    return folder
+
+
+def test_a_report_has_all_pictures_and_stands_alone(whole: Path) -> None:
+    found = whole / "report"
+    assert sorted(path.name for path in found.iterdir()) == sorted(
+        [*PICTURES, "report.html", "report.md"]
+    )
+    for name in PICTURES:
+        with Image.open(found / name) as image:
+            assert image.width == 1440
+            assert image.info.keys() <= {"dpi"}  # no clock, no program
+            assert len(image.convert("RGB").getcolors(2**24) or []) > 50
+    page = page_of(found)
+    images = [attributes for tag, attributes in page.tags if tag == "img"]
+    assert len(images) == len(PICTURES)
+    assert all((image["src"] or "").startswith("data:image/png;base64,") for image in images)
+    assert all(len(image["alt"] or "") > 40 for image in images)
+    assert not {"script", "link", "iframe"} & {tag for tag, _ in page.tags}
+    names = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(set(names)) == len(names)
+    targets = [(a["href"] or "")[1:] for tag, a in page.tags if tag == "a"]
+    assert targets
+    assert set(targets) <= set(names)
+    html = (found / "report.html").read_text(encoding="utf-8")
+    assert html.startswith("<!DOCTYPE html>")
+    assert "url(" not in html
+    assert "python -m runners.evaluate experiment=made_up\npython -m runners.report" in html
+
+
+def test_the_markdown_links_its_pictures_and_has_the_same_numbers(whole: Path) -> None:
+    text = (whole / "report" / "report.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"\]\(([\w.]+)\)", text)) == PICTURES
+    table = text.split("**PD in mm² by object**\n\n")[1].split("\n\n")[0]
+    lines = [line.strip("| ").split(" | ") for line in table.splitlines()]
+    assert [line[:2] for line in lines[2:]] == [["clamp", "4"], ["mustard", "8"]]
+    cells = [[cell.replace("**", "") for cell in line] for line in lines[2:]]
+    assert cells == page_of(whole / "report").tables["PD in mm² by object"][1:]
+    assert [line[2:].count(next(c for c in line if "**" in c)) for line in lines[2:]] == [1, 1]
+
+
+def test_the_same_evaluation_gives_the_same_bytes(whole: Path, tmp_path: Path) -> None:
+    assert run(str(whole), f"out={tmp_path / 'again'}").returncode == 0
+    for path in (whole / "report").iterdir():
+        assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path: Path) -> None:
+    values = {0: (1000.0, 10.0, 20.0), 1: (1000.0, 30.0, 60.0)}  # PD of seeds at steps 4, 5, 6
+    rows = [
+        row("can", seed, method, step, diversity=factor * value, seconds=0.01 * factor)
+        for seed, found in values.items()
+        for method, factor in (("chsel", 1.0), ("icp", 2.0))
+        for step, value in zip((4, 5, 6), found, strict=True)
+    ]
+    write_evaluation(tmp_path, rows)
+    assert run(str(tmp_path)).returncode == 0
+    tables = page_of(tmp_path / "report").tables
+    # 10, 20, 30, 60: the middle step of three is of the last half
+    expected = ["can", "4", "25 [17.5, 37.5]", "50 [35, 75]"]
+    assert tables["PD in mm² by object"] == [["object", "n", "CHSEL", "ICP"], expected]
+    assert tables["PD in mm² by configuration"][1] == expected
+    assert tables["PD in mm² of can by step"][2] == ["5", "2", "20 [15, 25]", "40 [30, 50]"]
+    assert tables["Time per registration in ms"][1:] == [
+        ["CHSEL", "10", "0", "10 [10, 10]", "6", "0"],
+        ["ICP", "20", "0", "20 [20, 20]", "6", "0"],
+    ]
+    html = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    assert '<td class="best">25<small>' in html
+    assert '<td class="best">50<small>' not in html
+
+
+def test_what_has_no_number_is_left_out_and_said(tmp_path: Path) -> None:
+    rows = [
+        row("can", 0, "chsel", 4, diversity=8.0, seconds=0.1),
+        row("can", 1, "chsel", 4, seconds=0.3) | {"status": "no plausible set: too few points"},
+        row("can", 0, "icp", 4, diversity=float("nan"), seconds=None),
+        row("can", 1, "icp", None) | {"status": "failed: the worker was killed"},
+    ]
+    methods = {"chsel": {}, "icp": {}, "svgd": {}}
+    write_evaluation(tmp_path, rows, configurations=["can"], seeds=[0, 1, 2], methods=methods)
+    assert run(str(tmp_path)).returncode == 0
+    tables = page_of(tmp_path / "report").tables
+    assert tables["PD in mm² by object"][1] == [
+        "can",
+        "1",
+        "8 [8, 8] 1 left out",
+        "-",
+        "- 1 left out",
+    ]
+    assert tables["Time per registration in ms"][1:] == [
+        ["CHSEL", "200", "100", "200 [150, 250]", "2", "0"]
+    ]
+    assert [line[:7] for line in tables["What is there"][1:]] == [
+        ["CHSEL", "2 of 3", "0", "1", "2", "0", "1"],
+        ["SVGD", "0 of 3", "0", "3", "0", "0", "0"],
+        ["ICP", "1 of 3", "1", "1", "1", "1", "1"],
+    ]
+    assert tables["What is missing"][1:] == [
+        ["can", "1", "chsel", "4", "no plausible set: too few points"],
+        ["can", "1", "icp", "all", "failed: the worker was killed"],
+        ["can", "0..2", "svgd", "all", "not there"],
+        ["can", "2", "chsel, icp", "all", "not there"],
+    ]
+
+
+def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Path) -> None:
+    write_evaluation(tmp_path, None, configurations=["can"], seeds=[0], methods={"icp": {}})
+    trial = tmp_path / "trials" / "can" / "seed_0"
+    trial.mkdir(parents=True)
+    write_table(trial / "icp.parquet", [row("can", 0, "icp", 5, diversity=3.0)])
+    write_table(trial / "svgd.parquet", [row("can", 0, "svgd", 5, diversity=4.0)])
+    failed = row("can", 0, "icp", None) | {"status": "failed: once"}
+    write_table(trial / "icp.failed.parquet", [failed])  # before it went well
+    evaluation = open_evaluation(tmp_path)
+    assert evaluation.gathered
+    assert [(row["method"], row["diversity"]) for row in evaluation.rows] == [
+        ("icp", 3.0),
+        ("svgd", 4.0),
+    ]
+    assert run(str(tmp_path)).returncode == 0
+    assert "no table of the whole" in (tmp_path / "report" / "report.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("rows", "drawn"),
+    [
+        ([], []),
+        ([row("can", 0, "chsel", 4) | {"status": "failed: no reason"}], []),
+        (
+            [row("can", 0, "chsel", 4, diversity=0.0, seconds=0.0)],
+            ["pd_boxes.png", "pd_over_probes.png", "times.png", "medial.png"],
+        ),
+        ([row("can", 0, "our own @#$1", 4, seconds=2.0)], ["times.png"]),
+    ],
+    ids=["nothing", "all failed", "one zero", "no PD"],
+)
+def test_pictures_that_cannot_be_drawn_say_why(tmp_path: Path, rows: list, drawn: list) -> None:
+    write_evaluation(tmp_path, rows)
+    done = run(str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    found = {path.name for path in (tmp_path / "report").glob("*.png")}
+    assert found == set(drawn)
+    html = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    reasons = html.count('<p class="missing">No picture: ')
+    assert reasons == done.stdout.count("no picture of ") == len(PICTURES) - len(drawn)
+    assert "experiment=paper_qd" in html
+    assert "there are no recordings" in html
+    page_of(tmp_path / "report")
+
+
+def test_settings_of_the_sequence_choose_trial_methods_and_steps(
+    whole: Path, tmp_path: Path
+) -> None:
+    out = f"out={tmp_path}"
+    some = ["sequence.methods=[icp]", "sequence.steps=[11]", "sequence.view=xy"]
+    assert run(str(whole), out, "sequence.trial=clamp/1", *some).returncode == 0
+    text = (tmp_path / "report.md").read_text("utf-8")
+    assert "seen from above" in text
+    assert "sequence.trial=clamp/1 'sequence.methods=[icp]' 'sequence.steps=[11]'" in text
+    assert "that ICP hold" in text
+    done = run(str(whole), out, "sequence.steps=[3]")
+    assert "step 3 has no result of every method shown; accepted: 10, 11" in done.stdout
+    done = run(str(whole), out, "sequence.trial=mustard/seed_0")
+    assert "there is no recording of mustard, seed 0" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "dir is missing"),
+        (["{}/nowhere"], "nowhere does not exist; accepted: a folder that runners.evaluate has"),
+        (["{}/empty"], "has no experiment.json"),
+        (["{}/text"], "experiment.json cannot be read"),
+        (["{}/damaged"], "results.parquet cannot be read as a table"),
+        (["{}/other"], "results.parquet lacks the column"),
+        (["{}/good", "sequence.trial=clamp"], "accepted: CONFIGURATION/SEED"),
+        (["{}/good", "sequence.view=zz"], "view is 'zz'; accepted: xz, xy, yz"),
+        (["{}/good", "sequence.steps=[]"], "steps is empty"),
+        (["{}/good", "colour=red"], "has no key 'colour'"),
+        (["{}/good", "{}/empty"], "one folder too many"),
+        (["{}/good", "out={}/good/experiment.json/x"], "cannot be written"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
+    write_evaluation(tmp_path / "good", [row("can", 0, "chsel", 4, diversity=1.0)])
+    write_evaluation(tmp_path / "damaged", [])
+    (tmp_path / "damaged" / "results.parquet").write_bytes(b"PAR1 and no more")
+    write_evaluation(tmp_path / "other", None)
+    write_table(tmp_path / "other" / "results.parquet", [{"a": 1}], None)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "experiment.json").write_text("{")
+    done = run(*(argument.format(tmp_path) for argument in arguments))
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert json.loads((tmp_path / "good" / "experiment.json").read_text())["name"] == "made_up"
