@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import subprocess
+from importlib.metadata import entry_points
 from pathlib import Path
 
 PACKAGES = (
@@ -29,7 +30,9 @@ def environment() -> dict[str, str]:
         "processor": _processor(),
         "checkout": _checkout(),
     }
-    return values | {f"package {name}": _version(name) for name in PACKAGES}
+    offering = {point.dist.name for point in entry_points(group="chsel.methods") if point.dist}
+    packages = [*PACKAGES, *sorted(offering.difference(PACKAGES))]
+    return values | {f"package {name}": _version(name) for name in packages}
 
 
 def _version(package: str) -> str:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import difflib
+import multiprocessing
 import os
 import re
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.config_store import ConfigStore
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -45,16 +49,40 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
             store_presets()
             _register_resolvers()
 
-            def job(config: DictConfig) -> None:
-                # Caught here as well: Hydra would print a line of its own about a failed job.
-                _exit_on_error(lambda: main(config), config_name, show_traceback)
-
+            job = _Job(_importable(main), config_name, show_traceback)
             run = hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
             _exit_on_error(run(job), config_name, show_traceback)
 
+        program.main = main  # type: ignore[attr-defined]
         return program
 
     return decorate
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One run of a program, named by its module: what launchers send to other processes."""
+
+    module: str
+    config_name: str
+    show_traceback: bool
+    process: int = field(default_factory=os.getpid)
+
+    def __call__(self, config: DictConfig) -> None:
+        main = import_module(self.module).main.main
+        if os.getpid() == self.process:
+            # Caught here as well: Hydra would print a line of its own about a failed job.
+            _exit_on_error(lambda: main(config), self.config_name, self.show_traceback)
+        else:
+            # Joblib's name for how it started this process says nothing to those started from it.
+            multiprocessing.set_start_method("spawn", force=True)
+            main(config)  # what it raises is told by the process that waits for it
+
+
+def _importable(main: Callable[[DictConfig], None]) -> str:
+    """The name of the module of `main`, by which another process imports it as well."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return spec.name if main.__module__ == "__main__" and spec else main.__module__
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -65,10 +93,13 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def choices(group: str) -> list[str]:
-    """The options of a group of conf/, those of nested folders with their path."""
+    """The options of a group, those of conf/ first, of nested folders with their path."""
     folder = CONF / group
     files = sorted(folder.rglob("*.yaml"), key=lambda file: (len(file.parts), file))
-    return [str(file.relative_to(folder).with_suffix("")) for file in files]
+    names = [str(file.relative_to(folder).with_suffix("")) for file in files]
+    stored = ConfigStore.instance().repo.get(group, {})  # such as methods of installed packages
+    more = sorted(Path(name).stem for name in stored if name.endswith(".yaml"))
+    return list(dict.fromkeys([*names, *more]))
 
 
 def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bool) -> None:

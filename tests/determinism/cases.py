@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from chsel.methods import METHODS, build_method, preset_settings
+from chsel.methods import OURS, build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.presets import PRESETS
 from chsel.settings import settings_mapping
@@ -63,7 +63,7 @@ def _on_plane(measure: str, plane: dict[str, Any], method: str = "chsel", **more
 
 
 _PRODUCT = {
-    f"{method} {preset}": Case(method, preset, steps=2) for method in METHODS for preset in PRESETS
+    f"{method} {preset}": Case(method, preset, steps=2) for method in OURS for preset in PRESETS
 }
 _COSTS = {
     "exact gradient": Case(

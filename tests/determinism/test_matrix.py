@@ -11,7 +11,7 @@ import pytest
 from chsel.cost_settings import FREE_TERMS, GRADIENTS, CostSettings
 from chsel.emitters import SEARCHES
 from chsel.measures import MEASURES
-from chsel.methods import METHODS
+from chsel.methods import OURS
 from chsel.methods.chsel import ChselSettings
 from chsel.presets import PRESETS
 from chsel.sdf import LOOKUPS, OUTSIDE
@@ -70,7 +70,7 @@ def test_the_cases_meet_every_choice_at_least_once() -> None:
     every = [getattr(made, "cost", None) for made in settings]
     costs = [cost for cost in every if isinstance(cost, CostSettings)]
     met = {
-        METHODS: {case.method for case in CASES.values()},
+        OURS: {case.method for case in CASES.values()},
         PRESETS: {case.preset for case in CASES.values()},
         tuple(SEARCHES): {made.search for made in searches},
         tuple(MEASURES): {made.archive.measure for made in searches},
