@@ -9,38 +9,28 @@ from matplotlib.cbook import boxplot_stats
 from matplotlib.figure import Figure
 
 from runners.reporting.evaluation_folder import Row
-from runners.reporting.method_style import MethodStyle
-from runners.reporting.panels import drawn, panels, positive_scale
-from runners.reporting.section import NotDrawn, Picture
+from runners.reporting.object_panels import COLUMNS, Styles, object_panels, rows_by_object
+from runners.reporting.panels import drawn, positive_scale
+from runners.reporting.section import Picture
 from runners.reporting.statistics import grouped, spread
 from runners.reporting.tables import DIVERSITY
-
-Styles = Mapping[str, MethodStyle]
 
 
 def picture_of_boxes(rows: Sequence[Row], styles: Styles, name: str) -> Picture:
     """The picture of the numbers of these rows; NotDrawn where there are none."""
-    by_object = grouped(
-        (row for row in rows if row[DIVERSITY] is not None and row["method"] in styles),
-        lambda row: row["object"],
-    )
-    if not by_object:
-        raise NotDrawn("no step of these methods has a PD")
+    by_object = rows_by_object(rows, styles)
     alt = (
-        f"Box plots of plausible diversity for {', '.join(sorted(by_object))}, a box for each of "
+        f"Box plots of plausible diversity for {', '.join(by_object)}, a box for each of "
         f"{', '.join(style.title for style in styles.values())}."
     )
     return Picture(name, alt, drawn(lambda: _figure(by_object, styles)))
 
 
 def _figure(by_object: Mapping[str, Sequence[Row]], styles: Styles) -> Figure:
-    figure, axes = panels(len(by_object), columns=min(3, len(by_object)))
-    for index, (panel, name) in enumerate(zip(axes, sorted(by_object), strict=True)):
-        _draw(panel, by_object[name], styles)
-        panel.set_title(name.replace("_", " "))
-        if panel.get_subplotspec().is_first_col():  # type: ignore[union-attr]
-            panel.set_ylabel("PD in mm²")
-        names = [style.title for style in styles.values()] if index + 3 >= len(axes) else []
+    figure, axes = object_panels(by_object, styles, _draw)
+    for index, panel in enumerate(axes):
+        lowest = index + COLUMNS >= len(axes)
+        names = [style.title for style in styles.values()] if lowest else []
         panel.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=10)
     return figure
 

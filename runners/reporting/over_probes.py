@@ -10,39 +10,27 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from runners.reporting.evaluation_folder import Evaluation, Row
-from runners.reporting.method_style import MethodStyle
-from runners.reporting.panels import drawn, legend_of_methods, panels, positive_scale
-from runners.reporting.section import NotDrawn, Picture
+from runners.reporting.object_panels import COLUMNS, Styles, object_panels, rows_by_object
+from runners.reporting.panels import drawn, legend_of_methods, positive_scale
+from runners.reporting.section import Picture
 from runners.reporting.statistics import grouped, spread
 from runners.reporting.tables import DIVERSITY
-
-Styles = Mapping[str, MethodStyle]
 
 
 def picture_over_probes(evaluation: Evaluation, styles: Styles, name: str) -> Picture:
     """The picture of some methods; NotDrawn where no step has a number."""
-    rows = [row for row in evaluation.rows if row["method"] in styles]
-    by_object = grouped(
-        (row for row in rows if row[DIVERSITY] is not None), lambda row: row["object"]
-    )
-    if not by_object:
-        raise NotDrawn("no step of these methods has a PD")
+    by_object = rows_by_object(evaluation.rows, styles)
     alt = (
-        f"Plausible diversity over probes for {', '.join(sorted(by_object))}: a line of medians "
+        f"Plausible diversity over probes for {', '.join(by_object)}: a line of medians "
         f"with its quartile band for each of {', '.join(s.title for s in styles.values())}."
     )
     return Picture(name, alt, drawn(lambda: _figure(by_object, styles)))
 
 
 def _figure(by_object: Mapping[str, Sequence[Row]], styles: Styles) -> Figure:
-    figure, axes = panels(len(by_object), columns=min(3, len(by_object)))
-    for index, (panel, name) in enumerate(zip(axes, sorted(by_object), strict=True)):
-        _draw(panel, by_object[name], styles)
-        panel.set_title(name.replace("_", " "))
-        if panel.get_subplotspec().is_first_col():  # type: ignore[union-attr]
-            panel.set_ylabel("PD in mm²")
-        if index + 3 >= len(axes):
-            panel.set_xlabel("step (index of the probe)")
+    figure, axes = object_panels(by_object, styles, _draw)
+    for panel in axes[-COLUMNS:]:
+        panel.set_xlabel("step (index of the probe)")
     shown = {row["method"] for rows in by_object.values() for row in rows}
     legend_of_methods(figure, [style for method, style in styles.items() if method in shown])
     return figure
