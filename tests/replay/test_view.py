@@ -274,15 +274,18 @@ def test_the_web_viewer_is_served_here_alone_and_ends_with_the_command(
     command = [sys.executable, "-m", "replay", "view", str(write(events)), "--web"]
     environment = {**ENVIRONMENT, "TMPDIR": str(folder), "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as viewing:
-        assert viewing.stdout is not None
-        address = viewing.stdout.readline().strip()
-        page, data = map(int, re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address))
-        with urllib.request.urlopen(f"http://127.0.0.1:{page}/") as answer:
-            assert b"<html" in answer.read()
-        assert rerun_viewer.is_listening(data)
-        assert [file.name for file in folder.rglob("*.rrd")] == ["recording.rrd"]
-        viewing.send_signal(ending)
-        assert viewing.wait(30.0) == status
+        try:
+            assert viewing.stdout is not None
+            address = viewing.stdout.readline().strip()
+            page, data = map(int, re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address))
+            with urllib.request.urlopen(f"http://127.0.0.1:{page}/") as answer:
+                assert b"<html" in answer.read()
+            assert rerun_viewer.is_listening(data)
+            assert [file.name for file in folder.rglob("*.rrd")] == ["recording.rrd"]
+            viewing.send_signal(ending)
+            assert viewing.wait(30.0) == status
+        finally:
+            viewing.kill()  # else the block would wait for one that a failure has left behind
     assert not rerun_viewer.is_listening(page)
     assert not rerun_viewer.is_listening(data)
     assert list(folder.iterdir()) == []
