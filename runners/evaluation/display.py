@@ -75,13 +75,16 @@ class Display:
             np.array(results[name].to_pylist(), dtype=float) for name in ("diversity", "seconds")
         )
         objects = list(dict.fromkeys(names))
-        columns = [["", *objects, "ms a registration"]]
+        table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0)
+        table.add_column("method", no_wrap=True)
+        for heading in [*(name.replace("_", "\n") for name in objects), "ms"]:
+            table.add_column(heading, justify="right", no_wrap=True, vertical="bottom")
         for label in there:
             own = labels == label
             cells = [_median(diversity[own & (names == name)]) for name in objects]
-            columns.append([label, *cells, _median(1000.0 * seconds[own])])
-        self.say("median PD in mm² over all steps of all trials")
-        self._console.print(_table(columns, self._console.width))
+            table.add_row(label, *cells, _median(1000.0 * seconds[own]))
+        self.say("medians over all steps of all trials: PD in mm² by object, ms a registration")
+        self._console.print(table)
 
     def written(self, folder: Path, results: pa.Table) -> None:
         """Where the tables are."""
@@ -92,21 +95,12 @@ class Display:
         self.say(text + (f", {without} without a plausible set" if without else ""))
 
 
-def _table(columns: list[list[str]], width: int) -> Table:
-    """Methods beside each other, or, where there is no room for that, below each other."""
-    needed = sum(max(map(len, column)) + 2 for column in columns)
-    rows = list(zip(*columns, strict=True)) if needed <= width else columns
-    table = Table(box=SIMPLE_HEAD, collapse_padding=True)
-    for index, name in enumerate(rows[0]):
-        table.add_column(name, justify="right" if index else "left")
-    for row in rows[1:]:
-        table.add_row(*row)
-    return table
-
-
 def _median(values: np.ndarray) -> str:
     values = values[~np.isnan(values)]
-    return f"{np.median(values):.4g}" if len(values) else ""
+    if len(values) == 0:
+        return ""
+    median = float(np.median(values))
+    return f"{median:.0f}" if median >= 100.0 else f"{median:.3g}"
 
 
 def _doing(state: schedule.Progress) -> str:
