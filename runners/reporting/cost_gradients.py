@@ -97,6 +97,7 @@ def _figure(sdf: SdfGrid, settings: CostSettings) -> Figure:
     points = np.stack([x.ravel(), np.full(x.size, nodes[1][j]), z.ravel()], axis=1)
     width, height = upper - lower
     figure = new_figure(float(np.clip(0.9 + 3.3 * height / width, 3.0, 8.0)))
+    figure.set_layout_engine("compressed")  # leaves room for titles above panels of fixed aspect
     for place, (kind, (title, color)) in enumerate(_KINDS.items()):
         axes = figure.add_subplot(1, 3, place + 1)
         gradients = point_gradients(sdf, settings, points, kind)
