@@ -6,6 +6,7 @@ import importlib.util
 import os
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from chsel.errors import SettingError, require_choice, require_positive
+from chsel.errors import RecordingError, SettingError, require_choice, require_positive
 from chsel.methods import METHODS
 from chsel.settings import build_settings
 from runners.cli import command, plain
@@ -105,8 +106,9 @@ def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
         nonlocal gathered
         display.progress(progress)
         if time.monotonic() - gathered > _GATHER:
-            gather(plan.folder)
             gathered = time.monotonic()
+            with suppress(RecordingError):  # of a damaged part: at the end it is told
+                gather(plan.folder)
 
     schedule = Schedule(plan, trials, workers, show)
     before = schedule.progress
@@ -118,8 +120,8 @@ def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
         schedule.run()
     finally:
         display.close()
-        results = gather(plan.folder)
         display.failures(schedule.progress)
+        results = gather(plan.folder)
         if sys.exc_info()[0] is KeyboardInterrupt:
             display.say("interrupted: what is finished stays, and the same command goes on")
     display.summary(results, _labels(plan.folder))
@@ -152,10 +154,11 @@ def _check(plan: Plan, trials: list[Trial]) -> None:
     for trial in trials:
         plan.session_settings(trial.configuration)
         plan.plausible_settings(plan.object_config(trial.configuration).epsilon)
-        plan.steps_of(trial.configuration)
     for scan in {plan.object_config(trial.configuration).scan for trial in trials}:
         if scan is not None:
             scan_file(plan.assets, scan)
+    if not any(plan.steps_of(trial.configuration) for trial in trials):
+        raise SettingError(f"steps is {plan.steps}; accepted: steps that a configuration has")
     if plan.session["kind"] == "simulated" and importlib.util.find_spec("pybullet") is None:
         raise SettingError("session=simulated needs PyBullet; accepted here: session=kinematic")
     for label, folder in plan.outside.items():

@@ -99,12 +99,10 @@ def _command() -> str:
 
 def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
     differing = [text for key in _FIXED for text in _differences(key, theirs.get(key), ours[key])]
-    for kind in ("methods", "outside"):
-        known = theirs.get(kind) or {}
-        for label in known:
-            if label in ours[kind]:
-                what = f"{kind}.{label}"
-                differing += _differences(what, known[label], ours[kind][label])
+    known = theirs.get("methods") or {}
+    for label in known:
+        if label in ours["methods"]:
+            differing += _differences(f"methods.{label}", known[label], ours["methods"][label])
     if differing:
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise SettingError(

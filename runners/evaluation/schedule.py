@@ -12,7 +12,7 @@ from runners.evaluation.outside import PRESET
 from runners.evaluation.plan import Plan, Trial, Unit
 from runners.evaluation.pool import Died, Job, Pool
 from runners.evaluation.table import RESULTS, Row, write_part
-from runners.evaluation.trial_session import read_session
+from runners.evaluation.trial_session import has_session, read_session
 from runners.evaluation.work import Outcome, is_finished, work
 from runners.sessions.configurations import CONFIGURATIONS
 
@@ -92,8 +92,7 @@ class Schedule:
         return unit.trial.seed, bool(unit.label), -self._speed.expected(unit), unit
 
     def _has_session(self, trial: Trial) -> bool:
-        session = Unit(trial)
-        return session not in self._open and session.finished(self._plan).exists()
+        return Unit(trial) not in self._open and has_session(self._plan, trial)
 
     def _take(self, unit: Unit, outcome: Outcome | Died) -> None:
         if isinstance(outcome, Died):
@@ -128,7 +127,7 @@ class Schedule:
         plan, trial = self._plan, unit.trial
         preset = PRESET if unit.label in plan.outside else plan.contenders[unit.label].preset
         steps: Sequence[int | None] = (None,)
-        if Unit(trial).finished(plan).exists():
+        if has_session(plan, trial):
             steps = read_session(plan, trial).steps
         return [
             {

@@ -8,10 +8,10 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from chsel.errors import SettingError
-from chsel.streams import StreamKey
 from runners.sessions.configurations import CONFIGURATIONS, fitting_configurations
 
 MOST_SEEDS = 100_000
+SEED_LIMIT = 2**63  # a column of the table holds them
 _RANGE = re.compile(r"(\d{1,19})\.\.(\d{1,19})")
 
 
@@ -64,10 +64,8 @@ def _seeds(part: Any) -> Iterable[int]:
     match = _RANGE.fullmatch(str(part))
     if match is not None:
         first, last = int(match[1]), int(match[2])
-        if first <= last < first + MOST_SEEDS:
-            StreamKey(last, 0)
+        if first <= last < min(first + MOST_SEEDS, SEED_LIMIT):
             return range(first, last + 1)
-    elif re.fullmatch(r"\d{1,20}", str(part)):
-        StreamKey(int(part), 0)
+    elif re.fullmatch(r"\d{1,20}", str(part)) and int(part) < SEED_LIMIT:
         return [int(part)]
-    raise SettingError(f"seeds names {part!r}; accepted: such as 3, [0,1] or 0..9")
+    raise SettingError(f"seeds names {part!r}; accepted: such as 3, [0,1] or 0..9, below 2^63")

@@ -72,6 +72,15 @@ def read_part(path: Path, schema: pa.Schema) -> pa.Table:
         ) from None
 
 
+def is_part(path: Path) -> bool:
+    """Whether there is a part that can be read, as far as its end tells."""
+    try:
+        pa.parquet.read_schema(path)
+    except (pa.ArrowException, ValueError, OSError):
+        return False
+    return True
+
+
 def about_part(path: Path) -> str:
     """What was kept with a part; empty if there is no such part."""
     try:

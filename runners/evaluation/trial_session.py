@@ -78,12 +78,26 @@ def read_session(plan: Plan, trial: Trial) -> TrialSession:
         raise RecordingError(f"{path} is damaged ({error}); remove it") from None
 
 
+def has_session(plan: Plan, trial: Trial) -> bool:
+    """Whether `make_session` has finished with a trial."""
+    try:
+        read_session(plan, trial)
+    except (OSError, RecordingError):
+        return False
+    return True
+
+
 def open_recorded(plan: Plan, trial: Trial) -> RecordedSession:
     """The session of a trial, from its recording."""
     path = trial.folder(plan) / "session.mcap"
     settings = plan.session_settings(trial.configuration)
     start = settings.start_contacts, settings.start_probe
-    return RecordedSession(RecordedSettings(str(path), *start))
+    try:
+        return RecordedSession(RecordedSettings(str(path), *start))
+    except RecordingError as error:
+        raise RecordingError(
+            f"{error}; or remove it and session.json beside it to have both made again"
+        ) from None
 
 
 def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSettings:

@@ -24,6 +24,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield beside
+        with beside.open("rb") as written:
+            os.fsync(written.fileno())  # else a power cut may leave the name without the content
         beside.replace(path)
     except (OSError, RecordingError) as error:
         reason = error if isinstance(error, OSError) else error.__context__

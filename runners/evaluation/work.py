@@ -17,8 +17,8 @@ from runners.evaluation.judge import one_line
 from runners.evaluation.outside import outside_digest, outside_file, rank_outside
 from runners.evaluation.plan import Plan, Unit
 from runners.evaluation.registering import register_trial
-from runners.evaluation.table import about_part
-from runners.evaluation.trial_session import make_session
+from runners.evaluation.table import about_part, is_part
+from runners.evaluation.trial_session import has_session, make_session
 from runners.evaluation.whole_file import WritingError
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")
@@ -38,12 +38,19 @@ class Outcome:
 
 
 def is_finished(plan: Plan, unit: Unit) -> bool:
-    """Whether there is nothing left to do. Sets from outside may have changed since."""
+    """Whether there is nothing left to do. Sets from outside may have changed since.
+
+    A file that is damaged, as by a power cut, is made again.
+    """
+    if not unit.label:
+        return has_session(plan, unit.trial)
     finished = unit.finished(plan)
+    if not is_part(finished):
+        return False
     if unit.label in plan.outside:
         path = outside_file(plan.outside[unit.label], unit.trial)
-        return finished.exists() and about_part(finished) == outside_digest(path)
-    return finished.exists()
+        return about_part(finished) == outside_digest(path)
+    return True
 
 
 def do_unit(plan: Plan, unit: Unit, warm: set[str]) -> Outcome:

@@ -149,6 +149,8 @@ def stamps(folder: Path) -> dict[str, int]:
         (["configurations=[mustard,teapot]"], "configurations names 'teapot'; accepted: all"),
         (["seeds=a"], "seeds names 'a'"),
         (["seeds=9..0"], "seeds names '9..0'"),
+        (["seeds=9223372036854775808"], "seeds names 9223372036854775808"),
+        (["steps=99"], "steps is 99; accepted: steps that a configuration has"),
         (["methods=[chsel,chsell]"], "method is 'chsell'"),
         (["methods=[chsel,chsel]"], "methods has chsel twice"),
         (["methods=[{name:chsel,label:a/b}]"], "'a/b' is no label"),
@@ -226,8 +228,10 @@ def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_p
 
 
 def wait_until_claimed(folder: Path, name: str, process: subprocess.Popen[str]) -> None:
+    latest = time.monotonic() + 300.0
     while not (folder / TRIAL / "session.json").exists() or not is_claimed(folder, name):
         assert process.poll() is None
+        assert time.monotonic() < latest
         time.sleep(0.1)
 
 

@@ -290,6 +290,23 @@ def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.parametrize("name", ["session.json", "icp.parquet"])
+def test_a_damaged_file_is_made_again(make_plan: MakePlan, name: str) -> None:
+    plan = make_plan()
+    Schedule(plan, [TRIAL], 1, lambda _: None).run()
+    before = results(plan)
+    path = TRIAL.folder(plan) / name
+    start = path.read_bytes()[:20]
+    path.unlink()  # other tests share the file
+    path.write_bytes(start)
+    progress = Schedule(plan, [TRIAL], 1, lambda _: None).run()
+    assert (progress.finished, progress.done, progress.failed) == (1, 1, {})
+    after = results(plan)
+    for row in before + after:
+        row.pop("seconds")
+    assert after == before
+
+
 def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Path) -> None:
     folders = {name: tmp_path / name for name in ("perfect", "text", "absent")}
     for folder in folders.values():
