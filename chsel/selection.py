@@ -148,11 +148,11 @@ class Judge(Protocol):
 def ranked_hypotheses(
     objective: Judge,
     object_from_world: FloatArray,
-    cells: IntArray,
-    elites: FloatArray,
-    archive: ArchiveSnapshot | None,
+    cells: IntArray | None = None,
+    elites: FloatArray | None = None,
+    archive: ArchiveSnapshot | None = None,
 ) -> Hypotheses:
-    """Poses (B, 4, 4) from archive cells (B,), costed as they are and put in order of cost."""
+    """Poses (B, 4, 4), costed as they are and put in order of cost; the rest as `ranked` has it."""
     cost = objective.costs(objective.space.encode(object_from_world))
     return ranked(object_from_world, cost, cells, elites, archive)
 
@@ -166,7 +166,8 @@ def ranked(
 ) -> Hypotheses:
     """Poses (B, 4, 4) in order of their costs (B,).
 
-    Without cells they are of none; without elites the poses themselves are all that is kept.
+    cells (B,): those of the archive that they come from; by default of none. elites (L, 4, 4): all
+    solutions kept; by default the poses in their order.
     """
     if not np.isfinite(cost).any():
         raise ChselError(

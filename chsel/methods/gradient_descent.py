@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from chsel.cost_settings import CostSettings
 from chsel.descent import DescentSettings, descend
 from chsel.engine import CompiledCost
@@ -46,5 +44,4 @@ class GradientDescent:
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
         estimates, _ = descend(objective, problem.initial_set, self.settings.descent, observer)
-        no_cells = np.full(len(estimates), -1, dtype=np.int64)
-        return ranked_hypotheses(objective, estimates, no_cells, estimates, None)
+        return ranked_hypotheses(objective, estimates, elites=estimates)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from chsel import presets
 from chsel.cma_es import CmaEsSettings, evolved
 from chsel.medial_cost import MedialCost, MedialCostSettings, MedialObjective
@@ -66,5 +64,4 @@ class MedialConstraint:
             objective, problem.initial_set, self.settings.cma_es, problem.key, observer
         )
         estimates = transforms_of(space, vectors)
-        no_cells = np.full(len(estimates), -1, dtype=np.int64)
-        return ranked_hypotheses(objective, estimates, no_cells, estimates, None)
+        return ranked_hypotheses(objective, estimates, elites=estimates)

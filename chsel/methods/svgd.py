@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from chsel import presets
 from chsel.arrays import FloatArray
 from chsel.cost_settings import CostSettings
@@ -86,8 +84,7 @@ class Svgd:
             objective, space.encode(problem.initial_set), observer or NullObserver()
         )
         estimates = transforms_of(space, vectors)
-        no_cells = np.full(len(estimates), -1, dtype=np.int64)
-        return ranked_hypotheses(objective, estimates, no_cells, estimates, None)
+        return ranked_hypotheses(objective, estimates, elites=estimates)
 
     def _moved(self, objective: Objective, vectors: FloatArray, observer: Observer) -> FloatArray:
         """Search vectors (B, d) after all iterations."""

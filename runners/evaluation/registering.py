@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 from chsel.methods.method import Method
@@ -203,23 +204,15 @@ def _started(
     of = session.recorded
     # Problems of another method do not follow from the results of this one.
     source = "" if plan.starts == OWN else file_digest(trial.folder(plan) / "session.mcap")
-    return SessionStarted(
+    return replace(
+        of,
         runner="evaluate",
-        object=of.object,
-        session=of.session,
         method=contender.name,
-        seed=trial.seed,
         config={
             **of.config,
             "method": {"name": contender.name, **contender.settings},
             "preset": {"name": contender.preset},
         },
-        mesh=of.mesh,
-        sdf=of.sdf,
-        workspace=of.workspace,
-        free_resolution=of.free_resolution,
-        initial_points=of.initial_points,
-        world_from_object=of.world_from_object,
         environment=environment(),
         source=source,
     )
