@@ -29,6 +29,7 @@ class Purpose(IntEnum):
     CMA_ES = 11
     PLAUSIBLE_ROTATIONS = 12
     METRIC_POINTS = 13
+    CONTACT_POINTS = 14
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,41 @@ class SessionStarted:
 
 
 @dataclass(frozen=True, eq=False)
+class RigDescribed:
+    """The sensors of a recorded robot session, and the raw log that they wrote.
+
+    Comes at most once, before any probe. name: of the rig. source: digest of the raw log, which is
+    not part of the recording. hand: its solid parts in its own frame, that of `Probe.gripper_path`,
+    where known.
+    """
+
+    step: int
+    name: str
+    source: str
+    hand: trimesh.Trimesh | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SensorImage:
+    """An image from which known points of a step come; it precedes the step's probe.
+
+    sensor: its name in the rig. kind: "depth" of a camera, or "deformation" of a tactile pad.
+    values (H, W): uint16, in units of `unit` metres, 0 where there is no measurement. mask (H, W):
+    the pixels that count: those whose rays are free, or those in contact. intrinsics (4,): fx, fy,
+    cx, cy, pixels. world_from_camera (4, 4): of the optical centre, x right, y down, z forward.
+    """
+
+    step: int
+    sensor: str
+    kind: str
+    values: np.ndarray
+    unit: float
+    mask: np.ndarray
+    intrinsics: FloatArray
+    world_from_camera: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Probe:
     """One probe and what it told.
 
@@ -140,6 +175,8 @@ class SessionEnded:
 
 Event = (
     SessionStarted
+    | RigDescribed
+    | SensorImage
     | Probe
     | ProblemPosed
     | SnapshotTaken

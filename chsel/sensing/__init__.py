@@ -1,0 +1,1 @@
+"""What cameras, tactile pads and a moving hand tell of free space and of the surface."""

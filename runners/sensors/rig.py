@@ -1,0 +1,248 @@
+"""A rig: which topics, frames and thresholds turn a raw log into known points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from chsel.errors import SettingError, require_choice, require_positive
+from chsel.points import Workspace
+
+Vector = tuple[float, float, float]
+Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class CameraRig:
+    """A depth camera that looks at the workspace; its rays are free (CHSEL, Sec. V-B).
+
+    depth, info: topics. frame: of the optical centre; null: that of the messages. unit: metres a
+    unit of the image; null: 0.001 for integers, 1 for floating point. range: metres, depths beyond
+    are invalid. fraction: how far along its ray each pixel's depth is free. edge: metres; pixels
+    beside a larger jump of depth are left out, as occlusion edges are measured badly; null: all
+    pixels count. rate: images a second that are used at most; null: all. rays: "traversal" of every
+    voxel, or the reference's "scaled_images". views: in so many images a voxel must have been seen
+    to be free.
+    """
+
+    name: str
+    depth: str
+    info: str
+    frame: str | None = None
+    unit: float | None = None
+    range: tuple[float, float] = (0.2, 5.0)
+    fraction: float = 0.95
+    edge: float | None = 0.05
+    rate: float | None = 2.0
+    rays: str = "traversal"
+    views: int = 1
+
+    def __post_init__(self) -> None:
+        _check_camera(self.name, self.unit, self.range)
+        require_positive("fraction", self.fraction)
+        if self.fraction > 1.0:
+            raise SettingError(f"fraction is {self.fraction}; accepted: above 0, at most 1")
+        require_choice("rays", self.rays, ("traversal", "scaled_images"))
+        for name in ("edge", "rate"):
+            if getattr(self, name) is not None:
+                require_positive(name, getattr(self, name))
+        require_positive("views", self.views)
+
+
+@dataclass(frozen=True)
+class BubbleRig:
+    """A soft-bubble pad: a depth camera behind a membrane that gives way (CHSEL, Sec. V-B).
+
+    kind: its topic has "depth" images, whose change against a reference is the deformation, or
+    "deformation" images. reference: an image file (.png, .npy) of the untouched membrane; null: the
+    median of the first images before the first probe.
+    """
+
+    name: str
+    depth: str
+    info: str
+    frame: str | None = None
+    unit: float | None = None
+    range: tuple[float, float] = (0.01, 0.5)
+    kind: str = "depth"
+    reference: str | None = None
+
+    def __post_init__(self) -> None:
+        _check_camera(self.name, self.unit, self.range)
+        require_choice("kind", self.kind, ("depth", "deformation"))
+
+
+@dataclass(frozen=True)
+class ContactRig:
+    """How contacts follow from deformations (CHSEL, Sec. V-B; methods, Sec. 10.2).
+
+    filter: side in pixels of the mean filter. quantile, threshold: a pixel is in contact if its
+    deformation is above this quantile of its image's and above so many metres. pixels: fewer of
+    them are no contact. points: of a contact at most, a random subset. per: a "contact", whose
+    points the pads share, or each "camera". reference_images: so many make up a missing reference.
+    """
+
+    filter: int = 10
+    quantile: float = 0.9
+    threshold: float = 0.004
+    pixels: int = 6
+    points: int = 50
+    per: str = "contact"
+    reference_images: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("filter", "threshold", "pixels", "points", "reference_images"):
+            require_positive(name, getattr(self, name))
+        if not 0.0 <= self.quantile < 1.0:
+            raise SettingError(f"quantile is {self.quantile}; accepted: from 0 to below 1")
+        require_choice("per", self.per, ("contact", "camera"))
+
+
+@dataclass(frozen=True)
+class BoxRig:
+    """A box of the hand in its frame: full sides, centre, metres; roll, pitch, yaw, radians."""
+
+    size: Vector
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for side in self.size:
+            require_positive("size", side)
+
+
+@dataclass(frozen=True)
+class HandRig:
+    """The hand, whose way is free space.
+
+    frame: its transform frame; pose: a topic with its pose in place of transforms. boxes, urdf: its
+    solid parts, in that frame; urdf: a file whose links' collision shapes, posed by the messages
+    of `joints`, belong to the hand; root: the link of the urdf that is `frame`; null: its base.
+    sweep: all of the "path", or as the reference the pads' surfaces and what is between them,
+    drawn "backwards" along the hand's z axis.
+    """
+
+    frame: str
+    pose: str | None = None
+    boxes: tuple[BoxRig, ...] = ()
+    urdf: str | None = None
+    root: str | None = None
+    joints: str | None = None
+    sweep: str = "path"
+
+    def __post_init__(self) -> None:
+        require_choice("sweep", self.sweep, ("path", "backwards"))
+
+
+@dataclass(frozen=True)
+class CloudRig:
+    """A topic of points, in the frame of its messages.
+
+    role: "rays", whose way from the frame's origin is free; "surface", points on the object; or
+    "contacts", the same, within probes alone. fraction: of "rays", as of a camera.
+    """
+
+    topic: str
+    role: str
+    fraction: float = 0.95
+
+    def __post_init__(self) -> None:
+        require_choice("role", self.role, ("rays", "surface", "contacts"))
+        require_positive("fraction", self.fraction)
+
+
+@dataclass(frozen=True)
+class ProbeTimes:
+    """A probe from its begin to its end, seconds since the first message of the log."""
+
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True)
+class ExtraContacts:
+    """Contacts that no sensor told: points (C, 3) in the world, or the mean of the bubbles'
+    `foremost` points furthest along the hand's z axis at the end of the probe's push."""
+
+    probe: int
+    points: tuple[Vector, ...] = ()
+    foremost: int = 0
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """What a person knows about one log. exclude: probes whose contacts are not used."""
+
+    exclude: tuple[int, ...] = ()
+    contacts: tuple[ExtraContacts, ...] = ()
+
+
+@dataclass(frozen=True)
+class ClockRig:
+    """Which times count. stamp: "header", by the sender, or "log".
+
+    offset: seconds by which a topic's stamps may differ from the log's clock more than those of
+    other topics do; beyond that they are shifted. gap: seconds between two transforms over which
+    none is interpolated. jump: seconds by which the log's time may step before it is reported.
+    """
+
+    stamp: str = "header"
+    offset: float = 1.0
+    gap: float = 0.5
+    jump: float = 10.0
+
+    def __post_init__(self) -> None:
+        require_choice("stamp", self.stamp, ("header", "log"))
+        for name in ("offset", "gap", "jump"):
+            require_positive(name, getattr(self, name))
+
+
+@dataclass(frozen=True)
+class Rig:
+    """All about a rig.
+
+    world: frame of the workspace and of all known points. workspace: x, y, z bounds, metres.
+    boundary: the workspace's six faces are free ("box_shell"), or not ("none"). markers: topic that
+    says where probes begin and end, with texts "begin N" and "end", integers (below 0: end), or
+    true and false. probes: their times in place of markers; without either the whole log is one.
+    surface_resolution: metres; one surface point a voxel of this side is kept of clouds and masks.
+    """
+
+    name: str
+    world: str
+    workspace: Bounds | None = None
+    boundary: str = "box_shell"
+    cameras: tuple[CameraRig, ...] = ()
+    bubbles: tuple[BubbleRig, ...] = ()
+    contact: ContactRig = field(default_factory=ContactRig)
+    hand: HandRig | None = None
+    clouds: tuple[CloudRig, ...] = ()
+    markers: str | None = None
+    probes: tuple[ProbeTimes, ...] | None = None
+    clock: ClockRig = field(default_factory=ClockRig)
+    annotations: Annotations = field(default_factory=Annotations)
+    surface_resolution: float = 0.005
+
+    def __post_init__(self) -> None:
+        require_choice("boundary", self.boundary, ("box_shell", "none"))
+        require_positive("surface_resolution", self.surface_resolution)
+        if self.workspace is not None:
+            self.box()
+        names = [sensor.name for sensor in (*self.cameras, *self.bubbles)]
+        if len(set(names)) < len(names):
+            raise SettingError(f"sensors are named {', '.join(names)}; accepted: each name once")
+
+    def box(self) -> Workspace:
+        """The workspace. Raises SettingError if there is none, PointsError if it is empty."""
+        if self.workspace is None:
+            raise SettingError("workspace is missing; accepted: [[x0, x1], [y0, y1], [z0, z1]]")
+        (x0, x1), (y0, y1), (z0, z1) = self.workspace
+        return Workspace((x0, y0, z0), (x1, y1, z1))
+
+
+def _check_camera(name: str, unit: float | None, reach: tuple[float, float]) -> None:
+    if not name or not name.replace("_", "").isalnum():
+        raise SettingError(f"name is {name!r}; accepted: letters, digits and _")
+    if unit is not None:
+        require_positive("unit", unit)
+    if not 0.0 <= reach[0] < reach[1]:
+        raise SettingError(f"range is {list(reach)}; accepted: [nearest, furthest], metres")
