@@ -18,6 +18,7 @@ from chsel.online import OnlineSettings, first_initial_set
 from chsel.presets import COST
 from chsel.streams import StreamKey
 from chsel.threads import threads as use_threads
+from runners.benchmarks.depth_images import depth_images
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
 from runners.benchmarks.methods import methods
 from runners.benchmarks.ours import PRESETS, StageTimer, register
@@ -168,6 +169,7 @@ MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
     "hypotheses": hypotheses,
     "methods": methods,
     "plausible_sets": plausible_sets,
+    "depth_images": depth_images,
     "evaluation": evaluation,
     "recording": recording,
     "memory": memory,

@@ -14,6 +14,7 @@ from chsel.online import OnlineSettings, first_initial_set
 from chsel.problem import RegistrationProblem
 from chsel.streams import StreamKey
 from chsel.threads import threads as use_threads
+from replay.events import Probe
 from runners.benchmarks.problems import PROBLEMS, drill, pose
 from runners.benchmarks.scope import Scope
 from runners.benchmarks.timing import Row, in_turn
@@ -70,6 +71,7 @@ def _probed(seed: int) -> Scene:
     session = open_session("kinematic", settings, model, seed)
     points = session.initial_points
     for probe in session.probes():
+        assert isinstance(probe, Probe)
         points = points.merged(probe.new_points)
     key, free = StreamKey(seed, 0), session.free_resolution
     initial_set = first_initial_set(session.workspace, points, key, OnlineSettings())

@@ -1,0 +1,87 @@
+"""Where a soft membrane with a camera behind it is pressed in (CHSEL, Sec. V-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from chsel.arrays import BoolArray, FloatArray, IntArray
+from chsel.errors import PointsError, require_positive
+
+
+def deformation(
+    reference: FloatArray, depth: FloatArray, *, valid: BoolArray | None = None
+) -> FloatArray:
+    """How far (H, W), in metres, a membrane is pressed towards its camera.
+
+    reference (H, W): depths of the untouched membrane; depth (H, W): now. 0 where either was not
+    measured (0, negative, not finite) or is not `valid` (H, W). Raises PointsError for shapes that
+    differ.
+    """
+    reference, depth = np.asarray(reference, np.float64), np.asarray(depth, np.float64)
+    if reference.shape != depth.shape:
+        raise PointsError(
+            f"the reference image has shape {reference.shape}; accepted: {depth.shape}, as the "
+            "images that are compared with it"
+        )
+    measured = np.isfinite(reference) & np.isfinite(depth) & (reference > 0.0) & (depth > 0.0)
+    if valid is not None:
+        measured &= valid
+    return np.subtract(reference, depth, out=np.zeros(depth.shape), where=measured)
+
+
+def smooth(image: FloatArray, side: int) -> FloatArray:
+    """The image (H, W), each pixel the mean of side x side around it; borders are reflected.
+
+    An even side reaches one pixel further up and left than down and right. What is not finite
+    counts as 0, or it would reach all of its row and column.
+    """
+    require_positive("side of the filter", side)
+    image = np.asarray(image, np.float64)
+    return uniform_filter(np.where(np.isfinite(image), image, 0.0), size=side, mode="reflect")
+
+
+def contact_mask(
+    deformation: FloatArray,
+    *,
+    quantile: float,
+    threshold: float,
+    valid: BoolArray | None = None,
+) -> BoolArray:
+    """Pixels (H, W) in contact: deformed by more than a quantile of all, and than `threshold` m.
+
+    valid (H, W): pixels that count; None: all.
+    """
+    counted = np.ones(deformation.shape, dtype=bool) if valid is None else np.asarray(valid)
+    if not counted.any():
+        return np.zeros(deformation.shape, dtype=bool)
+    level = max(float(np.quantile(deformation[counted], quantile)), threshold)
+    return counted & (deformation > level)
+
+
+def contact_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
+    """Ascending indices of at most `most` out of `count` pixels, any subset as likely as another.
+
+    All of them, and no number drawn, if there are no more.
+    """
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.argsort(stream.random(count), kind="stable")[:most])
+
+
+def share(counts: Sequence[int], most: int) -> list[int]:
+    """How many of at most `most` points each camera gets, in proportion to its count.
+
+    They sum to `most`, or to all there are if these are fewer. What proportions leave over goes
+    where it is missed most, to the first among equals.
+    """
+    total = sum(counts)
+    if total <= most:
+        return list(counts)
+    shares = [count * most // total for count in counts]
+    missed = sorted(range(len(counts)), key=lambda n: -(counts[n] * most % total))
+    for n in missed[: most - sum(shares)]:
+        shares[n] += 1
+    return shares

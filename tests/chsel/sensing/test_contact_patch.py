@@ -1,0 +1,124 @@
+"""Contacts of a soft membrane with a camera behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chsel.arrays import FloatArray
+from chsel.errors import PointsError
+from chsel.sensing.camera import PinholeCamera
+from chsel.sensing.contact_patch import contact_mask, contact_subset, deformation, share, smooth
+from chsel.streams import Purpose, StreamKey
+
+CAMERA = PinholeCamera(224, 171, 200.0, 200.0, 112.0, 85.0)
+MEMBRANE, RADIUS, PRESSED = 0.10, 0.03, 0.008  # m: its depth; of a sphere; how deep it is pressed
+CENTRE = np.array([0.006, -0.004, MEMBRANE + RADIUS - PRESSED])
+
+
+@pytest.fixture
+def pressed() -> FloatArray:
+    """Depths of a flat membrane that lies on a sphere where it touches it."""
+    ways = CAMERA.directions()
+    a, b = (ways**2).sum(axis=-1), (ways * CENTRE).sum(axis=-1)
+    rest = b**2 - a * (CENTRE @ CENTRE - RADIUS**2)
+    first = np.where(rest >= 0.0, (b - np.sqrt(np.maximum(rest, 0.0))) / a, np.inf)
+    return np.minimum(first, MEMBRANE)
+
+
+def test_a_sphere_is_touched_where_it_has_pressed_far_enough(pressed: FloatArray) -> None:
+    imprint = deformation(np.full(pressed.shape, MEMBRANE), pressed)
+    assert imprint.max() == pytest.approx(PRESSED, abs=1e-4)
+    mask = contact_mask(smooth(imprint, 10), quantile=0.9, threshold=0.004)
+    points = CAMERA.back_project(pressed)[mask]
+    assert np.abs(np.sqrt(((points - CENTRE) ** 2).sum(axis=1)) - RADIUS).max() < 1e-9
+    assert points[:, 2].max() < MEMBRANE - 0.003  # 4 mm, less what the filter spreads
+    # The cap that is pressed in by more than 4 mm, as large as the camera sees it; it is less than
+    # a tenth of the image.
+    cap = np.pi * (RADIUS**2 - (RADIUS - PRESSED + 0.004) ** 2) * (CAMERA.fx / 0.096) ** 2
+    assert mask.sum() == pytest.approx(cap, rel=0.05)
+    assert mask.mean() < 0.09
+    middle = points[:, :2].mean(axis=0)
+    np.testing.assert_allclose(middle, CENTRE[:2], atol=0.0005)
+
+
+def test_the_quantile_bounds_a_contact_that_is_larger(pressed: FloatArray) -> None:
+    imprint = deformation(np.full(pressed.shape, MEMBRANE), pressed)
+    mask = contact_mask(imprint, quantile=0.98, threshold=0.004)
+    assert mask.mean() == pytest.approx(0.02, abs=1e-3)
+    assert imprint[mask].min() >= imprint[~mask].max()
+
+
+def test_pixels_that_were_not_measured_are_not_deformed() -> None:
+    reference = np.array([[0.1, 0.1, 0.0, np.nan, 0.1, 0.1]])
+    depth = np.array([[0.08, np.nan, 0.08, 0.08, -1.0, 0.11]])
+    expected = [[0.02, 0.0, 0.0, 0.0, 0.0, -0.01]]
+    np.testing.assert_allclose(deformation(reference, depth), expected, atol=1e-15)
+    valid = np.array([[False, True, True, True, True, True]])
+    assert deformation(reference, depth, valid=valid)[0, 0] == 0.0
+    with pytest.raises(PointsError, match=r"shape \(2, 2\); accepted: \(1, 6\)"):
+        deformation(np.ones((2, 2)), depth)
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 4, 10])
+def test_the_filter_is_the_mean_around_each_pixel(side: int) -> None:
+    image = np.random.default_rng(0).uniform(0.0, 0.01, (12, 14))
+    smoothed = smooth(image, side)
+    reflected = np.pad(image, 10, mode="symmetric")
+    for row, column in ((0, 0), (5, 6), (11, 13), (2, 12)):
+        top, left = row + 10 - side // 2, column + 10 - side // 2
+        mean = reflected[top : top + side, left : left + side].mean()
+        assert smoothed[row, column] == pytest.approx(mean, abs=1e-15)
+
+
+def test_one_bad_pixel_does_not_spoil_its_row() -> None:
+    image = np.full((8, 8), 0.004)
+    image[2, 2] = np.nan
+    smoothed = smooth(image, 3)
+    assert np.isfinite(smoothed).all()
+    assert smoothed[2, 6] == pytest.approx(0.004)
+
+
+def test_without_valid_pixels_there_is_no_contact() -> None:
+    nothing = np.zeros((4, 5), dtype=bool)
+    mask = contact_mask(np.ones((4, 5)), quantile=0.9, threshold=0.0, valid=nothing)
+    assert mask.shape == (4, 5)
+    assert not mask.any()
+
+
+def test_pixels_that_do_not_count_are_not_in_the_quantile_or_in_contact() -> None:
+    imprint = np.arange(20.0).reshape(4, 5)
+    mask = contact_mask(imprint, quantile=0.5, threshold=1.0, valid=imprint < 10.0)
+    assert imprint[mask].tolist() == [5.0, 6.0, 7.0, 8.0, 9.0]
+
+
+def test_subsets_are_ascending_seeded_and_all_alike() -> None:
+    key = StreamKey(3, 1)
+    chosen = contact_subset(200, 50, key.stream(Purpose.CONTACT_POINTS))
+    assert len(chosen) == 50
+    assert (np.diff(chosen) > 0).all()
+    again = contact_subset(200, 50, key.stream(Purpose.CONTACT_POINTS))
+    np.testing.assert_array_equal(chosen, again)
+    stream = np.random.default_rng(0)
+    counts = sum(np.bincount(contact_subset(10, 3, stream), minlength=10) for _ in range(2000))
+    assert np.abs(counts / 2000 - 0.3).max() < 0.05
+    np.testing.assert_array_equal(contact_subset(4, 50, stream), np.arange(4))
+
+
+@given(st.lists(st.integers(0, 1000), max_size=5), st.integers(0, 200))
+def test_shares_are_in_proportion_and_sum_up(counts: list[int], most: int) -> None:
+    shares = share(counts, most)
+    total = sum(counts)
+    assert sum(shares) == min(most, total)
+    for count, part in zip(counts, shares, strict=True):
+        assert 0 <= part <= count
+        if total > most:
+            assert abs(part - count * most / total) < 1.0
+
+
+def test_shares_by_hand() -> None:
+    assert share([30, 10], 50) == [30, 10]
+    assert share([300, 100], 50) == [38, 12]  # 37.5 and 12.5: the first among equals
+    assert share([1, 1, 98], 50) == [1, 0, 49]

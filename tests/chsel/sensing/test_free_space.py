@@ -1,0 +1,210 @@
+"""Free space from rays and points in a dense grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from chsel.arrays import BoolArray, FloatArray
+from chsel.errors import PointsError, PoseError, SettingError
+from chsel.points import FreeVoxels, Lattice, Workspace
+from chsel.pose import axis_angle, compose, rotated
+from chsel.sensing.camera import PinholeCamera
+from chsel.sensing.free_space import SCALES, FreeGrid
+
+SPACING = 0.01
+WORKSPACE = Workspace((0.7, -0.2, 0.31), (1.1, 0.2, 0.6))  # the cabinet's
+CAMERA = PinholeCamera(64, 48, 60.0, 62.0, 31.2, 23.9)
+LOOKING_ALONG_X = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+TILTED = axis_angle(np.array([0.0, 1.0, 0.0]), 0.5) @ LOOKING_ALONG_X
+POSE = compose(TILTED, np.array([0.35, 0.02, 0.8]))
+
+
+def grid(views: int = 1) -> FreeGrid:
+    return FreeGrid(WORKSPACE, SPACING, views=views)
+
+
+def voxels(centres: FloatArray) -> set[tuple[int, ...]]:
+    indices = Lattice(WORKSPACE.lower, SPACING).voxels(centres)
+    found = {tuple(index) for index in indices.tolist()}
+    assert len(found) == len(centres)
+    return found
+
+
+@pytest.fixture
+def image() -> tuple[FloatArray, BoolArray]:
+    """Depths between 0.3 and 1.2 m, some of them missing, and what to use of them."""
+    stream = np.random.default_rng(3)
+    depth = stream.uniform(0.3, 1.2, (48, 64))
+    depth[stream.random(depth.shape) < 0.05] = np.nan
+    depth[stream.random(depth.shape) < 0.05] = np.inf
+    depth[stream.random(depth.shape) < 0.05] = 0.0
+    return depth, stream.random(depth.shape) < 0.8
+
+
+@pytest.fixture(params=[1, 2, 3])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+def test_the_grid_is_the_lattice_up_to_the_upper_corner() -> None:
+    assert grid().shape == (41, 41, 30)
+
+
+def test_a_ray_along_an_axis_passes_a_row_of_voxels_with_both_ends() -> None:
+    free = grid()
+    assert free.along_rays([0.752, 0.001, 0.4], [[0.898, 0.001, 0.4]]) == 16
+    expected = np.array([[0.7 + 0.01 * i, 0.0, 0.4] for i in range(5, 21)])
+    np.testing.assert_allclose(free.new(), expected, atol=1e-12)
+    assert free.count == 16
+
+
+def test_a_ray_into_the_workspace_begins_at_its_border() -> None:
+    free = grid()
+    assert free.along_rays([-1.0, 0.0, 0.4], [[0.8, 0.0, 0.4]]) == 11
+    assert free.along_rays([3.0, 0.0, 0.5], [[-3.0, 0.0, 0.5]]) == 41
+    assert free.along_rays([3.0, 0.0, 0.5], [[1.2, 0.0, 0.5], [3.0, 9.0, 0.5]]) == 0
+
+
+def test_random_rays_mark_what_they_meet_and_nothing_far_from_them() -> None:
+    stream = np.random.default_rng(0)
+    for _ in range(60):
+        a, b = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 3))
+        free = grid()
+        free.along_rays(a, b)
+        centres = free.new()
+        found = voxels(centres)
+
+        samples = a + np.linspace(0.0, 1.0, 2001)[:, None] * (b - a)
+        place = (samples - WORKSPACE.lower) / SPACING + 0.5
+        clear = (np.abs(place - np.rint(place)) > 1e-9).all(axis=1)
+        clear &= ((place > 0.0) & (place < free.shape)).all(axis=1)
+        assert {tuple(index) for index in np.floor(place[clear]).astype(int).tolist()} <= found
+
+        way = b - a
+        along = np.clip((centres - a) @ way / (way @ way), 0.0, 1.0)
+        off = centres - a - along[:, None] * way
+        assert np.sqrt((off**2).sum(axis=1)).max(initial=0.0) <= np.sqrt(3.0) / 2.0 * SPACING
+
+
+def test_rays_may_have_an_origin_each() -> None:
+    stream = np.random.default_rng(1)
+    origins, ends = stream.uniform([0.5, -0.4, 0.2], [1.3, 0.4, 0.8], (2, 20, 3))
+    together, one_by_one = grid(), grid()
+    together.along_rays(origins, ends)
+    for origin, end in zip(origins, ends, strict=True):
+        one_by_one.along_rays(origin, end)
+    assert together.count > 100
+    np.testing.assert_array_equal(together.new(), one_by_one.new())
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1e17])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_numbers_that_are_no_places_mark_nothing(bad: float, axis: int) -> None:
+    inside, outside = np.array([0.9, 0.0, 0.5]), np.array([0.9, 0.0, 0.5])
+    outside[axis] = bad
+    free = grid()
+    assert free.along_rays(inside, outside) == 0
+    assert free.along_rays(outside, inside) == 0
+    assert free.at(outside) == 0
+    assert free.at(inside) == 1
+
+
+def test_points_are_in_the_voxels_of_the_lattice() -> None:
+    stream = np.random.default_rng(2)
+    points = stream.uniform([0.7, -0.2, 0.31], [1.1, 0.2, 0.6], (500, 3))
+    points[:50] = np.rint(points[:50] * 200.0) / 200.0  # on faces, edges and corners
+    free, reference = grid(), FreeVoxels(Lattice(WORKSPACE.lower, SPACING))
+    for half in (points[:300], points[200:]):
+        free.at(half)
+        np.testing.assert_array_equal(free.new(), reference.add(half))
+    assert free.count == len(reference)
+    assert free.new().shape == (0, 3)
+
+
+def test_an_image_is_the_rays_of_its_pixels(image: tuple[FloatArray, BoolArray]) -> None:
+    depth, mask = image
+    by_image, by_rays = grid(), grid()
+    fresh = by_image.from_depth(depth, CAMERA, POSE, mask, fraction=0.9)
+    with np.errstate(invalid="ignore"):
+        ends = rotated(POSE[:3, :3], CAMERA.back_project(0.9 * depth)[mask]) + POSE[:3, 3]
+    assert by_rays.along_rays(POSE[:3, 3], ends) == fresh > 5000
+    np.testing.assert_array_equal(by_image.new(), by_rays.new())
+
+
+def test_the_number_of_threads_changes_nothing(
+    threads: int, image: tuple[FloatArray, BoolArray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    depth, mask = image
+    alone = grid()
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    alone.from_depth(depth, CAMERA, POSE, mask)
+    alone.at(CAMERA.back_project(depth)[mask], poses=POSE)
+    torch.set_num_threads(before)
+    for name in ("_RAYS_PER_THREAD", "_POINTS_PER_THREAD"):
+        monkeypatch.setattr(f"chsel.sensing.free_space.{name}", 1)
+    free = grid()
+    free.from_depth(depth, CAMERA, POSE, mask)
+    free.at(CAMERA.back_project(depth)[mask], poses=POSE)
+    assert free.count == alone.count > 5000
+    np.testing.assert_array_equal(free.new(), alone.new())
+
+
+def test_scaled_images_are_points_on_the_rays_with_gaps_between(
+    image: tuple[FloatArray, BoolArray],
+) -> None:
+    depth, mask = image
+    scaled, traversed = grid(), grid()
+    fresh = scaled.scaled_images(depth, CAMERA, POSE, mask)
+    traversed.from_depth(depth, CAMERA, POSE, mask, fraction=0.95 + 1e-9)
+    points = np.concatenate([CAMERA.back_project(scale * depth)[mask] for scale in SCALES])
+    points = rotated(POSE[:3, :3], points[np.isfinite(points).all(axis=1)]) + POSE[:3, 3]
+    plain = grid()
+    assert plain.at(points) == fresh
+    found = voxels(scaled.new())
+    assert found == voxels(plain.new())
+    assert found < voxels(traversed.new())
+
+
+def test_voxels_are_free_once_enough_views_saw_them() -> None:
+    free = grid(views=3)
+    eye = [0.0, 0.0, 0.4]
+    near, far = [[0.8, 0.0, 0.4]] * 5, [[0.9, 0.0, 0.4]]
+    assert [free.along_rays(eye, ends) for ends in (near, far, near)] == [0, 0, 11]
+    assert len(free.new()) == 11
+    assert [free.along_rays(eye, ends) for ends in (near, far, far)] == [0, 0, 10]
+    assert free.at([0.9, 0.0, 0.4]) == 0
+    assert free.at([1.0, 0.0, 0.4]) == 1
+    assert len(free.new()) == free.count - 11 == 11
+
+
+def test_a_grid_too_large_is_refused_with_both_numbers() -> None:
+    with pytest.raises(SettingError, match=r"0\.4 x 0\.4 x 0\.29 m .* 4\.644e\+10 .*200_000_000"):
+        FreeGrid(WORKSPACE, 0.0001)
+    with pytest.raises(SettingError, match="inf voxels"):
+        FreeGrid(WORKSPACE, 1e-320)
+    with pytest.raises(SettingError, match="views is 251; accepted"):
+        grid(views=251)
+
+
+def test_shapes_and_poses_that_do_not_fit_are_refused(image: tuple[FloatArray, BoolArray]) -> None:
+    depth, mask = image
+    free = grid()
+    with pytest.raises(PointsError, match=r"depth has shape \(64, 48\); accepted: \(48, 64\)"):
+        free.from_depth(depth.T, CAMERA, POSE, mask)
+    with pytest.raises(PointsError, match=r"mask has shape \(48,\)"):
+        free.scaled_images(depth, CAMERA, POSE, mask[:, 0])
+    with pytest.raises(PoseError, match="world_from_camera"):
+        free.from_depth(depth, CAMERA, 2.0 * POSE, mask)
+    with pytest.raises(PointsError, match=r"ends has shape \(5, 2\)"):
+        free.along_rays(np.zeros(3), np.zeros((5, 2)))
+    with pytest.raises(PointsError, match="origin has 2 points; accepted: 1, or 5"):
+        free.along_rays(np.zeros((2, 3)), np.zeros((5, 3)))
+    assert free.count == 0
