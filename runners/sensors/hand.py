@@ -1,0 +1,76 @@
+"""The solid parts of the hand: boxes of the rig, and the links of a URDF."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from chsel.arrays import FloatArray, frozen
+from chsel.errors import SettingError
+from chsel.pose import axis_angle, compose, product
+from runners.sensors.rig import BoxRig, HandRig
+from runners.sensors.urdf import Linkage
+
+
+class HandModel:
+    """The solids of a hand, read once, placed as often as joints move.
+
+    joint_names: joints whose values move any of them. remarks: what a user should know of how
+    they were read. Raises SettingError for a URDF that cannot be used.
+    """
+
+    def __init__(self, rig: HandRig) -> None:
+        self._boxes = [_solid(box, f"hand.boxes[{i}]") for i, box in enumerate(rig.boxes)]
+        self._linkage = None if rig.urdf is None else Linkage(Path(rig.urdf), rig.root)
+        self.joint_names = () if self._linkage is None else self._linkage.joint_names
+        self.remarks = () if self._linkage is None else self._linkage.remarks
+
+    def parts(self, joints: Mapping[str, float] | None = None) -> list[trimesh.Trimesh]:
+        """Closed solids in the hand's frame, metres; they may overlap.
+
+        joints: values by name, radians or metres. Those of other joints do not matter, missing
+        ones are 0. Raises SettingError for a value that is not finite.
+        """
+        links = [] if self._linkage is None else self._linkage.solids(joints or {})
+        return self._boxes + links
+
+    def solids(self, joints: Mapping[str, float] | None = None) -> trimesh.Trimesh | None:
+        """All parts as one mesh of several closed bodies; None if the rig describes none."""
+        parts = self.parts(joints)
+        joined: Any = trimesh.util.concatenate(parts) if parts else None
+        return joined
+
+    def missing(self, joints: Mapping[str, float] | None) -> list[str]:
+        """The joints that move the hand and have no value, so that 0 is used."""
+        return [name for name in self.joint_names if name not in (joints or {})]
+
+
+def hand_solids(hand: HandRig, joints: Mapping[str, float] | None = None) -> trimesh.Trimesh | None:
+    """The hand's solids at one moment, in its frame; what is worth a remark is a warning."""
+    model = HandModel(hand)
+    remarks = list(model.remarks)
+    if missing := model.missing(joints):
+        remarks.append(f"joints without a value are at 0: {', '.join(missing)}")
+    for remark in remarks:
+        warnings.warn(remark, stacklevel=2)
+    return model.solids(joints)
+
+
+def roll_pitch_yaw(angles: FloatArray) -> FloatArray:
+    """The rotation (3, 3) by angles (3,) about the fixed axes x, y, z, in this order (as URDF)."""
+    about_x, about_y, about_z = axis_angle(np.eye(3), angles)
+    return product(about_z, product(about_y, about_x))
+
+
+def _solid(box: BoxRig, where: str) -> trimesh.Trimesh:
+    values = {
+        name: frozen(f"{where}.{name}", getattr(box, name), (3,), error=SettingError)
+        for name in ("size", "position", "rotation")
+    }
+    hand_from_box = compose(roll_pitch_yaw(values["rotation"]), values["position"])
+    return trimesh.creation.box(values["size"], hand_from_box)

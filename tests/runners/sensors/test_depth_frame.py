@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+import chsel
+from chsel.errors import SessionError, SettingError
+from chsel.mesh import load_mesh
+from chsel.pose import apply, inverse
+from chsel.sdf import mesh_sdf
+from chsel.settings import build_settings
+from runners.sensors import depth_frame_points as module
+from runners.sensors.depth_frame import DepthFrame, read_depth_frame
+from runners.sensors.depth_frame_points import depth_frame_points, one_per_voxel
+from runners.sensors.rig import Rig
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+WIDTH, HEIGHT = 80, 60
+INTRINSICS = {"fx": 100.0, "fy": 110.0, "cx": 39.5, "cy": 29.5}
+BOX = (slice(20, 40), slice(30, 60))  # pixels of a box that faces the camera
+FRONT, WALL = 0.5, 0.9  # m
+POSE = [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def rig(**camera: Any) -> Rig:
+    path = REPOSITORY / "conf" / "session" / "rig" / "depth_frame.yaml"
+    built = build_settings(Rig, yaml.safe_load(path.read_text()), "session.rig")
+    (only,) = built.cameras
+    return dataclasses.replace(built, cameras=(dataclasses.replace(only, **camera),))
+
+
+def scene() -> tuple[np.ndarray, np.ndarray]:
+    """Depths (H, W) in millimetres of a box before a wall, and the label image."""
+    depth = np.full((HEIGHT, WIDTH), 1000 * WALL, dtype=np.uint16)
+    depth[BOX] = 1000 * FRONT
+    depth[:, :5] = 0
+    label = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    label[BOX] = 7
+    return depth, label
+
+
+def written(folder: Path, **changes: Any) -> Path:
+    """A frame's YAML with its images beside it; None takes a key away."""
+    depth, label = scene()
+    Image.fromarray(depth).save(folder / "depth.png")
+    Image.fromarray(label).save(folder / "label.png")
+    values = {
+        "depth": "depth.png",
+        "depth_scale": 0.001,
+        "intrinsics": INTRINSICS,
+        "label": "label.png",
+        "object_class": 7,
+        "factor_depth_in_file": 1000,
+    }
+    values = {key: value for key, value in {**values, **changes}.items() if value is not None}
+    path = folder / "frame.yaml"
+    path.write_text(json.dumps(values))
+    return path
+
+
+def test_a_frame_is_read_with_all_its_parts(tmp_path: Path) -> None:
+    rounded = [[round(value, 6) for value in row] for row in POSE]
+    (tmp_path / "sub").mkdir()
+    path = written(
+        tmp_path, world_from_camera=POSE, world_from_object=rounded, object="sub/../box.obj"
+    )
+    frame = read_depth_frame(path)
+    assert frame.depth[30, 45] == pytest.approx(FRONT)
+    assert frame.depth[0, 0] == 0.0
+    assert (frame.camera.width, frame.camera.height, frame.camera.fy) == (WIDTH, HEIGHT, 110.0)
+    assert frame.label is not None
+    assert int(frame.label.sum()) == 20 * 30
+    np.testing.assert_allclose(frame.world_from_camera, POSE)
+    np.testing.assert_allclose(frame.world_from_object, POSE)
+    assert frame.mesh == tmp_path / "sub" / ".." / "box.obj"
+
+
+def test_what_is_not_given_has_its_default(tmp_path: Path) -> None:
+    path = written(tmp_path, depth_scale=None, label=None, object_class=None)
+    frame = read_depth_frame(path)
+    assert frame.depth.max() == pytest.approx(WALL)  # integers are millimetres
+    assert (frame.label, frame.world_from_object, frame.mesh) == (None, None, None)
+    np.testing.assert_array_equal(frame.world_from_camera, np.eye(4))
+    both = read_depth_frame(written(tmp_path, object_class=None)).label
+    assert both is not None
+    assert int(both.sum()) == 20 * 30  # without a class all but 0
+
+
+@pytest.mark.parametrize("name", ["depth.npy", "depth.tiff"])
+def test_floating_point_is_in_metres(tmp_path: Path, name: str) -> None:
+    depth = (scene()[0] / 1000.0).astype(np.float32)
+    depth[0, 10] = np.nan
+    path = written(tmp_path, depth=name, depth_scale=None)
+    if name.endswith("npy"):
+        np.save(tmp_path / name, depth)
+    else:
+        Image.fromarray(depth).save(tmp_path / name)
+    np.testing.assert_array_equal(read_depth_frame(path).depth, depth.astype(float))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"depth": None}, "depth is missing"),
+        ({"intrinsics": None}, "intrinsics is missing"),
+        ({"dept": 1}, "'dept' does not exist; accepted: depth, intrinsics"),
+        ({"depth": "none.png"}, r"depth .*none\.png: no such file"),
+        ({"depth": "frame.yaml"}, r"depth .*frame\.yaml: of no known kind"),
+        ({"depth": ["depth.png"]}, r"depth is \['depth.png'\]; accepted: the path"),
+        ({"depth": "label.png"}, r"depth .*label\.png: 8 bits a pixel"),
+        ({"depth_scale": 0}, "depth_scale is 0"),
+        ({"depth_scale": "1mm"}, "depth_scale is '1mm'; accepted: a finite number"),
+        ({"depth_scale": True}, "depth_scale is True"),
+        ({"intrinsics": {"fx": 1.0}}, r"intrinsics is \{'fx': 1.0\}; accepted: fx, fy, cx, cy"),
+        ({"intrinsics": {**INTRINSICS, "fx": -1}}, "camera fx is -1"),
+        ({"intrinsics": {**INTRINSICS, "cx": None}}, r"intrinsics\.cx is None"),
+        ({"label": None}, "object_class without label"),
+        ({"object_class": 8}, "object_class 8 is not in label; accepted: 0, 7"),
+        ({"object_class": 7.5}, "object_class is 7.5"),
+        ({"label": "other.npy"}, r"label .*other\.npy: 3 x 2 pixels; accepted: .* 80 x 60"),
+        ({"label": "cut.png"}, r"label .*cut\.png: broken"),
+        ({"label": "colour.png"}, r"label .*colour\.png: mode RGB"),
+        ({"label": "bomb.png"}, r"label .*bomb\.png: .*100000 x 100000|label .*bomb\.png: broken"),
+        ({"label": "large.png"}, r"label .*large\.png: 9000 x 9000 pixels"),
+        ({"label": "cube.npy"}, r"label .*cube\.npy: type float64 and shape \(2, 2, 2\)"),
+        ({"label": "pickled.npy"}, r"label .*pickled\.npy: broken"),
+        ({"label": "long.npy"}, r"label .*long\.npy: broken"),
+        ({"world_from_camera": POSE[:3]}, r"world_from_camera has shape \(3, 4\)"),
+        ({"world_from_object": [[1, 0], [0]]}, "world_from_object is not an array of numbers"),
+        ({"world_from_object": (2 * np.eye(4)).tolist()}, "world_from_object.* not a rigid"),
+        ({"object": 3}, "object is 3; accepted: the path of a file"),
+    ],
+)
+def test_broken_frames_are_refused_in_a_line(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    path = written(tmp_path, **changes)
+    np.save(tmp_path / "other.npy", np.ones((2, 3), dtype=np.uint8))
+    np.save(tmp_path / "cube.npy", np.ones((2, 2, 2)))
+    np.save(tmp_path / "pickled.npy", np.array([[{}]], dtype=object), allow_pickle=True)
+    np.save(tmp_path / "long.npy", np.ones((2, 3), dtype=np.uint8))
+    data = (tmp_path / "long.npy").read_bytes()
+    (tmp_path / "long.npy").write_bytes(data.replace(b"(2, 3)", b"(9999999, 9)"))
+    (tmp_path / "cut.png").write_bytes((tmp_path / "label.png").read_bytes()[:60])
+    Image.fromarray(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).save(tmp_path / "colour.png")
+    (tmp_path / "bomb.png").write_bytes(png_head(100_000, 100_000))
+    (tmp_path / "large.png").write_bytes(png_head(9000, 9000))
+    with pytest.raises(SessionError, match=message) as caught:
+        read_depth_frame(path)
+    assert str(caught.value).startswith(f"depth frame {path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def png_head(width: int, height: int) -> bytes:
+    """The beginning of a PNG that claims to be large."""
+    head = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+    data = b"IDAT" + zlib.compress(bytes(1000))
+    whole = struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
+    return b"\x89PNG\r\n\x1a\n" + chunk + whole
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no mapping of keys to values"),
+        ("depth: [", "not YAML"),
+        ("depth: 2020-99-99", "not YAML"),
+        ("depth: &a [x, x]\nlabel: [*a, *a]", "an alias"),
+        ("depth: " + "[" * 5000, "nested too deep"),
+        ("depth: 0x" + "f" * 9000 + "\nintrinsics: 3", "depth is a number out of range"),
+        ("depth: x" + " " * 70_000, "too large"),
+        ("\xff\x00", "not YAML"),
+    ],
+)
+def test_hostile_yaml_is_refused_in_a_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "frame.yaml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(SessionError, match=message) as caught:
+        read_depth_frame(path)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+    with pytest.raises(SessionError, match=r"cannot be read"):
+        read_depth_frame(tmp_path / "other.yaml")
+
+
+def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path: Path) -> None:
+    frame = read_depth_frame(written(tmp_path, world_from_camera=POSE))
+    found = depth_frame_points(frame, rig(), free_resolution=0.01, diameter=0.3)
+    expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    expected[23:37, 33:57] = True  # 3 pixels within: the reach of an edge of depth
+    np.testing.assert_array_equal(found.surface, expected)
+    in_camera = apply(inverse(frame.world_from_camera), found.points.known)
+    np.testing.assert_allclose(in_camera[:, 2], FRONT, atol=1e-12)
+    assert in_camera[:, 0].min() == pytest.approx((33 - 39.5) / 100 * FRONT)
+    assert in_camera[:, 1].max() == pytest.approx((36 - 29.5) / 110 * FRONT)
+    assert found.invalid == HEIGHT * 5
+    assert found.edges == 96 + 104  # inside and outside of the outline
+    assert int(found.rays.sum()) == HEIGHT * WIDTH - found.invalid - found.edges
+    points = frame_points(frame, found)
+    bounds = [points.min(axis=0) - 0.3, points.max(axis=0) + 0.3]
+    np.testing.assert_allclose(found.workspace.bounds, bounds)
+
+
+def frame_points(frame: DepthFrame, found: module.FramePoints) -> np.ndarray:
+    """World points of all surface pixels."""
+    return apply(frame.world_from_camera, frame.camera.back_project(frame.depth)[found.surface])
+
+
+def test_free_space_is_what_rays_passed(tmp_path: Path) -> None:
+    frame = read_depth_frame(written(tmp_path))
+    found = depth_frame_points(frame, rig(), free_resolution=0.01, diameter=0.3)
+    free = found.points.free
+    column = np.rint(free[:, 0] / free[:, 2] * 100 + 39.5).astype(int)
+    row = np.rint(free[:, 1] / free[:, 2] * 110 + 29.5).astype(int)
+    behind = free[:, 2] > 0.95 * FRONT + 0.01
+    # Behind the box's front, no ray went but beside it, a voxel's half diagonal away or more.
+    within = (column > 33) & (column < 56) & (row > 23) & (row < 36)
+    assert not (behind & within).any()
+    assert (behind & ~within).any()
+    assert free[within][:, 2].max() > 0.95 * FRONT - 0.01
+    assert free[:, 2].max() < 0.95 * WALL + 0.01
+    further = rig(fraction=1.0)
+    closer = depth_frame_points(frame, further, free_resolution=0.01, diameter=0.3).points.free
+    taken = np.rint((frame_points(frame, found) - np.array(found.workspace.lower)) / 0.01)
+    near = np.rint((closer - np.array(found.workspace.lower)) / 0.01)
+    assert len(closer) > len(free)
+    assert not set(map(tuple, taken.tolist())) & set(map(tuple, near.tolist()))
+
+
+def test_the_references_way_and_an_own_workspace_are_options(tmp_path: Path) -> None:
+    frame = read_depth_frame(written(tmp_path, label=None, object_class=None))
+    bounds = ((-0.1, 0.1), (-0.1, 0.1), (0.3, 0.6))
+    own = dataclasses.replace(rig(rays="scaled_images"), workspace=bounds)
+    images = depth_frame_points(frame, own, free_resolution=0.01)
+    own = dataclasses.replace(rig(), workspace=bounds)
+    rays = depth_frame_points(frame, own, free_resolution=0.01)
+    assert 0 < len(images.points.free) < len(rays.points.free)
+    assert len(rays.points.known) == 0
+    assert not rays.surface.any()
+    np.testing.assert_allclose(rays.workspace.bounds[1], [0.1, 0.1, 0.6])
+
+
+def test_one_point_a_voxel_is_kept_the_one_nearest_its_centre() -> None:
+    points = np.array([[0.004, 0, 0], [0.011, 0, 0], [0.001, 0.001, 0], [0.01, 0, 0]])
+    np.testing.assert_array_equal(one_per_voxel(points, 0.01), points[[2, 3]])
+    assert one_per_voxel(np.zeros((0, 3)), 0.01).shape == (0, 3)
+
+
+def test_frames_and_rigs_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    frame = read_depth_frame(written(tmp_path))
+    without = dataclasses.replace(frame, label=None)
+    with pytest.raises(SettingError, match=r"workspace is missing.*accepted: \[\[x0"):
+        depth_frame_points(without, rig(), free_resolution=0.01, diameter=0.3)
+    with pytest.raises(SettingError, match="rig depth_frame has 0 cameras; accepted: 1"):
+        depth_frame_points(frame, dataclasses.replace(rig(), cameras=()), free_resolution=0.01)
+    tiny = dataclasses.replace(frame, depth=frame.depth * 0.001)
+    with pytest.raises(SessionError, match=r"median is 0\.0009 m: check depth_scale"):
+        depth_frame_points(tiny, rig(), free_resolution=0.01, diameter=0.3)
+    assert frame.label is not None
+    dots = np.zeros_like(frame.label)
+    dots[25, 35:37] = True
+    with pytest.raises(SessionError, match="none of the 2 pixels of label tells of the surface"):
+        depth_frame_points(
+            dataclasses.replace(frame, label=dots), rig(), free_resolution=0.01, diameter=0.3
+        )
+
+
+def test_the_real_frame_registers_near_its_published_pose(real_directory: Path) -> None:
+    path = real_directory / "ycbv_000001" / "frame.yaml"
+    if not path.is_file():
+        pytest.skip("optional data directory has no real/ycbv_000001/frame.yaml")
+    frame = read_depth_frame(path)
+    assert frame.mesh is not None
+    assert frame.world_from_object is not None
+    mesh = load_mesh(frame.mesh)
+    diameter = float(np.linalg.norm(mesh.extents))
+    found = depth_frame_points(frame, rig(), free_resolution=0.01, diameter=diameter)
+    points = found.points
+    truth = inverse(frame.world_from_object)
+    distance = mesh_sdf(mesh, apply(truth, points.known))[0]
+    assert np.abs(distance).mean() < 0.0008
+    assert np.abs(distance).max() < 0.0035  # no pixel of the background is among them
+    assert mesh_sdf(mesh, apply(truth, points.free))[0].min() > -0.002  # free space is outside
+    assert len(points.known) > 400
+    assert len(points.free) > 10_000
+    hypotheses = chsel.register(
+        mesh, surface=points.known, free=points.free, workspace=found.workspace, seed=1
+    )
+    best = hypotheses.object_from_world[int(np.argmin(hypotheses.cost))]
+    assert np.abs(mesh_sdf(mesh, apply(best, points.known))[0]).mean() < 0.004
+    centre = mesh.bounds.mean(axis=0)[None]  # the same place, whichever way round the box is found
+    miss = apply(inverse(best), centre) - apply(frame.world_from_object, centre)
+    assert np.linalg.norm(miss) < 0.015

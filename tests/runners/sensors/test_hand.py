@@ -1,0 +1,271 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.errors import SettingError
+from runners.sensors import collision_mesh
+from runners.sensors import urdf as urdf_module
+from runners.sensors.hand import HandModel, hand_solids, roll_pitch_yaw
+from runners.sensors.rig import BoxRig, HandRig
+
+GRIPPER = """<?xml version="1.0"?>
+<robot name="gripper">
+  <link name="arm"><collision><geometry><sphere radius="0.5"/></geometry></collision></link>
+  <joint name="wrist" type="revolute">
+    <parent link="arm"/><child link="palm"/><axis xyz="0 0 1"/><origin xyz="0 0 1"/>
+  </joint>
+  <link name="palm">
+    <collision><origin xyz="0 0 0.05"/><geometry><box size="0.04 0.2 0.1"/></geometry></collision>
+  </link>
+  <joint name="slide" type="prismatic">
+    <parent link="palm"/><child link="left"/><axis xyz="0 2 0"/><origin xyz="0 0 0.1"/>
+    <limit lower="0" upper="0.1" effort="1" velocity="1"/>
+  </joint>
+  <link name="left">
+    <collision><geometry><cylinder radius="0.01" length="0.06"/></geometry></collision>
+  </link>
+  <joint name="follow" type="prismatic">
+    <parent link="palm"/><child link="right"/><axis xyz="0 -1 0"/><origin xyz="0 0 0.1"/>
+    <mimic joint="slide" multiplier="2" offset="0.01"/>
+  </joint>
+  <link name="right">
+    <collision><geometry><cylinder radius="0.01" length="0.06"/></geometry></collision>
+  </link>
+  <joint name="bend" type="continuous">
+    <parent link="right"/><child link="tip"/><axis xyz="1 0 0"/>
+    <origin rpy="0 0 1.5707963267948966"/>
+  </joint>
+  <link name="tip">
+    <collision>
+      <origin xyz="0.03 0 0"/><geometry><sphere radius="0.005"/></geometry>
+    </collision>
+  </link>
+</robot>
+"""
+
+
+def urdf(folder: Path, text: str = GRIPPER) -> str:
+    path = folder / "gripper.urdf"
+    path.write_text(text)
+    return str(path)
+
+
+def one_link(folder: Path, geometry: str) -> str:
+    shape = f"<collision><geometry>{geometry}</geometry></collision>"
+    return urdf(folder, f'<robot name="r"><link name="a">{shape}</link></robot>')
+
+
+def hand(path: str, root: str | None = None) -> HandRig:
+    return HandRig(frame="hand", urdf=path, root=root)
+
+
+def test_boxes_stand_where_the_rig_puts_them() -> None:
+    boxes = (
+        BoxRig((0.1, 0.2, 0.3), (1.0, 0.0, 0.0)),
+        BoxRig((0.1, 0.2, 0.3), rotation=(np.pi / 2, 0.0, np.pi / 2)),
+    )
+    solids = hand_solids(HandRig(frame="hand", boxes=boxes))
+    assert solids is not None
+    assert solids.is_watertight
+    assert solids.volume == pytest.approx(2 * 0.006)
+    upright, turned = solids.split()
+    np.testing.assert_allclose(upright.bounds, [[0.95, -0.1, -0.15], [1.05, 0.1, 0.15]])
+    # First about x: y and z change places; then about z: x and y do.
+    np.testing.assert_allclose(turned.extents, [0.3, 0.1, 0.2], atol=1e-12)
+
+
+def test_angles_turn_about_fixed_axes_in_the_order_of_urdf() -> None:
+    angles = np.array([0.3, -0.7, 1.1])
+    expected = trimesh.transformations.euler_matrix(*angles, axes="sxyz")[:3, :3]
+    np.testing.assert_allclose(roll_pitch_yaw(angles), expected, atol=1e-12)
+
+
+def test_a_rig_without_solids_has_no_mesh() -> None:
+    assert hand_solids(HandRig(frame="hand", pose="/hand_pose")) is None
+
+
+def test_joints_place_the_links(tmp_path: Path) -> None:
+    joints = {"slide": 0.02, "bend": 0.4, "elbow": 7.0}
+    model = HandModel(hand(urdf(tmp_path), "palm"))
+    palm, left, right, tip = model.parts(joints)
+    assert model.joint_names == ("slide", "bend")
+    assert model.remarks == ()
+    np.testing.assert_allclose(palm.bounds, [[-0.02, -0.1, 0.0], [0.02, 0.1, 0.1]])
+    np.testing.assert_allclose(left.bounds.mean(axis=0), [0.0, 0.02, 0.1], atol=1e-12)
+    # The mimic goes to 2 x 0.02 + 0.01 along -y; a tip turned by 90 degrees about z points there.
+    np.testing.assert_allclose(right.bounds.mean(axis=0), [0.0, -0.05, 0.1], atol=1e-12)
+    np.testing.assert_allclose(tip.bounds.mean(axis=0), [0.0, -0.02, 0.1], atol=1e-12)
+    assert all(part.is_watertight and part.volume > 0.0 for part in model.parts(joints))
+
+
+def test_a_continuous_joint_turns_what_hangs_on_it(tmp_path: Path) -> None:
+    text = GRIPPER.replace('<axis xyz="1 0 0"/>', '<axis xyz="0 0 2"/>')
+    model = HandModel(hand(urdf(tmp_path, text), "right"))
+    right, tip = model.parts({"bend": np.pi / 2})
+    # 90 degrees of the origin and 90 of the joint turn x into -x.
+    np.testing.assert_allclose(tip.bounds.mean(axis=0), [-0.03, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(right.bounds.mean(axis=0), [0.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_follower_that_tells_its_own_value_is_believed(tmp_path: Path) -> None:
+    model = HandModel(hand(urdf(tmp_path), "palm"))
+    right = model.parts({"slide": 0.02, "follow": 0.03})[2]
+    np.testing.assert_allclose(right.bounds.mean(axis=0), [0.0, -0.03, 0.1], atol=1e-12)
+
+
+def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
+    whole = HandModel(hand(urdf(tmp_path)))
+    assert len(whole.parts()) == 5
+    assert whole.joint_names == ("wrist", "slide", "bend")
+    np.testing.assert_allclose(whole.parts()[1].bounds[:, 2], [1.0, 1.1])
+    with pytest.raises(SettingError, match=r"hand\.root 'wrist' is no link .*accepted: arm, palm"):
+        HandModel(hand(urdf(tmp_path), "wrist"))
+
+
+def test_joints_without_a_value_are_at_zero_and_remarked(tmp_path: Path) -> None:
+    rig = hand(urdf(tmp_path), "palm")
+    with pytest.warns(UserWarning, match="joints without a value are at 0: bend"):
+        solids = hand_solids(rig, {"slide": 0.0})
+    assert solids is not None
+    assert solids.bounds[1, 1] == pytest.approx(0.1)
+    assert HandModel(rig).missing({"slide": 0.1, "bend": 0.0}) == []
+    with pytest.raises(SettingError, match="joint slide is nan; accepted: a finite number"):
+        HandModel(rig).parts({"slide": float("nan")})
+
+
+def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) -> None:
+    package = tmp_path / "gripper_description"
+    (package / "meshes").mkdir(parents=True)
+    (package / "urdf").mkdir()
+    trimesh.creation.box((10.0, 20.0, 30.0)).export(package / "meshes" / "palm.stl")
+    for name in ("../meshes/palm.stl", "package://gripper_description/meshes/palm.stl"):
+        path = one_link(package / "urdf", f'<mesh filename="{name}" scale="0.001 0.001 -0.002"/>')
+        model = HandModel(hand(path))
+        assert model.remarks == ()
+        (palm,) = model.parts()
+        np.testing.assert_allclose(palm.extents, [0.01, 0.02, 0.06])
+        assert palm.volume == pytest.approx(12e-6)  # mirrored, and still turned outward
+    path = one_link(package / "urdf", '<mesh filename="package://other/palm.stl"/>')
+    with pytest.raises(SettingError, match=r"link a: mesh package://other/palm.stl does not exist"):
+        HandModel(hand(path))
+
+
+def test_an_open_mesh_becomes_its_hull(tmp_path: Path) -> None:
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    trimesh.Trimesh(box.vertices, box.faces[2:]).export(tmp_path / "open.stl")
+    model = HandModel(hand(one_link(tmp_path, '<mesh filename="open.stl"/>')))
+    (solid,) = model.parts()
+    assert solid.is_watertight
+    assert solid.volume == pytest.approx(1e-3)
+    assert ["open.stl is open; its convex hull is used" in text for text in model.remarks] == [True]
+
+
+def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "yourdfpy", None)
+    assert hand_solids(HandRig(frame="hand", boxes=(BoxRig((0.1, 0.1, 0.1)),))) is not None
+    with pytest.raises(SettingError, match=r"pip install chsel-replay\[urdf\]"):
+        HandModel(hand(urdf(tmp_path)))
+
+
+LINK = '<link name="a"><collision><geometry><sphere radius="1"/></geometry></collision></link>'
+CYCLE = (
+    '<robot name="r"><link name="a"/><link name="b"/>'
+    '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
+    '<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
+)
+BOMB = (
+    '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]><robot name="&b;"></robot>'
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is not XML"),
+        ("<robot", "is not XML"),
+        ("<robot/>", "is not a URDF"),
+        ('<robot name="r"/>', "has no links"),
+        ('<robot name="r"><link/></robot>', "is not a URDF"),
+        ('<robot name="r"><link name="a"/></robot>', "no collision shape at or below link a"),
+        (f'<robot name="r">{LINK}{LINK}</robot>', "two links or two joints of one name"),
+        (f'<robot name="r">{LINK}<link name="b"/></robot>', r"several base links; .*: a, b"),
+        (LINK.replace("link", "xacro:link"), "holds xacro macros|is not XML"),
+        ('<robot name="r" xmlns:xacro="x"><xacro:arm/></robot>', "holds xacro macros"),
+        (CYCLE, "has a cycle of joints and no base link"),
+        (BOMB, "has a DOCTYPE"),
+        ("<a>" * 40 + "</a>" * 40, "too many elements, or too deep ones"),
+        (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist holds link 'leg'"),
+        (GRIPPER.replace('type="revolute"', 'type="screw"'), "joint wrist has type 'screw'"),
+        (GRIPPER.replace('"0 2 0"', '"0 0 0"'), "joint slide: axis is"),
+        (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics 'follow'"),
+        (GRIPPER.replace('mimic joint="slide"', 'mimic joint="thumb"'), "follow mimics 'thumb'"),
+        (GRIPPER.replace('xyz="0 0 0.1"', 'xyz="0 0 nan"'), "joint slide: origin is not finite"),
+        (GRIPPER.replace('radius="0.01"', 'radius="-1"'), "link left: size of a cylinder"),
+        (GRIPPER.replace('"0.04 0.2 0.1"', '"0.04 0.2"'), "link palm: size of a box"),
+        (GRIPPER.replace('child link="tip"', 'child link="left"'), "link left hangs on two joints"),
+    ],
+)
+def test_unusable_files_are_refused_in_a_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(SettingError, match=message) as caught:
+        HandModel(hand(urdf(tmp_path, text)))
+    assert str(caught.value).startswith(f"hand.urdf {tmp_path}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_cycle_below_the_named_root_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="cycle of joints through link a"):
+        HandModel(hand(urdf(tmp_path, CYCLE), "a"))
+
+
+def test_more_links_than_any_robot_has_are_refused_at_once(tmp_path: Path) -> None:
+    links = "".join(f'<link name="l{i}"/>' for i in range(60_000))
+    with pytest.raises(SettingError, match="too many elements"):
+        HandModel(hand(urdf(tmp_path, f'<robot name="r">{links}</robot>')))
+    with pytest.raises(SettingError, match="is a folder; accepted: a URDF file"):
+        HandModel(hand(str(tmp_path)))
+
+
+PLY_BOMB = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\n"
+    b"property float y\nproperty float z\nelement face 99999999999\n"
+    b"property list uchar int vertex_indices\nend_header\n" + bytes(64)
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("noise.stl", b"\xff\x00\x81" * 90),
+        ("count.stl", bytes(80) + b"\xff\xff\xff\xff" + bytes(100)),
+        ("bomb.ply", PLY_BOMB),
+        ("bomb.off", b"OFF\n99999999999 99999999999 0\n0 0 0\n"),
+        ("empty.obj", b""),
+        ("missing.obj", b"v 0 0 0\nf 1 2 3\n"),
+        ("nan.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("solid.step", b"ISO-10303-21;"),
+    ],
+)
+def test_damaged_meshes_are_refused_in_a_line(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SettingError, match=f"link a: mesh .*{name}") as caught:
+        HandModel(hand(one_link(tmp_path, f'<mesh filename="{name}"/>')))
+    assert "\n" not in str(caught.value)
+
+
+def test_meshes_and_faces_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.stl")  # 684 bytes, 12 faces
+    path = one_link(tmp_path, '<mesh filename="box.stl"/>')
+    monkeypatch.setattr(urdf_module, "MOST_FACES", 11)
+    with pytest.raises(SettingError, match="has more than 11 faces"):
+        HandModel(hand(path))
+    monkeypatch.setattr(collision_mesh, "MOST_BYTES", 683)
+    with pytest.raises(SettingError, match="makes the meshes more than 683 bytes"):
+        HandModel(hand(path))
