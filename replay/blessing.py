@@ -66,7 +66,7 @@ def write_blessed(recording: Recording, path: Path) -> Recording:
     The file is removed again if that fails. Raises RecordingError if the recording was recovered
     with losses, behind which E_0 and E_l do not follow from what is left.
     """
-    if any(tells_loss(event) for event in recording.events()):
+    if any(tells_loss(event) for event in recording.events(images=False)):
         raise RecordingError(f"recording {recording.path} has lost events; accepted: whole ones")
     recorder = McapRecorder(path)
     try:
@@ -87,7 +87,7 @@ def changes(recorded: Recording, new: Recording) -> list[Change]:
     sets, truth = PlausibleSets(recorded), recorded.start.world_from_object
     before, after = _outputs(recorded), _outputs(new)
     found = []
-    for event in recorded.events():
+    for event in recorded.events(images=False):
         if isinstance(event, ProblemPosed) and recorded.has_result(event.step):
             step = event.step
             pair = recorded.hypotheses(step), new.hypotheses(step)
@@ -100,7 +100,7 @@ def changes(recorded: Recording, new: Recording) -> list[Change]:
 def _outputs(recording: Recording) -> dict[int, list[object]]:
     """All that today's code has a say in, by step, as far as its digests tell."""
     outputs: dict[int, list[object]] = {step: [] for step in recording.steps}
-    for event in recording.events():
+    for event in recording.events(images=False):
         match event:
             case ProblemPosed():
                 outputs[event.step].append(event.problem.digest)

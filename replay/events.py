@@ -45,9 +45,9 @@ class SessionStarted:
 class RigDescribed:
     """The sensors of a recorded robot session, and the raw log that they wrote.
 
-    Comes at most once, before any probe. name: of the rig. source: digest of the raw log, which is
-    not part of the recording. hand: its solid parts in its own frame, that of `Probe.gripper_path`,
-    where known.
+    Comes at most once, before all steps: its own is -1. name: of the rig. source: digest of the raw
+    log, which is not part of the recording. hand: its solid parts in its own frame, that of
+    `Probe.gripper_path`, where known.
     """
 
     step: int

@@ -9,7 +9,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping
+import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -28,11 +29,11 @@ FORMATS = ("npz", "csv", "json")
 class Exported:
     """The same content in three forms.
 
-    arrays: of an npz file, by name. document: plain values, mappings, lists and arrays, for JSON.
-    header, rows: of a table.
+    arrays: of an npz file, with their names, one after the other. document: plain values,
+    mappings, lists and arrays, for JSON. header, rows: of a table.
     """
 
-    arrays: Mapping[str, NDArray[Any]]
+    arrays: Iterable[tuple[str, NDArray[Any]]]
     document: Any
     header: tuple[str, ...]
     rows: Iterable[tuple[Any, ...]]
@@ -50,8 +51,11 @@ def write_export(exported: Exported, path: Path, file_format: str) -> None:
 
 
 def _write_npz(exported: Exported, file: IO[bytes]) -> None:
-    arrays: dict[str, Any] = dict(exported.arrays)
-    np.savez(file, **arrays)
+    """As numpy.savez does, but that arrays need not be in memory together."""
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, array in exported.arrays:
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as inside:
+                np.lib.format.write_array(inside, np.asanyarray(array), allow_pickle=False)
 
 
 def _write_csv(exported: Exported, file: IO[bytes]) -> None:

@@ -1,4 +1,4 @@
-"""What can be exported of a recording: hypotheses, points, archives, numbers."""
+"""What can be exported of a recording: hypotheses, points, archives, numbers, images."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from chsel.pose import inverse
 from chsel.problem import ArchiveSnapshot, Hypotheses
 from replay.events import Measured, Timed
 from replay.export import Exported
+from replay.export_images import exported_images
 from replay.mcap.contents import Contents
 from replay.mcap.foxglove_messages import poses_in_world
 from replay.mcap.reader import Recording
@@ -45,7 +46,7 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
     document = {"true_world_from_object": truth, "steps": listed}
     header = ("step", "rank", "cost", "duplicate", "cell", *_POSE, *_ENTRIES)
     rows = (row for step, hypotheses in found.items() for row in _hypothesis_rows(step, hypotheses))
-    return Exported(arrays, document, header, rows)
+    return Exported(arrays.items(), document, header, rows)
 
 
 def exported_points(recording: Recording, steps: str | None) -> Exported:
@@ -73,7 +74,7 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
     if recording.start.world_from_object is not None:
         arrays["world_from_object"] = recording.start.world_from_object
     header = ("x", "y", "z", "kind", "sdf", "step")
-    return Exported(arrays, arrays, header, _point_rows(arrays))
+    return Exported(arrays.items(), arrays, header, _point_rows(arrays))
 
 
 def exported_archive(recording: Recording, steps: str | None, *, last: bool = False) -> Exported:
@@ -100,7 +101,7 @@ def exported_archive(recording: Recording, steps: str | None, *, last: bool = Fa
     of_measures = tuple(f"measure_{i}" for i in range(measures))
     header = (*named, *of_measures, *(f"solution_{i}" for i in range(length)))
     rows = _archive_rows(taken, measures, length)
-    return Exported(arrays, {"snapshots": listed}, header, rows)
+    return Exported(arrays.items(), {"snapshots": listed}, header, rows)
 
 
 def exported_metrics(recording: Recording, steps: str | None) -> Exported:
@@ -119,7 +120,8 @@ def exported_metrics(recording: Recording, steps: str | None) -> Exported:
         name: np.array(column, dtype=kind)
         for name, column, kind in zip(header, columns, types, strict=True)
     }
-    return Exported(arrays, [dict(zip(header, row, strict=True)) for row in rows], header, rows)
+    listed = [dict(zip(header, row, strict=True)) for row in rows]
+    return Exported(arrays.items(), listed, header, rows)
 
 
 EXPORTS = {
@@ -127,6 +129,7 @@ EXPORTS = {
     "points": exported_points,
     "archive": exported_archive,
     "metrics": exported_metrics,
+    "images": exported_images,
 }
 """By the name that `--what` takes."""
 
@@ -190,7 +193,7 @@ def _metric_rows(recording: Recording) -> Iterator[tuple[int, str, str, float]]:
     """Step, source, name and value: what is known after all probes, then step by step."""
     contents = Contents()
     numbers: list[tuple[int, str, str, float]] = []
-    for event in recording.events():
+    for event in recording.events(images=False):
         contents.take(event)
         if isinstance(event, Measured):
             numbers += [(event.step, "measured", *item) for item in event.values.items()]

@@ -28,6 +28,7 @@ class RecordingInfo:
     """What `info` tells of a recording.
 
     size: of the file, bytes. session: names, seed, configuration and the like, plain values.
+    rig: name and source of the sensors of a robot session, None if it had none.
     steps: a mapping for each probe, named as the columns of the message `Contents`; points are
     all known with the probe. outcome: how the session ended, None if that is not told.
     attachments: bytes by name. messages, message_bytes: by topic; bytes are known where everything
@@ -44,6 +45,7 @@ class RecordingInfo:
     message_bytes: Mapping[str, int] | None = None
     checked: bool = False
     damage: str | None = None
+    rig: Mapping[str, str] | None = None
 
     @property
     def registrations(self) -> int:
@@ -70,6 +72,7 @@ class RecordingInfo:
             "path": str(self.path),
             "bytes": self.size,
             **self.session,
+            "rig": None if self.rig is None else dict(self.rig),
             "outcome": self.outcome,
             "registrations": self.registrations,
             "integrity": integrity,
@@ -104,7 +107,7 @@ def _from_index(index: McapIndex) -> RecordingInfo:
     session, contents = index.message("/session"), index.message("/contents")
     if session is None or contents is None:
         raise RecordingError(f"recording {index.path} has no session or no contents")
-    ended = index.message("/session_ended")
+    ended, rig = index.message("/session_ended"), index.message("/rig")
     return RecordingInfo(
         index.path,
         index.size,
@@ -113,6 +116,7 @@ def _from_index(index: McapIndex) -> RecordingInfo:
         None if ended is None else decode("SessionEnded", ended)["outcome"],
         index.attachments,
         index.messages,
+        rig=None if rig is None else _rig(index.path, decode("Rig", rig)),
     )
 
 
@@ -135,6 +139,7 @@ def _from_everything(path: Path) -> RecordingInfo:
         tally.bytes,
         checked=True,
         damage=recording.damage or damage,
+        rig=None if recording.rig is None else _rig(path, vars(recording.rig)),
     )
 
 
@@ -169,7 +174,7 @@ class _Tally:
 def _session(path: Path, data: bytes) -> dict[str, Any]:
     """The plain values of a session's first message, its configuration taken apart."""
     values = decode("Session", data)
-    if values["format_version"] != FORMAT_VERSION:
+    if not 1 <= values["format_version"] <= FORMAT_VERSION:
         raise RecordingError(f"recording {path} has format version {values['format_version']}")
     for name in ("runner", "object", "session", "method", "source"):
         check_name(f"{name} of recording {path}", values[name])
@@ -186,6 +191,13 @@ def _session(path: Path, data: bytes) -> dict[str, Any]:
         "environment": {item["name"]: item["value"] for item in values["environment"]},
         "config": config,
     }
+
+
+def _rig(path: Path, values: Mapping[str, Any]) -> dict[str, str]:
+    """Name and source of a rig."""
+    for name in ("name", "source"):
+        check_name(f"{name} of the rig of recording {path}", values[name])
+    return {name: values[name] for name in ("name", "source")}
 
 
 def _rows(columns: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:

@@ -106,7 +106,7 @@ def _start(
 
 def _up_to_problem(recording: Recording, step: int) -> Iterator[Event]:
     """The probes before the problem of a step, and the problem."""
-    for event in recording.events():
+    for event in recording.events(images=False):
         if isinstance(event, Probe):
             yield event
         elif isinstance(event, ProblemPosed) and event.step == step:

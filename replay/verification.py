@@ -76,7 +76,7 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
     method = recorded_method(recording)
     wanted = recording.checked_steps(steps)
     differing = environment_differences(recording.start)
-    events = recording.events()
+    events = recording.events(images=False)
     before, posed = _until_next_problem(events)
     previous = _previous(before, None)
     while posed is not None:

@@ -123,7 +123,7 @@ def medians(outcomes: Sequence[Outcome]) -> dict[str, float]:
 def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPosed]:
     """The problems of steps, each once."""
     left = set(steps)
-    for event in recording.events():
+    for event in recording.events(images=False):
         if isinstance(event, ProblemPosed) and event.step in left:
             left.remove(event.step)
             yield event

@@ -15,6 +15,7 @@ from replay.mcap.encoding import decode
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import FOXGLOVE, cloud_points
 from replay.mcap.schemas import RECORDS, STEP_TIME
+from replay.mcap.sensor_messages import image
 
 Content = dict[str, Any]
 """Arrays, numbers, texts and None by path, such as "config.method.cost.free_scale"."""
@@ -44,6 +45,9 @@ def message_content(message: StoredMessage) -> Content:
     values = decode(RECORDS[message.topic], message.data)
     if message.topic == "/session":
         values["config"] = _parsed_or_text(values["config"])
+    elif message.topic == "/sensor_image":
+        seen = image(values)
+        values |= {"values": seen.values, "mask": seen.mask}
     return _flat(values)
 
 

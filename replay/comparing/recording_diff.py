@@ -37,7 +37,7 @@ _MALFORMED = (ChselError, ValueError, RecursionError)
 class Key(NamedTuple):
     """What two messages have in common to be compared: `number` counts those with the same rest.
 
-    about: stage and iteration of a trace or archive, else empty.
+    about: stage and iteration of a trace or archive, sensor of an image, else empty.
     """
 
     topic: str
@@ -230,10 +230,15 @@ def _pairs(first: _Survey, second: _Survey) -> Iterator[_Pair]:
 
 
 def _about(message: StoredMessage) -> str:
-    """Stage and iteration of a trace or archive, by which another number of them shifts nothing."""
-    if message.topic in ("/trace", "/archive"):
+    """Stage and iteration of a trace or archive, sensor of an image.
+
+    By these another number of them shifts nothing.
+    """
+    if message.topic in ("/trace", "/archive", "/sensor_image"):
         with suppress(*_MALFORMED):
             values = decode(RECORDS[message.topic], message.data)
+            if "sensor" in values:
+                return str(values["sensor"])
             stage = f"{values['stage']} " if "stage" in values else ""
             later = f" (pass {values['refinement'] + 1})" if values.get("refinement") else ""
             return f"{stage}iteration {values['iteration']}{later}"

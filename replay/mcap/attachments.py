@@ -36,7 +36,7 @@ _LONGEST_HEADER = len(_HEADER) + 20
 def mesh_to_ply(mesh: trimesh.Trimesh) -> bytes:
     """Vertices and faces of a mesh as a PLY file with float64 coordinates; exact."""
     vertices = np.ascontiguousarray(mesh.vertices, "<f8")
-    _check_mesh(vertices, mesh.faces)
+    check_mesh(vertices, mesh.faces)
     faces = np.zeros(len(mesh.faces), _FACE)
     faces["count"] = 3
     faces["vertices"] = mesh.faces
@@ -58,11 +58,11 @@ def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
     indices = faces["vertices"].astype(np.int64)
     if (faces["count"] != 3).any():
         raise RecordingError(f"attachment {MESH} has a face that is no triangle")
-    _check_mesh(vertices, indices)
+    check_mesh(vertices, indices)
     return trimesh.Trimesh(vertices.astype(np.float64), indices, process=False)
 
 
-def _check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
+def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
     """Raise RecordingError unless vertices (V, 3) are finite and faces (F, 3) are of them."""
     if len(faces) == 0:
         raise RecordingError("the mesh has no faces; accepted: triangles")

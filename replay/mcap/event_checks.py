@@ -20,19 +20,28 @@ from replay.events import (
     Logged,
     Measured,
     Probe,
+    RigDescribed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
     Timed,
     Traced,
 )
+from replay.mcap.attachments import check_mesh
 from replay.mcap.texts import check_name, check_text
 
 OUTCOMES = ("contact", "free", "points")
 ENDS = ("finished", "interrupted")
 FAILED = "failed: "
+KINDS_OF_IMAGE = ("depth", "deformation")
+LARGEST_SIDE = 8192
+"""Pixels of an image, either way."""
 RECOVERED = "recovered: "
 """Opens what a recovery adds to a recording: lines of its log, and the end if there was none."""
+
+_UNITS = (1e-9, 1e3)
+_LONGEST_FOCUS = 1e6
 
 
 def check_event(event: Event) -> None:
@@ -48,6 +57,13 @@ def _check(event: Event) -> None:
     match event:
         case SessionStarted():
             _check_start(event)
+        case RigDescribed():
+            check_name("the rig", event.name)
+            check_name("the source of the rig", event.source)
+            if event.hand is not None:
+                check_mesh(event.hand.vertices, event.hand.faces)
+        case SensorImage():
+            _check_image(event)
         case Probe():
             _check_probe(event)
         case SnapshotTaken():
@@ -90,6 +106,38 @@ def check_free_resolution(resolution: float) -> None:
         )
 
 
+def check_image_head(
+    sensor: str,
+    kind: str,
+    shape: tuple[int, int],
+    unit: float,
+    intrinsics: FloatArray,
+    world_from_camera: FloatArray,
+) -> None:
+    """Raise RecordingError unless all of an image but its pixels (H, W) is as its class says."""
+    check_name("a sensor", sensor)
+    if not sensor.replace("_", "").isalnum():
+        raise RecordingError(f"a sensor is named {sensor!r}; accepted: letters, digits and _")
+    if kind not in KINDS_OF_IMAGE:
+        accepted = ", ".join(KINDS_OF_IMAGE)
+        raise RecordingError(f"an image of {sensor} is of kind {kind!r}; accepted: {accepted}")
+    if not (min(shape) >= 1 and max(shape) <= LARGEST_SIDE):
+        raise RecordingError(
+            f"an image of {sensor} has {shape} pixels; accepted: 1 to {LARGEST_SIDE} either way"
+        )
+    low, high = _UNITS
+    if not low <= unit <= high:
+        raise RecordingError(
+            f"the unit of an image of {sensor} is {unit}; accepted: {low:g} to {high:g} (m)"
+        )
+    if not (np.abs(intrinsics) <= _LONGEST_FOCUS).all() or not (intrinsics[:2] > 0.0).all():
+        raise RecordingError(
+            f"intrinsics of an image of {sensor} are {np.asarray(intrinsics).tolist()}; accepted: "
+            f"focal lengths above 0, all up to {_LONGEST_FOCUS:g} (pixels)"
+        )
+    check_poses(f"world_from_camera of {sensor}", np.asarray(world_from_camera)[None])
+
+
 def _check_start(event: SessionStarted) -> None:
     for name in ("runner", "object", "session", "method", "source"):
         check_name(name, getattr(event, name))
@@ -110,6 +158,25 @@ def _check_probe(event: Probe) -> None:
     check_poses("gripper_path", event.gripper_path)
     for name in ("contacts", "contact_normals"):
         _check_finite(f"{name} of probe {event.step}", getattr(event, name))
+
+
+def _check_image(event: SensorImage) -> None:
+    height, width = event.values.shape
+    check_image_head(
+        event.sensor,
+        event.kind,
+        (height, width),
+        event.unit,
+        event.intrinsics,
+        event.world_from_camera,
+    )
+    if event.values.dtype != np.uint16:
+        raise RecordingError(f"an image has values of {event.values.dtype}; accepted: uint16")
+    if event.mask.dtype != np.bool_ or event.mask.shape != event.values.shape:
+        raise RecordingError(
+            f"the mask of an image is {event.mask.dtype} {event.mask.shape}; "
+            f"accepted: bool {event.values.shape}"
+        )
 
 
 def _check_archive(what: str, archive: ArchiveSnapshot) -> None:

@@ -8,6 +8,8 @@ from replay.events import (
     HypothesesFound,
     Probe,
     ProblemPosed,
+    RigDescribed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
@@ -25,6 +27,7 @@ class EventOrder:
         self._probe = BEFORE_ALL_STEPS  # of the last probe
         self._posed = BEFORE_ALL_STEPS  # of the last problem
         self._registering = False  # a problem is posed and has no result yet
+        self.has_rig = False
         self._ended = False
 
     def take(self, event: Event) -> None:
@@ -37,6 +40,14 @@ class EventOrder:
                 if event.step <= self._probe:
                     raise RecordingError(f"probe {event.step} follows probe {self._probe}")
                 self._probe = event.step
+            case RigDescribed():
+                if self.has_rig or event.step != BEFORE_ALL_STEPS:
+                    raise RecordingError(
+                        f"there is a rig of step {event.step}; accepted: one, before all steps"
+                    )
+                self.has_rig = True
+            case SensorImage():
+                self._see(event.step)
             case ProblemPosed():
                 self._pose(event.step)
             case SnapshotTaken() | Traced() | HypothesesFound():
@@ -52,6 +63,11 @@ class EventOrder:
         self._advance(step)
         self._pose(step)
 
+    def see(self, step: int) -> None:
+        """The same for an image of a step."""
+        self._advance(step)
+        self._see(step)
+
     def _advance(self, step: int) -> None:
         if self._ended:
             raise RecordingError("an event follows the end of the session")
@@ -60,6 +76,12 @@ class EventOrder:
         if step < self.step:
             raise RecordingError(f"an event of step {step} follows one of step {self.step}")
         self.step = step
+
+    def _see(self, step: int) -> None:
+        if not self.has_rig:
+            raise RecordingError(f"an image of step {step} has no rig before it")
+        if step <= self._probe or step == BEFORE_ALL_STEPS:
+            raise RecordingError(f"an image of step {step} does not precede the probe of its step")
 
     def _pose(self, step: int) -> None:
         if step <= self._posed:

@@ -21,6 +21,7 @@ from replay.events import (
     Logged,
     Measured,
     Probe,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
@@ -35,7 +36,14 @@ from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import cloud_points, log_level_and_text
 from replay.mcap.plain_config import config_from_json
-from replay.mcap.schemas import FORMAT_VERSION, RECORDS, STEP_TIME, message_class
+from replay.mcap.schemas import (
+    FORMAT_VERSION,
+    RECORDS,
+    SINCE_VERSION,
+    STEP_TIME,
+    message_class,
+)
+from replay.mcap.sensor_messages import ImagePlace, check_image, plausible_pixels, rig
 from replay.mcap.wire import check_wire
 
 _VIEWS = ("/object_pose", "/gripper_path", "/hypothesis_poses")  # they repeat what records say
@@ -71,14 +79,23 @@ class RecordedProblem:
         return problem
 
 
-class EventReader:
-    """Joins messages to events. `within` is the topic of an event whose points are yet to come."""
+Entry = Event | RecordedProblem | ImagePlace
+"""An event, or what is kept of one that takes more than its message to make."""
 
-    def __init__(self, attachments: dict[str, bytes]) -> None:
-        self.entries: list[Event | RecordedProblem] = []
+
+class EventReader:
+    """Joins messages to events. `within` is the topic of an event whose points are yet to come.
+
+    size: of the file, bytes, by which it is judged how many pixels it can plausibly hold.
+    """
+
+    def __init__(self, attachments: dict[str, bytes], size: int) -> None:
+        self.entries: list[Entry] = []
         self.within: str | None = None
         self.contents = Contents()
         self.closed = False  # whether the contents, which come last, were there
+        self._pixels = plausible_pixels(size)  # that are left
+        self._version = FORMAT_VERSION
         self._order = EventOrder()
         self._sdf_digest = ""
         self._points_digest = ""  # of all points known so far, as recorded
@@ -107,7 +124,7 @@ class EventReader:
             self._compare_contents(data)
         else:
             if topic == "/session":
-                _check_version(data)
+                self._version = _checked_version(data)
             values = decode(RECORDS[topic], data)
             if values.get("step", step) != step:
                 raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
@@ -124,12 +141,16 @@ class EventReader:
             return topic == "/known_points" or (topic in _CLOUDS and topic not in self._clouds)
         if not self.entries:
             return topic == "/session"
+        if SINCE_VERSION.get(topic, 0) > self._version:
+            return False
         return topic not in (*_CLOUDS, "/known_points", "/session")
 
-    def _append(self, entry: Event | RecordedProblem) -> None:
+    def _append(self, entry: Entry) -> None:
         if isinstance(entry, RecordedProblem):
             self._order.pose(entry.step)
             self.contents.pose(entry.step)
+        elif isinstance(entry, ImagePlace):
+            self._order.see(entry.step)
         else:
             self._order.take(entry)
             check_event(entry)
@@ -144,10 +165,14 @@ class EventReader:
             if recorded[name].tobytes() != column.tobytes():
                 raise RecordingError(f"its contents, as read, have another {name} than recorded")
 
-    def _event(self, topic: str, values: dict[str, Any]) -> Event | RecordedProblem:
+    def _event(self, topic: str, values: dict[str, Any]) -> Entry:
         match topic:
             case "/known_points":
                 return self._close(values)
+            case "/rig":
+                return rig(values)
+            case "/sensor_image":
+                return self._image(values)
             case "/problem":
                 return self._problem(values)
             case "/archive":
@@ -188,6 +213,18 @@ class EventReader:
             self._sdf_digest = self._opening["sdf_digest"]
             return _session(self._opening, points, self._attachments)
         return Probe(**self._opening, new_points=points)
+
+    def _image(self, values: dict[str, Any]) -> ImagePlace | SensorImage:
+        """The place of an image: all of them would fill the memory."""
+        self._count_pixels(values)
+        return ImagePlace(values["step"])
+
+    def _count_pixels(self, values: dict[str, Any]) -> None:
+        """Raise RecordingError if an image is wrong from outside, or one too many to look at."""
+        check_image(values)
+        self._pixels -= values["height"] * values["width"]
+        if self._pixels < 0:
+            raise RecordingError("its images have more pixels than a file of its size can hold")
 
     def _problem(self, values: dict[str, Any]) -> RecordedProblem:
         step, low_cost_set = values["step"], values["low_cost_set"]
@@ -263,21 +300,22 @@ def _mapping(what: str, items: tuple[dict[str, Any], ...]) -> dict[str, Any]:
     return mapping
 
 
-def _check_version(data: bytes) -> None:
-    """Raise RecordingError for a session of another format, before reading more of it."""
+def _checked_version(data: bytes) -> int:
+    """The format of a session; RecordingError for one not known, before reading more of it."""
     session: Any = message_class("Session")()
     check_wire(session.DESCRIPTOR, data)
     try:
         session.ParseFromString(data)
     except DecodeError:
         raise RecordingError("a message is no valid chsel.Session") from None
-    version = session.format_version
+    version = int(session.format_version)
     if version > FORMAT_VERSION:
         raise RecordingError(
             f"written by a newer version: format {version}; this one reads up to {FORMAT_VERSION}"
         )
     if version < 1:
         raise RecordingError(f"it has format version {version}; accepted: 1 to {FORMAT_VERSION}")
+    return version
 
 
 def _snapshot(values: dict[str, Any]) -> ArchiveSnapshot:

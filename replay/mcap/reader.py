@@ -15,15 +15,19 @@ from replay.events import (
     HypothesesFound,
     Probe,
     ProblemPosed,
+    RigDescribed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
     Timed,
 )
-from replay.mcap.event_reader import EventReader, RecordedProblem
+from replay.mcap.encoding import decode
+from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
 from replay.mcap.file import McapFile, StoredMessage
 from replay.mcap.foxglove_messages import FOXGLOVE
-from replay.mcap.schemas import RECORDS, message_class
+from replay.mcap.schemas import RECORDS, STEP_TIME, message_class
+from replay.mcap.sensor_messages import ImagePlace, image
 from replay.mcap.texts import one_line
 
 
@@ -32,12 +36,11 @@ class Recording:
 
     path: of the file. damage: what cut reading short, None if the file is whole. start: how the
     session began. ended: how it ended, None if it did not. probes: in their order. steps: those
-    with a registration problem.
+    with a registration problem. rig: of a recorded robot session, else None. image_steps: those
+    with images of sensors.
     """
 
-    def __init__(
-        self, path: Path, entries: list[Event | RecordedProblem], damage: str | None
-    ) -> None:
+    def __init__(self, path: Path, entries: list[Entry], damage: str | None) -> None:
         if not entries or not isinstance(entries[0], SessionStarted):
             raise RecordingError(f"recording {path} has no session in it")
         self.path = path
@@ -46,18 +49,33 @@ class Recording:
         self.ended = next((entry for entry in entries if isinstance(entry, SessionEnded)), None)
         self.probes = [entry for entry in entries if isinstance(entry, Probe)]
         self.steps = tuple(entry.step for entry in entries if isinstance(entry, RecordedProblem))
+        self.rig = next((entry for entry in entries if isinstance(entry, RigDescribed)), None)
+        seen = (entry.step for entry in entries if isinstance(entry, ImagePlace))
+        self.image_steps = tuple(dict.fromkeys(seen))
         self._entries = entries
 
-    def events(self) -> Iterator[Event]:
-        """All events in the order in which they were recorded."""
+    def events(self, *, images: bool = True) -> Iterator[Event]:
+        """All events in the order in which they were recorded.
+
+        Images are read from the file once more, one at a time, or left out.
+        """
         points = self.start.initial_points
+        seen = self._images()
         for entry in self._entries:
             if isinstance(entry, Probe):
                 points = points.merged(entry.new_points)
             if isinstance(entry, RecordedProblem):
                 yield ProblemPosed(entry.step, self._completed(entry, points))
-            else:
+            elif not isinstance(entry, ImagePlace):
                 yield entry
+            elif images:
+                yield self._next(seen, entry)
+
+    def sensor_images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
+        """The images of some steps (None: of all) in their order, read one at a time."""
+        for step in steps or ():
+            self._check_step(step, self.image_steps, "image of a sensor")
+        return self._images(steps)
 
     def problem(self, step: int) -> RegistrationProblem:
         """The registration problem of a step, from the file alone; its digest is checked."""
@@ -98,6 +116,23 @@ class Recording:
         taken = [e for e in self._entries if isinstance(e, SnapshotTaken)]
         return [event.archive for event in taken if event.step == step]
 
+    def _images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
+        """The images in the file; others are passed by."""
+        topic = "/sensor_image"
+        schemas = {topic: message_class(RECORDS[topic]).DESCRIPTOR.full_name}
+        for message in McapFile(self.path, schemas, partial=self.damage is not None).messages():
+            if steps is None or message.log_time // STEP_TIME - 1 in steps:
+                with _blaming(self.path):
+                    found = image(decode(RECORDS[topic], message.data))
+                yield found
+
+    def _next(self, seen: Iterator[SensorImage], place: ImagePlace) -> SensorImage:
+        """The image that stands at a place; the file should still be the one that was read."""
+        found = next(seen, None)
+        if found is None or found.step != place.step:
+            raise RecordingError(f"recording {self.path} has changed while it was read")
+        return found
+
     def _completed(self, entry: RecordedProblem, points: KnownPoints) -> RegistrationProblem:
         with _blaming(self.path):
             return entry.completed(self.start.sdf, points)
@@ -127,7 +162,7 @@ def read_recording(
     schemas = {topic: message_class(name).DESCRIPTOR.full_name for topic, name in RECORDS.items()}
     schemas |= {topic: kind.DESCRIPTOR.full_name for topic, kind in FOXGLOVE.items()}
     file = McapFile(path, schemas, partial=partial)
-    events = EventReader(file.attachments)
+    events = EventReader(file.attachments, path.stat().st_size if path.is_file() else 0)
     for message in file.messages():
         if watch is not None:
             watch(message)

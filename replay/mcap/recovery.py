@@ -15,6 +15,7 @@ from replay.events import (
     Logged,
     Probe,
     ProblemPosed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
@@ -24,12 +25,13 @@ from replay.mcap.contents import Row, rows
 from replay.mcap.encoding import decode
 from replay.mcap.event_checks import RECOVERED, check_event
 from replay.mcap.event_order import EventOrder
-from replay.mcap.event_reader import EventReader, RecordedProblem
+from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.reader import read_recording
 from replay.mcap.salvage import Gap, Salvage
 from replay.mcap.schemas import RECORDS, STEP_TIME, message_class
+from replay.mcap.sensor_messages import ImagePlace, image
 from replay.mcap.texts import one_line
 from replay.mcap.whole_records import Damage
 from replay.mcap.writer import McapRecorder
@@ -45,11 +47,12 @@ class Recovered:
     """What a recovery found.
 
     damage: why the file cannot be read as it is; None if it can, and nothing is lost. probes,
-    problems, results: steps of those kept. damages: bytes that cannot be believed. messages:
-    how many are known to be missing. events: lost for other reasons than missing bytes. complete:
-    whether the recording's own list of contents was there, so that all losses are known.
-    lost_probes: first and last of steps in a row; without the list, those that may be lost.
-    lost_problems, lost_results: steps of registrations; without the list, those known to be lost.
+    problems, results: steps of those kept. images: how many are. damages: bytes that cannot be
+    believed. messages: how many are known to be missing. events: lost for other reasons than
+    missing bytes. complete: whether the recording's own list of contents was there, so that all
+    losses are known. lost_probes: first and last of steps in a row; without the list, those that
+    may be lost. lost_problems, lost_results: steps of registrations; without the list, those known
+    to be lost.
     ended: outcome, where the recording told it.
     """
 
@@ -58,6 +61,7 @@ class Recovered:
     probes: list[int] = field(default_factory=list)
     problems: list[int] = field(default_factory=list)
     results: list[int] = field(default_factory=list)
+    images: int = 0
     messages: int = 0
     events: list[str] = field(default_factory=list)
     complete: bool = False
@@ -81,10 +85,12 @@ def recover(path: Path, out: Path) -> Recovered:
     with new_file(out) as beside:
         recovery = _Recovery(path)
         recorder = McapRecorder(beside)
+        flushed = -1
         try:
             for event in recovery.events():
-                if isinstance(event, Probe):
+                if isinstance(event, Probe | SensorImage) and event.step > flushed:
                     recorder.flush()  # as a session does, so that a chunk holds one probe
+                    flushed = event.step
                 recorder.record(event)
         finally:
             recorder.close()
@@ -106,6 +112,7 @@ class _Recovery:
         self._path = path
         self._order = EventOrder()
         self._lost_steps: set[int] = set()  # of registrations
+        self._blind = False  # whether images are lost with their rig
 
     def events(self) -> Iterator[Event]:
         """Each event as it was; where some are lost, a warning; an end where there is none."""
@@ -132,6 +139,8 @@ class _Recovery:
                     found.problems.append(event.step)
                 case HypothesesFound():
                     found.results.append(event.step)
+                case SensorImage():
+                    found.images += 1
                 case SessionEnded() if found.ended is None:
                     found.ended = event.outcome
             yield event
@@ -140,7 +149,7 @@ class _Recovery:
         names = {topic: message_class(name).DESCRIPTOR.full_name for topic, name in RECORDS.items()}
         names |= {topic: kind.DESCRIPTOR.full_name for topic, kind in FOXGLOVE.items()}
         self._file = file = Salvage(self._path, names)
-        reader = _GapReader(file.attachments)
+        reader = _GapReader(file.attachments, self._path.stat().st_size)
         unsure: list[tuple[int, int]] = []  # first and last step of those with missing messages
         gap = False
         for message in file.messages():
@@ -176,9 +185,16 @@ class _Recovery:
         for entry in entries:
             yield from self._kept(reader, entry)
 
-    def _kept(self, reader: _GapReader, entry: Event | RecordedProblem) -> Iterator[Event]:
+    def _kept(self, reader: _GapReader, entry: Entry) -> Iterator[Event]:
         """The event, if it still makes sense where it is; else a warning, once a registration."""
         step = getattr(entry, "step", -1)
+        if isinstance(entry, ImagePlace):
+            return  # there is none of them here
+        if isinstance(entry, SensorImage) and not self._order.has_rig:
+            if not self._blind:
+                self._blind = True
+                yield from self._lost("all images of sensors: their rig was lost before")
+            return
         if isinstance(entry, _OF_REGISTRATION) and step in self._lost_steps:
             return  # with its problem
         try:
@@ -250,8 +266,8 @@ class _GapReader(EventReader):
     contents, once they were there.
     """
 
-    def __init__(self, attachments: dict[str, bytes]) -> None:
-        super().__init__(attachments)
+    def __init__(self, attachments: dict[str, bytes], size: int) -> None:
+        super().__init__(attachments, size)
         self.start: SessionStarted | None = None
         self.rows: list[Row] = []
         self._points: Any = None
@@ -264,7 +280,7 @@ class _GapReader(EventReader):
         self._clouds.clear()
         self._last_snapshot = None
 
-    def drained(self) -> list[Event | RecordedProblem]:
+    def drained(self) -> list[Entry]:
         """The events since the last call; the session's start stays, as the first of all."""
         keep = 0 if self.start is None else 1
         news = self.entries[keep:]
@@ -281,10 +297,14 @@ class _GapReader(EventReader):
         assert self.start is not None
         return ProblemPosed(entry.step, entry.completed(self.start.sdf, self._points))
 
-    def _append(self, entry: Event | RecordedProblem) -> None:
-        if not isinstance(entry, RecordedProblem):
+    def _append(self, entry: Entry) -> None:
+        if not isinstance(entry, RecordedProblem | ImagePlace):
             check_event(entry)
         self.entries.append(entry)
+
+    def _image(self, values: dict[str, Any]) -> SensorImage:
+        self._count_pixels(values)
+        return image(values)
 
     def _close(self, values: dict[str, Any]) -> SessionStarted | Probe:
         if self.wanting:  # points that are lost were counted; the new ones must all be there

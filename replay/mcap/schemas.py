@@ -12,8 +12,11 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
-FORMAT_VERSION = 1
-"""Of the recording. A reader refuses all others, so any change of meaning needs a new number."""
+FORMAT_VERSION = 2
+"""The newest. A reader refuses newer ones, so any change of meaning needs a new number.
+
+A recording has the lowest number that fits: 1, or 2 with a rig and images of its sensors.
+"""
 
 PROFILE = "chsel"
 """How the file's header names this use of MCAP."""
@@ -114,6 +117,27 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
     "Measured": {"step": "sint32", "values": "Number*"},
     "Timed": {"step": "sint32", "seconds": "Number*"},
     "SessionEnded": {"step": "sint32", "outcome": "string"},
+    "Rig": {
+        "step": "sint32",
+        "name": "string",
+        "source": "string",  # digest of the raw log
+        "hand_vertices": "f8[V,3]?",
+        "hand_faces": "i4[F,3]?",
+    },
+    # Pixels are compressed by Zstandard, row by row: a blank image is as good as nothing, and no
+    # other message may grow as much as one can.
+    "SensorImage": {
+        "step": "sint32",
+        "sensor": "string",
+        "kind": "string",
+        "height": "uint32",
+        "width": "uint32",
+        "values": "bytes",  # 16 bits a pixel, little-endian
+        "unit": "double",
+        "mask": "bytes",  # a bit a pixel, the first the highest of a byte
+        "intrinsics": "f8[4]",
+        "world_from_camera": "f8[4,4]",
+    },
     # The last message: a row for each probe, so that a large file tells at once what is in it.
     "Contents": {
         "step": "i8[S]",
@@ -147,8 +171,13 @@ RECORDS: Mapping[str, str] = {
     "/timed": "Timed",
     "/session_ended": "SessionEnded",
     "/contents": "Contents",
+    "/rig": "Rig",
+    "/sensor_image": "SensorImage",
 }
 """Topics that carry messages of the table."""
+
+SINCE_VERSION: Mapping[str, int] = {"/rig": 2, "/sensor_image": 2}
+"""Topics that a recording of a lower version does not have."""
 
 PACKAGE = "chsel"
 _ARRAY_KIND = re.compile(r"([fib]\d)(~?)\[(.*)\]")

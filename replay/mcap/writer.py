@@ -25,6 +25,8 @@ from replay.events import (
     Probe,
     ProblemPosed,
     Recorder,
+    RigDescribed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
@@ -45,15 +47,17 @@ from replay.mcap.foxglove_messages import (
 )
 from replay.mcap.plain_config import config_to_json
 from replay.mcap.schemas import (
-    FORMAT_VERSION,
     PROFILE,
     RECORDS,
+    SINCE_VERSION,
     STEP_TIME,
     descriptor_set,
     message_class,
 )
+from replay.mcap.sensor_messages import image_values, rig_values
 
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
+_FIRST_VERSION = 1
 _LIBRARY = "chsel-replay"  # without versions of packages, which stand in the session's environment
 
 
@@ -69,25 +73,12 @@ class McapRecorder(Recorder):
     def __init__(self, path: str | Path) -> None:
         self._path = Path(path)
         self._closed = False
-        self._count = 0  # messages written so far
-        self._channels: dict[str, int] = {}
-        self._points: KnownPoints | None = None  # all that is known, once a session has started
-        self._sdf_digest = ""
         self._contents = Contents()
         self._order = EventOrder()
-        self._last_snapshot = b""
-        self._last_elites: FloatArray | None = None
+        self._before_steps: list[Event] = []  # as long as a rig may follow
         with self._writing():
             self._file = self._path.open("xb")
-            self._writer = Writer(
-                self._file,
-                chunk_size=_CHUNK_SIZE,
-                compression=CompressionType.ZSTD,
-                enable_crcs=True,
-                enable_data_crcs=True,
-            )
-            self._writer.start(profile=PROFILE, library=_LIBRARY)
-            self._register_channels()
+            self._begin(_FIRST_VERSION)
 
     def record(self, event: Event) -> None:
         """Write one event."""
@@ -98,8 +89,14 @@ class McapRecorder(Recorder):
         with self._writing():
             self._order.take(event)
             check_event(event)
+            if isinstance(event, RigDescribed):
+                self._begin_again(max(SINCE_VERSION.values()))
             self._write(event)
         self._contents.take(event)
+        if self._order.has_rig or self._order.step != BEFORE_ALL_STEPS:
+            self._before_steps.clear()
+        else:
+            self._before_steps.append(event)
 
     def flush(self) -> None:
         """End the chunk in progress and hand it to the operating system."""
@@ -120,9 +117,44 @@ class McapRecorder(Recorder):
                 self._file.close()
             self._closed = True
 
+    def _begin(self, version: int) -> None:
+        """Start a file, of a version that has all topics that its events will need."""
+        self._version = version
+        self._count = 0  # messages written so far
+        self._channels: dict[str, int] = {}
+        self._points: KnownPoints | None = None  # all that is known, once a session has started
+        self._sdf_digest = ""
+        self._last_snapshot = b""
+        self._last_elites: FloatArray | None = None
+        self._writer = Writer(
+            self._file,
+            chunk_size=_CHUNK_SIZE,
+            compression=CompressionType.ZSTD,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        self._writer.start(profile=PROFILE, library=_LIBRARY)
+        self._register_channels()
+
+    def _begin_again(self, version: int) -> None:
+        """Write all events so far once more, in a file of a higher version.
+
+        Only what comes after a session's start tells whether that is needed. A reader of a lower
+        version would pass unknown topics by and take the rest for the whole.
+        """
+        self._file.seek(0)
+        self._file.truncate()
+        self._begin(version)
+        for event in self._before_steps:
+            self._write(event)
+
     def _register_channels(self) -> None:
-        """Describe every topic, used or not, ahead of the first message."""
-        topics: dict[str, Any] = {topic: message_class(name) for topic, name in RECORDS.items()}
+        """Describe every topic of the version, used or not, ahead of the first message."""
+        topics: dict[str, Any] = {
+            topic: message_class(name)
+            for topic, name in RECORDS.items()
+            if SINCE_VERSION.get(topic, 0) <= self._version
+        }
         schemas: dict[str, int] = {}
         for topic, kind in {**topics, **FOXGLOVE}.items():
             name = kind.DESCRIPTOR.full_name
@@ -137,6 +169,11 @@ class McapRecorder(Recorder):
         match event:
             case SessionStarted():
                 self._write_session(event)
+            case RigDescribed():
+                self._record("/rig", event.step, rig_values(event))
+                self._writer.flush()  # so that it is read, or lost, apart from what follows
+            case SensorImage():
+                self._record("/sensor_image", event.step, image_values(event))
             case Probe():
                 self._write_probe(event)
             case ProblemPosed():
@@ -167,7 +204,7 @@ class McapRecorder(Recorder):
         self._sdf_digest = event.sdf.digest
         named = ("runner", "object", "session", "method", "seed", "free_resolution")
         values = {name: getattr(event, name) for name in (*named, "world_from_object")}
-        values["format_version"] = FORMAT_VERSION
+        values["format_version"] = self._version
         values["config"] = config_to_json(event.config)
         values["workspace"] = event.workspace.bounds
         values["environment"] = [{"name": k, "value": v} for k, v in event.environment.items()]

@@ -16,12 +16,15 @@ from replay.rerun.curves import SEARCH_FRAME
 from replay.rerun.legend import LEGEND_FRAME
 from replay.rerun.plane import Frame
 from replay.rerun.scene import CUMULATIVE
+from replay.rerun.sensors import SensorPicture
 
 USUAL_ARCHIVE = Frame(40, 40)
 """Cells of the map that is made room for until the first snapshot is there."""
 _EYE_DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the workspace's middle; probes move along +x
 _EYE_DISTANCE = 1.06  # in diagonals of the workspace
 _LOOK_DOWN = 0.04  # in heights of the workspace, whose near corner would be cut off
+_SENSORS_SHARE = 4.6  # of all other views, where a column of pictures has 1
+_IN_A_COLUMN = 4
 _GRID_LINES = 5  # at least these across the diagonal of the workspace
 
 
@@ -31,11 +34,12 @@ def session_blueprint(
     pose_known: bool,
     archive: Frame | None = USUAL_ARCHIVE,
     timed: bool = False,
+    sensors: Sequence[SensorPicture] = (),
 ) -> rrb.Blueprint:
     """Scene, archive and text above, curves below; opens at the last probe.
 
     archive: size of the heat map in cells; None for a method without an archive. timed: whether
-    there are wall-clock times to show.
+    there are wall-clock times to show. sensors: of a robot session, their pictures beside all.
     """
     scene = rrb.Vertical(scene_view(workspace), legend_view(), row_shares=[9, 1])
     upper: list[rrb.View | rrb.Container] = [scene, _text_views()]
@@ -45,7 +49,12 @@ def session_blueprint(
         shares = [9.0, 7.0, 4.0]
     above = rrb.Horizontal(*upper, column_shares=shares)
     below = rrb.Horizontal(*_curve_views(pose_known=pose_known, timed=timed))
-    return at_last_probe(rrb.Vertical(above, below, row_shares=[65, 35]))
+    views: rrb.Container = rrb.Vertical(above, below, row_shares=[65, 35])
+    if sensors:
+        columns = 1 if len(sensors) <= _IN_A_COLUMN else 2
+        shares = [_SENSORS_SHARE, columns]
+        views = rrb.Horizontal(views, _sensor_views(sensors, columns), column_shares=shares)
+    return at_last_probe(views)
 
 
 def at_last_probe(views: rrb.Container) -> rrb.Blueprint:
@@ -98,6 +107,15 @@ def archive_view(
 ) -> rrb.Spatial2DView:
     """The heat map under the entity `root`; the mouse finds its costs, not its colours."""
     return plane_view(root, name, frame, (0.2, 0.28, 0.2, 0.24), inert=f"/{root}/colors")
+
+
+def _sensor_views(sensors: Sequence[SensorPicture], columns: int) -> rrb.Container:
+    """A picture for each sensor, one above the other."""
+    views = [
+        plane_view(f"sensors/{s.sensor}", s.title, s.frame, (0.02, 0.02, 0.14, 0.02))
+        for s in sensors
+    ]
+    return rrb.Grid(*views, grid_columns=columns)
 
 
 def legend_view(root: str = "legend") -> rrb.Spatial2DView:

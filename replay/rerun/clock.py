@@ -39,6 +39,11 @@ class Clock:
         self._step = step
         self._set()
 
+    def tick(self) -> None:
+        """A moment passes between two registrations, with something of its own to see."""
+        self._now += 1
+        self._set()
+
     def start_registration(self) -> None:
         """A registration starts: one moment after all that was before."""
         self._now += 1

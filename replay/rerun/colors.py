@@ -25,6 +25,8 @@ FREE_FAINT: Rgb = (58, 84, 116)
 OCCUPIED: Rgb = (240, 140, 40)
 KNOWN: Rgb = (225, 120, 220)
 GRIPPER: Rgb = (255, 255, 255)
+HAND: Rgb = (150, 190, 230)
+CAMERA: Rgb = (90, 210, 190)
 PAST: Rgb = (140, 146, 156)
 
 CURVES: dict[str, Rgb] = {

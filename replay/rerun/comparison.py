@@ -76,7 +76,7 @@ def _draw(
 ) -> None:
     drawing = _Comparison(stream, recording, tuple(results))
     drawn: set[int] = set()
-    for event in recording.events():
+    for event in recording.events(images=False):
         if isinstance(event, Probe):
             if event.step > last:
                 return

@@ -17,11 +17,13 @@ from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
 from replay.rerun.clock import Clock
 from replay.rerun.colors import number
 from replay.rerun.curves import Curves, SearchPlot
+from replay.rerun.hand import HandMesh
 from replay.rerun.hypotheses import HypothesisMeshes
 from replay.rerun.legend import Legend
 from replay.rerun.live import live_sink
 from replay.rerun.plane import Frame
 from replay.rerun.scene import Scene, bare_mesh
+from replay.rerun.sensors import SensorImages
 from replay.rerun.text import session_markdown
 
 APPLICATION = "chsel"
@@ -46,6 +48,8 @@ class RerunRecorder(Recorder):
         self._clock = Clock(self._stream)
         self._scene = Scene(self._stream)
         self._meshes = HypothesisMeshes(self._stream)
+        self._hand = HandMesh(self._stream)
+        self._sensors = SensorImages(self._stream)
         self._legend = Legend(self._stream)
         self._archive = ArchiveMap(self._stream)
         self._curves = Curves(self._stream)
@@ -58,7 +62,9 @@ class RerunRecorder(Recorder):
 
     def record(self, event: events.Event) -> None:
         """Draw one event."""
-        self._clock.set_probe(getattr(event, "step", 0))
+        self._clock.set_probe(
+            max(getattr(event, "step", 0), 0)
+        )  # what precedes all is of the first
         self._draw(event)
 
     def flush(self) -> None:
@@ -118,7 +124,20 @@ class RerunRecorder(Recorder):
         self._scene.add_points(event.initial_points, new=False)
 
     @_draw.register
+    def _(self, event: events.RigDescribed) -> None:
+        if event.hand is not None:
+            self._hand.set_up(event.hand)
+
+    @_draw.register
+    def _(self, event: events.SensorImage) -> None:
+        self._clock.tick()
+        if self._sensors.add(event):
+            self._lay_out()
+
+    @_draw.register
     def _(self, event: events.Probe) -> None:
+        self._sensors.end_step()
+        self._hand.draw(event)
         self._scene.add_probe(event)
 
     @_draw.register
@@ -191,5 +210,6 @@ class RerunRecorder(Recorder):
                 pose_known=self._started.world_from_object is not None,
                 archive=self._archive_frame,
                 timed=self._timed,
+                sensors=[*self._sensors.pictures.values()],
             )
             self._stream.send_blueprint(layout)

@@ -91,6 +91,7 @@ def _facts(info: RecordingInfo) -> Table:
         "session": f"{session['session']}, runner {session['runner']}; {counts}",
         "method": f"{session['method']}{preset}, seed {session['seed']}",
         "source": f"recording {session['source']}" if session["source"] else "",
+        "rig": "" if info.rig is None else f"{info.rig['name']}, raw log {info.rig['source']}",
         "true pose": "known" if session["true_pose"] else "unknown",
         "outcome": info.outcome or "not told: the session did not end",
         "size": f"{decimal(info.size)}, of that, uncompressed: {files}",

@@ -31,7 +31,8 @@ def run(given: argparse.Namespace) -> int:
     console = Console(highlight=False, soft_wrap=True)
     _tell_losses(console, found)
     kept = f"{len(found.probes)} probes, {len(found.problems)} registration problems, "
-    console.print(f"kept: {kept}{len(found.results)} results")
+    images = f", {found.images} images" if found.images else ""
+    console.print(f"kept: {kept}{len(found.results)} results{images}")
     console.print(str(out), markup=False)
     return 0
 

@@ -24,6 +24,8 @@ from replay.events import (
     Measured,
     Probe,
     ProblemPosed,
+    RigDescribed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
@@ -112,6 +114,26 @@ def bare_events() -> list[Event]:
         HypothesesFound(1, nothing),
         Measured(1, {}),
     ]
+
+
+def with_sensors(events: list[Event], *, height: int = 5, width: int = 7) -> list[Event]:
+    """The same session of a robot with a camera and a pad: a rig, and images before each probe."""
+    random = np.random.default_rng(11)
+    hand = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
+    made: list[Event] = []
+    for event in events:
+        if isinstance(event, Probe):
+            for sensor, kind in (("camera", "depth"), ("pad_1", "deformation")) * 2:
+                values = random.integers(0, 2**16, (height, width), dtype=np.uint16)
+                pose = _poses(random, 1)[0]
+                intrinsics = np.array([500.0, 501.0, width / 2, -0.5])
+                mask = random.uniform(size=values.shape) < 0.5
+                seen = (values, 0.001, mask, intrinsics, pose)
+                made.append(SensorImage(event.step, sensor, kind, *seen))
+        made.append(event)
+        if isinstance(event, SessionStarted):
+            made.append(RigDescribed(-1, "cabinet", "sha256:0a1b", hand))
+    return made
 
 
 def same_bits(a: Any, b: Any) -> bool:
@@ -203,10 +225,17 @@ def make_events() -> Callable[..., list[Event]]:
     return example_events
 
 
-@pytest.fixture(params=["full", "bare", "start alone"])
+@pytest.fixture
+def sensor_events() -> list[Event]:
+    return with_sensors(example_events())
+
+
+@pytest.fixture(params=["full", "bare", "start alone", "sensors"])
 def any_events(request: pytest.FixtureRequest) -> list[Event]:
     if request.param == "bare":
         return bare_events()
+    if request.param == "sensors":
+        return with_sensors(example_events(steps=2))
     return example_events() if request.param == "full" else example_events()[:1]
 
 

@@ -32,7 +32,12 @@ from replay.registration import recorded_method
 from replay.verification import DIFFERS, EQUAL, Verdict, verify
 from tests.replay.conftest import same_bits
 from tests.replay.mutations import LAYERS, Random, meaning
-from tests.replay.small_recordings import METHODS, registered_session, write_recording
+from tests.replay.small_recordings import (
+    METHODS,
+    registered_session,
+    robot_session,
+    write_recording,
+)
 
 MEANING = "meaning"
 SHARES = {"raw": 0.25, "records": 0.2, "messages": 0.3, MEANING: 0.25}
@@ -64,10 +69,12 @@ class Tally:
 
 
 def originals(folder: Path) -> list[Original]:
-    """A small recording of each method."""
+    """A small recording of each method, and one of a robot with sensors."""
+    sessions = {name: registered_session(name) for name in METHODS}
+    sessions["sensors"] = robot_session("gradient_descent")
     made = []
-    for name in METHODS:
-        data = write_recording(folder / f"{name}.mcap", registered_session(name))
+    for name, events in sessions.items():
+        data = write_recording(folder / f"{name}.mcap", events)
         made.append(Original(name, data, [*read_recording(folder / f"{name}.mcap").events()]))
     return made
 

@@ -30,6 +30,15 @@ _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")  # first and last time, size, checksum
 _EXTREMES = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, 1e9, 1e-9)
 _WHOLE = (-(2**63), -(2**31), -2, -1, 0, 1, 2, 3, 7, 100, 2**31 - 1, 2**32 - 1, 2**63 - 1)
+_WRONG = (
+    ChselError,
+    ValueError,
+    OverflowError,
+    AttributeError,
+    TypeError,
+    KeyError,
+    struct.error,
+)
 _TEXTS = ("", "x", "\x1b[2J", "é" * 7, "a\nb", "nan", "/etc/passwd", "builtins.eval", "9" * 400)
 
 
@@ -117,7 +126,7 @@ def meaning(events: Sequence[Event], path: Path, random: Random) -> bytes | None
             ):
                 return write_recording(path, changed)
         return write_recording(path, changed)
-    except (ChselError, ValueError, OverflowError, AttributeError, TypeError, struct.error):
+    except _WRONG:
         return None
 
 

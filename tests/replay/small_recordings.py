@@ -23,6 +23,8 @@ from replay.events import (
     Measured,
     Probe,
     ProblemPosed,
+    RigDescribed,
+    SensorImage,
     SessionEnded,
     SessionStarted,
 )
@@ -91,6 +93,24 @@ def registered_session(name: str, *, seed: int = 3) -> list[Event]:
         recorder.record(Logged(step, "info", f"probe {step}: contact"))
     recorder.record(SessionEnded(1, "finished"))
     return recorder.events
+
+
+def robot_session(name: str) -> list[Event]:
+    """The same events of a robot: a hand, and a depth and a deformation image before each probe."""
+    random = np.random.default_rng(5)
+    made: list[Event] = []
+    for event in registered_session(name):
+        if isinstance(event, Probe):
+            for sensor, kind in (("camera", "depth"), ("pad", "deformation")):
+                values = random.integers(0, 900, (6, 8), dtype=np.uint16)
+                camera = np.array([9.0, 9.0, 3.5, 2.5])
+                seen = (values, 0.001, values > 300, camera, np.eye(4))
+                made.append(SensorImage(event.step, sensor, kind, *seen))
+        made.append(event)
+        if isinstance(event, SessionStarted):
+            hand = trimesh.creation.box((0.05, 0.04, 0.03))
+            made.append(RigDescribed(-1, "cabinet", "0a1b", hand))
+    return made
 
 
 def write_recording(path: Path, events: Iterable[Event]) -> bytes:

@@ -376,9 +376,9 @@ def test_files_that_cannot_be_used_are_named(events, write, tmp_path, capsys):
             assert message in error
 
 
-def test_every_topic_is_met(events, write):
+def test_every_topic_is_met(sensor_events, write):
     """So that no topic of the table is passed over in silence."""
-    path = write(events)
+    path = write(sensor_events)
     with path.open("rb") as file:
         topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
     assert set(RECORDS) <= topics

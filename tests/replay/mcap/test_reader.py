@@ -334,7 +334,7 @@ def test_another_format_version_is_named_before_all_else(events, write):
         session.ClearField("workspace")
         return session.SerializeToString()
 
-    with pytest.raises(RecordingError, match="newer version: format 2; this one reads up to 1"):
+    with pytest.raises(RecordingError, match="newer version: format 3; this one reads up to 2"):
         read_recording(rewritten(write(events), newer))
 
 
