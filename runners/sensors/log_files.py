@@ -1,0 +1,104 @@
+"""Which files a raw log consists of: one, or those of a rosbag2 folder."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from chsel.errors import SessionError
+from replay.mcap.texts import one_line
+
+ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
+_METADATA = "metadata.yaml"
+_METADATA_ERRORS = (
+    OSError,
+    yaml.YAMLError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RecursionError,
+)
+_LONGEST_METADATA = 2**20  # bytes
+
+
+def log_files(path: Path, remarks: list[str]) -> list[Path]:
+    """The MCAP files of a log in their order; what a user should know of it goes into remarks.
+
+    Raises SessionError if there are none, or if they are compressed or stored in another way.
+    """
+    if not path.exists():
+        raise SessionError(f"log {path} does not exist; {ACCEPTED}")
+    if path.is_file():
+        _require_mcap([path])
+        return [path]
+    if not path.is_dir():
+        raise SessionError(f"log {path} is neither a file nor a folder; {ACCEPTED}")
+    named = _named_files(path, remarks)
+    inside = sorted((file for file in path.iterdir() if file.is_file()), key=_natural)
+    _require_mcap([*named, *inside])
+    found = [file for file in named if file.is_file()]
+    for file in named:
+        if not file.is_file():
+            remarks.append(f"file {file.name}, which {_METADATA} names, is missing")
+    if not found:
+        found = [file for file in inside if file.suffix == ".mcap"]
+    if not found:
+        raise SessionError(f"log {path} is a folder without .mcap files; {ACCEPTED}")
+    return found
+
+
+def _named_files(folder: Path, remarks: list[str]) -> list[Path]:
+    """The files that a bag's metadata name, none if they cannot be read."""
+    try:
+        with (folder / _METADATA).open("rb") as file:
+            text = file.read(_LONGEST_METADATA)
+        about = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        storage, names = about.get("storage_identifier", "mcap"), about["relative_file_paths"]
+        compression = about.get("compression_mode") or ""
+    except FileNotFoundError:
+        remarks.append(f"{_METADATA} is missing: its .mcap files are read in the order of names")
+        return []
+    except _METADATA_ERRORS as error:
+        return _without_metadata(remarks, error)
+    texts = [storage, compression, *names] if isinstance(names, list) else [names]
+    if not all(isinstance(text, str) for text in texts):
+        return _without_metadata(remarks, ValueError("relative_file_paths are no names"))
+    if storage != "mcap":
+        raise SessionError(
+            f"log {folder} has storage {one_line(storage)!r}; {ACCEPTED}: convert it with "
+            "`ros2 bag convert`"
+        )
+    if compression:
+        raise SessionError(
+            f"log {folder} is compressed by rosbag2 ({one_line(compression)}); {ACCEPTED}, not "
+            "compressed but by MCAP itself: convert it with `ros2 bag convert`"
+        )
+    # Some versions put the folder's name ahead; and no file of another folder is the bag's.
+    files = [folder / Path(name.replace("\0", "")).name for name in names]
+    return list(dict.fromkeys(files))
+
+
+def _without_metadata(remarks: list[str], error: Exception) -> list[Path]:
+    reason = one_line(str(error) or type(error).__name__)[:200]
+    remarks.append(
+        f"{_METADATA} cannot be read ({reason}): the .mcap files are read in the order of names"
+    )
+    return []
+
+
+def _require_mcap(files: list[Path]) -> None:
+    for file in files:
+        if file.name.endswith((".mcap.zstd", ".mcap.lz4", ".mcap.zst")):
+            raise SessionError(
+                f"log {file} is compressed as a whole; accepted: .mcap: unpack it with `zstd -d`"
+            )
+
+
+def _natural(path: Path) -> list[Any]:
+    """A key by which bag_2 comes before bag_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

@@ -1,0 +1,101 @@
+"""The ROS 2 messages that are read: their fields, which never come from a file."""
+
+from __future__ import annotations
+
+import re
+
+_HEADER = "std_msgs/Header header"
+_POSE = "geometry_msgs/Pose pose"
+
+DEFINITIONS = {
+    "std_msgs/Header": "builtin_interfaces/Time stamp; string frame_id",
+    "std_msgs/String": "string data",
+    "std_msgs/Bool": "bool data",
+    **{
+        f"std_msgs/{sign}Int{bits}": f"{sign.lower()}int{bits} data"
+        for sign in ("", "U")
+        for bits in (8, 16, 32, 64)
+    },
+    "geometry_msgs/Vector3": "float64 x; float64 y; float64 z",
+    "geometry_msgs/Point": "float64 x; float64 y; float64 z",
+    "geometry_msgs/Quaternion": "float64 x; float64 y; float64 z; float64 w",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation; "
+    "geometry_msgs/Quaternion rotation",
+    "geometry_msgs/Pose": "geometry_msgs/Point position; geometry_msgs/Quaternion orientation",
+    "geometry_msgs/PoseStamped": f"{_HEADER}; {_POSE}",
+    "geometry_msgs/PoseArray": f"{_HEADER}; geometry_msgs/Pose[] poses",
+    "geometry_msgs/PointStamped": f"{_HEADER}; geometry_msgs/Point point",
+    "geometry_msgs/TransformStamped": f"{_HEADER}; string child_frame_id; "
+    "geometry_msgs/Transform transform",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "sensor_msgs/JointState": f"{_HEADER}; string[] name; float64[] position; "
+    "float64[] velocity; float64[] effort",
+    "sensor_msgs/Image": f"{_HEADER}; uint32 height; uint32 width; string encoding; "
+    "uint8 is_bigendian; uint32 step; uint8[] data",
+    "sensor_msgs/CompressedImage": f"{_HEADER}; string format; uint8[] data",
+    "sensor_msgs/RegionOfInterest": "uint32 x_offset; uint32 y_offset; uint32 height; "
+    "uint32 width; bool do_rectify",
+    "sensor_msgs/CameraInfo": f"{_HEADER}; uint32 height; uint32 width; string distortion_model; "
+    "float64[] d; float64[9] k; float64[9] r; float64[12] p; uint32 binning_x; uint32 binning_y; "
+    "sensor_msgs/RegionOfInterest roi",
+    "sensor_msgs/PointField": "string name; uint32 offset; uint8 datatype; uint32 count",
+    "sensor_msgs/PointCloud2": f"{_HEADER}; uint32 height; uint32 width; "
+    "sensor_msgs/PointField[] fields; bool is_bigendian; uint32 point_step; uint32 row_step; "
+    "uint8[] data; bool is_dense",
+}
+"""Fields by the name of the message, of which names in files have "/msg" besides."""
+
+_LONGEST_TEXT = 2**16
+_SAME = {"byte": "uint8", "char": "uint8"}
+_LIMIT = re.compile(r"<=\d+")
+
+
+def short_name(name: str) -> str:
+    """The name of a message as `DEFINITIONS` has it."""
+    return name.replace("/msg/", "/")
+
+
+def full_definition(name: str) -> str:
+    """The definition of a message with those of all that it is made of, as ROS 2 writes them."""
+    needed = [name]
+    for found in needed:
+        for kind, _ in _fields(DEFINITIONS[found]):
+            inner = kind.split("[")[0]
+            if inner in DEFINITIONS and inner not in needed:
+                needed.append(inner)
+    parts = [DEFINITIONS[found].replace("; ", "\n") for found in needed]
+    for index, inner in enumerate(needed[1:], 1):
+        parts[index] = f"MSG: {inner}\n{parts[index]}"
+    return f"\n{'=' * 80}\n".join(parts)
+
+
+def is_laid_out(name: str, text: str) -> bool:
+    """Whether a definition in a file has the fields of the one that is read in its place.
+
+    Texts of other parts than the message's own are those of ROS 2 itself, and not looked at.
+    """
+    if len(text) > _LONGEST_TEXT:
+        return False
+    own = re.split(r"^={3,}\s*$", text, maxsplit=1, flags=re.MULTILINE)[0]
+    lines = "; ".join(line.split("#")[0] for line in own.splitlines())
+    return not lines.strip("; ") or _plain(lines) == _plain(DEFINITIONS[name])
+
+
+def _plain(text: str) -> list[tuple[str, str]]:
+    """Types without packages and limits, names in small letters: what texts agree in."""
+    plain = []
+    for kind, name in _fields(text):
+        kind = _LIMIT.sub("", kind).rsplit("/", 1)[-1]
+        base, bracket, rest = kind.partition("[")
+        plain.append((_SAME.get(base, base) + bracket + rest, name.lower()))
+    return plain
+
+
+def _fields(text: str) -> list[tuple[str, str]]:
+    """Types and names of the fields of a definition without comments; constants are none."""
+    found = []
+    for part in text.split(";"):
+        words = part.split()
+        if len(words) >= 2 and not any("=" in word for word in words[1:3]):
+            found.append((words[0], words[1]))
+    return found

@@ -1,0 +1,268 @@
+"""Small logs as robots write them, with one message or more of all kinds that are read."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from mcap_ros2.writer import Writer
+from PIL import Image
+
+from runners.sensors.ros2_definitions import full_definition
+
+SECOND = 10**9
+BEGIN = 1_700_000_000 * SECOND
+QUARTER_TURN = (0.0, 0.0, 0.5**0.5, 0.5**0.5)  # about z
+
+Sent = tuple[str, str, Any, int]  # topic, type, message, log time
+
+
+def write_ros2(
+    path: Path,
+    sent: Sequence[Sent],
+    *,
+    chunk_size: int = 2000,
+    compression: CompressionType = CompressionType.ZSTD,
+    finished: bool = True,
+) -> bytes:
+    """A ROS 2 log; its bytes."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_size, compression=compression)
+        schemas: dict[str, Any] = {}
+        for topic, kind, message, log_time in sent:
+            if kind not in schemas:
+                name = kind.replace("/", "/msg/")
+                schemas[kind] = writer.register_msgdef(name, full_definition(kind))
+            writer.write_message(topic, schemas[kind], message, log_time)
+        if finished:
+            writer.finish()
+    return path.read_bytes()
+
+
+def write_foxglove(path: Path, sent: Sequence[tuple[str, Any, int]]) -> bytes:
+    """A log of Foxglove's messages; its bytes."""
+    with path.open("wb") as file:
+        writer = McapWriter(file, chunk_size=2000)
+        writer.start()
+        channels: dict[str, int] = {}
+        for topic, message, log_time in sent:
+            if topic not in channels:
+                name = message.DESCRIPTOR.full_name
+                schema = writer.register_schema(name, "protobuf", b"of no matter")
+                channels[topic] = writer.register_channel(topic, "protobuf", schema)
+            writer.add_message(channels[topic], log_time, message.SerializeToString(), log_time)
+        writer.finish()
+    return path.read_bytes()
+
+
+def header(frame: str, stamp: int) -> dict[str, Any]:
+    """A std_msgs/Header."""
+    seconds, nanoseconds = divmod(stamp, SECOND)
+    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
+
+
+def ros2_image(values: np.ndarray, stamp: int, **changes: Any) -> dict[str, Any]:
+    """A sensor_msgs/Image, its rows with four bytes of padding."""
+    rows = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), -1)
+    rows = np.pad(rows, ((0, 0), (0, 4)))
+    message = {
+        "header": header("camera", stamp),
+        "height": values.shape[0],
+        "width": values.shape[1],
+        "encoding": "16UC1" if values.dtype.itemsize == 2 else "32FC1",
+        "is_bigendian": int(values.dtype.byteorder == ">"),
+        "step": rows.shape[1],
+        "data": rows.tobytes(),
+    }
+    return {**message, **changes}
+
+
+def ros2_transform(
+    parent: str,
+    child: str,
+    position: Sequence[float],
+    stamp: int,
+    quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+) -> dict[str, Any]:
+    """A geometry_msgs/TransformStamped."""
+    transform = {
+        "translation": dict(zip("xyz", position, strict=True)),
+        "rotation": dict(zip("xyzw", quaternion, strict=True)),
+    }
+    return {"header": header(parent, stamp), "child_frame_id": child, "transform": transform}
+
+
+def ros2_cloud(points: np.ndarray, stamp: int) -> dict[str, Any]:
+    """A sensor_msgs/PointCloud2 of one row: z first, y as float64, then four bytes of nothing."""
+    kind = np.dtype({"names": list("zxy"), "formats": [">f4", ">f4", ">f8"], "itemsize": 20})
+    packed = np.zeros(len(points), kind)
+    for axis, name in enumerate("xyz"):
+        packed[name] = points[:, axis]
+    fields = [
+        {"name": name, "offset": kind.fields[name][1], "datatype": 8 if name == "y" else 7}
+        for name in "zxy"
+    ]
+    return {
+        "header": header("lidar", stamp),
+        "height": 1,
+        "width": len(points),
+        "fields": [{**field, "count": 1} for field in fields],
+        "is_bigendian": True,
+        "point_step": 20,
+        "row_step": 20 * len(points),
+        "data": packed.tobytes(),
+        "is_dense": True,
+    }
+
+
+def png(values: np.ndarray) -> bytes:
+    """A grey PNG, of 8 or 16 bits as the values (H, W) are."""
+    file = BytesIO()
+    Image.fromarray(values).save(file, "PNG")
+    return file.getvalue()
+
+
+def depth(seed: int = 0) -> np.ndarray:
+    """A depth image (3, 5), millimetres."""
+    return np.random.default_rng(seed).integers(300, 900, (3, 5)).astype(np.uint16)
+
+
+def ros2_sent(count: int = 4) -> list[Sent]:
+    """What a robot sends in a few seconds; log times are 1 ms after the stamps."""
+    sent: list[Sent] = []
+    camera = {
+        "header": header("camera", BEGIN),
+        "height": 3,
+        "width": 5,
+        "distortion_model": "plumb_bob",
+        "d": [0.0] * 5,
+        "k": [400.0, 0.0, 2.0, 0.0, 410.0, 1.0, 0.0, 0.0, 1.0],
+        "r": [0.0] * 9,
+        "p": [0.0] * 12,
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+    }
+    for step in range(count):
+        stamp = BEGIN + step * SECOND
+        quantised = struct.pack("<iff", 1, 100.0, -20.0) + png(depth(step))
+        pose = {
+            "position": {"x": 1.0, "y": 2.0, "z": 3.0},
+            "orientation": dict(zip("xyzw", QUARTER_TURN, strict=True)),
+        }
+        of_step: list[tuple[str, str, Any]] = [
+            ("/tf_static", "tf2_msgs/TFMessage", [("base", "camera", (0.0, 0.0, 1.0))]),
+            ("/tf", "tf2_msgs/TFMessage", [("world", "base", (step, 0.0, 0.0))]),
+            ("/depth", "sensor_msgs/Image", ros2_image(depth(step), stamp)),
+            (
+                "/compressed",
+                "sensor_msgs/CompressedImage",
+                {"header": header("camera", stamp), "format": "png", "data": png(depth(step))},
+            ),
+            (
+                "/quantised",
+                "sensor_msgs/CompressedImage",
+                {
+                    "header": header("camera", stamp),
+                    "format": "32FC1; compressedDepth png",
+                    "data": quantised,
+                },
+            ),
+            ("/info", "sensor_msgs/CameraInfo", {**camera, "header": header("camera", stamp)}),
+            ("/pose", "geometry_msgs/PoseStamped", {"header": header("base", stamp), "pose": pose}),
+            (
+                "/poses",
+                "geometry_msgs/PoseArray",
+                {"header": header("base", stamp), "poses": [pose, pose]},
+            ),
+            (
+                "/point",
+                "geometry_msgs/PointStamped",
+                {"header": header("base", stamp), "point": {"x": 1.0, "y": 0.0, "z": 2.0}},
+            ),
+            (
+                "/joints",
+                "sensor_msgs/JointState",
+                {
+                    "header": header("", stamp),
+                    "name": ["elbow", "wrist"],
+                    "position": [0.5, -0.25],
+                    "velocity": [],
+                    "effort": [],
+                },
+            ),
+            ("/cloud", "sensor_msgs/PointCloud2", ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)),
+            ("/probe", "std_msgs/String", {"data": f"begin {step}"}),
+            ("/touch", "std_msgs/Bool", {"data": step % 2 == 0}),
+            ("/count", "std_msgs/Int32", {"data": -step}),
+        ]
+        for topic, kind, message in of_step:
+            if kind == "tf2_msgs/TFMessage":
+                message = {"transforms": [ros2_transform(*one, stamp) for one in message]}
+            sent.append((topic, kind, message, stamp + 10**6))
+    return sent
+
+
+def foxglove_sent() -> list[tuple[str, Any, int]]:
+    """A message of each kind of Foxglove's."""
+    x, y, z, w = QUARTER_TURN
+    time = {"seconds": BEGIN // SECOND, "nanos": 5}
+    pose = {
+        "position": {"x": 1.0, "y": 2.0, "z": 3.0},
+        "orientation": {"x": x, "y": y, "z": z, "w": w},
+    }
+    metres = np.array([[0.5, np.nan], [0.25, 2.0]], "<f4")
+    transform = FrameTransform(
+        timestamp=time,
+        parent_frame_id="world",
+        child_frame_id="base",
+        translation={"x": 1.0},
+        rotation={"x": 2 * x, "y": 2 * y, "z": 2 * z, "w": 2 * w},
+    )
+    fields = [
+        PackedElementField(name=name, offset=4 * index, type=PackedElementField.FLOAT32)
+        for index, name in enumerate("xyz")
+    ]
+    cloud = PointCloud(
+        timestamp=time,
+        frame_id="lidar",
+        pose=pose,
+        point_stride=12,
+        fields=fields,
+        data=np.array([[1.0, 0.0, 0.0]], "<f4").tobytes(),
+    )
+    info = CameraCalibration(timestamp=time, frame_id="camera", width=2, height=2)
+    info.K.extend([400.0, 0.0, 1.0, 0.0, 410.0, 0.5, 0.0, 0.0, 1.0])
+    image = RawImage(timestamp=time, frame_id="camera", width=2, height=2, encoding="32FC1")
+    image.step, image.data = 8, metres.tobytes()
+    packed = CompressedImage(timestamp=time, frame_id="camera", format="png", data=png(depth()))
+    sent = [
+        ("/tf", transform),
+        ("/transforms", FrameTransforms(transforms=[transform, transform])),
+        ("/depth", image),
+        ("/compressed", packed),
+        ("/info", info),
+        ("/pose", PoseInFrame(timestamp=time, frame_id="base", pose=pose)),
+        ("/poses", PosesInFrame(timestamp=time, frame_id="base", poses=[pose])),
+        ("/cloud", cloud),
+        ("/log", Log(timestamp=time, message="begin 1")),
+        ("/pair", KeyValuePair(key="begin", value="2")),
+    ]
+    return [(topic, message, BEGIN + index) for index, (topic, message) in enumerate(sent)]

@@ -1,0 +1,109 @@
+"""Images and clouds as bytes: both orders of bytes, padding, and what is no depth."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from runners.sensors.images import compressed_pixels, pixel_rows, png_pixels
+from runners.sensors.packed_points import named_fields, packed_points
+from runners.sensors.unusable import UnusableMessage
+from tests.runners.sensors.small_logs import png
+
+VALUES = np.random.default_rng(0).integers(0, 2**16, (4, 7)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+@pytest.mark.parametrize(("encoding", "kind"), [("16UC1", "u2"), ("mono16", "u2"), ("32FC1", "f4")])
+@pytest.mark.parametrize("padding", [0, 3])
+def test_rows_of_pixels(encoding: str, kind: str, big_endian: bool, padding: int) -> None:
+    stored = VALUES.astype((">" if big_endian else "<") + kind)
+    rows = np.pad(stored.view(np.uint8).reshape(4, -1), ((0, 0), (0, padding)))
+    found = pixel_rows(rows.tobytes(), encoding, (7, 4), rows.shape[1], big_endian=big_endian)
+    assert found.dtype == np.dtype(kind)
+    assert found.dtype.isnative
+    np.testing.assert_array_equal(found, VALUES)
+
+
+@pytest.mark.parametrize(
+    ("size", "step", "reason"),
+    [
+        ((7, 5), 14, "cannot have 56 bytes"),
+        ((7, 4), 13, "cannot have 56 bytes"),
+        ((0, 4), 14, "0 x 4 pixels"),
+        ((2**16, 2**16), 2**17, "accepted: 1 to 33554432"),
+    ],
+)
+def test_rows_that_do_not_fit_are_refused(size: tuple[int, int], step: int, reason: str) -> None:
+    with pytest.raises(UnusableMessage, match=reason):
+        pixel_rows(VALUES.tobytes(), "16UC1", size, step)
+
+
+def test_png_is_read_only_if_it_is_depth() -> None:
+    np.testing.assert_array_equal(png_pixels(png(VALUES)), VALUES)
+    colour = np.zeros((2, 2, 3), np.uint8)
+    for data, reason in (
+        (png(VALUES.astype(np.uint8)), "8 bits, grey"),
+        (png(colour), "8 bits, RGB"),
+        (png(VALUES)[:-40], "broken"),
+        (png(VALUES)[:20], "ends within its head"),
+        (b"\xff\xd8\xff\xe0", "JPEG"),
+        (b"", "accepted: PNG"),
+    ):
+        with pytest.raises(UnusableMessage, match=reason):
+            png_pixels(data)
+
+
+def test_a_bomb_is_refused_before_it_is_unpacked() -> None:
+    bomb = bytearray(png(VALUES))
+    struct.pack_into(">II", bomb, 16, 60_000, 60_000)
+    with pytest.raises(UnusableMessage, match="60000 x 60000 pixels"):
+        png_pixels(bytes(bomb))
+
+
+def test_compressed_depth_is_that_of_image_transport() -> None:
+    whole = struct.pack("<iff", 0, 0.0, 0.0) + png(VALUES)
+    np.testing.assert_array_equal(compressed_pixels(whole, "16UC1; compressedDepth png"), VALUES)
+    depth = np.array([[0.5, 2.0], [8.0, np.nan]])  # as the sender quantises: n = a / depth + b
+    scale, offset = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0
+    numbers = np.where(np.isnan(depth), 0, np.rint(scale / np.nan_to_num(depth, nan=1.0) + offset))
+    data = struct.pack("<iff", 1, scale, offset) + png(numbers.astype(np.uint16))
+    found = compressed_pixels(data, "32FC1; compressedDepth")
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, depth, rtol=5e-3)
+    for text, reason in (("16UC1; compressedDepth rvl", "RVL"), ("16UC1; compressedDepth", "PNG")):
+        with pytest.raises(UnusableMessage, match=reason):
+            compressed_pixels(bytes(30), text)
+    with pytest.raises(UnusableMessage, match="quantisation"):
+        compressed_pixels(
+            struct.pack("<iff", 1, np.nan, 0.0) + png(VALUES), "32FC1; compressedDepth"
+        )
+
+
+def test_points_of_several_rows_with_gaps() -> None:
+    points = np.random.default_rng(1).normal(size=(2, 3, 3))
+    layout = np.dtype(
+        {"names": list("xyz"), "formats": ["<f8"] * 3, "offsets": [8, 16, 0], "itemsize": 30}
+    )
+    packed = np.zeros((2, 3), layout)
+    for axis, name in enumerate("xyz"):
+        packed[name] = points[:, :, axis]
+    rows = np.pad(packed.view(np.uint8).reshape(2, 90), ((0, 0), (0, 40)))
+    fields = named_fields([("x", 8, 8), ("intensity", 24, 4), ("y", 16, 8), ("z", 0, 8)])
+    found = packed_points(rows.tobytes(), fields, 30, size=(3, 2), row=130)
+    np.testing.assert_array_equal(found, points.reshape(-1, 3))
+    for stride, size, row, reason in (
+        (23, (3, 2), 130, "out of its 23 bytes"),
+        (30, (5, 2), 130, "cannot have 260 bytes"),
+        (30, (3, 3), 130, "cannot have 260 bytes"),
+    ):
+        with pytest.raises(UnusableMessage, match=reason):
+            packed_points(rows.tobytes(), fields, stride, size=size, row=row)
+    assert packed_points(b"", fields, 30, size=(0, 1), row=0).shape == (0, 3)
+
+
+def test_clouds_without_places_are_refused() -> None:
+    with pytest.raises(UnusableMessage, match="lacks the field z"):
+        named_fields([("x", 0, 7), ("y", 4, 7)])
+    with pytest.raises(UnusableMessage, match="y of a point cloud is no float"):
+        named_fields([("x", 0, 7), ("y", 4, 5), ("z", 8, 7)])

@@ -1,0 +1,78 @@
+"""Files that say where an object is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chsel.errors import ChselError, RecordingError, SessionError
+from chsel.pose import compose, rotation_vector
+from runners.sensors.pose_file import beside, read_pose, read_pose_file, write_pose
+
+POSE = compose(rotation_vector(np.array([0.3, -1.2, 0.4])), np.array([0.9, -0.05, 0.31]))
+ROWS = "world_from_object: [[1,0,0,0.5],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+
+
+def test_a_pose_is_read_as_it_was_written_with_all_that_stands_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "log.pose.yaml"
+    write_pose(path, POSE, {"cost": 0.25, "search": {"spans": (1, 2)}})
+    np.testing.assert_allclose(read_pose(path), POSE, atol=1e-15)
+    assert read_pose_file(path).about == {"cost": 0.25, "search": {"spans": [1, 2]}}
+
+
+def test_a_pose_file_is_replaced_only_if_that_is_wanted(tmp_path: Path) -> None:
+    path = tmp_path / "log.pose.yaml"
+    write_pose(path, POSE, {})
+    with pytest.raises(RecordingError, match="exists; accepted: the name of a new file"):
+        write_pose(path, np.eye(4), {})
+    np.testing.assert_allclose(read_pose(path), POSE, atol=1e-15)
+    write_pose(path, np.eye(4), {}, overwrite=True)
+    np.testing.assert_array_equal(read_pose(path), np.eye(4))
+    assert [file.name for file in tmp_path.iterdir()] == ["log.pose.yaml"]
+
+
+def test_the_pose_of_a_log_is_beside_it(tmp_path: Path) -> None:
+    assert beside(tmp_path / "a.b.mcap") == tmp_path / "a.b.pose.yaml"
+    assert beside(tmp_path / "bag_2024.01.02") == tmp_path / "bag_2024.01.02.pose.yaml"
+    assert beside("log.mcap").is_absolute()
+
+
+def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
+    path = tmp_path / "hand.yaml"
+    rows = [[0.866, -0.5, 0, 0.9], [0.5, 0.866, 0, 0], [0, 0, 1, 0.31], [0, 0, 0, 1]]
+    path.write_text(f"world_from_object: {rows}")
+    rotation = read_pose(path)[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(np.arctan2(rotation[1, 0], rotation[0, 0]), np.pi / 6, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is not such a file"),
+        ("world_from_object: [1, 2, 3]", "no world_from_object of 4 x 4 numbers"),
+        (ROWS.replace("0.5", ".nan"), "no world_from_object of 4 x 4 numbers"),
+        (ROWS.replace("0.5", "true"), "no world_from_object of 4 x 4 numbers"),
+        (ROWS.replace("[[1,", "[[2,"), "world_from_object is not rigid"),
+        (ROWS.replace("[[1,", "[[-1,"), "world_from_object is not rigid"),
+        ("world_from_object: [[[", "is no YAML"),
+        ("a: &a [*a, *a]\nworld_from_object: *a", "no world_from_object of 4 x 4 numbers"),
+        ("[" * 20_000, "is no YAML"),
+        ("x: " + "y" * 1_000_001, "is not such a file"),
+        ("world_from_object: !!python/object/apply:os.getcwd []", "is no YAML"),
+    ],
+)
+def test_another_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "pose.yaml"
+    path.write_text(text)
+    with pytest.raises(SessionError, match=message) as error:
+        read_pose(path)
+    assert "\n" not in str(error.value)
+    assert "accepted: YAML with world_from_object" in str(error.value)
+
+
+def test_a_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ChselError, match=r"pose file .* cannot be read"):
+        read_pose(tmp_path / "none.yaml")

@@ -1,0 +1,174 @@
+"""The tree of transforms: interpolation, gaps, and trees that are none."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from chsel.arrays import FloatArray
+from chsel.pose import axis_angle, compose, inverse, random_rotations, rotation_angle
+from runners.sensors.messages import TransformMessage
+from runners.sensors.quaternions import rigid, unit_quaternion
+from runners.sensors.transforms import TransformError, TransformTree
+from runners.sensors.unusable import UnusableMessage
+
+SECOND = 10**9
+X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def pose(x: float = 0.0, angle: float = 0.0, axis: FloatArray = Z) -> FloatArray:
+    return compose(axis_angle(axis, angle), np.array([x, 0.0, 0.0]))
+
+
+def tree(*transforms: tuple[float, str, str, FloatArray]) -> TransformTree:
+    """Transforms at seconds; None of them static."""
+    made = TransformTree()
+    for time, parent, child, parent_from_child in transforms:
+        made.add(int(time * SECOND), TransformMessage(parent, child, parent_from_child))
+    return made
+
+
+def test_between_samples_it_goes_straight_and_along_the_shorter_arc() -> None:
+    start, end = 3.0, 3.0 - 2 * np.pi + 0.5  # 0.5 rad further, the long way round as numbers
+    moving = tree((1, "a", "b", pose(0.0, start)), (2, "a", "b", pose(1.0, end)))
+    for time, x, angle in ((1.0, 0.0, 3.0), (1.5, 0.5, 3.25), (1.9, 0.9, 3.45), (2.0, 1.0, 3.5)):
+        found = moving.lookup("a", "b", int(time * SECOND), gap_s=1.0)
+        np.testing.assert_allclose(found, pose(x, angle), atol=1e-12)
+        back = moving.lookup("b", "a", int(time * SECOND), gap_s=1.0)
+        np.testing.assert_allclose(back, inverse(pose(x, angle)), atol=1e-12)
+
+
+def test_a_chain_joins_static_and_moving_frames_over_their_common_root() -> None:
+    made = tree(
+        (0, "world", "arm", pose(1.0, np.pi / 2)),
+        (1, "world", "arm", pose(1.0, np.pi / 2)),
+        (0, "world", "stand", pose(-1.0)),
+        (1, "world", "stand", pose(-3.0)),
+    )
+    camera = pose(0.5, 0.3, X)
+    made.add(0, TransformMessage("arm", "camera", camera, static=True))
+    found = made.lookup("stand", "camera", SECOND // 2, gap_s=1.0)
+    expected = inverse(pose(-2.0)) @ pose(1.0, np.pi / 2) @ camera
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_array_equal(made.lookup("arm", "arm", 5, gap_s=1.0), np.eye(4))
+
+
+def test_order_and_repetition_do_not_matter() -> None:
+    random = np.random.default_rng(0)
+    samples = [(i / 10, "a", "b", pose(random.normal(), 3 * random.normal())) for i in range(30)]
+    mixed = [samples[i] for i in random.permutation(30)] + samples[5:9]
+    stamps = random.integers(0, 29 * SECOND // 10, 50)
+    expected, all_valid = tree(*samples).lookups("a", "b", stamps, gap_s=0.2)
+    found, valid = tree(*mixed).lookups("a", "b", stamps, gap_s=0.2)
+    assert all_valid.all()
+    assert valid.all()
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_gaps_and_ends_are_bridged_as_far_as_told() -> None:
+    made = tree(*((time, "a", "b", pose(time)) for time in (1.0, 1.4, 3.0)))
+    times = np.array([0.4, 0.6, 1.2, 1.4, 1.5, 2.9, 3.0, 3.5, 3.6])
+    stamps = (times * SECOND).astype(np.int64)
+    poses, valid = made.lookups("a", "b", stamps, gap_s=0.5)
+    assert valid.tolist() == [False, True, True, True, False, False, True, True, False]
+    np.testing.assert_allclose(poses[valid][:, 0, 3], [1.0, 1.2, 1.4, 3.0, 3.0])
+    assert np.isnan(poses[~valid]).all()
+    with pytest.raises(TransformError, match=r"b in a is not known at 2\.500 s; .* 0\.500 s after"):
+        made.lookup("a", "b", int(2.5 * SECOND), gap_s=0.5)
+    with pytest.raises(TransformError, match=r"not known at 4\.000 s; .* 1\.000 s before"):
+        made.lookup("a", "b", 4 * SECOND, gap_s=0.5)
+
+
+def test_what_is_missing_is_said() -> None:
+    made = tree((0, "world", "arm", pose()), (0, "map", "camera", pose()))
+    with pytest.raises(TransformError, match="frame wrist is in no transform; there are arm, cam"):
+        made.lookup("world", "wrist", 0, gap_s=1.0)
+    trees = "world: arm, world; map: camera, map"
+    with pytest.raises(TransformError, match=f"world and camera are not connected.*{trees}"):
+        made.lookup("world", "camera", 0, gap_s=1.0)
+    with pytest.raises(TransformError, match="there are none"):
+        TransformTree().lookup("a", "b", 0, gap_s=1.0)
+
+
+def test_two_parents_and_cycles_are_faults_and_the_first_counts() -> None:
+    made = tree(
+        (0, "a", "b", pose(1.0)),
+        (0, "b", "c", pose(2.0)),
+        (1, "x", "c", pose(5.0)),
+        (1, "c", "a", pose(5.0)),
+        (1, "d", "d", pose(5.0)),
+    )
+    assert made.faults == {
+        "frame c has two parents, b and x": 1,
+        "frame a is its own ancestor, by way of c": 1,
+        "frame d is its own ancestor, by way of d": 1,
+    }
+    np.testing.assert_allclose(made.lookup("a", "c", 0, gap_s=1.0), pose(3.0))
+    assert made.frames == ["a", "b", "c"]
+
+
+def test_of_static_transforms_the_latest_holds_and_a_change_is_a_fault() -> None:
+    made = TransformTree()
+    for time, x in ((5, 1.0), (9, 2.0), (7, 3.0), (9, 2.0)):
+        made.add(time, TransformMessage("a", "b", pose(x), static=True))
+    np.testing.assert_allclose(made.lookup("a", "b", 10**18, gap_s=0.1), pose(2.0))
+    assert made.faults == {"frame b is said to be static in several places": 2}
+
+
+def test_ever_new_frames_take_neither_time_nor_memory() -> None:
+    made = TransformTree()
+    for index in range(1500):
+        made.add(0, TransformMessage(f"f{index}", f"f{index + 1}", np.eye(4)))
+    assert made.faults == {"there are more than 1024 frames": 1500 - 1024}
+    made.lookup("f0", "f1024", 0, gap_s=1.0)
+
+
+def test_a_sample_takes_64_bytes_and_room_to_grow() -> None:
+    message = TransformMessage("a", "b", pose(1.0, 0.5))
+    made = TransformTree()
+    tracemalloc.start()
+    for stamp in range(20_000):
+        made.add(stamp, message)
+    used = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert used < 20_000 * 64 * 1.15
+
+
+def test_quaternions_and_rotations_are_each_others_inverse() -> None:
+    turns = random_rotations(np.random.default_rng(1), 200)
+    halves = [axis_angle(axis, np.pi) for axis in np.eye(3)]  # where the usual formula divides by 0
+    for rotation in [*turns, np.eye(3), *halves]:
+        transform = compose(rotation, np.array([1.0, 2.0, 3.0]))
+        quaternion = unit_quaternion(transform.tolist())
+        again = rigid([1.0, 2.0, 3.0], [1e300 * value for value in quaternion])
+        np.testing.assert_allclose(again, transform, atol=1e-14)
+
+
+def test_interpolation_turns_at_a_constant_rate() -> None:
+    first, second = random_rotations(np.random.default_rng(2), 2)
+    whole = rotation_angle(first.T @ second)
+    made = tree(
+        (0, "a", "b", compose(first, np.zeros(3))), (1, "a", "b", compose(second, np.zeros(3)))
+    )
+    for fraction in (0.1, 0.5, 0.8):
+        found = made.lookup("a", "b", int(fraction * SECOND), gap_s=1.0)
+        np.testing.assert_allclose(
+            rotation_angle(first.T @ found[:3, :3]), fraction * whole, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize(
+    ("position", "quaternion"),
+    [
+        ((0, 0, 0), (0, 0, 0, 0)),
+        ((0, 0, 0), (0, np.nan, 0, 1)),
+        ((0, 0, 0), (0, np.inf, 0, 1)),
+        ((0, np.nan, 0), (0, 0, 0, 1)),
+        ((-np.inf, 0, 0), (0, 0, 0, 1)),
+    ],
+)
+def test_poses_that_are_none_are_refused(
+    position: tuple[float, ...], quaternion: tuple[float, ...]
+) -> None:
+    with pytest.raises(UnusableMessage):
+        rigid(position, quaternion)
