@@ -35,10 +35,10 @@ def test_a_room_imports_only_what_it_may(room: str) -> None:
     assert not {file: names for file, names in found.items() if names}
 
 
-def test_the_physics_engine_is_imported_by_its_session_alone() -> None:
+def test_the_physics_engine_is_imported_in_one_place() -> None:
     files = (REPOSITORY / "runners").rglob("*.py")
     users = {file.name for file in files if imported(file) & {"pybullet", "pybullet_data"}}
-    assert users == {"simulated.py"}
+    assert users == {"physics_engine.py"}
 
 
 def test_nothing_imports_the_physics_engine_before_it_is_needed() -> None:

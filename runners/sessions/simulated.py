@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import os
-import sys
 import tempfile
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +13,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from chsel.arrays import FloatArray
-from chsel.errors import SessionError
 from chsel.pose import apply, compose, inverse
+from runners.physics_engine import connect, silent
 from runners.sessions import hand
 from runners.sessions.configurations import Configuration, find_configuration
 from runners.sessions.placement import centre_of_mass, laid_down, lowest
@@ -131,16 +126,7 @@ _POINT_ON_B, _NORMAL_ON_B, _FORCE = 6, 7, 9
 
 def _new_world() -> Any:
     """A world of its own with a floor; SessionError where PyBullet is not installed."""
-    with _silent():
-        try:
-            import pybullet
-            from pybullet_utils.bullet_client import BulletClient
-        except ImportError:
-            raise SessionError(
-                "PyBullet is not installed (it has wheels for Python 3.11 only); "
-                "use session=kinematic, the same session without a physics engine"
-            ) from None
-        world = BulletClient(pybullet.DIRECT)
+    world = connect("use session=kinematic, the same session without a physics engine")
     world.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
     world.setTimeStep(TIME_STEP)
     floor = world.createMultiBody(0, world.createCollisionShape(world.GEOM_PLANE))
@@ -187,7 +173,7 @@ def _collision_file(world: Any, mesh: trimesh.Trimesh, folder: Path, kind: str) 
     _write_obj(whole, [mesh])
     if kind == "visual":
         return whole
-    with _silent():
+    with silent():
         world.vhacd(str(whole), str(parts), str(folder / "log.txt"))
     return parts
 
@@ -230,24 +216,3 @@ def _write_obj(path: Path, meshes: list[trimesh.Trimesh]) -> None:
         lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + first).tolist()]
         first += len(mesh.vertices)
     path.write_text("\n".join(lines) + "\n")
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Swallow what compiled code prints meanwhile: PyBullet greets, and VHACD reports at length."""
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    kept = [os.dup(descriptor) for descriptor in _OUTPUTS]
-    with open(os.devnull, "w") as nowhere:
-        for descriptor in _OUTPUTS:
-            os.dup2(nowhere.fileno(), descriptor)
-    try:
-        yield
-    finally:
-        ctypes.CDLL(None).fflush(None)  # what C still holds back
-        for descriptor, copy in zip(_OUTPUTS, kept, strict=True):
-            os.dup2(copy, descriptor)
-            os.close(copy)
-
-
-_OUTPUTS = (1, 2)

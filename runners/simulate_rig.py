@@ -1,0 +1,137 @@
+"""Simulate the paper's cabinet and write the robot's raw log: python -m runners.simulate_rig."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.filesize import decimal
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from chsel.errors import SettingError
+from chsel.settings import build_settings
+from chsel.streams import StreamKey
+from runners.cli import command, plain
+from runners.evaluation.whole_file import WritingError, whole_file
+from runners.objects.loader import ObjectConfig, load_object
+from runners.objects.scans import AssetsConfig
+from runners.twin.configurations import CabinetConfiguration, find_cabinet_configuration
+from runners.twin.settings import TwinSettings
+from runners.twin.simulation import Push, SimulatedLog, probe_count, simulate_log
+
+EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here
+
+
+@dataclass(frozen=True)
+class SimulateRigConfig:
+    """conf/simulate_rig.yaml but for the settings of the twin. object: checked where it is used."""
+
+    configuration: str
+    object: Any
+    assets: AssetsConfig
+    out: str | None = None
+    overwrite: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        StreamKey(self.seed, 0)
+        if not self.out or Path(self.out).suffix != ".mcap":
+            raise SettingError(f"out is {self.out}; accepted: the name of a file, out=FILE.mcap")
+
+
+@command("simulate_rig")
+def main(config: DictConfig) -> None:
+    """Write a log and the truth beside it, and say what is in it."""
+    values = plain(config)
+    own = {name: values.pop(name) for name in SimulateRigConfig.__dataclass_fields__}
+    checked = build_settings(SimulateRigConfig, own, "simulate_rig")
+    settings = build_settings(TwinSettings, values, "simulate_rig")
+    configuration = find_cabinet_configuration(checked.configuration)
+    count = probe_count(configuration, settings)
+    chosen = _object(checked.object, configuration)
+    log = Path(checked.out or "").expanduser()
+    truth = log.with_suffix(".truth.yaml")
+    for path in (log, truth):
+        if os.path.lexists(path) and not checked.overwrite:
+            raise SettingError(f"{path} exists; accepted: another out=FILE.mcap, or overwrite=true")
+    mesh = load_object(chosen, checked.assets.folder).mesh
+    console = Console(highlight=False)
+    console.print(
+        f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, {count} probes, seed "
+        f"{checked.seed}",
+        style="bold",
+        soft_wrap=True,
+    )
+    try:
+        with _bar(console) as bar:
+            task = bar.add_task("probes", total=count)
+
+            def told(push: Push) -> None:
+                bar.advance(task)
+                bar.console.print(_line(push, count), soft_wrap=True)
+
+            simulated = simulate_log(log, configuration, mesh, checked.seed, settings, told)
+        with whole_file(truth) as beside:
+            beside.write_text(_truth(checked, chosen, simulated))
+    except WritingError as error:
+        reason = error.__cause__ or error
+        raise SettingError(
+            f"{log} cannot be written ({getattr(reason, 'strerror', None) or reason}); accepted: "
+            "an out=FILE.mcap that can be written"
+        ) from error
+    console.print(
+        f"{log}  {decimal(log.stat().st_size)}, {simulated.messages} messages of "
+        f"{simulated.seconds:.1f} simulated seconds\n{truth}  the true pose",
+        soft_wrap=True,
+        markup=False,
+    )
+
+
+def _object(values: dict[str, Any], configuration: CabinetConfiguration) -> ObjectConfig:
+    """The chosen object; without a choice, our own model of the configuration's."""
+    if "kind" not in values:
+        values = {"name": configuration.object, "epsilon": EPSILON, **values}
+        values["configuration"] = configuration.name
+    return build_settings(ObjectConfig, values, "object")
+
+
+def _bar(console: Console) -> Progress:
+    return Progress(
+        TextColumn("  {task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+
+
+def _line(push: Push, count: int) -> str:
+    stops = {"pads": "felt by the pads", "hand": "stopped by the hand", "end": "nothing touched"}
+    pads = ", ".join(f"{pad} {pixels} px" for pad, pixels in push.pressed.items() if pixels)
+    return (
+        f"probe {push.step + 1:>3}/{count}  y {push.y:+.3f} z {push.z:.3f} m  pushed "
+        f"{push.reach:.3f} m  {stops[push.stopped]}{f' ({pads})' if pads else ''}"
+    )
+
+
+def _truth(config: SimulateRigConfig, chosen: ObjectConfig, simulated: SimulatedLog) -> str:
+    content = {
+        "configuration": config.configuration,
+        "object": chosen.name,
+        "kind": chosen.kind,
+        "scale": chosen.scale,
+        "seed": config.seed,
+        "world_from_object": simulated.world_from_object.tolist(),
+    }
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The simulated twin of the paper's cabinet: a robot cell that writes a raw log."""

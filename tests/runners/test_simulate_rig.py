@@ -1,0 +1,151 @@
+"""The command that simulates a robot's log, as a user runs it."""
+
+from __future__ import annotations
+
+import io
+import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+
+from chsel.settings import build_settings, settings_mapping
+from runners import simulate_rig
+from runners.cli import CONF, plain
+from runners.objects.models import MODELS
+from runners.sensors.rig import Rig
+from runners.simulate_rig import SimulateRigConfig
+from runners.twin import wrist
+from runners.twin.configurations import (
+    CABINET_CONFIGURATIONS,
+    CABINET_WORKSPACE,
+    stood_on_shelf,
+)
+from runners.twin.membrane import CAP, CAP_BASE
+from runners.twin.recorder import WORLD, WRIST
+from runners.twin.settings import TwinSettings
+
+QUICK = (
+    "probes=1",
+    "push_steps=1",
+    "standing=0.1",
+    "dwell=0.1",
+    "camera.width=32",
+    "bubbles.width=32",
+)
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command left behind."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run(*arguments: str) -> Done:
+    """Run the command in this process, which spares it the imports."""
+    out, errors, status = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
+        patch.setattr(sys, "argv", ["program", *arguments])
+        patch.setenv("HYDRA_FULL_ERROR", "0")
+        patch.setattr(warnings, "showwarning", warnings.showwarning)
+        try:
+            simulate_rig.main()
+        except SystemExit as error:
+            status = int(error.code or 0)
+    return Done(status, out.getvalue(), errors.getvalue())
+
+
+def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+    log = tmp_path / "new" / "log.mcap"
+    done = run(f"out={log}", "configuration=cabinet_mustard", "seed=4", *QUICK)
+    assert done.returncode == 0, done.stderr
+    assert sorted(file.name for file in log.parent.iterdir()) == ["log.mcap", "log.truth.yaml"]
+    truth = yaml.safe_load(log.with_suffix(".truth.yaml").read_text())
+    pose = stood_on_shelf(MODELS["mustard"](), CABINET_CONFIGURATIONS["cabinet_mustard"])
+    assert np.allclose(truth.pop("world_from_object"), pose, atol=1e-12)
+    assert truth == {
+        "configuration": "cabinet_mustard",
+        "object": "mustard",
+        "kind": "model",
+        "scale": 1.0,
+        "seed": 4,
+    }
+    assert "probe   1/1" in done.stdout
+    assert "nothing touched" in done.stdout
+
+    before = log.read_bytes()
+    again = run(f"out={log}", "configuration=cabinet_mustard", "seed=5", *QUICK)
+    assert again.returncode == 2
+    assert "exists; accepted: another out=FILE.mcap, or overwrite=true" in again.stderr
+    assert log.read_bytes() == before
+    again = run(f"out={log}", "configuration=cabinet_mustard", "overwrite=true", "seed=5", *QUICK)
+    assert again.returncode == 0, again.stderr
+    assert log.read_bytes() != before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "out is None; accepted: the name of a file, out=FILE.mcap"),
+        (("out=log.bag",), "out is log.bag; accepted: the name of a file, out=FILE.mcap"),
+        (("out=x.mcap", "configuration=drill"), "accepted: cabinet_drill, cabinet_drill_opposite"),
+        (("out=x.mcap", "probes=7"), "probes is 7; accepted: 1 to 6"),
+        (("out=x.mcap", "camera.width=4"), "width is 4; accepted: 16 to 4096"),
+        (("out=x.mcap", "camera.widht=4"), "did you mean width?"),
+        (("out=x.mcap", "drop=1"), "drop is 1.0; accepted: 0 to 0.9"),
+        (("out=x.mcap", "push_steps=9"), "accepted: 0.25 m at most"),
+        (("out=x.mcap", "object=drill", "object.scale=2.5"), "more than the cabinet has"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_log_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+    (tmp_path / "file").touch()
+    done = run(f"out={tmp_path / 'file' / 'x.mcap'}", *QUICK)
+    assert done.returncode == 2
+    assert "x.mcap cannot be written" in done.stderr
+    assert "out=FILE.mcap" in done.stderr
+
+
+def test_the_configuration_file_says_the_defaults_of_the_twin() -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        values = plain(compose("simulate_rig"))
+    for name in SimulateRigConfig.__dataclass_fields__:
+        del values[name]
+    assert values == settings_mapping(TwinSettings())
+
+
+def test_the_rig_of_the_cabinet_describes_the_twin() -> None:
+    values = yaml.safe_load((CONF / "session" / "rig" / "cabinet.yaml").read_text())
+    rig = build_settings(Rig, values, "rig")
+    assert rig.world == WORLD
+    assert rig.box().lower == CABINET_WORKSPACE.lower
+    assert rig.box().upper == CABINET_WORKSPACE.upper
+    assert rig.hand is not None
+    assert rig.hand.frame == WRIST
+    assert len(rig.hand.boxes) == len(wrist.rigid_parts())
+    for box, part in zip(rig.hand.boxes, wrist.rigid_parts(), strict=True):
+        assert np.allclose(box.size, part.size)
+        assert np.allclose(box.position, part.position, atol=1e-6)
+        assert np.allclose(box.rotation, part.rotation, atol=1e-6)
+    for bubble in rig.bubbles:
+        assert bubble.range[0] < CAP_BASE < CAP_BASE + CAP[2] < bubble.range[1]
