@@ -10,10 +10,12 @@ from pathlib import Path
 
 from chsel.errors import SessionError
 from replay.mcap.texts import one_line
+from runners.sensors.catalogue import Channel
 from runners.sensors.decoding import Decode, decoder
 from runners.sensors.log_files import log_files
 from runners.sensors.messages import Received
-from runners.sensors.raw_file import Channel, Fault, RawFile, RawMessage, Wanted
+from runners.sensors.raw_file import RawFile
+from runners.sensors.raw_reading import Fault, RawMessage, Wanted
 from runners.sensors.unusable import UnusableMessage
 
 Progress = Callable[[int, int], None]  # bytes so far, and of all
@@ -147,14 +149,14 @@ class RawLog:
         for part in self._parts:
             counts: dict[Channel, int] = {}
             if part.counts is not None:
-                for number, channel in part.channels.items():
+                for number, channel in part.catalogue.channels.items():
                     counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
                 times += part.times or ()
             else:
                 for message in part.messages(Wanted(), fault, _after(done, tell)):
                     counts[message.channel] = counts.get(message.channel, 0) + 1
                     times = [min([message.log_time, *times]), max([message.log_time, *times])]
-                for channel in part.channels.values():
+                for channel in part.catalogue.channels.values():
                     counts.setdefault(channel, 0)
             for channel, count in counts.items():
                 self._add_topic(channel, count)

@@ -14,7 +14,7 @@ from mcap.writer import Writer as McapWriter
 
 from chsel.errors import SessionError
 from replay.file_digest import file_digest
-from runners.sensors import raw_file
+from runners.sensors import raw_reading
 from runners.sensors.log import RawLog
 from runners.sensors.messages import (
     CameraInfoMessage,
@@ -187,7 +187,7 @@ def test_chunks_that_all_overlap_are_not_all_held(
     mixed = [sent[i] for i in np.random.default_rng(0).permutation(len(sent))]
     write_ros2(tmp_path / "log.mcap", mixed, chunk_size=300)
     ordered = Counter(texts(read(tmp_path / "log.mcap")))
-    monkeypatch.setattr(raw_file, "_MOST_HELD", 1000)
+    monkeypatch.setattr(raw_reading, "_MOST_HELD", 1000)
     log = RawLog(tmp_path / "log.mcap")
     received = list(log.messages(log.topics))
     assert [one.log_time for one in received] != sorted(one.log_time for one in received)
@@ -343,8 +343,8 @@ def test_a_file_of_false_chunks_is_not_searched_for_ever(
         head = struct.pack("<BQQQQII", 6, rest, 0, 0, 10, 0, 4) + b"zstd"
         heads.append(head + struct.pack("<Q", rest - 44))
     (tmp_path / "log.mcap").write_bytes(data + b"\0" + b"".join(heads))
-    monkeypatch.setattr(raw_file, "_PLAUSIBLE_SIZE", 2**20)
-    monkeypatch.setattr(raw_file, "_WINDOW", 2**12)
+    monkeypatch.setattr(raw_reading, "_PLAUSIBLE_SIZE", 2**20)
+    monkeypatch.setattr(raw_reading, "_WINDOW", 2**12)
     log = RawLog(tmp_path / "log.mcap")
     assert 10 < log.faults.total() < count / 2
     assert list(log.messages(log.topics))
