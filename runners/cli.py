@@ -30,6 +30,7 @@ from runners.presets import store_presets
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 TRACEBACK = "--traceback"
+_NESTED_GROUPS = ("session/rig",)  # choices of their own, not options of the group around them
 _USER_ERRORS = (ChselError, HydraException, OmegaConfBaseException, OSError)
 
 
@@ -96,6 +97,8 @@ def choices(group: str) -> list[str]:
     """The options of a group, those of conf/ first, of nested folders with their path."""
     folder = CONF / group
     files = sorted(folder.rglob("*.yaml"), key=lambda file: (len(file.parts), file))
+    nested = [CONF / name for name in _NESTED_GROUPS if name != group]
+    files = [file for file in files if not any(file.is_relative_to(other) for other in nested)]
     names = [str(file.relative_to(folder).with_suffix("")) for file in files]
     stored = ConfigStore.instance().repo.get(group, {})  # such as methods of installed packages
     more = sorted(Path(name).stem for name in stored if name.endswith(".yaml"))
@@ -120,7 +123,7 @@ def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bo
 def _message(error: Exception, config_name: str) -> str:
     """One line: what was wrong, and what is accepted."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        group, _, choice = str(error.missing_cfg_file).partition("/")
+        group, choice = _group_and_choice(str(error.missing_cfg_file))
         if (CONF / group).is_dir():
             return _not_accepted(group, f"has no option {choice!r}", choice, choices(group))
     unknown = re.match(r"Could not override '([^']+)'", str(error))
@@ -134,6 +137,15 @@ def _message(error: Exception, config_name: str) -> str:
         text = f"{text}: {error.__cause__}"
     text = re.split(r"\nConfig search path:|\nSee https?://|\n\s*full_key:", text)[0]
     return re.sub(r"\s*\n\s*", " ", text).strip()
+
+
+def _group_and_choice(name: str) -> tuple[str, str]:
+    """The group that an option GROUP/CHOICE is of; both may have slashes."""
+    for group in _NESTED_GROUPS:
+        if name.startswith(f"{group}/"):
+            return group, name.removeprefix(f"{group}/")
+    group, _, choice = name.partition("/")
+    return group, choice
 
 
 def _unknown_key(key: str, config_name: str) -> str:

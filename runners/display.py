@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,48 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from runners.sensors.tally import Report, Tally
+
+
+class Bar:
+    """What is being done, and how much of it is done; gone as soon as it is."""
+
+    def __init__(self, console: Console) -> None:
+        self._progress = Progress(
+            TextColumn("  {task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task: Any = None
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """A stage stands at `done` of `total`."""
+        if self._task is None:
+            self._progress.start()
+            self._task = self._progress.add_task(stage, total=total)
+        self._progress.update(self._task, description=stage, completed=done, total=total)
+
+    def clear(self) -> None:
+        """Give the line back."""
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+            self._task = None
+        self._progress.stop()
+
+
+@contextmanager
+def reading_bar() -> Iterator[Bar]:
+    """A bar of its own, as long as a session is opened."""
+    bar = Bar(Console(highlight=False))
+    try:
+        yield bar
+    finally:
+        bar.clear()
+
 
 class Display:
     """One line a probe, a bar within a registration, a table at the end."""
@@ -22,31 +65,16 @@ class Display:
     def __init__(self, title: str, count: int) -> None:
         self._console = Console(highlight=False)
         self._count = count
-        self._bar = Progress(
-            TextColumn("  {task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed}/{task.total}"),
-            TimeElapsedColumn(),
-            console=self._console,
-            transient=True,
-            disable=not self._console.is_terminal,
-        )
-        self._task: Any = None
+        self._bar = Bar(self._console)
         self._console.print(title, style="bold", soft_wrap=True)
 
     def working(self, stage: str, iteration: int, total: int) -> None:
-        """A stage of the registration stands at `iteration` of `total`."""
-        if self._task is None:
-            self._bar.start()
-            self._task = self._bar.add_task(stage, total=total)
-        self._bar.update(self._task, description=stage, completed=iteration, total=total)
+        """A stage of the registration, or of reading, stands at `iteration` of `total`."""
+        self._bar.show(stage, iteration, total)
 
     def probe(self, index: int, row: Mapping[str, Any]) -> None:
         """A probe, and the registration after it if there was one, are done."""
-        if self._task is not None:
-            self._bar.remove_task(self._task)
-            self._bar.stop()
-            self._task = None
+        self._bar.clear()
         text = f"probe {index + 1:>3}/{self._count}  {row['outcome']:<8}"
         text += f" contacts {row['contacts']:>3}  free points {row['free_points']:>6}"
         if "best_cost" in row:
@@ -81,6 +109,14 @@ class Display:
             table.add_row(*cells, f"{row['seconds']:.2f} s")
         self._console.print(table)
 
+    def sensed(self, report: Report) -> None:
+        """What a robot's sensors told, probe by probe, and what was wrong with it."""
+        if report.tallies:
+            self._console.print(_sensor_table(report))
+        for level, text in report.lines:
+            line = f"warning: {text}" if level == "warning" else text
+            self._console.print(line, markup=False, soft_wrap=True)
+
     def written(self, folder: Path, files: Mapping[str, int]) -> None:
         """What lies in the run's folder, and how to look at it."""
         for name, size in files.items():
@@ -91,7 +127,7 @@ class Display:
 
     def close(self) -> None:
         """Give the terminal back."""
-        self._bar.stop()
+        self._bar.clear()
 
 
 def _viewer() -> str:
@@ -100,6 +136,38 @@ def _viewer() -> str:
     if shutil.which("rerun") or not beside.is_file():
         return "rerun"
     return str(beside.relative_to(Path.cwd()) if beside.is_relative_to(Path.cwd()) else beside)
+
+
+def _sensor_table(report: Report) -> Table:
+    """Counts by probe and sensor, of those that told anything, and the totals."""
+    rows: list[tuple[str, str, Tally]] = []
+    total = {"all": report.total()} if len(report.tallies) > 1 else {}
+    for step, tallies in [*report.tallies.items(), *total.items()]:
+        told = [(sensor, tally) for sensor, tally in tallies.items() if tally.images]
+        rows += [("" if k else str(step), *entry) for k, entry in enumerate(told)]
+    columns = {
+        "used": [f"{tally.used}/{tally.images}" for _, _, tally in rows],
+        "no pose": [str(tally.lost or "") for _, _, tally in rows],
+        "bad": [str(tally.unusable or "") for _, _, tally in rows],
+        "invalid": [_share(tally.invalid, tally.pixels) for _, _, tally in rows],
+        "edge": [_share(tally.edges, tally.pixels) for _, _, tally in rows],
+        "points": [str(tally.contacts or "") for _, _, tally in rows],
+        "new voxels": [str(tally.free or "") for _, _, tally in rows],
+    }
+    columns = {name: cells for name, cells in columns.items() if any(cells)}
+    title = "sensors; invalid, edge: % of pixels"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
+    table.add_column("probe", justify="right")
+    table.add_column("sensor", no_wrap=True)
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
+    for index, (step, sensor, _) in enumerate(rows):
+        table.add_row(step, sensor, *(cells[index] for cells in columns.values()))
+    return table
+
+
+def _share(count: int, of: int) -> str:
+    return f"{100.0 * count / of:.1f}" if of else ""
 
 
 def _errors(row: Mapping[str, Any], which: str) -> tuple[str, str]:

@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Mapping
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,18 @@ from chsel.streams import StreamKey
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from runners.cli import command, plain
-from runners.display import Display
+from runners.display import Display, reading_bar
 from runners.interrupt import Interrupt
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
 from runners.recording import RecordingConfig, make_run_folder, open_recorder
+from runners.sensors.tally import Report
 from runners.session_run import Row, SessionRun
 from runners.sessions import open_session, session_settings
+from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.recorded import RecordedSession
-from runners.sessions.session import Session
+from runners.sessions.sensors import SensorsSession
+from runners.sessions.session import Progress, Session, unwatched
 
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
@@ -64,15 +67,33 @@ class ProbeConfig:
         require_positive("threads", self.threads)
 
 
+@dataclass
+class Watcher:
+    """Hands progress on to whatever shows it at the time."""
+
+    show: Progress = unwatched
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """See `Progress`."""
+        self.show(stage, done, total)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The session and the object that it hides."""
+    """The session and the object that it hides. watcher: is told of what the session reads."""
 
     session: Session
     object_name: str
     mesh: trimesh.Trimesh
     sdf: SdfGrid
     start: tuple[int, int]
+    watcher: Watcher = field(default_factory=Watcher)
+
+    @property
+    def report(self) -> Report | None:
+        """What became of sensors' images, once they are read."""
+        session = self.session
+        return session.report if isinstance(session, SensorsSession | DepthFrameSession) else None
 
 
 @command("probe")
@@ -84,7 +105,8 @@ def main(config: DictConfig) -> None:
     method_config = dict(checked.method)
     method_name = str(method_config.pop("name", None))
     method = build_method(method_name, method_config)
-    scene = open_scene(checked)
+    with reading_bar() as bar:
+        scene = open_scene(checked, bar.show)
     try:
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
@@ -97,8 +119,9 @@ def main(config: DictConfig) -> None:
         sys.exit(130)
 
 
-def open_scene(config: ProbeConfig) -> Scene:
+def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
     """Open the session with its object; a recorded session brings its own."""
+    watcher = Watcher(show)
     session_config = dict(config.session)
     kind = str(session_config.pop("kind", None))
     settings = session_settings(kind, session_config)
@@ -107,12 +130,12 @@ def open_scene(config: ProbeConfig) -> Scene:
         of = recorded.recorded
         return Scene(recorded, of.object, of.mesh, of.sdf, recorded.start)
     object_model = load_object(config.object, config.assets.folder)
-    session = open_session(kind, settings, object_model, config.seed)
+    session = open_session(kind, settings, object_model, config.seed, watcher)
     sdf = SdfGrid.from_mesh(
         object_model.mesh, settings.object_resolution, padding=settings.object_padding
     )
     start = (settings.start_contacts, settings.start_probe)
-    return Scene(session, object_model.name, object_model.mesh, sdf, start)
+    return Scene(session, object_model.name, object_model.mesh, sdf, start, watcher)
 
 
 def session_started(
@@ -155,6 +178,7 @@ def run(
         interrupt.check()
         display.working(stage, iteration, total)
 
+    scene.watcher.show = show
     recorder = open_recorder(folder, config.recording)
     session_run = SessionRun(
         scene.session,
@@ -187,6 +211,8 @@ def run(
     finally:
         display.close()
     _finish(folder, recorder, session_run.step, started, rows, outcome)
+    if scene.report is not None:
+        display.sensed(scene.report)
     display.table(rows)
     if outcome == "interrupted":
         display.say("interrupted: the recording holds everything up to here")

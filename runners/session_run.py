@@ -55,7 +55,11 @@ class SessionRun:
     def steps(self) -> Iterator[tuple[Probe, Row]]:
         """Each probe with the row of numbers that is shown and summarised about it."""
         begun = time.perf_counter()
-        for probe in self._session.probes():
+        for event in self._session.probes():
+            self._recorder.record(event)
+            if not isinstance(event, Probe):
+                continue
+            probe = event
             self.step = probe.step
             seconds = {"probe": time.perf_counter() - begun}
             self._take(probe)
@@ -76,7 +80,6 @@ class SessionRun:
             begun = time.perf_counter()
 
     def _take(self, probe: Probe) -> None:
-        self._recorder.record(probe)
         self.points = self.points.merged(probe.new_points)
         self.contact_count = len(self.points.contacts)
 

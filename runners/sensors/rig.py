@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from chsel.errors import SettingError, require_choice, require_positive
+from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.points import Workspace
 
 Vector = tuple[float, float, float]
@@ -18,10 +18,10 @@ class CameraRig:
     depth, info: topics. frame: of the optical centre; null: that of the messages. unit: metres a
     unit of the image; null: 0.001 for integers, 1 for floating point. range: metres, depths beyond
     are invalid. fraction: how far along its ray each pixel's depth is free. edge: metres; pixels
-    beside a larger jump of depth are left out, as occlusion edges are measured badly; null: all
-    pixels count. rate: images a second that are used at most; null: all. rays: "traversal" of every
-    voxel, or the reference's "scaled_images". views: in so many images a voxel must have been seen
-    to be free.
+    within `edge_reach` pixels of a larger jump of depth are left out, as occlusion edges are
+    measured badly; null: all pixels count. rate: images a second that are used at most; null: all.
+    rays: "traversal" of every voxel, or the reference's "scaled_images". views: in so many images a
+    voxel must have been seen to be free.
     """
 
     name: str
@@ -35,9 +35,12 @@ class CameraRig:
     rate: float | None = 2.0
     rays: str = "traversal"
     views: int = 1
+    edge_reach: int = 5
 
     def __post_init__(self) -> None:
         _check_camera(self.name, self.unit, self.range)
+        require_positive("edge_reach", self.edge_reach)
+        require_at_most("edge_reach", self.edge_reach, 100)
         require_positive("fraction", self.fraction)
         if self.fraction > 1.0:
             raise SettingError(f"fraction is {self.fraction}; accepted: above 0, at most 1")
@@ -227,9 +230,14 @@ class Rig:
         require_positive("surface_resolution", self.surface_resolution)
         if self.workspace is not None:
             self.box()
-        names = [sensor.name for sensor in (*self.cameras, *self.bubbles)]
+        names = [sensor.name for sensor in self.sensors]
         if len(set(names)) < len(names):
             raise SettingError(f"sensors are named {', '.join(names)}; accepted: each name once")
+
+    @property
+    def sensors(self) -> tuple[CameraRig | BubbleRig, ...]:
+        """All that send depth images: the cameras, then the pads."""
+        return (*self.cameras, *self.bubbles)
 
     def box(self) -> Workspace:
         """The workspace. Raises SettingError if there is none, PointsError if it is empty."""

@@ -12,13 +12,15 @@ from runners.sessions.configurations import find_configuration
 from runners.sessions.points import PointsSession, PointsSettings
 from runners.sessions.probing import ProbingSettings
 from runners.sessions.recorded import RecordedSession, RecordedSettings
-from runners.sessions.session import Session
+from runners.sessions.sensors import SensorsSettings, open_sensors
+from runners.sessions.session import Progress, Session, unwatched
 
 SESSIONS: dict[str, type[Any]] = {
     "simulated": ProbingSettings,
     "kinematic": ProbingSettings,
     "points": PointsSettings,
     "recorded": RecordedSettings,
+    "sensors": SensorsSettings,
 }
 
 
@@ -28,8 +30,14 @@ def session_settings(kind: str, config: Mapping[str, Any]) -> Any:
     return build_settings(SESSIONS[kind], config, "session")
 
 
-def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int) -> Session:
-    """Open a session with settings from `session_settings`.
+def open_session(
+    kind: str,
+    settings: Any,
+    object_model: ObjectModel,
+    seed: int,
+    progress: Progress = unwatched,
+) -> Session:
+    """Open a session with settings from `session_settings`; `progress` is told of long readings.
 
     Raises SessionError if it cannot be opened, or if a configuration is one of another object.
     """
@@ -37,6 +45,8 @@ def open_session(kind: str, settings: Any, object_model: ObjectModel, seed: int)
         return PointsSession(settings, object_model)
     if kind == "recorded":
         return RecordedSession(settings)
+    if kind == "sensors":
+        return open_sensors(settings, object_model, seed, progress)
     configuration = settings.configuration or object_model.configuration
     find_configuration(configuration, object_model.name)
     if kind == "kinematic":

@@ -22,8 +22,9 @@ def floor_slab(lattice: Lattice, vertices: FloatArray) -> FloatArray:
 def box_shell(lattice: Lattice, workspace: Workspace) -> FloatArray:
     """Centres of one layer of voxels on the six faces of the workspace."""
     last = lattice.voxels(workspace.bounds[1:])[0]
-    voxels = _box(last + 1)
-    return lattice.centres(voxels[((voxels == 0) | (voxels == last)).any(axis=1)])
+    shell = np.ones(last + 1, dtype=bool)
+    shell[1:-1, 1:-1, 1:-1] = False
+    return lattice.centres(np.argwhere(shell))
 
 
 def swept_voxels(lattice: Lattice, interior: FloatArray, positions: FloatArray) -> FloatArray:

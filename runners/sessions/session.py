@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from chsel.arrays import FloatArray
 from chsel.points import KnownPoints, Workspace
-from replay.events import Probe
+from replay.events import Logged, Probe, RigDescribed, SensorImage
+
+SessionEvent = RigDescribed | SensorImage | Logged | Probe
+"""What a session yields: probes, and ahead of each what else is to be recorded about it."""
+
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, and how much of how much of it is done."""
+
+
+def unwatched(stage: str, done: int, total: int) -> None:
+    """The progress that nobody watches."""
 
 
 class Session(Protocol):
@@ -28,8 +38,8 @@ class Session(Protocol):
     count: int
     """How many probes there will be."""
 
-    def probes(self) -> Iterator[Probe]:
-        """Do, or read, one probe after the other."""
+    def probes(self) -> Iterator[SessionEvent]:
+        """Do, or read, one probe after the other; events that are no Probe are to be recorded."""
 
     def close(self) -> None:
         """Let go of engines and files."""

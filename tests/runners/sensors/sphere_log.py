@@ -38,7 +38,11 @@ RIG = Rig(
     name="sphere",
     world="world",
     workspace=((0.7, 1.1), (-0.2, 0.2), (0.3, 0.6)),
-    cameras=(CameraRig("camera", "/camera/depth", "/camera/info", range=(0.1, 2.0), rate=None),),
+    cameras=(
+        CameraRig(
+            "camera", "/camera/depth", "/camera/info", range=(0.1, 2.0), rate=None, edge_reach=1
+        ),
+    ),
     bubbles=(BubbleRig("pad", "/pad/depth", "/pad/info", range=(0.01, 0.1)),),
     contact=ContactRig(filter=3, points=50),
     hand=HandRig("hand", boxes=(BoxRig((0.04, 0.06, 0.08), (0.0, 0.0, 0.04)),)),

@@ -1,0 +1,76 @@
+"""What all sensors of a robot cell share: where things are, what is free, what to remark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.arrays import BoolArray, FloatArray
+from chsel.points import Workspace
+from chsel.sensing.free_space import FreeGrid
+from runners.sensors.remarks import Remarks
+from runners.sensors.tally import Tally
+from runners.sensors.transforms import TransformError, TransformTree
+
+
+class FreeMap:
+    """The voxels of the workspace that are known to be free."""
+
+    def __init__(self, workspace: Workspace, spacing: float) -> None:
+        self.workspace = workspace
+        self.grid = FreeGrid(workspace, spacing)
+        self._told = np.zeros(self.grid.shape, dtype=bool)
+
+    @contextmanager
+    def by(self, tally: Tally) -> Iterator[FreeGrid]:
+        """The grid to mark in; what becomes free within is counted as the tally's."""
+        before = self.grid.count
+        yield self.grid
+        tally.free += self.grid.count - before
+
+    def new(self) -> FloatArray:
+        """Centres (N, 3) of the voxels that became free since the last call."""
+        centres = self.grid.new()
+        self._told[tuple(self.grid.lattice.voxels(centres).T)] = True
+        return centres
+
+    def holds(self, points: FloatArray) -> BoolArray:
+        """Which of points (N, 3) lie in voxels that `new` has given."""
+        voxels = self.grid.lattice.voxels(points)
+        inside = ((voxels >= 0) & (voxels < self.grid.shape)).all(axis=1)
+        held = np.zeros(len(points), dtype=bool)
+        held[inside] = self._told[tuple(voxels[inside].T)]
+        return held
+
+    def within(self, points: FloatArray) -> BoolArray:
+        """Which of points (N, 3) lie in the workspace, or less than a voxel beside it."""
+        margin = self.grid.lattice.spacing
+        lower, upper = self.workspace.bounds
+        return ((points >= lower - margin) & (points <= upper + margin)).all(axis=1)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """world: the frame of all known points. gap: seconds over which no pose is interpolated."""
+
+    world: str
+    tree: TransformTree
+    gap: float
+    free: FreeMap
+    remarks: Remarks
+
+    @property
+    def spacing(self) -> float:
+        """Side of a free voxel, metres."""
+        return self.free.grid.lattice.spacing
+
+    def world_from(self, frame: str, time: int, sensor: str) -> FloatArray | None:
+        """Pose (4, 4) of a frame at a time in nanoseconds; None, with a remark, where unknown."""
+        try:
+            return self.tree.lookup(self.world, frame, time, gap_s=self.gap)
+        except TransformError:
+            self.remarks.warn(f"{sensor}: left out, as the pose of {frame} is not known then")
+            return None

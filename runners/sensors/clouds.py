@@ -1,0 +1,65 @@
+"""Topics of points: rays that are free, or the object's surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.points import Lattice
+from chsel.pose import apply
+from runners.sensors.cell import Cell
+from runners.sensors.messages import CloudMessage
+from runners.sensors.rig import CloudRig
+from runners.sensors.tally import Tally
+
+
+class Clouds:
+    """The points of one topic."""
+
+    def __init__(self, rig: CloudRig, cell: Cell, resolution: float) -> None:
+        """resolution: metres; of surface points one a voxel of this side is kept."""
+        self._rig, self._cell = rig, cell
+        self._lattice = Lattice(cell.free.workspace.lower, resolution)
+        self._seen: set[tuple[int, int, int]] = set()
+        self._new: list[FloatArray] = []
+
+    @property
+    def touches(self) -> bool:
+        """Whether its points are contacts."""
+        return self._rig.role == "contacts"
+
+    def take(self, time: int, message: CloudMessage, tally: Tally, *, within: bool) -> None:
+        """Use the points of one message of the current probe."""
+        tally.images += 1
+        if self.touches and not within:
+            tally.spared += 1
+            return
+        pose = self._cell.world_from(message.frame, time, self._rig.topic)
+        if pose is None:
+            tally.lost += 1
+            return
+        points = message.points[np.isfinite(message.points).all(axis=1)]
+        tally.pixels += len(message.points)
+        tally.invalid += len(message.points) - len(points)
+        tally.used += 1
+        points = apply(pose, points)
+        if self._rig.role == "rays":
+            origin = pose[:3, 3]
+            with self._cell.free.by(tally) as grid:
+                grid.along_rays(origin, origin + self._rig.fraction * (points - origin))
+        else:
+            self._new.append(self._unseen(points[self._cell.free.within(points)]))
+
+    def surface(self) -> FloatArray:
+        """Points (N, 3) on the surface that came since the last call."""
+        new, self._new = self._new, []
+        return np.concatenate([np.zeros((0, 3)), *new])
+
+    def _unseen(self, points: FloatArray) -> FloatArray:
+        """The first point of every voxel that had none."""
+        _, first = np.unique(self._lattice.voxels(points), axis=0, return_index=True)
+        points = points[np.sort(first)]
+        voxels = [tuple(voxel) for voxel in self._lattice.voxels(points).tolist()]
+        new = [voxel not in self._seen for voxel in voxels]
+        self._seen.update(voxels)
+        return points[np.array(new, dtype=bool)]

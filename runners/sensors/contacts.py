@@ -1,0 +1,94 @@
+"""Points on the object that the pads felt, and those that a person knows of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.sensing.contact_patch import contact_subset, share
+from chsel.streams import Purpose, StreamKey
+from runners.sensors.cell import Cell
+from runners.sensors.pad import Imprint, Pad
+from runners.sensors.push_end import PushEnd
+from runners.sensors.rig import Rig
+from runners.sensors.tally import Tally
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Points (C, 3) on the object's surface, and its normals (C, 3), zero where unknown."""
+
+    points: FloatArray
+    normals: FloatArray
+
+    @classmethod
+    def without_normals(cls, points: FloatArray) -> Contacts:
+        """Points (C, 3) alone."""
+        return cls(points, np.zeros_like(points))
+
+    @classmethod
+    def joined(cls, several: list[Contacts]) -> Contacts:
+        """All of several, in their order; of none, no points."""
+        nothing = np.zeros((0, 3))
+        return cls(
+            np.concatenate([nothing, *(some.points for some in several)]),
+            np.concatenate([nothing, *(some.normals for some in several)]),
+        )
+
+
+class ContactFinder:
+    """Picks a probe's contacts, by the rig's rule and its annotations (CHSEL, Sec. V-B)."""
+
+    def __init__(self, rig: Rig, pads: Mapping[str, Pad], cell: Cell, seed: int) -> None:
+        self._rig, self._pads, self._cell, self._seed = rig, pads, cell, seed
+
+    def felt(
+        self, step: int, imprints: Mapping[str, Imprint], tallies: Mapping[str, Tally]
+    ) -> Contacts:
+        """A seeded subset of the contact pixels of all pads, of those within the workspace."""
+        if step in self._rig.annotations.exclude:
+            if any(imprint.size for imprint in imprints.values()):
+                self._cell.remarks.tell(f"probe {step}: contacts left out, as the rig annotates")
+            return Contacts.joined([])
+        key = StreamKey(self._seed, step)
+        found = []
+        for index, (name, most) in enumerate(self._shares(imprints).items()):
+            imprint = imprints[name]
+            chosen = contact_subset(imprint.size, most, key.stream(Purpose.CONTACT_POINTS, index))
+            points, normals = self._pads[name].contacts(imprint, chosen)
+            kept = self._cell.free.within(points)
+            self._cell.remarks.warn(
+                f"{name}: a contact left out, as it is out of the workspace", int((~kept).sum())
+            )
+            tallies[name].contacts += int(kept.sum())
+            found.append(Contacts(points[kept], normals[kept]))
+        return Contacts.joined(found)
+
+    def annotated(self, step: int, push_end: PushEnd | None) -> Contacts:
+        """The points that the rig adds to a probe."""
+        added = []
+        for extra in self._rig.annotations.contacts:
+            if extra.probe != step:
+                continue
+            added.append(np.array(extra.points, dtype=np.float64).reshape(-1, 3))
+            if extra.foremost and push_end is not None:
+                added.append(push_end.foremost_mean(extra.foremost))
+            elif extra.foremost:
+                self._cell.remarks.warn(
+                    f"probe {step}: no foremost point is added, as no membrane was seen"
+                )
+        contacts = Contacts.joined([Contacts.without_normals(points) for points in added])
+        if len(contacts.points):
+            count = len(contacts.points)
+            self._cell.remarks.tell(f"probe {step}: {count} contacts added, as the rig annotates")
+        return contacts
+
+    def _shares(self, imprints: Mapping[str, Imprint]) -> dict[str, int]:
+        """How many points each pad gives."""
+        sizes, rule = [imprint.size for imprint in imprints.values()], self._rig.contact
+        if rule.per == "contact":
+            return dict(zip(imprints, share(sizes, rule.points), strict=True))
+        return dict.fromkeys(imprints, rule.points)

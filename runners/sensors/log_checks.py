@@ -1,0 +1,161 @@
+"""Whether a log has what its rig needs."""
+
+from __future__ import annotations
+
+from chsel.arrays import IntArray
+from chsel.errors import SessionError, SettingError
+from chsel.sensing.camera import PinholeCamera
+from runners.sensors.clocks import ClockCorrection
+from runners.sensors.first_pass import FirstPass
+from runners.sensors.log import RawLog
+from runners.sensors.movements import Movements
+from runners.sensors.remarks import Remarks
+from runners.sensors.rig import Rig
+from runners.sensors.sightings import missing_images
+from runners.sensors.transforms import TransformError
+
+_TRANSFORMS = ("TFMessage", "TransformStamped", "FrameTransform", "FrameTransforms")
+
+
+def require_topics(log: RawLog, rig: Rig) -> None:
+    """Raise SessionError, which lists what the log has, unless it has the topics of the rig."""
+    missing = {topic: user for topic, user in named_topics(rig).items() if topic not in log.topics}
+    if missing:
+        listed = ", ".join(f"{topic} ({user})" for topic, user in missing.items())
+        raise SessionError(
+            f"log {log.path} lacks what rig {rig.name} names: {listed}; it has {log.listing()}"
+        )
+
+
+def named_topics(rig: Rig) -> dict[str, str]:
+    """All topics that a rig names, and what for."""
+    named = {}
+    for sensor in rig.sensors:
+        named[sensor.depth] = f"depth of {sensor.name}"
+        named[sensor.info] = f"camera info of {sensor.name}"
+    named |= {cloud.topic: "points" for cloud in rig.clouds}
+    if rig.hand is not None and rig.hand.pose:
+        named[rig.hand.pose] = "pose of the hand"
+    if rig.hand is not None and rig.hand.joints:
+        named[rig.hand.joints] = "joints of the hand"
+    if rig.markers and rig.probes is None:
+        named[rig.markers] = "markers of probes"
+    if not (rig.cameras or rig.bubbles or rig.clouds):
+        raise SettingError(
+            f"rig {rig.name} has no sensor; accepted: at least one of cameras, bubbles, clouds"
+        )
+    return named
+
+
+def transform_topics(log: RawLog) -> list[str]:
+    """The topics of a log that hold transforms, by their schemas."""
+    return [
+        name
+        for name, topic in log.topics.items()
+        if topic.schema.replace(".", "/").split("/")[-1] in _TRANSFORMS
+    ]
+
+
+class LogChecks:
+    """Looks at what a first pass gathered; raises SessionError for what no session can do without.
+
+    times: of the messages by topic (N,), nanoseconds, ascending.
+    """
+
+    def __init__(
+        self,
+        log: RawLog,
+        rig: Rig,
+        seen: FirstPass,
+        moving: Movements,
+        clocks: ClockCorrection,
+        remarks: Remarks,
+    ) -> None:
+        self._log, self._rig, self._seen, self._moving = log, rig, seen, moving
+        self._remarks = remarks
+        self.times = {topic: sightings.times(clocks) for topic, sightings in seen.sightings.items()}
+
+    def sensors(self) -> None:
+        """Messages of every sensor, units, and the poses of sensors and hand."""
+        for sensor in self._rig.sensors:
+            self._require_messages(sensor.depth, sensor.name, "depth images")
+            self._require_poses(sensor.name, sensor.depth, sensor.frame)
+            suspicious = self._seen.units[sensor.name].judge()
+            if suspicious:
+                self._remarks.warn(suspicious)
+            lost = missing_images(self.times[sensor.depth])
+            if lost:
+                count = len(self.times[sensor.depth])
+                self._remarks.tell(
+                    f"{sensor.name}: about {lost} of {count + lost} images are missing"
+                )
+        for cloud in self._rig.clouds:
+            self._require_messages(cloud.topic, cloud.topic, "points")
+            self._require_poses(cloud.topic, cloud.topic, None)
+        if self._rig.hand is not None:
+            self._require_hand(self._rig.hand.frame)
+
+    def cameras(self) -> dict[str, PinholeCamera]:
+        """Intrinsics by the names of sensors."""
+        cameras = {}
+        for sensor in self._rig.sensors:
+            info = self._seen.infos.get(sensor.info)
+            if info is None:
+                raise SessionError(
+                    f"log {self._log.path}: no camera info of {sensor.name} on topic "
+                    f"{sensor.info}{self._reason(sensor.info)}"
+                )
+            sizes = self._seen.sightings[sensor.depth].sizes
+            if (info.height, info.width) not in sizes:
+                (height, width), _ = sizes.most_common(1)[0]
+                raise SessionError(
+                    f"log {self._log.path}: images of {sensor.name} have {width} x {height} "
+                    f"pixels, and its camera info says {info.width} x {info.height}; accepted: "
+                    "the same"
+                )
+            if info.distorted:
+                self._remarks.warn(
+                    f"{sensor.name}: its camera info names a distortion, which is not undone"
+                )
+            changes = self._seen.changed_infos.get(sensor.info, 0)
+            if changes:
+                self._remarks.warn(f"{sensor.name}: another camera info than the first", changes)
+            cameras[sensor.name] = PinholeCamera(
+                info.width, info.height, info.fx, info.fy, info.cx, info.cy
+            )
+        return cameras
+
+    def _require_messages(self, topic: str, sensor: str, what: str) -> None:
+        if not len(self.times[topic]):
+            raise SessionError(
+                f"log {self._log.path}: topic {topic} of {sensor} gives no {what}"
+                f"{self._reason(topic)}"
+            )
+
+    def _reason(self, topic: str) -> str:
+        """What was wrong with the messages of a topic, or what they are."""
+        for fault in self._log.faults:
+            if fault.startswith(f"{topic}: "):
+                return f" ({fault.removeprefix(f'{topic}: ')})"
+        return f" (its schema is {self._log.topics[topic].schema})"
+
+    def _require_poses(self, name: str, topic: str, frame: str | None) -> None:
+        frame = frame or self._seen.sightings[topic].frame or ""
+        self._require_known(name, frame, self.times[topic])
+
+    def _require_hand(self, frame: str) -> None:
+        times = self._moving.times()
+        if len(times):
+            self._require_known("hand", frame, times)
+        else:
+            self._remarks.warn("no transform of the log ever changes: the hand has no path")
+
+    def _require_known(self, name: str, frame: str, times: IntArray) -> None:
+        """Raise SessionError unless a frame's pose is known at one of the times at least."""
+        tree, world, gap = self._moving.tree, self._rig.world, self._rig.clock.gap
+        try:
+            known = tree.lookups(world, frame, times, gap_s=gap)[1]
+            if not known.any():
+                tree.lookup(world, frame, int(times[len(times) // 2]), gap_s=gap)
+        except TransformError as error:
+            raise SessionError(f"log {self._log.path}: {name}: {error}") from None

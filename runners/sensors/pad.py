@@ -1,0 +1,189 @@
+"""A soft-bubble pad: contacts where its membrane gives way, free space within the membrane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+
+from chsel.arrays import BoolArray, FloatArray
+from chsel.pose import apply, inverse, rotated, rotation_angle
+from chsel.sensing.camera import PinholeCamera
+from chsel.sensing.contact_patch import contact_mask, deformation, smooth
+from replay.events import SensorImage
+from runners.sensors.cell import Cell
+from runners.sensors.depth_source import DepthSource, View, intrinsics_of, recorded
+from runners.sensors.messages import ImageMessage
+from runners.sensors.rig import BubbleRig, ContactRig
+from runners.sensors.tally import Tally
+
+REACH = 0.1  # m: of the membrane from its camera, for how far a turn moves it
+
+
+@dataclass(frozen=True, eq=False)
+class Imprint:
+    """One image of a membrane, in contact or not.
+
+    view: depth of the membrane as it is. pressed (H, W): smoothed deformation, metres. touching
+    (H, W): pixels in contact.
+    """
+
+    view: View
+    pressed: FloatArray
+    touching: BoolArray
+
+    @property
+    def size(self) -> int:
+        """How many pixels are in contact."""
+        return int(self.touching.sum())
+
+    def outweighs(self, other: Imprint | None) -> bool:
+        """Whether more pixels are in contact, or without any contact, the membrane gives more."""
+        if other is None or self.size != other.size:
+            return other is None or self.size > other.size
+        return self.size == 0 and bool(self.pressed.max() > other.pressed.max())
+
+
+class Pad:
+    """One pad; its contact is that of the image with the most pixels in contact (Sec. V-B)."""
+
+    def __init__(
+        self,
+        rig: BubbleRig,
+        contact: ContactRig,
+        camera: PinholeCamera,
+        reference: FloatArray,
+        cell: Cell,
+        *,
+        inside: bool,
+    ) -> None:
+        """reference (H, W): depth of the untouched membrane, metres, 0 where it is not known.
+
+        inside: whether the way from the camera to the membrane is free.
+        """
+        self._rig, self._contact, self._cell = rig, contact, cell
+        self._camera, self._reference, self._inside = camera, reference, inside
+        self._source = DepthSource(rig, camera, cell)
+        self._lengths = np.sqrt((camera.directions() ** 2).sum(axis=-1))
+        self._last_pose: FloatArray | None = None
+        self._best: Imprint | None = None
+
+    def take(
+        self, time: int, message: ImageMessage, tally: Tally, *, within: bool
+    ) -> Imprint | None:
+        """Use an image of the current probe; `within` its begin and end, contacts count."""
+        tally.images += 1
+        imprint = self._imprint(time, message, tally)
+        if imprint is None:
+            return None
+        used = within
+        if within and imprint.outweighs(self._best):
+            self._best = imprint
+        if self._inside and self._has_moved(imprint.view.world_from_camera):
+            self._mark(imprint.view, tally)
+            used = True
+        tally.used += used
+        tally.spared += not used
+        return imprint
+
+    def strongest(self, tally: Tally) -> Imprint | None:
+        """The image of the contact since the last call; with too few pixels it touches nothing."""
+        best, self._best = self._best, None
+        if best is None:
+            return None
+        if best.size < self._contact.pixels:
+            return Imprint(best.view, best.pressed, np.zeros_like(best.touching))
+        tally.touching += best.size
+        if self._inside:
+            self._mark(best.view, tally)
+        return best
+
+    def image(self, step: int, imprint: Imprint) -> SensorImage:
+        """The deformation with the pixels in contact."""
+        counts = imprint.view.valid & (imprint.pressed > 0.0)
+        values, unit = recorded(imprint.pressed, counts)
+        return SensorImage(
+            step,
+            self._rig.name,
+            "deformation",
+            values,
+            unit,
+            imprint.touching,
+            intrinsics_of(self._camera),
+            imprint.view.world_from_camera,
+        )
+
+    def contacts(self, imprint: Imprint, chosen: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        """Points (C, 3) and outward normals (C, 3) of the object, of chosen (C,) contact pixels."""
+        view, touching = imprint.view, imprint.touching
+        points = self._camera.back_project(view.metres)[touching][chosen]
+        filled = np.where(view.valid, view.metres, self._reference)
+        normals = self._normals(smooth(filled, self._contact.filter))[touching][chosen]
+        pose = view.world_from_camera
+        return apply(pose, points), rotated(pose[:3, :3], normals)
+
+    def membrane(self, view: View) -> FloatArray:
+        """All points (N, 3) of the membrane in the world."""
+        points = self._camera.back_project(view.metres)[view.valid]
+        return apply(view.world_from_camera, points)
+
+    def _imprint(self, time: int, message: ImageMessage, tally: Tally) -> Imprint | None:
+        view = self._source.view(time, message, tally)
+        if view is None:
+            return None
+        known = self._reference > 0.0
+        if self._rig.kind == "deformation":
+            told = known & np.isfinite(view.metres)
+            pressed = np.where(told, view.metres, 0.0)
+            depth = self._reference - pressed
+            nearest, furthest = self._rig.range
+            valid = told & (depth >= nearest) & (depth <= furthest)
+            view = View(depth, valid, view.world_from_camera)
+        else:
+            valid = view.valid & known
+            pressed = deformation(self._reference, view.metres, valid=valid)
+        if not valid.any():
+            tally.unusable += 1
+            self._cell.remarks.warn(f"{self._rig.name}: an image without a pixel that counts")
+            return None
+        pressed = smooth(pressed, self._contact.filter)
+        touching = contact_mask(
+            pressed,
+            quantile=self._contact.quantile,
+            threshold=self._contact.threshold,
+            valid=valid,
+        )
+        return Imprint(view, pressed, touching)
+
+    def _mark(self, view: View, tally: Tally) -> None:
+        """The pad's inside is free, less half a voxel's diagonal before what it may touch."""
+        margin = sqrt(0.75) * self._cell.spacing
+        depth = view.metres - margin / self._lengths
+        with self._cell.free.by(tally) as grid:
+            grid.from_depth(
+                depth,
+                self._camera,
+                view.world_from_camera,
+                view.valid & (depth > 0.0),
+                fraction=1.0,
+            )
+
+    def _has_moved(self, pose: FloatArray) -> bool:
+        """Whether the membrane is half a voxel away from where it was last marked."""
+        if self._last_pose is not None:
+            change = inverse(self._last_pose) @ pose
+            distance = np.sqrt((change[:3, 3] ** 2).sum())
+            if distance + REACH * rotation_angle(change[:3, :3]) < 0.5 * self._cell.spacing:
+                return False
+        self._last_pose = pose
+        return True
+
+    def _normals(self, depth: FloatArray) -> FloatArray:
+        """Unit normals (H, W, 3) of a depth image's surface, towards the camera; 0 if unknown."""
+        points = self._camera.back_project(depth)
+        normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+        away = (normals * points).sum(axis=-1, keepdims=True) > 0.0
+        normals = np.where(away, -normals, normals)
+        length = np.sqrt((normals**2).sum(axis=-1, keepdims=True))
+        return np.where(length > 0.0, normals / np.where(length > 0.0, length, 1.0), 0.0)

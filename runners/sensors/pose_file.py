@@ -1,0 +1,100 @@
+"""Files that say where the object of a session is, beside the session's log or recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from chsel.arrays import FloatArray
+from chsel.errors import PoseError, SessionError
+from chsel.pose import nearest_rigid
+from replay.new_file import new_file
+from runners.evaluation.whole_file import whole_file
+
+SUFFIX = ".pose.yaml"
+KEY = "world_from_object"
+_MOST_BYTES = 1_000_000
+_ACCEPTED = (
+    f"accepted: YAML with {KEY}, four rows of four numbers: a rotation and a position in metres, "
+    "last row 0 0 0 1"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFile:
+    """A pose world_from_object (4, 4), and what else the file says about it."""
+
+    world_from_object: FloatArray
+    about: Mapping[str, Any]
+
+
+def beside(path: str | Path) -> Path:
+    """Where the pose of a log or recording is looked for: X.pose.yaml beside X.mcap or folder X."""
+    path = Path(path).absolute()
+    return path.with_name(path.name.removesuffix(".mcap") + SUFFIX)
+
+
+def read_pose(path: str | Path) -> FloatArray:
+    """world_from_object (4, 4) of a file. Raises SessionError unless it holds a rigid one."""
+    return read_pose_file(path).world_from_object
+
+
+def read_pose_file(path: str | Path) -> PoseFile:
+    """A pose with all that stands beside it. Raises SessionError unless it is rigid."""
+    path = Path(path).expanduser()
+    values = _values(path)
+    rows = values.pop(KEY, None)
+    if not _is_matrix(rows):
+        raise SessionError(f"pose file {path} has no {KEY} of 4 x 4 numbers; {_ACCEPTED}")
+    try:
+        # Entries may have been written by hand, with a few digits.
+        pose = nearest_rigid(KEY, np.array(rows, dtype=np.float64)[None])[0]
+    except PoseError:
+        raise SessionError(f"pose file {path}: {KEY} is not rigid; {_ACCEPTED}") from None
+    pose.setflags(write=False)
+    return PoseFile(pose, values)
+
+
+def write_pose(
+    path: Path, world_from_object: FloatArray, about: Mapping[str, Any], *, overwrite: bool = False
+) -> None:
+    """Write a pose (4, 4), and what a person may want to know about it, plain values.
+
+    Raises RecordingError if there is such a file already, unless told to overwrite it, and
+    ChselError if it cannot be written.
+    """
+    values = {KEY: np.asarray(world_from_object, dtype=np.float64).tolist(), **about}
+    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+    with whole_file(path) if overwrite else new_file(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
+def _values(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES + 1)
+        values = yaml.safe_load(data) if len(data) <= _MOST_BYTES else None
+    except OSError as error:
+        reason = error.strerror or error
+        raise SessionError(f"pose file {path} cannot be read ({reason}); {_ACCEPTED}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise SessionError(f"pose file {path} is no YAML ({reason}); {_ACCEPTED}") from None
+    if not isinstance(values, dict):
+        raise SessionError(f"pose file {path} is not such a file; {_ACCEPTED}")
+    return {str(key): value for key, value in values.items()}
+
+
+def _is_matrix(rows: Any) -> bool:
+    """Whether a value is four lists of four finite numbers."""
+    if not isinstance(rows, list) or len(rows) != 4:
+        return False
+    if not all(isinstance(row, list) and len(row) == 4 for row in rows):
+        return False
+    numbers = [value for row in rows for value in row]
+    return all(type(value) in (int, float) and abs(value) < 1e6 for value in numbers)

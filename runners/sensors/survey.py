@@ -1,0 +1,138 @@
+"""The first pass over a log: all that is small, and whether the rig fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from chsel.arrays import FloatArray, IntArray
+from chsel.sensing.camera import PinholeCamera
+from runners.sensors.clocks import ClockCorrection
+from runners.sensors.first_pass import FirstPass
+from runners.sensors.joint_history import JointHistory
+from runners.sensors.log import RawLog
+from runners.sensors.log_checks import LogChecks, named_topics, require_topics, transform_topics
+from runners.sensors.messages import ImageMessage, MarkerMessage
+from runners.sensors.movements import Movements
+from runners.sensors.references import membrane_reference
+from runners.sensors.remarks import Remarks
+from runners.sensors.rig import Rig
+from runners.sensors.transforms import TransformTree
+from runners.sensors.windows import ProbeWindow, marked_windows, timed_windows, whole_log
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What is known of a log before its images are read.
+
+    transform_times (T,): nanoseconds, ascending. cameras, references: by the names of sensors, the
+    latter (H, W) in metres of the untouched membranes of pads. bulky: topics for the second pass.
+    """
+
+    tree: TransformTree
+    transform_times: IntArray
+    joints: JointHistory
+    clocks: ClockCorrection
+    windows: list[ProbeWindow]
+    cameras: dict[str, PinholeCamera]
+    references: dict[str, FloatArray]
+    bulky: tuple[str, ...]
+
+
+def survey_log(
+    log: RawLog, rig: Rig, joint_names: Sequence[str], remarks: Remarks, progress: Progress
+) -> Survey:
+    """Look through a log. joint_names: of the joints that move the hand.
+
+    Raises SessionError if topics, camera infos or transforms are missing, or depths are no depths.
+    """
+    require_topics(log, rig)
+    seen = FirstPass(rig, joint_names)
+    topics = {*named_topics(rig), *transform_topics(log)}
+    seen.read(log, topics, progress)
+    clocks = seen.clocks.correction()
+    moving = Movements(rig, joint_names)
+    if seen.moving.differs(clocks):
+        again = {topic for topic in topics if topic in seen.moving.topics}
+        for received in log.messages(again, progress=progress):
+            moving.add(received, clocks.time(received))
+    else:
+        moving = seen.moving
+    for text in (*log.remarks, *clocks.remarks):
+        remarks.warn(text)
+    for text, count in moving.tree.faults.items():
+        remarks.warn(text, count)
+    checks = LogChecks(log, rig, seen, moving, clocks, remarks)
+    checks.sensors()
+    windows = _windows(log, rig, seen, clocks, checks.times, remarks)
+    cameras = checks.cameras()
+    return Survey(
+        tree=moving.tree,
+        transform_times=moving.times(),
+        joints=moving.joints,
+        clocks=clocks,
+        windows=windows,
+        cameras=cameras,
+        references=_references(log, rig, seen, cameras, windows, clocks, remarks),
+        bulky=tuple(seen.sightings),
+    )
+
+
+def _windows(
+    log: RawLog,
+    rig: Rig,
+    seen: FirstPass,
+    clocks: ClockCorrection,
+    times: dict[str, IntArray],
+    remarks: Remarks,
+) -> list[ProbeWindow]:
+    """The probes of the log; all of it is one if nothing tells them apart."""
+    begin = log.begin + clocks.typical
+    first = min([begin, *(int(of[0]) for of in times.values())])
+    last = max([log.end + clocks.typical, *(int(of[-1]) for of in times.values())])
+    if rig.probes is not None:
+        windows = timed_windows(rig.probes, begin, last, remarks)
+        return windows or whole_log(first, last)
+    if rig.markers:
+        markers = [
+            (clocks.time(received), received.content.text)
+            for received in seen.markers
+            if isinstance(received.content, MarkerMessage)
+        ]
+        windows = marked_windows(markers, first, last, remarks)
+        if windows:
+            return windows
+        remarks.warn(f"topic {rig.markers} marks no probe: the whole log is one")
+    return whole_log(first, last)
+
+
+def _references(
+    log: RawLog,
+    rig: Rig,
+    seen: FirstPass,
+    cameras: dict[str, PinholeCamera],
+    windows: list[ProbeWindow],
+    clocks: ClockCorrection,
+    remarks: Remarks,
+) -> dict[str, FloatArray]:
+    """Depth images of the untouched membranes, by the names of pads."""
+    references = {}
+    for pad in rig.bubbles:
+        camera, first = cameras[pad.name], seen.first_images[pad.depth]
+        size = (camera.height, camera.width)
+        fitting = [
+            (clocks.time(received), received.content.values)
+            for received in first
+            if isinstance(received.content, ImageMessage) and received.content.values.shape == size
+        ]
+        untouched = [values for time, values in fitting if time < windows[0].begin]
+        if pad.reference is None and pad.kind == "depth" and not untouched:
+            untouched = [values for _, values in fitting]
+            remarks.warn(
+                f"{pad.name}: no image before the first probe; its reference is made of the first "
+                f"{len(untouched)} of the probe"
+            )
+        references[pad.name] = membrane_reference(pad, untouched, camera, log.path.parent)
+    return references

@@ -1,0 +1,90 @@
+"""A session of one depth image, as plain files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from chsel.points import KnownPoints
+from replay.events import Logged, Probe, RigDescribed, SensorImage
+from replay.file_digest import file_digest
+from runners.objects.loader import ObjectModel
+from runners.sensors.depth_frame import DepthFrame, read_depth_frame
+from runners.sensors.depth_frame_points import FramePoints, depth_frame_points
+from runners.sensors.depth_source import intrinsics_of, recorded
+from runners.sensors.rig import Rig
+from runners.sensors.tally import Report, Tally
+from runners.sessions.session import SessionEvent
+
+
+class DepthFrameSession:
+    """What a depth image tells, as a single probe; see `Session`."""
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        object_model: ObjectModel,
+        *,
+        free_resolution: float,
+        images: bool,
+    ) -> None:
+        self.report = Report()
+        self.free_resolution = free_resolution
+        self.initial_points = KnownPoints()
+        self.count = 1
+        self._rig, self._path, self._images = rig, path, images
+        self._frame: DepthFrame = read_depth_frame(path)
+        diameter = float(np.sqrt((np.asarray(object_model.mesh.extents) ** 2).sum()))
+        self._points: FramePoints = depth_frame_points(
+            self._frame, rig, free_resolution=free_resolution, diameter=diameter
+        )
+        self.workspace = self._points.workspace
+        self.world_from_object = self._frame.world_from_object
+
+    def probes(self) -> Iterator[SessionEvent]:
+        """The image, and what follows from it."""
+        found, (camera,) = self._points, self._rig.cameras
+        self.report.tallies[0] = {
+            camera.name: Tally(
+                images=1,
+                used=1,
+                pixels=found.rays.size,
+                invalid=found.invalid,
+                edges=found.edges,
+                contacts=len(found.points.known),
+                free=len(found.points.free),
+            )
+        }
+        yield RigDescribed(-1, self._rig.name, file_digest(self._path))
+        if self._images:
+            yield self._image(camera.name)
+        count = len(found.points.known)
+        text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
+        yield Logged(0, "info", text)
+        lower, upper = self.workspace.bounds
+        outside = ((found.points.known < lower) | (found.points.known > upper)).any(axis=1).sum()
+        if outside:
+            text = f"{outside} of {count} surface points are out of the workspace"
+            self.report.lines = [("warning", text)]
+            yield Logged(0, "warning", text)
+        yield Probe(0, "points", found.points)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _image(self, name: str) -> SensorImage:
+        depth, frame = np.nan_to_num(self._frame.depth, posinf=0.0, neginf=0.0), self._frame
+        values, unit = recorded(depth, depth > 0.0)
+        return SensorImage(
+            0,
+            name,
+            "depth",
+            values,
+            unit,
+            self._points.rays,
+            intrinsics_of(frame.camera),
+            frame.world_from_camera,
+        )

@@ -1,0 +1,175 @@
+"""A session whose known points come from what a robot's sensors wrote into a log."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.errors import SettingError, require_positive
+from chsel.points import KnownPoints
+from replay.events import Logged, RigDescribed
+from runners.objects.loader import ObjectModel
+from runners.sensors.cell import Cell, FreeMap
+from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
+from runners.sensors.hand import HandModel
+from runners.sensors.log import RawLog
+from runners.sensors.pose_file import beside, read_pose
+from runners.sensors.reading import LogReading
+from runners.sensors.remarks import Remarks
+from runners.sensors.rig import Rig
+from runners.sensors.survey import survey_log
+from runners.sensors.tally import Report
+from runners.sensors.time_order import in_time_order
+from runners.sessions.depth_frame import DepthFrameSession
+from runners.sessions.free_space import box_shell
+from runners.sessions.session import Progress, Session, SessionEvent, unwatched
+
+NO_POSE = "none"
+_MEGABYTE = 2**20
+_MANY = 0.4  # of a camera's pixels at edges: rather a slanted surface, seen in few pixels
+
+
+@dataclass(frozen=True)
+class SensorsSettings:
+    """path: of the log, an .mcap file or a rosbag2 folder, or of a depth image's YAML.
+
+    rig: what the log's topics are. pose: file of the true pose, by default that beside the log if
+    there is one; "none": unknown. free_resolution: side of a free voxel, metres.
+    object_resolution, object_padding: of the SDF grid, metres. start_contacts, start_probe: a
+    registration needs so many contacts and this probe index. images: record the images, too.
+    """
+
+    rig: Rig
+    path: str | None = None
+    pose: str | None = None
+    free_resolution: float = 0.01
+    object_resolution: float = 0.005
+    object_padding: float = 0.05
+    start_contacts: int = 4
+    start_probe: int = 0
+    images: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.path:
+            raise SettingError(
+                "path is missing; pass session.path=LOG, an .mcap file, a rosbag2 folder, or the "
+                ".yaml of a depth image"
+            )
+        for name in ("free_resolution", "object_resolution", "object_padding"):
+            require_positive(name, getattr(self, name))
+        for name in ("start_contacts", "start_probe"):
+            require_positive(name, getattr(self, name), zero=True)
+
+
+def open_sensors(
+    settings: SensorsSettings, object_model: ObjectModel, seed: int, progress: Progress = unwatched
+) -> Session:
+    """The session of a log, or of a depth image. Raises SessionError if it cannot be used."""
+    path = Path(settings.path or "").expanduser()
+    if path.suffix.lower() in FRAME_SUFFIXES:
+        return DepthFrameSession(
+            path,
+            settings.rig,
+            object_model,
+            free_resolution=settings.free_resolution,
+            images=settings.images,
+        )
+    session = SensorsSession(settings, seed, progress)
+    longest, side = (
+        object_model.mesh.extents.max(),
+        float(np.ptp(session.workspace.bounds, 0).max()),
+    )
+    if longest > side:
+        warnings.warn(
+            f"the object is {longest:.3g} m long and the workspace {side:.3g} m; objects of real "
+            f"size have object.scale=1, and this one has {object_model.scale:g}",
+            stacklevel=2,
+        )
+    return session
+
+
+class SensorsSession:
+    """Reads a log twice: what is small at once, images one after the other; see `Session`."""
+
+    def __init__(
+        self, settings: SensorsSettings, seed: int, progress: Progress = unwatched
+    ) -> None:
+        """seed: of the choice of contact pixels. Raises SessionError for a log without use."""
+        path = Path(settings.path or "").expanduser()
+        rig = settings.rig
+        self.report = Report()
+        self.workspace = rig.box()
+        self.free_resolution = settings.free_resolution
+        self.world_from_object: FloatArray | None = None
+        self._rig, self._seed, self._images = rig, seed, settings.images
+        self._progress = progress
+        self._opening = Remarks()
+        self._hand = HandModel(rig.hand) if rig.hand else None
+        self._log = RawLog(path, progress=self._shown("looking for topics"))
+        self._find_pose(path, settings.pose)
+        joints = self._hand.joint_names if self._hand else ()
+        self._survey = survey_log(
+            self._log, rig, joints, self._opening, self._shown("first pass over the log")
+        )
+        self.source = self._log.digest(self._shown("digest of the log"))
+        self.count = len(self._survey.windows)
+        self.initial_points = KnownPoints(free=self._free_map()[1])
+        annotated = {*rig.annotations.exclude, *(add.probe for add in rig.annotations.contacts)}
+        for step in sorted(annotated - {window.step for window in self._survey.windows}):
+            self._opening.warn(f"the rig annotates probe {step}, which the log does not have")
+
+    def probes(self) -> Iterator[SessionEvent]:
+        """The probes of the log, in their order; its images are read as they go."""
+        rig, survey, remarks = self._rig, self._survey, Remarks(self._opening)
+        self.report.tallies.clear()
+        cell = Cell(rig.world, survey.tree, rig.clock.gap, self._free_map()[0], remarks)
+        reading = LogReading(
+            rig, survey, cell, self.report, self._hand, seed=self._seed, images=self._images
+        )
+        hand = self._hand.solids(survey.joints.first()) if self._hand else None
+        yield RigDescribed(-1, rig.name, self.source, hand)
+        messages = self._log.messages(survey.bulky, progress=self._shown("reading images"))
+        yield from reading.events(in_time_order(messages, survey.clocks.time))
+        for text, count in self._log.faults.items():
+            remarks.warn(text, count)
+        for name, tally in self.report.total().items():
+            if tally.edges > _MANY * tally.pixels:
+                remarks.warn(
+                    f"{name}: {100 * tally.edges // tally.pixels} % of its pixels are left out as "
+                    "edges; a larger edge (m), or a smaller edge_reach (pixels), keeps more"
+                )
+        self.report.lines = remarks.lines()
+        last = survey.windows[-1].step
+        yield from (Logged(last, level, text) for level, text in self.report.lines)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _free_map(self) -> tuple[FreeMap, FloatArray]:
+        """A map in which the workspace's border is free, and the centres (N, 3) of its voxels."""
+        free = FreeMap(self.workspace, self.free_resolution)
+        if self._rig.boundary == "box_shell":
+            free.grid.at(box_shell(free.grid.lattice, self.workspace))
+        return free, free.new()
+
+    def _find_pose(self, path: Path, chosen: str | None) -> None:
+        """The true pose, if a file tells."""
+        if chosen == NO_POSE:
+            return
+        file = Path(chosen).expanduser() if chosen else beside(path)
+        if chosen or file.is_file():
+            self.world_from_object = read_pose(file)
+            self._opening.tell(f"the true pose is that of {file.name}")
+
+    def _shown(self, stage: str) -> Callable[[int, int], None]:
+        """Progress of a stage in bytes, told in megabytes."""
+
+        def show(done: int, total: int) -> None:
+            self._progress(f"{stage}, MB", done // _MEGABYTE, -(-total // _MEGABYTE))
+
+        return show

@@ -1,0 +1,554 @@
+"""Sessions of raw logs: known answers, and logs that lack something."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from omegaconf import OmegaConf
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial import cKDTree
+
+from chsel.errors import SessionError, SettingError
+from chsel.methods import build_method
+from chsel.pose import apply, inverse
+from chsel.sdf import SdfGrid, mesh_sdf
+from chsel.settings import build_settings, settings_mapping
+from replay.events import Logged, Probe, RigDescribed, SensorImage, SessionEnded, SessionStarted
+from replay.mcap.reader import read_recording
+from replay.mcap.writer import McapRecorder
+from runners.cli import CONF
+from runners.display import Display
+from runners.objects.loader import ObjectConfig, load_object
+from runners.recording import RecordingConfig
+from runners.sensors.pose_file import beside, write_pose
+from runners.sensors.rig import (
+    Annotations,
+    BubbleRig,
+    CloudRig,
+    ExtraContacts,
+    ProbeTimes,
+    Rig,
+)
+from runners.session_run import SessionRun
+from runners.sessions import session_settings
+from runners.sessions.sensors import SensorsSession, SensorsSettings
+from tests.runners.sensors.small_logs import ros2_cloud, ros2_transform, write_ros2
+from tests.runners.sensors.sphere_log import (
+    BEGIN,
+    CENTRE,
+    HAND_FROM_PAD,
+    LATENCY,
+    MEMBRANE,
+    OUTER,
+    RADIUS,
+    RIG,
+    SECOND,
+    WORLD_FROM_CAMERA,
+    SphereLog,
+    directions,
+    hand_pose,
+    seen,
+)
+
+SPACING = 0.01
+DIAGONAL = 3**0.5 * SPACING
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return SphereLog().write(tmp_path_factory.mktemp("log") / "sphere.mcap")
+
+
+@pytest.fixture(scope="module")
+def events(log: Path) -> list[Any]:
+    return list(open_log(log).probes())
+
+
+def open_log(path: Path, rig: Rig = RIG, seed: int = 0, **settings: Any) -> SensorsSession:
+    return SensorsSession(SensorsSettings(rig, str(path), **settings), seed)
+
+
+def probes(events: Any) -> list[Probe]:
+    return [event for event in events if isinstance(event, Probe)]
+
+
+def lines(events: Any, level: str = "warning") -> str:
+    found = [event for event in events if isinstance(event, Logged) and event.level == level]
+    return "\n".join(event.text for event in found)
+
+
+def heights(points: np.ndarray) -> np.ndarray:
+    """Signed distance (N,) to the sphere."""
+    return np.sqrt(((points - CENTRE) ** 2).sum(axis=1)) - RADIUS
+
+
+def test_contacts_lie_on_what_was_touched(events: list[Any]) -> None:
+    touching, passing = probes(events)
+    assert (touching.step, touching.outcome) == (0, "contact")
+    assert (passing.step, passing.outcome) == (1, "free")
+    assert len(touching.contacts) == 50
+    assert len(passing.contacts) == len(passing.new_points.known) == 0
+    assert np.abs(heights(touching.contacts)).max() < 0.0015
+    np.testing.assert_array_equal(touching.new_points.contacts, touching.contacts)
+    outward = (touching.contacts - CENTRE) / RADIUS
+    assert ((outward * touching.contact_normals).sum(axis=1) > 0.99).all()
+    # A tenth of the pixels is a disk of 7.4 of them, 1 mm each at that depth.
+    across = np.sqrt(((touching.contacts - CENTRE)[:, 1:] ** 2).sum(axis=1))
+    assert across.max() == pytest.approx(0.0071, abs=0.0007)
+    assert touching.contacts[:, 0].max() < CENTRE[0]
+
+
+def test_free_space_is_where_rays_passed_and_the_hand_went(events: list[Any], log: Path) -> None:
+    free = np.concatenate(
+        [open_log(log).initial_points.free, *(probe.new_points.free for probe in probes(events))]
+    )
+    assert len(np.unique(np.rint(free / 1e-6).astype(int), axis=0)) == len(free)
+    assert heights(free).min() > -DIAGONAL
+    known = cKDTree(free)
+    depth = seen()
+    edges = maximum_filter(depth, 3) - minimum_filter(depth, 3) > 0.05
+    for fraction in (0.3, 0.6, 0.94):
+        ways = (fraction * depth[..., None] * directions(OUTER))[~edges][::50]
+        points = ways @ WORLD_FROM_CAMERA[:3, :3].T + WORLD_FROM_CAMERA[:3, 3]
+        lower, upper = np.array(RIG.workspace).T
+        points = points[((points > lower) & (points < upper)).all(axis=1)]
+        assert len(points) > 10
+        assert (known.query(points, p=np.inf)[0] <= 0.5 * SPACING + 1e-9).all()
+    nose = hand_pose(4.0) @ [0.0, 0.0, 0.08, 1.0]
+    assert known.query(nose[:3] - [0.005, 0.0, 0.0], p=np.inf)[0] <= 0.5 * SPACING + 1e-9
+    within_pad = hand_pose(2.0) @ HAND_FROM_PAD @ [0.0, 0.0, MEMBRANE - 0.03, 1.0]
+    assert known.query(within_pad[:3], p=np.inf)[0] <= 0.5 * SPACING + 1e-9
+    behind = np.array([0.5 * RADIUS, 0.0, 0.0])
+    assert known.query(CENTRE + behind)[0] > 0.01
+
+
+def test_images_come_ahead_of_their_probe(events: list[Any], log: Path) -> None:
+    kinds = [type(event) for event in events]
+    assert kinds[0] is RigDescribed
+    assert (events[0].name, events[0].step, events[0].hand.is_watertight) == ("sphere", -1, True)
+    assert len(events[0].source) == 32
+    first = kinds.index(Probe)
+    images = [event for event in events[:first] if isinstance(event, SensorImage)]
+    assert [(image.sensor, image.kind, image.step) for image in images] == [
+        ("camera", "depth", 0),
+        ("pad", "deformation", 0),
+    ]
+    camera, pad = images
+    np.testing.assert_allclose(camera.values * camera.unit, seen(), atol=0.0011)
+    np.testing.assert_allclose(camera.world_from_camera, WORLD_FROM_CAMERA, atol=1e-9)
+    assert 0.9 < camera.mask.mean() < 1.0
+    deepest = (pad.values * pad.unit).max()
+    assert deepest == pytest.approx(0.012, abs=0.001)
+    assert (pad.values[pad.mask] * pad.unit > 0.0039).all()
+    assert pad.mask.sum() > 50
+    without = list(open_log(log, images=False).probes())
+    assert not any(isinstance(event, SensorImage) for event in without)
+    for one, other in zip(probes(events), probes(without), strict=True):
+        assert one.new_points.digest == other.new_points.digest
+
+
+def test_the_hand_is_shown_where_it_was(events: list[Any]) -> None:
+    path = probes(events)[0].gripper_path
+    assert 10 < len(path) <= 200
+    np.testing.assert_allclose(path[0], hand_pose(0.0), atol=1e-9)
+    furthest = path[np.argmax(path[:, 0, 3])]
+    np.testing.assert_allclose(furthest[:3, 3], hand_pose(2.0)[:3, 3], atol=0.003)
+
+
+def test_the_seed_chooses_among_contact_pixels_and_changes_nothing_else(
+    events: list[Any], log: Path
+) -> None:
+    again = probes(open_log(log).probes())[0]
+    other = probes(open_log(log, seed=1).probes())[0]
+    first = probes(events)[0]
+    assert again.new_points.digest == first.new_points.digest
+    np.testing.assert_array_equal(other.new_points.free, first.new_points.free)
+    assert len(other.contacts) == 50
+    assert not np.array_equal(other.contacts, first.contacts)
+
+
+def test_a_session_can_be_read_twice(log: Path) -> None:
+    session = open_log(log)
+    one, other = ([p.new_points.digest for p in probes(session.probes())] for _ in range(2))
+    assert one == other
+    assert session.report.total()["pad"].contacts == 50
+
+
+def test_contacts_count_between_begin_and_end_alone(tmp_path: Path) -> None:
+    marks = ((0.5, "begin 3"), (1.2, "end 3"), (2.8, "begin 4"), (4.9, "end 4"))
+    log = SphereLog(marks=marks).write(tmp_path / "log.mcap")
+    session = open_log(log)
+    found = probes(session.probes())
+    assert [(probe.step, probe.outcome) for probe in found] == [(3, "free"), (4, "free")]
+    # What is seen between two probes is known with the first of them.
+    assert len(found[0].new_points.free) > 10 * len(found[1].new_points.free)
+
+
+def test_a_log_without_markers_is_one_probe_and_times_can_stand_in_for_them(
+    tmp_path: Path, log: Path
+) -> None:
+    rig = replace(RIG, markers=None)
+    (probe,) = probes(open_log(log, rig).probes())
+    assert (probe.step, probe.outcome, len(probe.contacts)) == (0, "contact", 50)
+    rig = replace(rig, probes=(ProbeTimes(1.0, 1.2), ProbeTimes(1.5, 3.0), ProbeTimes(3.0, 4.9)))
+    found = probes(open_log(log, rig).probes())
+    assert [probe.outcome for probe in found] == ["free", "contact", "free"]
+    rig = replace(rig, probes=(ProbeTimes(1.0, 2.0), ProbeTimes(1.5, 3.0)))
+    with pytest.raises(SettingError, match=r"probes\[1\] runs from 1.5 to 3.0 s; accepted: a begi"):
+        open_log(log, rig)
+
+
+def test_annotations_leave_out_and_add_contacts(log: Path) -> None:
+    annotations = Annotations(
+        exclude=(0,),
+        contacts=(
+            ExtraContacts(0, foremost=5),
+            ExtraContacts(1, points=((0.9, 0.01, 0.41), (0.9, 0.0, 0.41))),
+            ExtraContacts(7, points=((0.9, 0.01, 0.41),)),
+        ),
+    )
+    events = list(open_log(log, replace(RIG, annotations=annotations)).probes())
+    first, second = probes(events)
+    # The foremost part of a plane that gives way is at the membrane's rim.
+    assert first.contacts[0, 0] == pytest.approx(CENTRE[0] - RADIUS + 0.012, abs=0.001)
+    assert len(first.contacts) == 1
+    np.testing.assert_array_equal(second.contacts, [[0.9, 0.01, 0.41], [0.9, 0.0, 0.41]])
+    assert (second.contact_normals == 0.0).all()
+    assert "annotates probe 7, which the log does not have" in lines(events)
+    assert "probe 0: contacts left out" in lines(events, "info")
+
+
+def test_the_references_ways_tell_less(log: Path, events: list[Any]) -> None:
+    assert RIG.hand is not None
+    scaled = replace(RIG.cameras[0], rays="scaled_images")
+    backwards = replace(RIG.hand, sweep="backwards")
+    rig = replace(RIG, cameras=(scaled,), hand=backwards)
+    found = probes(open_log(log, rig).probes())
+    both = [sum(len(p.new_points.free) for p in some) for some in (found, probes(events))]
+    assert 0.3 * both[1] < both[0] < both[1]
+    rig = replace(RIG, cameras=(), hand=backwards)
+    free = probes(open_log(log, rig).probes())[0].new_points.free
+    end = hand_pose(2.0)[:3, 3] + [HAND_FROM_PAD[2, 3] + MEMBRANE, 0.0, 0.0]
+    behind = end[0] - free[:, 0]
+    # 0.02 to 0.15 m behind the membrane, as deep as it was pressed in; one voxel is the grid's.
+    assert len(free) > 50
+    assert -0.5 * SPACING < behind.min() - 0.02 < SPACING
+    assert behind.max() < 0.15 + 0.012 + SPACING
+
+
+def joined(path: Path, *parts: Path) -> Path:
+    """One log of the messages of several, in order of their log times."""
+    found = []
+    for part in parts:
+        with part.open("rb") as file:
+            found += [(each[2].log_time, *each) for each in make_reader(file).iter_messages()]
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels: dict[str, int] = {}
+        for time, schema, channel, message in sorted(found, key=lambda each: each[0]):
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.topic], time, message.data, time)
+        writer.finish()
+    return path
+
+
+def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
+    SphereLog().write(tmp_path / "a.mcap")
+    origin = np.array([0.72, 0.1, 0.55])
+    points = np.array([[0.2, 0.0, 0.0], [0.2, 0.0, 0.001], [np.nan, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    fixed = {"transforms": [ros2_transform("world", "lidar", origin, BEGIN)]}
+    sent = [("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)]
+    for seconds in (0.5, 2.0):
+        stamp = BEGIN + round(seconds * SECOND)
+        for topic in ("/lidar", "/skin"):
+            cloud = ros2_cloud(points, stamp)
+            sent.append((topic, "sensor_msgs/PointCloud2", cloud, stamp + LATENCY))
+    write_ros2(tmp_path / "b.mcap", sent)
+    log = joined(tmp_path / "log.mcap", tmp_path / "a.mcap", tmp_path / "b.mcap")
+    with_clouds = replace(
+        RIG,
+        cameras=(),
+        hand=None,
+        clouds=(CloudRig("/lidar", "rays"), CloudRig("/skin", "contacts")),
+    )
+    session = open_log(log, with_clouds)
+    events = list(session.probes())
+    first, second = probes(events)
+    assert len(first.contacts) == 51  # one of the cloud's two in a voxel; 9 m is out of the room
+    np.testing.assert_allclose(first.contacts[-1], [0.92, 0.1, 0.55], atol=1e-6)
+    assert len(second.contacts) == 0
+    on_ray = (np.abs(first.new_points.free - origin)[:, 1:] < 1e-9).all(axis=1)
+    assert len(first.new_points.free[on_ray]) >= 18
+    tally = session.report.tallies[0]["/skin"]
+    assert (tally.images, tally.used, tally.spared, tally.contacts) == (2, 1, 1, 1)
+    surface = replace(with_clouds, clouds=(CloudRig("/skin", "surface"),))
+    first = probes(open_log(log, surface).probes())[0]
+    assert (len(first.contacts), len(first.new_points.known)) == (50, 51)
+
+
+@pytest.mark.parametrize(
+    ("changes", "left_out", "message"),
+    [
+        (
+            {"markers": "/marks"},
+            (),
+            r"lacks what rig sphere names: /marks \(markers of probes\);",
+        ),
+        (
+            {},
+            ("/camera/depth",),
+            r"/camera/depth \(depth of camera\); it has /camera/info \(sen",
+        ),
+        ({}, ("/pad/info",), r"/pad/info \(camera info of pad\)"),
+        ({}, ("/tf", "/tf_static"), r"camera: frame world is in no transform; there are none"),
+        ({"world": "map"}, (), r"camera: frame map is in no transform; there are camera_frame, ha"),
+        ({"workspace": None}, (), r"workspace is missing"),
+        ({"cameras": (), "bubbles": ()}, (), r"rig sphere has no sensor"),
+    ],
+)
+def test_a_log_that_lacks_something_says_so(
+    tmp_path: Path, changes: dict[str, Any], left_out: tuple[str, ...], message: str
+) -> None:
+    log = SphereLog(left_out=left_out).write(tmp_path / "log.mcap")
+    with pytest.raises((SessionError, SettingError), match=message):
+        open_log(log, replace(RIG, **changes))
+
+
+def test_depths_in_another_unit_are_an_error_that_names_it(tmp_path: Path, log: Path) -> None:
+    metres = SphereLog(unit=1.0).write(tmp_path / "log.mcap")  # so that whole metres are sent
+    with pytest.raises(SessionError, match=r"/camera/depth of camera has depths of 0.001 m \(medi"):
+        open_log(metres)
+    # Depths a thousand times as large: the pad's are in metres.
+    millimetres = replace(RIG.bubbles[0], unit=0.001)
+    with pytest.raises(SessionError, match=r"at 0.001 m a unit\); accepted: from 0.01 to 0.1 m"):
+        open_log(log, replace(RIG, bubbles=(millimetres,)))
+
+
+def test_a_topic_of_another_kind_is_no_depth(log: Path) -> None:
+    wrong = replace(RIG.cameras[0], depth="/probe")
+    with pytest.raises(SessionError, match=r"/probe of camera gives no depth images \(its schem"):
+        open_log(log, replace(RIG, cameras=(wrong,)))
+
+
+def test_a_hole_in_the_transforms_costs_the_images_within(tmp_path: Path) -> None:
+    log = SphereLog(lost_transforms=(3.4, 4.6)).write(tmp_path / "log.mcap")
+    session = open_log(log)
+    events = list(session.probes())
+    first, second = probes(events)
+    assert len(first.contacts) == 50
+    assert (second.outcome, session.report.tallies[0]["pad"].lost) == ("free", 0)
+    assert session.report.tallies[1]["pad"].lost == 12
+    assert "pad: left out, as the pose of pad_frame is not known then (12 times)" in lines(events)
+    # Nothing is swept across the hole.
+    steps = np.abs(np.diff(second.gripper_path[:, 0, 3]))
+    assert steps.max() > 0.02 or len(second.gripper_path) < 20
+
+
+def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path: Path, events: list[Any]) -> None:
+    log = SphereLog(camera_clock=100.0).write(tmp_path / "log.mcap")
+    ahead = list(open_log(log).probes())
+    assert "/camera/depth is 100 s ahead of other topics'" in lines(ahead)
+    for one, other in zip(probes(ahead), probes(events), strict=True):
+        np.testing.assert_array_equal(one.contacts, other.contacts)
+        np.testing.assert_array_equal(one.new_points.free, other.new_points.free)
+
+
+def test_marks_that_do_not_fit_are_reported(tmp_path: Path) -> None:
+    marks = (
+        (0.5, "end 9"),
+        (0.9, "begin 2"),
+        (1.0, "hello"),
+        (3.0, "begin 2"),
+        (3.1, "begin 1"),
+    )
+    log = SphereLog(marks=marks).write(tmp_path / "log.mcap")
+    events = list(open_log(log).probes())
+    assert [(probe.step, probe.outcome) for probe in probes(events)] == [
+        (0, "contact"),
+        (1, "free"),
+    ]
+    said = lines(events)
+    for part in (
+        "probe 9 has an end and no begin; ignored",
+        "a marker says 'hello'; understood: begin N, end",
+        "probe 2 begins twice without an end; taken as one",
+        "probe 2 has a begin and no end; the next begin ends it",
+        "probe 1 has a begin and no end; the log's end ends it",
+        "probes are marked 2, 1; as these do not rise, they are counted from 0 to 1",
+    ):
+        assert part in said
+
+
+def test_a_pose_beside_the_log_is_the_true_one(tmp_path: Path) -> None:
+    log = SphereLog().write(tmp_path / "log.mcap")
+    assert open_log(log).world_from_object is None
+    pose = np.eye(4)
+    pose[:3, 3] = CENTRE
+    write_pose(beside(log), pose, {})
+    session = open_log(log)
+    np.testing.assert_array_equal(session.world_from_object, pose)
+    assert "the true pose is that of log.pose.yaml" in lines(session.probes(), "info")
+    assert open_log(log, pose="none").world_from_object is None
+    with pytest.raises(SessionError, match=r"other.yaml cannot be read"):
+        open_log(log, pose=str(tmp_path / "other.yaml"))
+
+
+def test_a_pad_that_sends_deformations_needs_its_shape(log: Path, tmp_path: Path) -> None:
+    pad = BubbleRig("pad", "/pad/depth", "/pad/info", kind="deformation")
+    with pytest.raises(SessionError, match=r"pad has images of deformation and no reference"):
+        open_log(log, replace(RIG, bubbles=(pad,)))
+    np.save(tmp_path / "small.npy", np.full((4, 4), 0.06))
+    pad = replace(RIG.bubbles[0], reference=str(tmp_path / "small.npy"))
+    with pytest.raises(SessionError, match=r"reference of pad has 4 x 4 pixels; accepted: .* 48 x"):
+        open_log(log, replace(RIG, bubbles=(pad,)))
+    np.save(tmp_path / "whole.npy", np.full((36, 48), MEMBRANE))
+    pad = replace(RIG.bubbles[0], reference=str(tmp_path / "whole.npy"))
+    found = probes(open_log(log, replace(RIG, bubbles=(pad,))).probes())
+    assert np.abs(heights(found[0].contacts)).max() < 0.0015
+
+
+def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) -> None:
+    values = {"path": str(log), "rig": settings_mapping(RIG)}
+    assert session_settings("sensors", values).rig == RIG
+    values["rig"]["cameras"][0]["edges"] = 0.1
+    with pytest.raises(SettingError, match=r"rig.cameras\[0\].edges does not exist; did you mean"):
+        session_settings("sensors", values)
+    with pytest.raises(SettingError, match=r"path is missing; pass session.path=LOG"):
+        build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")
+
+
+def test_progress_is_told_in_megabytes(log: Path) -> None:
+    told: list[tuple[str, int, int]] = []
+    session = SensorsSession(
+        SensorsSettings(RIG, str(log)), 0, lambda *progress: told.append(progress)
+    )
+    list(session.probes())
+    assert {stage for stage, _, _ in told} >= {
+        "first pass over the log, MB",
+        "digest of the log, MB",
+        "reading images, MB",
+    }
+    assert all(0 <= done <= total == 1 for _, done, total in told)
+
+
+def damaged(whole: bytes, count: int) -> Iterator[bytes]:
+    """Logs cut and with bytes flipped, always the same."""
+    stream = np.random.default_rng(0)
+    for index in range(count):
+        data = bytearray(whole)
+        if index % 3 == 0:
+            del data[int(stream.integers(len(data))) :]
+        else:
+            for place in stream.integers(len(data), size=int(stream.integers(1, 20))):
+                data[place] = int(stream.integers(256))
+        yield bytes(data)
+
+
+def test_damaged_logs_give_points_or_one_clear_error(log: Path, tmp_path: Path) -> None:
+    path, told = tmp_path / "damaged.mcap", []
+    for data in damaged(log.read_bytes(), 24):
+        path.write_bytes(data)
+        try:
+            found = probes(open_log(path, images=False).probes())
+        except SessionError as error:
+            told.append("error" if "\n" not in str(error) else "several lines")
+            continue
+        told.append("points")
+        for probe in found:
+            if len(probe.contacts):
+                assert np.abs(heights(probe.contacts)).max() < 0.0015
+    assert set(told) == {"error", "points"}
+
+
+def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet")
+    from runners.twin.configurations import find_cabinet_configuration
+    from runners.twin.settings import TwinBubbles, TwinCamera, TwinSettings
+    from runners.twin.simulation import simulate_log
+
+    mesh = load_object(ObjectConfig("mustard", 1.0, 0.0003, "mustard"), tmp_path).mesh
+    small = TwinSettings(probes=1, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=64))
+    log = tmp_path / "log.mcap"
+    made = simulate_log(log, find_cabinet_configuration("cabinet_mustard"), mesh, 0, small)
+    rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
+    rig["cameras"][0]["edge_reach"] = 2  # of fewer pixels than usual
+    session = SensorsSession(session_settings("sensors", {"path": str(log), "rig": rig}), 0)
+    (probe,) = probes(session.probes())
+    object_from_world = inverse(made.world_from_object)
+    heights = mesh_sdf(mesh, apply(object_from_world, probe.contacts))[0]
+    assert len(heights) >= 30
+    assert np.abs(heights).mean() < 0.001
+    assert np.abs(heights).max() < 0.003
+    free = mesh_sdf(mesh, apply(object_from_world, probe.new_points.free))[0]
+    assert len(free) > 5000
+    assert free.min() > -0.02  # a coarse image with strays at edges
+    assert (free < 0.0).mean() < 0.01
+    lost = [tally.lost for tally in session.report.total().values()]
+    assert sum(lost) == 0
+
+
+def test_recordings_of_such_sessions_can_be_read_and_registered_again(
+    log: Path, tmp_path: Path
+) -> None:
+    sphere = trimesh.creation.icosphere(2, RADIUS)
+    sdf = SdfGrid.from_mesh(sphere, 0.005, padding=0.02)
+    session, path = open_log(log), tmp_path / "recording.mcap"
+    recorder = McapRecorder(path)
+    started = SessionStarted(
+        runner="probe",
+        object="sphere",
+        session="sensors",
+        method="icp",
+        seed=0,
+        config={},
+        mesh=sphere,
+        sdf=sdf,
+        workspace=session.workspace,
+        free_resolution=session.free_resolution,
+        initial_points=session.initial_points,
+    )
+    recorder.record(started)
+    run = SessionRun(
+        session,
+        build_method("icp", {}),
+        sdf,
+        recorder,
+        seed=0,
+        start=(4, 0),
+        recording=RecordingConfig(),
+        show=lambda *_: None,
+    )
+    rows = [row for _, row in run.steps()]
+    recorder.record(SessionEnded(1, "finished"))
+    recorder.close()
+    assert [("best_cost" in row, row["contacts"]) for row in rows] == [(True, 50), (True, 50)]
+    recording = read_recording(path)
+    assert recording.rig is not None
+    assert (recording.rig.name, recording.rig.source) == ("sphere", session.source)
+    assert [probe.new_points.digest for probe in recording.probes] == [
+        probe.new_points.digest for probe in probes(session.probes())
+    ]
+
+
+def test_the_report_is_a_table_of_what_was_used(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = open_log(log)
+    list(session.probes())
+    display = Display("title", 2)
+    display.sensed(session.report)
+    shown = capsys.readouterr().out
+    rows = {tuple(line.split()[:3]) for line in shown.splitlines()}
+    assert {("0", "camera", "7/7"), ("pad", "22/31", "0.0"), ("all", "camera", "11/11")} <= rows
+    assert "no pose" not in shown
