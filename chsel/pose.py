@@ -97,6 +97,12 @@ def axis_angle(axis: FloatArray, angle: FloatArray | float) -> FloatArray:
     return cosine * np.eye(3) + sine * hat + (1.0 - cosine) * outer
 
 
+def roll_pitch_yaw(angles: FloatArray) -> FloatArray:
+    """The rotation (3, 3) by angles (3,), radians, about the fixed axes x, y, z, in this order."""
+    about_x, about_y, about_z = axis_angle(np.eye(3), np.asarray(angles, dtype=np.float64))
+    return product(product(about_z, about_y), about_x)
+
+
 def rotation_vector(vectors: FloatArray) -> FloatArray:
     """Rotations (..., 3, 3) of rotation vectors (..., 3): the exponential map of SO(3)."""
     angle = np.sqrt((vectors**2).sum(axis=-1))

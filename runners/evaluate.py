@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from chsel.errors import RecordingError, SettingError, require_choice, require_positive
+from chsel.evaluation.true_pose import TruePoseSettings
 from chsel.methods import METHODS
 from chsel.settings import build_settings
 from runners.cli import command, plain
+from runners.evaluation.configurations import SENSORS
 from runners.evaluation.contenders import chosen_contenders, require_label
 from runners.evaluation.display import Display
 from runners.evaluation.experiment import join_experiment, read_experiment
@@ -28,12 +30,15 @@ from runners.evaluation.outside import outside_file, read_outside
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
 from runners.evaluation.schedule import Progress, Schedule
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
+from runners.evaluation.sensor_logs import check_log, is_missing
+from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
 from runners.plausible import store_definitions
 from runners.probe import PresetName
 
 _GATHER = 300.0  # s between tables of what is finished so far
 _OPEN_GROUPS = ("settings.", "outside.")
+_OF_TRIAL = ("configuration", "logs")
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,7 @@ class EvaluateConfig:
     metrics: MetricsConfig
     iterations: IterationsConfig
     assets: AssetsConfig
+    truth: TruePoseSettings = field(default_factory=TruePoseSettings)
     objects: str = "models"
     steps: str | None = None
     starts: str = OWN
@@ -86,9 +92,9 @@ def main(config: DictConfig) -> None:
     if values["steps"] is not None:
         values["steps"] = str(values["steps"])
     checked = build_settings(EvaluateConfig, values, "evaluate")
-    configurations = chosen_configurations(checked.configurations)
-    seeds = chosen_seeds(checked.seeds)
     plan = _plan(checked)
+    configurations = chosen_configurations(checked.configurations, plan.configurations)
+    seeds = chosen_seeds(checked.seeds)
     trials = [Trial(seed, name) for seed in seeds for name in configurations]
     _check(plan, trials)
     join_experiment(plan, checked.name, configurations, seeds)
@@ -125,6 +131,7 @@ def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
         if sys.exc_info()[0] is KeyboardInterrupt:
             display.say("interrupted: what is finished stays, and the same command goes on")
     display.summary(results, _labels(plan.folder))
+    display.true_poses(true_poses(plan.folder, read_experiment(plan.folder)))
     display.written(plan.folder, results)
     return any(text.startswith("failed") for text in results["status"].to_pylist())
 
@@ -132,10 +139,11 @@ def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
 def _plan(config: EvaluateConfig) -> Plan:
     outside = {str(name): Path(folder).expanduser() for name, folder in config.outside.items()}
     chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
+    logs = config.session.get("logs")
     return Plan(
         folder=Path(config.out).expanduser(),
         preset=config.preset.name,
-        session={key: value for key, value in config.session.items() if key != "configuration"},
+        session={key: value for key, value in config.session.items() if key not in _OF_TRIAL},
         objects=config.objects,
         definition=config.definition,
         metrics=config.metrics,
@@ -146,21 +154,22 @@ def _plan(config: EvaluateConfig) -> Plan:
         assets=config.assets.folder,
         contenders={contender.label: contender for contender in chosen},
         outside=outside,
+        logs=Path(str(logs)).expanduser() if logs is not None else None,
+        truth=config.truth,
     )
 
 
 def _check(plan: Plan, trials: list[Trial]) -> None:
     """What would fail everywhere fails here, before any work."""
     for trial in trials:
-        plan.session_settings(trial.configuration)
+        plan.session_settings(trial)
         plan.plausible_settings(plan.object_config(trial.configuration).epsilon)
     for scan in {plan.object_config(trial.configuration).scan for trial in trials}:
         if scan is not None:
             scan_file(plan.assets, scan)
     if not any(plan.steps_of(trial.configuration) for trial in trials):
         raise SettingError(f"steps is {plan.steps}; accepted: steps that a configuration has")
-    if plan.session["kind"] == "simulated" and importlib.util.find_spec("pybullet") is None:
-        raise SettingError("session=simulated needs PyBullet; accepted here: session=kinematic")
+    _check_sessions(plan, trials)
     for label, folder in plan.outside.items():
         require_label(label)
         if label in plan.contenders:
@@ -170,7 +179,22 @@ def _check(plan: Plan, trials: list[Trial]) -> None:
         for trial in trials:
             path = outside_file(folder, trial)
             if path is not None:
-                read_outside(path, trial)
+                read_outside(plan, trial, path)
+
+
+def _check_sessions(plan: Plan, trials: list[Trial]) -> None:
+    """What sessions need that is not there: an engine, or raw logs and guesses of poses."""
+    if plan.kind == SENSORS:
+        for trial in trials:
+            check_log(plan, trial)
+        to_simulate = any(is_missing(plan, trial) for trial in trials)
+    elif plan.logs is not None:
+        raise SettingError(f"session.logs is for session=sensors; this one is {plan.kind}")
+    else:
+        to_simulate = plan.kind == "simulated"
+    if to_simulate and importlib.util.find_spec("pybullet") is None:
+        what = "a simulated log" if plan.kind == SENSORS else "session=simulated"
+        raise SettingError(f"{what} needs PyBullet; accepted here: session=kinematic")
 
 
 def _labels(folder: Path) -> list[str]:

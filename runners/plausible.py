@@ -37,6 +37,7 @@ from runners.cli import command, plain
 from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig
 from runners.plausible_source import Source, open_source
+from runners.sensors.pose_file import beside, read_pose
 
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 _OVERRIDE = re.compile(r"[~+]{0,2}[\w.@/:]+=")
@@ -108,16 +109,13 @@ def _settings(definition: Any, source: Source) -> PlausibleSettings:
 def _truth(
     config: PlausibleConfig, source: Source, settings: PlausibleSettings, console: Console
 ) -> FloatArray:
-    """The true pose that the file gives, or else the one that is found near a guess."""
+    """The true pose that the file gives; else the one near a guess, or that of a pose file."""
     if source.world_from_object is not None:
         if config.guess is not None:
             raise SettingError("guess is for files without a true pose; this one has it")
         return source.world_from_object
     if config.guess is None:
-        raise SettingError(
-            f"{config.file} has no true pose; accepted: a file with world_from_object, or "
-            "guess=[[...],[...],[...],[0,0,0,1]] near it"
-        )
+        return _aligned(Path(config.file or "").expanduser(), console)
     problem = source.problems.problem(source.steps[-1])
     found = find_true_pose(problem, np.array(config.guess))
     console.print(
@@ -127,6 +125,19 @@ def _truth(
         markup=False,
     )
     return found.world_from_object
+
+
+def _aligned(path: Path, console: Console) -> FloatArray:
+    """The pose in the file beside, which runners.align writes."""
+    there = beside(path)
+    if not there.exists():
+        raise SettingError(
+            f"{path} has no true pose, and there is no {there.name} beside it; accepted: a pose "
+            f"that `python -m runners.align {path} position=[x,y,z] rotation=[roll,pitch,yaw]` "
+            "finds, guess=[[...],[...],[...],[0,0,0,1]] near it, or a file with world_from_object"
+        )
+    console.print(f"true pose: that of {there}", soft_wrap=True, markup=False)
+    return read_pose(there)
 
 
 def _rows(

@@ -1,33 +1,44 @@
-"""Where plausible sets are made for: the registration problems of a recording or a points file."""
+"""Where plausible sets are made for: the problems of a recording, a raw log or a points file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import trimesh
+from mcap.exceptions import McapError
+from mcap.records import Header
+from mcap.stream_reader import StreamReader
 
 from chsel.arrays import FloatArray
-from chsel.errors import RecordingError
-from chsel.points import KnownPoints
+from chsel.errors import RecordingError, SettingError
+from chsel.points import KnownPoints, Workspace
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
+from replay.events import Event, Probe, RigDescribed
+from replay.file_digest import file_digest
 from replay.mcap.reader import Recording, read_recording
+from replay.mcap.schemas import PROFILE
 from runners.objects.loader import ObjectConfig, load_object
+from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
+from runners.sessions import open_session, session_settings
 from runners.sessions.points import PointsSession, PointsSettings
+
+_LONGEST_HEADER = 4096  # bytes
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
     """What a file holds: the object, its true pose (4, 4) where known, and problems by step.
 
-    epsilon: of the object, metres; None where the file does not say.
+    epsilon: of the object, metres; None where the file does not say. digest: of the file's bytes.
     """
 
     object: str
@@ -36,6 +47,7 @@ class Source:
     epsilon: float | None
     steps: tuple[int, ...]
     problems: Problems
+    digest: str
 
 
 class Problems(Protocol):
@@ -55,32 +67,110 @@ def open_source(
     assets: Path,
     seed: int,
 ) -> Source:
-    """A recording, else a file of known points, for which the object must be named."""
-    if path.suffix.lower() == ".mcap":
+    """A recording; else a raw log or a file of known points, for which the object must be named.
+
+    session: its settings, for what is no recording; raw logs need those of kind "sensors", with
+    which a .yaml is a depth image.
+    """
+    is_mcap = path.suffix.lower() == ".mcap"
+    if is_mcap and _is_recording(path):
         return _recorded(path)
-    config = build_settings(ObjectConfig, object_config, "object")
-    model = load_object(config, assets)
     values = {key: value for key, value in session.items() if key != "kind"}
-    settings = build_settings(PointsSettings, {**values, "path": str(path)}, "session")
-    points = PointsSession(settings, model)
-    sdf = SdfGrid.from_mesh(model.mesh, settings.object_resolution, padding=settings.object_padding)
-    problems = _PointProblems(points, sdf, seed)
-    steps = tuple(probe.step for probe in problems.probes)
-    truth = points.world_from_object
-    return Source(model.name, model.mesh, truth, model.epsilon, steps, problems)
+    of_sensors = session.get("kind") == "sensors"
+    is_frame = of_sensors and path.suffix.lower() in FRAME_SUFFIXES
+    if is_mcap or path.is_dir() or is_frame:
+        if not of_sensors:
+            raise SettingError(
+                f"{path} is no recording; accepted for a raw log: session=sensors "
+                "session/rig=NAME object=NAME"
+            )
+        return _raw(path, object_config, values, assets, seed)
+    return _points(path, object_config, values, assets, seed)
 
 
 def _recorded(path: Path) -> Source:
     recording = read_recording(path)
-    if not recording.steps:
-        raise RecordingError(f"recording {path} has no registration problem")
     start = recording.start
     config = start.config.get("object")
     epsilon = config.get("epsilon") if isinstance(config, Mapping) else None
     epsilon = float(epsilon) if isinstance(epsilon, int | float) else None
-    problems = _RecordedProblems(recording)
+    problems: Problems = _RecordedProblems(recording)
+    steps = recording.steps
+    if not steps:  # nothing was registered, as where somebody else's method is to be measured
+        problems = _ProbedProblems(
+            recording.probes,
+            start.initial_points,
+            start.workspace,
+            start.sdf,
+            start.free_resolution,
+            start.seed,
+        )
+        steps = problems.steps
+    if not steps:
+        raise RecordingError(f"recording {path} has no registration problem and no probe")
     truth = start.world_from_object
-    return Source(start.object, start.mesh, truth, epsilon, recording.steps, problems)
+    return Source(start.object, start.mesh, truth, epsilon, steps, problems, file_digest(path))
+
+
+def _raw(
+    path: Path,
+    object_config: Mapping[str, Any],
+    session: Mapping[str, Any],
+    assets: Path,
+    seed: int,
+) -> Source:
+    """A log of sensors, of which known points are made first."""
+    model = load_object(build_settings(ObjectConfig, object_config, "object"), assets)
+    # Images are for the eye; a pose beside the log is what is sought here.
+    chosen = {**session, "path": str(path), "pose": "none", "images": False}
+    settings = session_settings("sensors", chosen)
+    sensors = open_session("sensors", settings, model, seed)
+    try:
+        events: list[Event] = list(sensors.probes())
+    finally:
+        sensors.close()
+    sdf = SdfGrid.from_mesh(model.mesh, settings.object_resolution, padding=settings.object_padding)
+    problems = _ProbedProblems(
+        events, sensors.initial_points, sensors.workspace, sdf, sensors.free_resolution, seed
+    )
+    told = [event.source for event in events if isinstance(event, RigDescribed)]
+    digest = told[0] if told else file_digest(path)
+    return Source(model.name, model.mesh, None, model.epsilon, problems.steps, problems, digest)
+
+
+def _points(
+    path: Path,
+    object_config: Mapping[str, Any],
+    session: Mapping[str, Any],
+    assets: Path,
+    seed: int,
+) -> Source:
+    model = load_object(build_settings(ObjectConfig, object_config, "object"), assets)
+    settings = build_settings(PointsSettings, {**session, "path": str(path)}, "session")
+    points = PointsSession(settings, model)
+    sdf = SdfGrid.from_mesh(model.mesh, settings.object_resolution, padding=settings.object_padding)
+    problems = _ProbedProblems(
+        list(points.probes()),
+        points.initial_points,
+        points.workspace,
+        sdf,
+        points.free_resolution,
+        seed,
+    )
+    truth, digest = points.world_from_object, file_digest(path)
+    return Source(model.name, model.mesh, truth, model.epsilon, problems.steps, problems, digest)
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether a file is not some other program's, as its first record tells."""
+    try:
+        with path.open("rb") as file:
+            first = BytesIO(file.read(_LONGEST_HEADER))
+        records = StreamReader(first, record_size_limit=_LONGEST_HEADER).records
+        header = next(iter(records), None)
+    except (McapError, OSError, ValueError):  # what is wrong with it is told when it is read
+        return True
+    return not isinstance(header, Header) or header.profile == PROFILE
 
 
 class _RecordedProblems:
@@ -94,24 +184,33 @@ class _RecordedProblems:
         return self._recording.hypotheses(step) if self._recording.has_result(step) else None
 
 
-class _PointProblems:
+class _ProbedProblems:
     """All points up to a step; where a registration starts does not matter here."""
 
-    def __init__(self, session: PointsSession, sdf: SdfGrid, seed: int) -> None:
-        self.probes = list(session.probes())
-        self._session, self._sdf, self._seed = session, sdf, seed
+    def __init__(
+        self,
+        events: Sequence[Event],
+        initial_points: KnownPoints,
+        workspace: Workspace,
+        sdf: SdfGrid,
+        free_resolution: float,
+        seed: int,
+    ) -> None:
+        self._probes = [event for event in events if isinstance(event, Probe)]
+        self._initial, self._workspace = initial_points, workspace
+        self._sdf, self._free_resolution, self._seed = sdf, free_resolution, seed
+        self.steps = tuple(probe.step for probe in self._probes)
 
     def problem(self, step: int) -> RegistrationProblem:
-        news = [probe.new_points for probe in self.probes if probe.step <= step]
-        points = reduce(KnownPoints.merged, news, self._session.initial_points)
+        news = [probe.new_points for probe in self._probes if probe.step <= step]
         return RegistrationProblem(
             self._sdf,
-            points,
+            reduce(KnownPoints.merged, news, self._initial),
             np.eye(4)[None],
-            self._session.workspace,
-            self._session.free_resolution,
+            self._workspace,
+            self._free_resolution,
             StreamKey(self._seed, step),
         )
 
     def found(self, step: int) -> None:
-        """A points file holds no result."""
+        """Nothing was registered."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from math import degrees
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from runners.evaluation import schedule
+from runners.evaluation.true_poses import FoundPose
 
 _SPARSE = 60.0  # s between lines where there is no terminal
 _MOST_SHOWN = 3  # units at work, failures
@@ -85,6 +87,25 @@ class Display:
             table.add_row(label, *cells, _median(1000.0 * seconds[own]))
         self.say("medians over all steps of all trials: PD in mm² by object, ms a registration")
         self._console.print(table)
+
+    def true_poses(self, found: Sequence[FoundPose]) -> None:
+        """How far the true poses that were sought are from guesses, and from a simulated truth."""
+        if not found:
+            return
+        self.say(
+            f"true poses were sought in {len(found)} trials: mean |SDF| of contacts "
+            f"{1000.0 * float(np.mean([one.mean_distance for one in found])):.2f} mm, "
+            f"{sum(one.violations for one in found)} free points inside of objects"
+        )
+        simulated = [one for one in found if one.position_error is not None]
+        if simulated:
+            positions = [1000.0 * (one.position_error or 0.0) for one in simulated]
+            rotations = [degrees(one.rotation_error or 0.0) for one in simulated]
+            self.say(
+                f"from the simulated truth of {len(simulated)}: "
+                f"{np.mean(positions):.1f} mm in the mean, {max(positions):.1f} mm at worst; "
+                f"{np.mean(rotations):.1f} and {max(rotations):.1f} degrees"
+            )
 
     def written(self, folder: Path, results: pa.Table) -> None:
         """Where the tables are."""

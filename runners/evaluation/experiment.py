@@ -13,9 +13,9 @@ from chsel.errors import RecordingError, SettingError
 from chsel.settings import settings_mapping
 from replay.environment import environment
 from runners.evaluation.claims import claimed
+from runners.evaluation.configurations import SENSORS
 from runners.evaluation.plan import Plan
 from runners.evaluation.whole_file import whole_file
-from runners.sessions.configurations import CONFIGURATIONS
 
 FILE = "experiment.json"
 FORMAT = 1
@@ -29,6 +29,8 @@ _FIXED = (
     "steps",
     "starts",
     "iterations",
+    "logs",
+    "truth",
 )
 
 
@@ -46,7 +48,7 @@ def join_experiment(
         if path.exists():
             theirs = read_experiment(plan.folder)
             _check_same(plan.folder, theirs, ours)
-            ours = _united(theirs, ours)
+            ours = _united(plan, theirs, ours)
         elif (plan.folder / "trials").exists():
             raise SettingError(f"{plan.folder} has trials but no {FILE}; accepted: another out=DIR")
         with whole_file(path) as beside:
@@ -83,6 +85,8 @@ def _described(
         "steps": plan.steps,
         "starts": plan.starts,
         "iterations": {"every": plan.every},
+        "logs": None if plan.logs is None else str(plan.logs),
+        "truth": settings_mapping(plan.truth) if plan.kind == SENSORS else None,
         "commands": [_command()],
         "environment": environment(),
         "other_environments": [],
@@ -123,7 +127,7 @@ def _differences(path: str, theirs: Any, ours: Any) -> list[str]:
     return [] if theirs == ours else [f"{path} is {ours!r}, was {theirs!r}"]
 
 
-def _united(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> dict[str, Any]:
+def _united(plan: Plan, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> dict[str, Any]:
     both = {*theirs.get("configurations", ()), *ours["configurations"]}
     seeds = {*theirs.get("seeds", ()), *ours["seeds"]}
     known = [theirs.get("environment"), *theirs.get("other_environments", ())]
@@ -132,7 +136,7 @@ def _united(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> dict[str, Any
     return {
         **ours,
         "name": theirs.get("name", ours["name"]),
-        "configurations": [name for name in CONFIGURATIONS if name in both],
+        "configurations": [name for name in plan.configurations if name in both],
         "seeds": sorted(seeds),
         "methods": {**theirs.get("methods", {}), **ours["methods"]},
         "outside": {**theirs.get("outside", {}), **ours["outside"]},

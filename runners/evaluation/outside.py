@@ -23,7 +23,6 @@ from runners.evaluation.judge import Judge
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.table import RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded, problems
-from runners.sessions.configurations import CONFIGURATIONS
 
 PRESET = "outside"
 """What the table has for a preset."""
@@ -72,7 +71,7 @@ def outside_digest(path: Path | None) -> str:
     return "none" if path is None else file_digest(path)
 
 
-def read_outside(path: Path, trial: Trial) -> dict[int, OutsideSet]:
+def read_outside(plan: Plan, trial: Trial, path: Path) -> dict[int, OutsideSet]:
     """The sets of a trial by step.
 
     npz: arrays `step_K` (B, 4, 4), world_from_object of step K; where known `cost_K` (B,) and
@@ -80,7 +79,7 @@ def read_outside(path: Path, trial: Trial) -> dict[int, OutsideSet]:
     else: other names, steps that do not exist, shapes, numbers, rotations.
     """
     values = _values(path)
-    steps = range(len(CONFIGURATIONS[trial.configuration].grid))
+    steps = plan.probes_of(trial.configuration)
     for key in values:
         match = _KEY.fullmatch(key)
         if match is None:
@@ -99,7 +98,7 @@ def rank_outside(plan: Plan, trial: Trial, label: str) -> None:
     """Write the part of the table about the sets of a folder, of one trial."""
     path = outside_file(plan.outside[label], trial)
     about = outside_digest(path)
-    sets = {} if path is None else read_outside(path, trial)
+    sets = {} if path is None else read_outside(plan, trial, path)
     reason = f"{path} has no set of this step"
     if path is None:
         reason = f"there is no {_wanted(plan, trial, label)}"

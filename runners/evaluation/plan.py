@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from chsel.errors import SettingError, require_choice
 from chsel.evaluation.plausible_settings import PlausibleSettings
+from chsel.evaluation.true_pose import TruePoseSettings
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.settings import build_settings
 from replay.step_ranges import chosen_steps
-from runners.cli import CONF
+from runners.evaluation.configurations import (
+    MOST_PROBES,
+    SENSORS,
+    TrialConfiguration,
+    configurations_of,
+    object_values,
+    recorded_object,
+)
 from runners.evaluation.contenders import Contender
 from runners.evaluation.measure import MetricsConfig
+from runners.evaluation.sensor_logs import log_of
 from runners.objects.loader import ObjectConfig
 from runners.sessions import session_settings
-from runners.sessions.configurations import CONFIGURATIONS
-from runners.sessions.probing import ProbingSettings
 
-SESSIONS = ("simulated", "kinematic")
+SESSIONS = ("simulated", "kinematic", SENSORS)
 OWN = "own"
 OBJECTS = {"models": "", "scans": "ycb/"}
 """Folders of conf/object by the name of what is in them."""
@@ -38,7 +44,9 @@ class Plan:
     and E_l of a step follow from the results of each method itself (CHSEL, Alg. 2), or the method
     from whose results they follow, so that all register the same problems. every: iterations
     between measures of the search; None: at its end alone. recordings: whether to write
-    METHOD.mcap. outside: folders of hypothesis sets by label.
+    METHOD.mcap. outside: folders of hypothesis sets by label. logs: a folder of raw logs, for
+    sessions of sensors; None: those of the twin, in the evaluation's folder. truth: how the true
+    pose of such a session is sought.
     """
 
     folder: Path
@@ -54,6 +62,25 @@ class Plan:
     assets: Path
     contenders: Mapping[str, Contender]
     outside: Mapping[str, Path]
+    logs: Path | None = None
+    truth: TruePoseSettings = field(default_factory=TruePoseSettings)
+
+    @property
+    def kind(self) -> str:
+        """Of the sessions. Raises SettingError for one that evaluations cannot have."""
+        kind = str(self.session.get("kind"))
+        require_choice("session", kind, SESSIONS)
+        return kind
+
+    @cached_property
+    def configurations(self) -> dict[str, TrialConfiguration]:
+        """All that there are, by name."""
+        return configurations_of(self.kind, self.logs)
+
+    @property
+    def log_folder(self) -> Path:
+        """Where CONFIGURATION/seed_K.mcap are, in sessions of sensors."""
+        return self.logs if self.logs is not None else self.folder / "logs"
 
     def leader(self) -> Method | None:
         """The method whose problems all methods get, if these are not their own."""
@@ -62,24 +89,28 @@ class Plan:
         return build_method(self.starts, preset_settings(self.starts, self.preset))
 
     def object_config(self, configuration: str) -> ObjectConfig:
-        """The object of a configuration."""
+        """The object of a configuration; at its real size in sessions of sensors."""
         require_choice("objects", self.objects, OBJECTS)
-        name = f"{OBJECTS[self.objects]}{CONFIGURATIONS[configuration].object}"
-        values = yaml.safe_load((CONF / "object" / f"{name}.yaml").read_text())
+        of = self.configurations[configuration]
+        if of.log_folder is not None:
+            return recorded_object(of)
+        values = object_values(f"{OBJECTS[self.objects]}{of.object}")
+        if self.kind == SENSORS:
+            values |= {"scale": 1.0, "configuration": configuration}
         return build_settings(ObjectConfig, values, "object")
 
-    def session_config(self, configuration: str) -> dict[str, Any]:
-        """The settings of the session of a configuration, with its kind."""
-        return {**self.session, "configuration": configuration}
+    def session_config(self, trial: Trial) -> dict[str, Any]:
+        """The settings of the session of a trial, with its kind."""
+        if self.kind == SENSORS:
+            # A pose beside the log is a guess here, from which the true pose is sought.
+            return {**self.session, "path": str(log_of(self, trial)), "pose": "none"}
+        return {**self.session, "configuration": trial.configuration}
 
-    def session_settings(self, configuration: str) -> ProbingSettings:
+    def session_settings(self, trial: Trial) -> Any:
         """The same, checked."""
-        config = self.session_config(configuration)
-        kind = str(config.pop("kind", None))
-        require_choice("session", kind, SESSIONS)
-        settings = session_settings(kind, config)
-        assert isinstance(settings, ProbingSettings)
-        return settings
+        config = self.session_config(trial)
+        config.pop("kind")
+        return session_settings(self.kind, config)
 
     def plausible_settings(self, epsilon: float) -> PlausibleSettings:
         """The definition of the plausible sets of an object of this epsilon, metres."""
@@ -88,9 +119,14 @@ class Plan:
             values["epsilon"] = epsilon
         return build_settings(PlausibleSettings, values, "definition")
 
+    def probes_of(self, configuration: str) -> range:
+        """The indices that probes of a configuration may have."""
+        probes = self.configurations[configuration].probes
+        return range(MOST_PROBES if probes is None else probes)
+
     def steps_of(self, configuration: str) -> tuple[int, ...]:
         """The steps at which there may be a registration; none if the configuration has none."""
-        every = range(len(CONFIGURATIONS[configuration].grid))
+        every = self.probes_of(configuration)
         try:
             return chosen_steps(self.steps, every)
         except SettingError:

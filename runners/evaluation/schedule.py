@@ -14,7 +14,6 @@ from runners.evaluation.pool import Died, Job, Pool
 from runners.evaluation.table import RESULTS, Row, write_part
 from runners.evaluation.trial_session import has_session, read_session
 from runners.evaluation.work import Outcome, is_finished, work
-from runners.sessions.configurations import CONFIGURATIONS
 
 ATTEMPTS = 2  # of a unit whose worker dies
 _TICK = 1.0  # s: how long is waited before what is shown is renewed
@@ -56,7 +55,7 @@ class Schedule:
         self._open = {unit for unit in units if not is_finished(plan, unit)}
         self._not_before: dict[Unit, float] = {}
         self._attempts: dict[Unit, int] = {}
-        self._speed = _Speed()
+        self._speed = _Speed(plan)
         self.progress = Progress(len(units), len(units) - len(self._open))
 
     def run(self) -> Progress:
@@ -131,7 +130,7 @@ class Schedule:
             steps = read_session(plan, trial).steps
         return [
             {
-                "object": CONFIGURATIONS[trial.configuration].object,
+                "object": plan.configurations[trial.configuration].object,
                 "configuration": trial.configuration,
                 "seed": trial.seed,
                 "method": unit.label,
@@ -154,7 +153,8 @@ class Schedule:
 class _Speed:
     """How long units take, from those that are done: by label, for every probe."""
 
-    def __init__(self) -> None:
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
         self._seconds: dict[str, float] = {}
         self._probes: dict[str, int] = {}
 
@@ -167,18 +167,17 @@ class _Speed:
         """A unit is done."""
         label = unit.label
         self._seconds[label] = self._seconds.get(label, 0.0) + seconds
-        self._probes[label] = self._probes.get(label, 0) + _probes(unit)
+        self._probes[label] = self._probes.get(label, 0) + self._probes_of(unit)
 
     def expected(self, unit: Unit) -> float:
         """Seconds that a unit will take; of an unknown label, as the mean of all."""
         if unit.label in self._probes:
-            return _probes(unit) * self._seconds[unit.label] / self._probes[unit.label]
+            return self._probes_of(unit) * self._seconds[unit.label] / self._probes[unit.label]
         probes = sum(self._probes.values())
-        return _probes(unit) * (sum(self._seconds.values()) / probes if probes else 1.0)
+        return self._probes_of(unit) * (sum(self._seconds.values()) / probes if probes else 1.0)
 
-
-def _probes(unit: Unit) -> int:
-    return len(CONFIGURATIONS[unit.trial.configuration].grid)
+    def _probes_of(self, unit: Unit) -> int:
+        return self._plan.configurations[unit.trial.configuration].probes or 1
 
 
 def _ending(code: int | None) -> str:

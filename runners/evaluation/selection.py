@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
 from chsel.errors import SettingError
-from runners.sessions.configurations import CONFIGURATIONS, fitting_configurations
+from runners.evaluation.configurations import TrialConfiguration
 
 MOST_SEEDS = 100_000
 SEED_LIMIT = 2**63  # a column of the table holds them
 _RANGE = re.compile(r"(\d{1,19})\.\.(\d{1,19})")
 
 
-def chosen_configurations(value: Any) -> tuple[str, ...]:
-    """The configurations that a value names, in the order of all of them.
+def chosen_configurations(
+    value: Any, existing: Mapping[str, TrialConfiguration]
+) -> tuple[str, ...]:
+    """Which of the existing configurations a value names, in the order of all of them.
 
     A name, a pattern such as drill*, an object (all of its configurations, unless one has the same
     name), "all", or a list of these. Raises SettingError if one of them names none.
     """
-    chosen = {name for text in _listed("configurations", value) for name in _named(text)}
-    return tuple(name for name in CONFIGURATIONS if name in chosen)
+    listed = _listed("configurations", value)
+    chosen = {name for text in listed for name in _named(text, existing)}
+    return tuple(name for name in existing if name in chosen)
 
 
 def chosen_seeds(value: Any) -> tuple[int, ...]:
@@ -45,17 +48,17 @@ def _split(part: Any) -> list[Any]:
     return [text.strip() for text in part.split(",")] if isinstance(part, str) else [part]
 
 
-def _named(text: Any) -> Iterable[str]:
+def _named(text: Any, existing: Mapping[str, TrialConfiguration]) -> Iterable[str]:
     if text == "all":
-        return CONFIGURATIONS
-    if text in CONFIGURATIONS:
+        return existing
+    if text in existing:
         return [text]
-    matching = fitting_configurations(text)
-    matching = matching or [name for name in CONFIGURATIONS if fnmatchcase(name, str(text))]
+    matching = [name for name, one in existing.items() if one.object == text]
+    matching = matching or [name for name in existing if fnmatchcase(name, str(text))]
     if not matching:
         raise SettingError(
             f"configurations names {text!r}; accepted: all, an object, a pattern such as drill*, "
-            f"{', '.join(CONFIGURATIONS)}"
+            f"{', '.join(existing)}"
         )
     return matching
 

@@ -14,19 +14,13 @@ from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
 from chsel.evaluation.plausible_settings import PlausibleSettings
 from chsel.online import OnlineSettings, pose_problem
 from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
-from replay.environment import environment
-from replay.events import Logged, SessionEnded, SessionStarted
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.session_recording import TRUTH, record_session
 from runners.evaluation.whole_file import WritingError, whole_file
-from runners.objects.loader import load_object
-from runners.sessions import open_session
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
-METHOD = "none"
-"""The method that the recording of a session alone names."""
 _ONE = OnlineSettings(hypotheses=1)
 
 
@@ -47,7 +41,7 @@ def make_session(plan: Plan, trial: Trial) -> None:
     folder, begun = trial.folder(plan), time.perf_counter()
     if not (folder / "session.mcap").exists():
         with whole_file(folder / "session.mcap") as beside:
-            _record(plan, trial, McapRecorder(beside))
+            record_session(plan, trial, McapRecorder(beside))
     probed = time.perf_counter()
     session = open_recorded(plan, trial)
     settings = plausible_settings_of(plan, session)
@@ -62,6 +56,8 @@ def make_session(plan: Plan, trial: Trial) -> None:
             failures[str(step)] = " ".join(str(error).split())
     seconds = {"session": probed - begun, "plausible sets": time.perf_counter() - probed}
     told = {"steps": steps, "no_plausible_set": failures, "seconds": seconds}
+    if TRUTH in session.recorded.config:
+        told[TRUTH] = session.recorded.config[TRUTH]
     with whole_file(folder / "session.json") as beside:
         beside.write_text(json.dumps(told, indent=2) + "\n")
 
@@ -90,7 +86,7 @@ def has_session(plan: Plan, trial: Trial) -> bool:
 def open_recorded(plan: Plan, trial: Trial) -> RecordedSession:
     """The session of a trial, from its recording."""
     path = trial.folder(plan) / "session.mcap"
-    settings = plan.session_settings(trial.configuration)
+    settings = plan.session_settings(trial)
     start = settings.start_contacts, settings.start_probe
     try:
         return RecordedSession(RecordedSettings(str(path), *start))
@@ -132,51 +128,6 @@ def load_members(
             f"{folder} has no set of step {problem.key.step}; remove session.json"
         )
     return found
-
-
-def _record(plan: Plan, trial: Trial, recorder: McapRecorder) -> None:
-    object_config = plan.object_config(trial.configuration)
-    model = load_object(object_config, plan.assets)
-    settings = plan.session_settings(trial.configuration)
-    kind = str(plan.session["kind"])
-    session = open_session(kind, settings, model, trial.seed)
-    try:
-        sdf = SdfGrid.from_mesh(
-            model.mesh, settings.object_resolution, padding=settings.object_padding
-        )
-        recorder.record(
-            SessionStarted(
-                runner="evaluate",
-                object=model.name,
-                session=kind,
-                method=METHOD,
-                seed=trial.seed,
-                config={
-                    "object": vars(object_config),
-                    "session": plan.session_config(trial.configuration),
-                    "preset": {"name": plan.preset},
-                    "seed": trial.seed,
-                    "configuration": trial.configuration,
-                },
-                mesh=model.mesh,
-                sdf=sdf,
-                workspace=session.workspace,
-                free_resolution=session.free_resolution,
-                initial_points=session.initial_points,
-                world_from_object=session.world_from_object,
-                environment=environment(),
-            )
-        )
-        step = 0
-        for probe in session.probes():
-            step = probe.step
-            recorder.record(probe)
-            recorder.flush()
-        recorder.record(Logged(step, "info", "session finished"))
-        recorder.record(SessionEnded(step, "finished"))
-    finally:
-        session.close()
-        recorder.close()
 
 
 def _made(

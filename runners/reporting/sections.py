@@ -25,6 +25,7 @@ from runners.reporting.shown_trial import named_trial, usual_trial
 from runners.reporting.silhouette import VIEWS
 from runners.reporting.statistics import last_half
 from runners.reporting.tables import method_table
+from runners.reporting.true_pose_table import true_pose_sections
 
 Styles = Mapping[str, MethodStyle]
 Best = Callable[[Sequence[float]], float] | None
@@ -78,6 +79,7 @@ def sections_of(evaluation: Evaluation, sequence: SequenceConfig) -> list[Sectio
                 failures_table(evaluation),
             ),
         ),
+        *true_pose_sections(evaluation),
         _over_probes(evaluation, styles),
         _boxes(half, styles),
         _times(evaluation, styles),

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray, frozen
+from chsel.arrays import frozen
 from chsel.errors import SettingError
-from chsel.pose import axis_angle, compose, product
+from chsel.pose import compose, roll_pitch_yaw
 from runners.sensors.rig import BoxRig, HandRig
 from runners.sensors.urdf import Linkage
 
@@ -59,12 +58,6 @@ def hand_solids(hand: HandRig, joints: Mapping[str, float] | None = None) -> tri
     for remark in remarks:
         warnings.warn(remark, stacklevel=2)
     return model.solids(joints)
-
-
-def roll_pitch_yaw(angles: FloatArray) -> FloatArray:
-    """The rotation (3, 3) by angles (3,) about the fixed axes x, y, z, in this order (as URDF)."""
-    about_x, about_y, about_z = axis_angle(np.eye(3), angles)
-    return product(about_z, product(about_y, about_x))
 
 
 def _solid(box: BoxRig, where: str) -> trimesh.Trimesh:

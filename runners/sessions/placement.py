@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from chsel.arrays import FloatArray
 from chsel.errors import SessionError
-from chsel.pose import apply, axis_angle, compose
+from chsel.pose import apply, axis_angle, compose, roll_pitch_yaw
 from runners.sessions.configurations import MESH_YAW, Configuration
 
 _FLAT = 1e-6  # m: vertices lower than this touch the floor
@@ -29,11 +29,8 @@ def laid_down(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray
 
 def spawn_pose(mesh: trimesh.Trimesh, configuration: Configuration) -> FloatArray:
     """The pose world_from_object (4, 4) that a configuration gives its object, floor or not."""
-    roll, pitch, yaw = (
-        axis_angle(np.eye(3)[axis], angle) for axis, angle in enumerate(configuration.rotation)
-    )
     own_yaw = axis_angle(np.eye(3)[2], MESH_YAW.get(configuration.object, 0.0))
-    rotation = yaw @ pitch @ roll @ own_yaw
+    rotation = roll_pitch_yaw(np.array(configuration.rotation)) @ own_yaw
     return compose(rotation, np.array(configuration.position) - rotation @ centre_of_mass(mesh))
 
 

@@ -24,6 +24,7 @@ from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, NO_RESULT, verify
 from runners.evaluation import registering, work
 from runners.evaluation.claims import claimed
+from runners.evaluation.configurations import configurations_of
 from runners.evaluation.contenders import Contender, chosen_contenders
 from runners.evaluation.experiment import join_experiment
 from runners.evaluation.gathering import gather
@@ -108,8 +109,9 @@ def results(plan: Plan) -> list[dict[str, Any]]:
 def test_configurations_are_named_alone_by_patterns_or_by_object(
     value: Any, names: list[str]
 ) -> None:
-    assert list(chosen_configurations(value)) == names
-    assert len(chosen_configurations("all")) == 17
+    existing = configurations_of("kinematic")
+    assert list(chosen_configurations(value, existing)) == names
+    assert len(chosen_configurations("all", existing)) == 17
 
 
 def test_seeds_are_named_alone_in_lists_or_as_ranges() -> None:
@@ -378,7 +380,7 @@ def test_a_set_from_outside_that_is_wrong_is_told(
     path = tmp_path / "seed_0.npz"
     np.savez(path, **values)
     with pytest.raises(OutsideError, match=message):
-        read_outside(path, TRIAL)
+        read_outside(plan_in(tmp_path), TRIAL, path)
 
 
 def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None:

@@ -11,6 +11,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -314,3 +315,25 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: st
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
     assert json.loads((tmp_path / "good" / "experiment.json").read_text())["name"] == "made_up"
+
+
+def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -> None:
+    names = ["cabinet_drill", "cabinet_mustard"]
+    rows = made_up_rows(names, [0, 1], 2, ["chsel"])
+    write_evaluation(tmp_path, rows, configurations=names, seeds=[0, 1, 2])
+    for index, (name, seed) in enumerate([(names[0], 0), (names[0], 1), (names[1], 0)]):
+        truth: dict[str, Any] = {"cost": 0.001, "guess_cost": 0.1, "mean_distance": 0.001}
+        truth["violations"] = index
+        truth["from_guess"] = {"position": 0.002 * index, "rotation": 0.0}
+        if name == names[0]:
+            truth["from_simulated"] = {"position": 0.003 + 0.002 * index, "rotation": 0.01745329}
+        folder = tmp_path / "trials" / name / f"seed_{seed}"
+        folder.mkdir(parents=True)
+        (folder / "session.json").write_text(json.dumps({"truth": truth}))
+    done = run(str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    table = page_of(tmp_path / "report").tables["True poses found"]
+    assert [line[:2] for line in table[1:]] == [[names[0], "2"], [names[1], "1"], ["all", "3"]]
+    assert table[1][2:] == ["1 [1]", "0.5 [1]", "1 [2]", "0 [0]", "4 [5]", "1 [1]"]
+    assert table[2][3:] == ["2 [2]", "4 [4]", "0 [0]", "-", "-"]
+    assert "True poses found" in (tmp_path / "report" / "report.md").read_text()

@@ -8,9 +8,10 @@ import pytest
 import trimesh
 
 from chsel.errors import SettingError
+from chsel.pose import roll_pitch_yaw
 from runners.sensors import collision_mesh
 from runners.sensors import urdf as urdf_module
-from runners.sensors.hand import HandModel, hand_solids, roll_pitch_yaw
+from runners.sensors.hand import HandModel, hand_solids
 from runners.sensors.rig import BoxRig, HandRig
 
 GRIPPER = """<?xml version="1.0"?>

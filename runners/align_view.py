@@ -1,0 +1,50 @@
+"""A Rerun file that shows how an object fits what is known, at a guess and where it was found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import rerun as rr
+import rerun.blueprint as rrb
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.errors import RecordingError
+from chsel.problem import RegistrationProblem
+from replay.rerun.blueprint import at_last_probe, scene_view
+from replay.rerun.clock import PROBE
+from replay.rerun.drawing import check_new
+from replay.rerun.scene import Scene, display_mesh
+
+APPLICATION = "chsel alignment"
+_GUESS = (240, 140, 40, 60)
+
+
+def save_view(
+    path: Path,
+    mesh: trimesh.Trimesh,
+    problem: RegistrationProblem,
+    guess: FloatArray,
+    found: FloatArray,
+) -> None:
+    """Write a new .rrd with the known points and the mesh at both poses (4, 4), world_from_object.
+
+    Raises RecordingError if the file exists or cannot be written.
+    """
+    check_new(path)
+    stream = rr.RecordingStream(APPLICATION, send_properties=False)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    try:
+        stream.set_sinks(rr.FileSink(path))
+    except (OSError, RuntimeError) as error:
+        raise RecordingError(f"{path} cannot be written ({error}); accepted: a new .rrd") from None
+    stream.set_time(PROBE, sequence=problem.key.step)
+    view = scene_view(problem.workspace, name="The object where it was found; orange: the guess")
+    stream.send_blueprint(at_last_probe(rrb.Vertical(view)))
+    scene = Scene(stream)
+    scene.set_up(mesh, problem.workspace, found)
+    pose = rr.Transform3D(translation=guess[:3, 3], mat3x3=guess[:3, :3])
+    stream.log("scene/guess", display_mesh(mesh, _GUESS), pose, static=True)
+    scene.add_points(problem.points, new=False)
+    stream.disconnect()

@@ -1,0 +1,115 @@
+"""The configurations of an evaluation: simulated ones, the twin's, or folders of recorded logs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from chsel.errors import SettingError
+from chsel.settings import build_settings
+from runners.cli import CONF
+from runners.objects.loader import ObjectConfig
+from runners.sessions.configurations import CONFIGURATIONS
+from runners.twin.configurations import CABINET_CONFIGURATIONS
+
+SENSORS = "sensors"
+MOST_PROBES = 1_000
+OBJECT_FILE = "object.yaml"
+_ACCEPTED = "accepted: a name of conf/object, with any other of its keys, such as name: drill"
+
+
+@dataclass(frozen=True)
+class TrialConfiguration:
+    """One configuration as evaluations know it.
+
+    object: whose it is. probes: how many it has; None: its logs tell. log_folder: of recorded
+    logs, beside which OBJECT_FILE says what the object is; None where logs are simulated.
+    """
+
+    name: str
+    object: str
+    probes: int | None = None
+    log_folder: Path | None = None
+
+
+def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialConfiguration]:
+    """All configurations of a kind of session, by name.
+
+    Those of sessions of sensors are the folders in `logs`, and the twin's where there are no
+    others. Raises SettingError for a folder that does not exist or does not name its object.
+    """
+    if kind != SENSORS:
+        return {
+            name: TrialConfiguration(name, one.object, len(one.grid))
+            for name, one in CONFIGURATIONS.items()
+        }
+    twin = {
+        name: TrialConfiguration(name, one.object, len(one.grid))
+        for name, one in CABINET_CONFIGURATIONS.items()
+    }
+    if logs is None:
+        return twin
+    if not logs.is_dir():
+        raise SettingError(
+            f"session.logs is {logs}; accepted: a folder with CONFIGURATION/seed_0.mcap and "
+            f"CONFIGURATION/{OBJECT_FILE}, or an empty one for logs of the twin"
+        )
+    there = {path.name: path for path in sorted(logs.iterdir()) if path.is_dir()}
+    if set(there) <= set(twin):
+        return twin
+    return {name: twin.get(name) or _recorded(name, path) for name, path in there.items()}
+
+
+def object_values(name: str) -> dict[str, Any]:
+    """What conf/object/NAME.yaml says."""
+    path = CONF / "object" / f"{name}.yaml"
+    if not path.is_file():
+        known = sorted(str(file.relative_to(path.parent).with_suffix("")) for file in _objects())
+        raise SettingError(f"object {name!r} does not exist; accepted: {', '.join(known)}")
+    return dict(yaml.safe_load(path.read_text()))
+
+
+def recorded_object(configuration: TrialConfiguration) -> ObjectConfig:
+    """The object of a folder of logs, at its real size unless its file gives another scale.
+
+    `name` alone, of a model of our own (or `ycb/NAME` of a scan), or with other keys of
+    conf/object; a `path` is relative to the folder. Raises SettingError for anything else.
+    """
+    assert configuration.log_folder is not None
+    file = configuration.log_folder / OBJECT_FILE
+    given = _object_file(file)
+    name = str(given["name"])
+    known = name in {str(path.relative_to(CONF / "object").with_suffix("")) for path in _objects()}
+    values = object_values(name) if known else {"kind": "file", "epsilon": 0.001}
+    values |= {"scale": 1.0, "configuration": configuration.name}
+    values |= {**given, "name": values.get("name", name)}
+    if values.get("path") is not None:
+        values["path"] = str(file.parent / Path(str(values["path"])).expanduser())
+    return build_settings(ObjectConfig, values, str(file))
+
+
+def _recorded(name: str, folder: Path) -> TrialConfiguration:
+    given = _object_file(folder / OBJECT_FILE)
+    return TrialConfiguration(name, str(given["name"]).rpartition("/")[2], None, folder)
+
+
+def _object_file(path: Path) -> Mapping[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text())
+    except FileNotFoundError:
+        raise SettingError(f"{path} is missing; {_ACCEPTED}") from None
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise SettingError(
+            f"{path} cannot be read ({' '.join(str(error).split())}); {_ACCEPTED}"
+        ) from None
+    if not isinstance(values, dict) or not isinstance(values.get("name"), str):
+        raise SettingError(f"{path} has no name; {_ACCEPTED}")
+    return {str(key): value for key, value in values.items()}
+
+
+def _objects() -> list[Path]:
+    return list((CONF / "object").rglob("*.yaml"))

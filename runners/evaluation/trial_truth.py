@@ -1,0 +1,88 @@
+"""The true pose T* of a trial whose session comes from sensors: sought near a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chsel.arrays import FloatArray
+from chsel.errors import SessionError
+from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.true_pose import TruePose, find_true_pose
+from chsel.points import KnownPoints
+from chsel.pose import inverse
+from chsel.problem import RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from replay.events import Event, Probe
+from runners.alignment_fit import fit_of
+from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.sensor_logs import guessed_pose, twin_truth
+from runners.sessions.session import Session
+
+
+def known_at_the_end(
+    trial: Trial, session: Session, sdf: SdfGrid, events: Sequence[Event]
+) -> RegistrationProblem:
+    """All that a session tells, as a problem of its last step.
+
+    Raises SessionError if it has no contact.
+    """
+    probes = [event for event in events if isinstance(event, Probe)]
+    points = reduce(
+        KnownPoints.merged, [probe.new_points for probe in probes], session.initial_points
+    )
+    if len(points.known) == 0:
+        raise SessionError(f"none of {len(probes)} probes has a contact; accepted: at least one")
+    return RegistrationProblem(
+        sdf,
+        points,
+        np.eye(4)[None],
+        session.workspace,
+        session.free_resolution,
+        StreamKey(trial.seed, probes[-1].step),
+    )
+
+
+def find_truth(
+    plan: Plan, problem: RegistrationProblem, log: Path
+) -> tuple[FloatArray, dict[str, Any]]:
+    """T* as world_from_object (4, 4), and what is to be told about it, plain values.
+
+    Of the problem of a trial's last step: the pose of least evaluation cost near the guess that
+    belongs to the log. Distances are in metres and radians.
+    """
+    guess, truth = guessed_pose(log), twin_truth(log)
+    found = find_true_pose(problem, guess, plan.truth)
+    return found.world_from_object, _told(plan, problem, found, guess, truth)
+
+
+def _told(
+    plan: Plan,
+    problem: RegistrationProblem,
+    found: TruePose,
+    guess: FloatArray,
+    truth: FloatArray | None,
+) -> dict[str, Any]:
+    fit = fit_of(problem, found.world_from_object, found.cost, plan.truth.cost)
+    told: dict[str, Any] = {
+        "cost": found.cost,
+        "mean_distance": fit.mean_distance,
+        "violations": fit.violations,
+        "guess": guess.tolist(),
+        "guess_cost": found.guess_cost,
+        "from_guess": _between(found.world_from_object, guess),
+    }
+    if truth is not None:
+        told["simulated"] = truth.tolist()
+        told["from_simulated"] = _between(found.world_from_object, truth)
+    return told
+
+
+def _between(one: FloatArray, other: FloatArray) -> dict[str, float]:
+    position, rotation = pose_errors(inverse(one)[None], other)
+    return {"position": float(position[0]), "rotation": float(rotation[0])}

@@ -1,0 +1,184 @@
+"""The command that finds where the object of real data is, as a user runs it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from chsel.evaluation.evaluation_cost import EvaluationCost
+from chsel.evaluation.plausible_settings import EvaluationCostSettings
+from chsel.mesh import clean_mesh
+from chsel.pose import apply, axis_angle, compose, inverse, roll_pitch_yaw
+from replay.file_digest import file_digest
+from replay.mcap.reader import read_recording
+from runners import align, plausible, probe
+from runners.objects.models import MODELS
+from runners.sensors.pose_file import beside, read_pose, read_pose_file
+from runners.twin.configurations import CABINET_CONFIGURATIONS
+from runners.twin.settings import TwinBubbles, TwinCamera, TwinSettings
+from tests.runners.test_plausible import Done, run
+
+YAW = 0.5
+POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(YAW)), np.array([0.1, 0.2, 0.3]))
+NEAR = ("position=[0.12,0.19,0.31]", "rotation=[0,0,0.46]")
+SEARCH = ("search.reach=0.03", "search.rotations=200", "search.angle=0.04")
+SETS = ("definition.grid.rotations=200", "definition.grid.upright=0")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of points on a box whose pose nobody told."""
+    folder = tmp_path_factory.mktemp("align")
+    box = trimesh.creation.box((0.1, 0.06, 0.2))
+    box.export(folder / "box.ply")
+    surface = apply(POSE, trimesh.sample.sample_surface(box, 60, seed=0)[0])
+    free = apply(POSE, np.random.default_rng(0).uniform(0.12, 0.2, (40, 3)))
+    steps = np.arange(60) // 30
+    np.savez(folder / "box.npz", surface=surface, surface_step=steps, free=free)
+    done = run(
+        probe.main,
+        "session=points",
+        f"session.path={folder / 'box.npz'}",
+        "object=mesh",
+        f"object.path={folder / 'box.ply'}",
+        "object.epsilon=0.002",
+        "method=gradient_descent",
+        "recording=mcap",
+        f"logs={folder / 'logs'}",
+    )
+    assert done.returncode == 0, done.stderr
+    (recording,) = (folder / "logs").rglob("recording.mcap")
+    assert read_recording(recording).start.world_from_object is None
+    return recording
+
+
+@pytest.fixture
+def path(recorded: Path, tmp_path: Path) -> Path:
+    """The same, where nothing else is yet."""
+    path = tmp_path / "session.mcap"
+    shutil.copyfile(recorded, path)
+    return path
+
+
+def aligned(path: Path, *arguments: str) -> Done:
+    return run(align.program, str(path), *SEARCH, *arguments)
+
+
+def test_the_pose_is_found_near_a_guess_and_written_with_a_picture(path: Path) -> None:
+    done = aligned(path, *NEAR)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert sorted(file.name for file in path.parent.iterdir()) == [
+        "session.mcap",
+        "session.pose.rrd",
+        "session.pose.yaml",
+    ]
+    found = read_pose_file(path.with_name("session.pose.yaml"))
+    away = inverse(POSE) @ found.world_from_object
+    assert np.abs(away[:3, 3]).max() < 0.005
+    assert np.arccos((np.trace(away[:3, :3]) - 1.0) / 2.0) < 0.06
+    problem = read_recording(path).problem(1)
+    cost = EvaluationCost(problem, EvaluationCostSettings())
+    costs = cost.evaluate(inverse(np.stack([found.world_from_object, POSE])))
+    assert found.about["cost"] == pytest.approx(costs[0], rel=1e-9)
+    assert found.about["cost"] <= costs[1] + 1e-3
+    assert found.about["cost"] < found.about["guess_cost"] / 3.0
+    assert found.about["source"] == file_digest(path)
+    assert found.about["search"]["rotations"] == 200
+    guess = np.array(found.about["guess"])
+    np.testing.assert_allclose(guess[:3, 3], [0.12, 0.19, 0.31])
+    moved = 1000.0 * np.linalg.norm(found.world_from_object[:3, 3] - guess[:3, 3])
+    assert f"moved from the guess by {moved:.1f} mm" in done.stdout
+    assert "warning" not in done.stdout
+
+
+def test_the_found_pose_is_the_next_guess_and_what_is_there_stays(path: Path) -> None:
+    assert aligned(path, *NEAR).returncode == 0
+    there = path.with_name("session.pose.yaml")
+    before = there.read_bytes()
+    refused = aligned(path, f"pose={there}")
+    assert refused.returncode == 2
+    assert "session.pose.yaml exists; accepted: overwrite=true" in refused.stderr
+    assert there.read_bytes() == before
+    again = aligned(path, f"pose={there}", "overwrite=true")
+    assert (again.returncode, again.stderr) == (0, "")
+    about = read_pose_file(there).about
+    assert about["guess_cost"] == pytest.approx(yaml.safe_load(before)["cost"], rel=1e-9)
+    assert about["cost"] <= about["guess_cost"]
+
+
+def test_a_pose_at_the_edge_of_the_search_is_a_warning(path: Path) -> None:
+    done = aligned(path, "position=[0.145,0.2,0.3]", "rotation=[0,0,0.5]", "search.reach=0.02")
+    assert done.returncode == 0
+    assert "at the edge of the search along x" in done.stdout
+
+
+def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path: Path) -> None:
+    refused = run(plausible.program, str(path), *SETS)
+    assert refused.returncode == 2
+    assert refused.stderr.count("\n") == 1
+    assert f"python -m runners.align {path} position=[x,y,z]" in refused.stderr
+    assert aligned(path, *NEAR).returncode == 0
+    done = run(plausible.program, str(path), *SETS)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"true pose: that of {path.with_name('session.pose.yaml')}" in done.stdout
+    x, y, z = read_pose(path.with_name("session.pose.yaml"))[:3, 3]
+    assert f"around ({x:.3f}, {y:.3f}, {z:.3f}) m" in done.stdout
+
+
+def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet")
+    from runners.twin.simulation import simulate_log
+
+    log = tmp_path / "log.mcap"
+    small = TwinSettings(probes=1, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=96))
+    model = MODELS["mustard"]()
+    mesh = clean_mesh(model.vertices, model.faces, name="mustard", scale=1.0)
+    made = simulate_log(log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh, 0, small)
+    x, y, z = (float(value) for value in made.world_from_object[:3, 3] + [0.01, 0.0, 0.005])
+    yaw = float(np.arctan2(made.world_from_object[1, 0], made.world_from_object[0, 0]))
+    guess = (f"position=[{x},{y},{z}]", f"rotation=[0,0,{yaw}]")
+    done = aligned(log, *guess, "session/rig=cabinet", "object=mustard", "object.scale=1")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "mustard, after probe 0: 50 contacts" in done.stdout
+    found = read_pose_file(beside(log))
+    assert found.about["cost"] < found.about["guess_cost"]
+    assert found.about["mean_distance"] < 0.004
+    assert found.about["source"] == file_digest(log)
+    refused = run(plausible.program, str(log), "object=mustard")
+    assert refused.returncode == 2
+    assert "accepted for a raw log: session=sensors session/rig=NAME object=NAME" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "accepted: either position=[x,y,z] rotation=[roll,pitch,yaw]"),
+        ((*NEAR, "pose=some.yaml"), "accepted: either position=[x,y,z]"),
+        (("position=[0,0]",), "align.position has 2 entries; accepted: 3"),
+        (("position=[0,0,nan]",), "is not finite"),
+        (("pose=none.yaml",), "pose file none.yaml cannot be read"),
+        ((*NEAR, "search.reach=-1"), "reach is -1"),
+        ((*NEAR, "serch.reach=1"), "has no key 'serch'"),
+    ],
+)
+def test_what_cannot_be_searched_is_one_line(
+    path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    done = run(align.program, str(path), *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert len(list(path.parent.iterdir())) == 1
+
+
+def test_roll_pitch_and_yaw_turn_about_the_axes_of_the_world_in_this_order() -> None:
+    x, y, z = np.eye(3)
+    turned = roll_pitch_yaw(np.array([np.pi / 2, 0.0, np.pi / 2])) @ np.stack([x, y, z], axis=1)
+    np.testing.assert_allclose(turned.T, [y, z, x], atol=1e-12)
+    pitched = roll_pitch_yaw(np.array([0.0, np.pi / 2, 0.0])) @ x
+    np.testing.assert_allclose(pitched, -z, atol=1e-12)

@@ -1,0 +1,211 @@
+"""Evaluations of sessions whose raw logs are read: which there are, and their true poses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from chsel.errors import SettingError
+from chsel.evaluation.true_pose import TruePoseSettings
+from chsel.pose import compose, inverse, rotation_angle, rotation_vector
+from replay.events import RigDescribed
+from replay.mcap.reader import read_recording
+from runners import evaluate
+from runners.align import roll_pitch_yaw
+from runners.cli import CONF
+from runners.evaluation.configurations import configurations_of
+from runners.evaluation.display import Display
+from runners.evaluation.plan import Plan, Trial, Unit
+from runners.evaluation.selection import chosen_configurations
+from runners.evaluation.sensor_logs import (
+    TRUTH,
+    angles_of,
+    as_set_by_hand,
+    check_log,
+    guessed_pose,
+    is_missing,
+    log_of,
+)
+from runners.evaluation.trial_session import open_recorded
+from runners.evaluation.true_poses import FoundPose, true_poses
+from runners.evaluation.work import do_unit
+from runners.sensors.pose_file import beside, read_pose, write_pose
+from tests.runners.test_evaluation import plan_in
+from tests.runners.test_plausible import run
+
+CABINET = ["cabinet_drill", "cabinet_drill_opposite", "cabinet_mustard", "cabinet_mustard_sideways"]
+POSE = compose(rotation_vector(np.array([0.31, -0.4, 1.1])), np.array([0.913, -0.046, 0.338]))
+
+
+def sensors_plan(folder: Path, **changes: Any) -> Plan:
+    """A plan of sessions of the twin's rig."""
+    rig = yaml.safe_load((CONF / "session" / "rig" / "cabinet.yaml").read_text())
+    session = {"kind": "sensors", "rig": rig, "start_contacts": 1, "start_probe": 0}
+    truth = TruePoseSettings(reach=0.02, spacing=0.01, rotations=200, angle=0.05, passes=2)
+    return replace(plan_in(folder), session=session, steps=None, truth=truth, **changes)
+
+
+def own_logs(folder: Path, **objects: dict[str, Any]) -> Path:
+    """A folder of logs of one's own, which are empty files here."""
+    for name, values in objects.items():
+        (folder / name).mkdir(parents=True)
+        (folder / name / "object.yaml").write_text(yaml.safe_dump(values))
+        (folder / name / "seed_0.mcap").touch()
+    return folder
+
+
+def test_configurations_are_the_twins_unless_there_are_logs_of_ones_own(tmp_path: Path) -> None:
+    assert list(configurations_of("sensors")) == CABINET
+    assert [one.probes for one in configurations_of("sensors").values()] == [6, 6, 6, 6]
+    (tmp_path / "cabinet_drill").mkdir()
+    assert list(configurations_of("sensors", tmp_path)) == CABINET
+    own_logs(tmp_path, shelf={"name": "mustard"}, table={"name": "ycb/drill"})
+    own = configurations_of("sensors", tmp_path)
+    assert list(own) == ["cabinet_drill", "shelf", "table"]
+    assert [own[name].object for name in own] == ["drill", "mustard", "drill"]
+    assert own["shelf"].probes is None
+    assert chosen_configurations("drill", own) == ("cabinet_drill", "table")
+    with pytest.raises(SettingError, match="configurations names 'box'; accepted: all, an object"):
+        chosen_configurations("box", own)
+
+
+def test_objects_of_logs_are_of_real_size_unless_their_file_says_otherwise(tmp_path: Path) -> None:
+    plan = sensors_plan(tmp_path)
+    assert plan.object_config("cabinet_drill").scale == 1.0
+    assert plan.object_config("cabinet_drill").epsilon == 0.001
+    assert plan.object_config("cabinet_mustard").epsilon == 0.0003
+    assert replace(plan, objects="scans").object_config("cabinet_drill").kind == "scan"
+    jug = {"name": "jug", "path": "jug.ply", "scale": 0.001, "epsilon": 0.002}
+    logs = own_logs(tmp_path / "logs", a={"name": "mustard"}, b={"name": "ycb/drill"}, c=jug)
+    own = sensors_plan(tmp_path, logs=logs)
+    assert (own.object_config("a").name, own.object_config("a").scale) == ("mustard", 1.0)
+    assert own.object_config("b").scan == "035_power_drill"
+    assert own.object_config("c").path == str(logs / "c" / "jug.ply")
+    assert (own.object_config("c").scale, own.object_config("c").epsilon) == (0.001, 0.002)
+    assert own.steps_of("a")[:2] == (0, 1)
+    assert replace(own, steps="3..5").steps_of("a") == (3, 4, 5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "object.yaml is missing; accepted: a name of conf/object"),
+        ("[1]", "object.yaml has no name"),
+        ("name: [", "object.yaml cannot be read"),
+    ],
+)
+def test_a_folder_of_logs_must_name_its_object(
+    tmp_path: Path, text: str | None, message: str
+) -> None:
+    (tmp_path / "shelf").mkdir()
+    if text is not None:
+        (tmp_path / "shelf" / "object.yaml").write_text(text)
+    with pytest.raises(SettingError, match=message):
+        configurations_of("sensors", tmp_path)
+    with pytest.raises(SettingError, match=r"session.logs is .*none; accepted: a folder with"):
+        configurations_of("sensors", tmp_path / "none")
+
+
+def test_logs_of_ones_own_need_a_guess_and_the_twins_are_made(tmp_path: Path) -> None:
+    logs = own_logs(tmp_path / "logs", shelf={"name": "mustard"})
+    plan, trial = sensors_plan(tmp_path, logs=logs), Trial(0, "shelf")
+    assert not is_missing(plan, trial)
+    with pytest.raises(SettingError, match=r"no .*seed_0.pose.yaml; accepted: .*runners.align"):
+        check_log(plan, trial)
+    with pytest.raises(SettingError, match=r"no .*seed_7.mcap; accepted: seeds of which"):
+        check_log(plan, Trial(7, "shelf"))
+    write_pose(beside(log_of(plan, trial)), POSE, {})
+    check_log(plan, trial)
+    np.testing.assert_allclose(guessed_pose(log_of(plan, trial)), POSE, atol=1e-12)
+    (logs / "shelf" / "seed_1").mkdir()
+    assert log_of(plan, Trial(1, "shelf")) == logs / "shelf" / "seed_1"
+    twin = sensors_plan(tmp_path)
+    assert is_missing(twin, Trial(0, "cabinet_drill"))
+    check_log(twin, Trial(0, "cabinet_drill"))
+    assert log_of(twin, trial) == twin.folder / "logs" / "shelf" / "seed_0.mcap"
+
+
+def test_a_pose_set_by_hand_is_near_the_truth_but_not_it() -> None:
+    hand = as_set_by_hand(POSE)
+    np.testing.assert_allclose(hand[:3, 3], [0.91, -0.05, 0.34], atol=1e-12)
+    angles = np.rad2deg(angles_of(hand[:3, :3]))
+    np.testing.assert_allclose(angles, np.rint(angles / 10.0) * 10.0, atol=1e-9)
+    assert np.abs(angles - np.rad2deg(angles_of(POSE[:3, :3]))).max() <= 5.0
+    assert 0.0 < rotation_angle((inverse(POSE) @ hand)[:3, :3]) < 0.16
+    np.testing.assert_allclose(roll_pitch_yaw(angles_of(POSE[:3, :3])), POSE[:3, :3], atol=1e-12)
+
+
+def test_how_far_true_poses_are_off_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    Display().true_poses([])
+    assert capsys.readouterr().out == ""
+    near = FoundPose("cabinet_drill", 0, 0.001, 0.1, 0.0004, 0, 0.01, 0.1, 0.002, np.deg2rad(1.0))
+    far = replace(near, mean_distance=0.0006, violations=3, position_error=0.006)
+    own = replace(near, mean_distance=0.0002, position_error=None, rotation_error=None)
+    Display().true_poses([near, far, own])
+    told = capsys.readouterr().out
+    assert "sought in 3 trials: mean |SDF| of contacts 0.40 mm, 3 free points inside" in told
+    assert "simulated truth of 2: 4.0 mm in the mean, 6.0 mm at worst; 1.0 and 1.0 deg" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("session=kinematic", "session.logs=LOGS"), "session.logs is for session=sensors"),
+        (("session=sensors", "session.logs=LOGS", "seeds=0"), "seed_0.pose.yaml; accepted:"),
+        (("session=sensors", "session.logs=LOGS", "seeds=4"), "seed_4.mcap; accepted: seeds"),
+        (("session=sensors", "configurations=mustard_fallen"), "mustard_sideways"),
+        (("session=sensors", "truth.reach=0"), "evaluate.truth: reach is 0.0"),
+        (("session=sensors", "session.rig.wrld=a"), "has no key 'wrld'"),
+    ],
+)
+def test_an_evaluation_of_logs_that_cannot_be_is_one_line(
+    tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    logs = own_logs(tmp_path / "logs", shelf={"name": "mustard"})
+    words = [word.replace("LOGS", str(logs)) for word in arguments]
+    done = run(evaluate.program, *words, f"out={tmp_path / 'out'}")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_trial_gets_its_log_its_true_pose_and_its_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pybullet")
+    from runners.evaluation import sensor_logs
+    from runners.twin.settings import TwinBubbles, TwinCamera, TwinSettings
+
+    small = TwinSettings(probes=2, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=96))
+    monkeypatch.setattr(sensor_logs, "TwinSettings", lambda: small)
+    plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
+    outcome = do_unit(plan, Unit(trial), set())
+    assert (outcome.kind, outcome.reason) == ("done", "")
+    log = log_of(plan, trial)
+    assert {file.name for file in log.parent.iterdir()} == {"seed_0.mcap", f"seed_0{TRUTH}"}
+    truth = read_pose(log.with_name(f"seed_0{TRUTH}"))
+    recording = read_recording(trial.folder(plan) / "session.mcap")
+    found = recording.start.world_from_object
+    assert found is not None
+    assert np.abs(found[:3, 3] - as_set_by_hand(truth)[:3, 3]).max() < 0.035
+    assert any(isinstance(event, RigDescribed) for event in recording.events())
+    assert str(tmp_path) not in json.dumps(dict(recording.start.config))
+    assert len(recording.probes) == 2
+    (told,) = true_poses(plan.folder, {"configurations": CABINET, "seeds": [0]})
+    assert told.cost < told.guess_cost
+    assert told.position_error == pytest.approx(np.linalg.norm(found[:3, 3] - truth[:3, 3]))
+    session = open_recorded(plan, trial)
+    assert session.start == (1, 0)
+    elsewhere = replace(plan, folder=tmp_path / "again", logs=log.parents[1])
+    assert do_unit(elsewhere, Unit(trial), set()).kind == "done"
+    first, second = (trial.folder(one) / "session.mcap" for one in (plan, elsewhere))
+    assert first.read_bytes() == second.read_bytes()
+    log.with_name(f"seed_0{TRUTH}").unlink()
+    assert is_missing(plan, trial)
