@@ -38,7 +38,7 @@ class Bar:
         """A stage stands at `done` of `total`."""
         if self._task is None:
             self._progress.start()
-            self._task = self._progress.add_task(stage, total=total)
+            self._task = self._progress.add_task(stage, completed=done, total=total)
         self._progress.update(self._task, description=stage, completed=done, total=total)
 
     def clear(self) -> None:

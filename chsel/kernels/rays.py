@@ -59,18 +59,21 @@ def mark_points(met, counts, lower, spacing, points, moves, first, last):  # typ
 
 
 @compiled
-def settle(met, seen, gain, enough):  # type: ignore[no-untyped-def]
+def settle(words, met, seen, gain, enough):  # type: ignore[no-untyped-def]
     """Add `gain` to how often (V,) marked voxels were seen, up to `enough`, and unmark all.
 
-    How many of them now have enough. Those with more than enough stay as they are.
+    words: the bytes of `met` by eights, the last ones filled up, as most voxels are not marked. How
+    many of them now have enough. Those with more than enough stay as they are.
     """
     fresh = 0
-    for n in range(len(met)):
-        if met[n]:
-            met[n] = 0
-            if seen[n] < enough:
-                seen[n] = min(seen[n] + gain, enough)
-                fresh += 1 if seen[n] == enough else 0
+    for word in range(len(words)):
+        if words[word]:
+            for n in range(8 * word, min(8 * word + 8, len(met))):
+                if met[n]:
+                    met[n] = 0
+                    if seen[n] < enough:
+                        seen[n] = min(seen[n] + gain, enough)
+                        fresh += 1 if seen[n] == enough else 0
     return fresh
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from chsel.arrays import BoolArray, FloatArray
+from chsel.kernels.windows import window_minimum
 
 
 def valid_pixels(depth: FloatArray, *, nearest: float, furthest: float) -> BoolArray:
@@ -26,8 +26,16 @@ def occlusion_edges(
     valid (H, W): pixels that count, and that can be edges. reach: how many pixels away, along rows
     and columns, a neighbour may be; 2 also finds jumps where one pixel between them is invalid.
     """
-    size = 2 * reach + 1
-    nearest = minimum_filter(np.where(valid, depth, np.inf), size, mode="nearest")
-    furthest = maximum_filter(np.where(valid, depth, -np.inf), size, mode="nearest")
     own = np.where(valid, depth, 0.0)
+    nearest = _least_around(np.where(valid, depth, np.inf), reach)
+    furthest = -_least_around(np.where(valid, -own, np.inf), reach)
     return valid & ((furthest - own > jump) | (own - nearest > jump))
+
+
+def _least_around(image: FloatArray, reach: int) -> FloatArray:
+    """The least (H, W) of the pixels up to `reach` away from each, along rows and columns."""
+    height, width = image.shape
+    padded = np.full((height + 2 * reach, width + 2 * reach), np.inf)
+    padded[reach : reach + height, reach : reach + width] = image
+    window_minimum(padded, 2 * reach + 1)
+    return padded[:height, :width]

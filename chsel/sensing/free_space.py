@@ -51,7 +51,8 @@ class FreeGrid:
         self.count = 0
         self._views = int(views)
         voxels = int(np.prod(self.shape))
-        self._met = np.zeros(voxels, dtype=np.uint8)  # in the view at hand
+        self._words = np.zeros(-(-voxels // 8), dtype=np.uint64)
+        self._met = self._words.view(np.uint8)[:voxels]  # in the view at hand
         self._seen = np.zeros(voxels, dtype=np.uint8)  # in how many views, then _TOLD
         self._grid = self._met, self.shape, np.array(workspace.lower), float(spacing)
 
@@ -141,7 +142,7 @@ class FreeGrid:
 
     def _settle(self, views: int) -> int:
         """Count what was met as seen in so many views, and how many voxels that made free."""
-        fresh = int(settle(self._met, self._seen, views, self._views))
+        fresh = int(settle(self._words, self._met, self._seen, views, self._views))
         self.count += fresh
         return fresh
 

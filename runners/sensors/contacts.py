@@ -80,7 +80,13 @@ class ContactFinder:
                 self._cell.remarks.warn(
                     f"probe {step}: no foremost point is added, as no membrane was seen"
                 )
-        contacts = Contacts.joined([Contacts.without_normals(points) for points in added])
+        points = np.concatenate([np.zeros((0, 3)), *added])
+        kept = self._cell.free.within(points)
+        self._cell.remarks.warn(
+            f"probe {step}: a contact that the rig adds is left out, as it is out of the workspace",
+            int((~kept).sum()),
+        )
+        contacts = Contacts.without_normals(points[kept])
         if len(contacts.points):
             count = len(contacts.points)
             self._cell.remarks.tell(f"probe {step}: {count} contacts added, as the rig annotates")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import trimesh
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.points import Lattice
@@ -37,7 +38,8 @@ class HandPath:
         """times (T,): of all transforms, nanoseconds, ascending."""
         self._rig, self._model, self._joints, self._times = rig, model, joints, times
         self._cell = cell
-        self._interiors: dict[tuple[tuple[str, float], ...], FloatArray] = {}
+        self._filled: tuple[dict[str, float], FloatArray] | None = None
+        self._filled_parts: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     def follow(self, window: ProbeWindow, tally: Tally) -> FloatArray:
         """Sweep the hand along the path of a probe; some of its poses (P, 4, 4), in their order."""
@@ -92,11 +94,18 @@ class HandPath:
 
     def _interior(self, joints: dict[str, float]) -> FloatArray:
         """Points (M, 3) in the hand, dense enough to miss no voxel."""
-        key = tuple(sorted(joints.items()))
-        if key not in self._interiors:
-            parts = self._model.parts(joints)
-            nodes = [interior_lattice(part, 0.5 * self._cell.spacing) for part in parts]
-            points = np.concatenate([np.zeros((0, 3)), *nodes])
+        if self._filled is None or self._filled[0] != joints:
+            parts = enumerate(self._model.parts(joints))
+            points = np.concatenate([np.zeros((0, 3)), *(self._nodes(*part) for part in parts)])
             lattice = Lattice((0.0, 0.0, 0.0), 0.5 * self._cell.spacing)
-            self._interiors[key] = lattice.centres(np.unique(lattice.voxels(points), axis=0))
-        return self._interiors[key]
+            self._filled = joints, lattice.centres(np.unique(lattice.voxels(points), axis=0))
+        return self._filled[1]
+
+    def _nodes(self, number: int, part: trimesh.Trimesh) -> FloatArray:
+        """Points (M, 3) in a part; found again only once it has moved in the hand."""
+        vertices = np.array(part.vertices)
+        known = self._filled_parts.get(number)
+        if known is None or not np.array_equal(known[0], vertices):
+            known = vertices, interior_lattice(part, 0.5 * self._cell.spacing)
+            self._filled_parts[number] = known
+        return known[1]

@@ -12,6 +12,7 @@ from chsel.errors import SessionError
 from replay.mcap.texts import one_line
 from runners.sensors.catalogue import Channel
 from runners.sensors.decoding import Decode, decoder
+from runners.sensors.file_merge import Span, merged, most_at_once
 from runners.sensors.log_files import log_files
 from runners.sensors.messages import Received
 from runners.sensors.raw_file import RawFile
@@ -59,6 +60,7 @@ class RawLog:
             raise SessionError(f"log {self.path} cannot be read: {reason}") from None
         self._parts = [RawFile(file) for file in self.files]
         self.size = sum(part.size for part in self._parts)
+        self._spans: list[Span] = []
         self._find_topics(progress)
 
     @property
@@ -76,7 +78,7 @@ class RawLog:
         end: int | None = None,
         progress: Progress | None = None,
     ) -> Iterator[Received]:
-        """The messages on topics, in order of log time where a file has an index.
+        """The messages on topics, in order of log time where the files have an index.
 
         begin, end: log times in nanoseconds, begin <= t < end. What cannot be read is passed by,
         and counted in `faults`. Raises SessionError if the log has none of the topics.
@@ -136,22 +138,29 @@ class RawLog:
     def _raw_messages(
         self, wanted: Wanted, fault: Fault, tell: Callable[[int], None]
     ) -> Iterator[RawMessage]:
-        before = 0
-        for part in self._parts:
-            yield from part.messages(wanted, fault, _after(before, tell))
-            before += part.size
-            tell(before)
+        done = [0] * len(self._parts)
+        at_once = most_at_once(self._spans)
+
+        def read(number: int) -> Iterator[RawMessage]:
+            def told(of_file: int) -> None:
+                done[number] = of_file
+                tell(sum(done))
+
+            return self._parts[number].messages(wanted, fault, told, at_once=at_once)
+
+        yield from merged(self._spans, read)
+        tell(self.size)
 
     def _find_topics(self, progress: Progress | None) -> None:
         """From the indices of files; files without one are read through."""
-        times: list[int] = []
+        told: list[int] = []
         tell, done, fault = _seldom(progress, self.size), 0, self._new_faults()
         for part in self._parts:
             counts: dict[Channel, int] = {}
+            times = list(part.times or ())
             if part.counts is not None:
                 for number, channel in part.catalogue.channels.items():
                     counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
-                times += part.times or ()
             else:
                 for message in part.messages(Wanted(), fault, _after(done, tell)):
                     counts[message.channel] = counts.get(message.channel, 0) + 1
@@ -161,8 +170,10 @@ class RawLog:
             for channel, count in counts.items():
                 self._add_topic(channel, count)
             done += part.size
-        if times:
-            self.begin, self.end = min(times), max(times)
+            self._spans.append((min(times, default=0), max(times, default=0)))
+            told += times
+        if told:
+            self.begin, self.end = min(told), max(told)
 
     def _add_topic(self, channel: Channel, count: int) -> None:
         known = self.topics.get(channel.topic)

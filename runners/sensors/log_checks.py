@@ -16,9 +16,16 @@ from runners.sensors.transforms import TransformError
 
 _TRANSFORMS = ("TFMessage", "TransformStamped", "FrameTransform", "FrameTransforms")
 
+_OWN_SCHEMAS = "chsel."
+
 
 def require_topics(log: RawLog, rig: Rig) -> None:
     """Raise SessionError, which lists what the log has, unless it has the topics of the rig."""
+    if any(topic.schema.startswith(_OWN_SCHEMAS) for topic in log.topics.values()):
+        raise SessionError(
+            f"log {log.path} is a recording of a session, not a robot's log; accepted: "
+            f"session=recorded session.path={log.path}"
+        )
     missing = {topic: user for topic, user in named_topics(rig).items() if topic not in log.topics}
     if missing:
         listed = ", ".join(f"{topic} ({user})" for topic, user in missing.items())
@@ -140,7 +147,12 @@ class LogChecks:
         return f" (its schema is {self._log.topics[topic].schema})"
 
     def _require_poses(self, name: str, topic: str, frame: str | None) -> None:
-        frame = frame or self._seen.sightings[topic].frame or ""
+        frame = frame or self._seen.sightings[topic].frame
+        if not frame:
+            raise SessionError(
+                f"log {self._log.path}: messages on {topic} of {name} name no frame; accepted: the "
+                "frame of a transform, in the messages or as frame in the rig"
+            )
         self._require_known(name, frame, self.times[topic])
 
     def _require_hand(self, frame: str) -> None:

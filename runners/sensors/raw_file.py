@@ -16,6 +16,7 @@ from runners.sensors.catalogue import Catalogue
 from runners.sensors.chunks import UNPACKING_ERRORS, records
 from runners.sensors.log_files import ACCEPTED
 from runners.sensors.raw_reading import (
+    MOST_HELD,
     RECORD_HEAD,
     ChunkPlace,
     Fault,
@@ -63,14 +64,17 @@ class RawFile:
             raise SessionError(f"log {path} cannot be read: {error.strerror or error}") from None
 
     def messages(
-        self, wanted: Wanted, fault: Fault, progress: Callable[[int], None]
+        self, wanted: Wanted, fault: Fault, progress: Callable[[int], None], *, at_once: int = 1
     ) -> Iterator[RawMessage]:
-        """The messages that matter. fault: called with each damage. progress: with bytes done."""
+        """The messages that matter. fault: called with each damage. progress: with bytes done.
+
+        at_once: how many files share the memory for messages that wait for their turn.
+        """
         try:
             with self.path.open("rb") as file:
                 reading = RawReading(file, self.catalogue, wanted, fault, self.remarks, progress)
                 if self.is_indexed:
-                    yield from reading.ordered(self._chunks)
+                    yield from reading.ordered(self._chunks, MOST_HELD // at_once)
                 else:
                     yield from reading.as_written()
         except OSError as error:

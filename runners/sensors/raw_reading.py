@@ -28,7 +28,7 @@ _LAST_RECORDS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}  # with their 
 _CHUNK_MARK = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 _MARK_AT, _LONGEST_MARK = RECORD_HEAD.size + 28, 8
 _WINDOW = 2**20
-_MOST_HELD = 2**28  # bytes of messages that wait for their turn
+MOST_HELD = 2**28  # bytes of messages that wait for their turn
 _OVERLAP = "its chunks overlap so far in time that messages come in another order"
 _END_OF_TIME = 2**63
 _READ_RATIO = 8  # how often a file is read at most, in search of what is whole
@@ -89,14 +89,17 @@ class RawReading:
         self._readable = _PLAUSIBLE_SIZE + _READ_RATIO * self._size  # bytes
         self._tried = 0  # where the last chunk was, or seemed to be
 
-    def ordered(self, chunks: list[ChunkPlace]) -> Iterator[RawMessage]:
-        """In order of log time: a chunk is read once no message before it can be missing."""
+    def ordered(self, chunks: list[ChunkPlace], most: int) -> Iterator[RawMessage]:
+        """In order of log time: a chunk is read once no message before it can be missing.
+
+        most: bytes of messages that wait for their turn.
+        """
         waiting: list[tuple[int, int, int, RawMessage]] = []
         held = done = 0
         for chunk in sorted(chunks):
-            if held > _MOST_HELD and _OVERLAP not in self._remarks:
+            if held > most and _OVERLAP not in self._remarks:
                 self._remarks.append(_OVERLAP)
-            while waiting and (waiting[0][0] < chunk.first or held > _MOST_HELD):
+            while waiting and (waiting[0][0] < chunk.first or held > most):
                 message = heapq.heappop(waiting)[3]
                 held -= len(message.data)
                 yield message

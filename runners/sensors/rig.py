@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from chsel.arrays import frozen
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.points import Workspace
+
+_LARGEST_HAND = 100.0  # metres
+_LONGEST = 1e9  # seconds; they are counted in nanoseconds
 
 Vector = tuple[float, float, float]
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -95,6 +99,7 @@ class ContactRig:
     def __post_init__(self) -> None:
         for name in ("filter", "threshold", "pixels", "points", "reference_images"):
             require_positive(name, getattr(self, name))
+        require_at_most("filter", self.filter, 200)
         if not 0.0 <= self.quantile < 1.0:
             raise SettingError(f"quantile is {self.quantile}; accepted: from 0 to below 1")
         require_choice("per", self.per, ("contact", "camera"))
@@ -111,6 +116,9 @@ class BoxRig:
     def __post_init__(self) -> None:
         for side in self.size:
             require_positive("size", side)
+            require_at_most("size", side, _LARGEST_HAND)
+        for distance in frozen("position", self.position, (3,), error=SettingError).tolist():
+            require_at_most("distance from the hand's frame", abs(distance), _LARGEST_HAND)
 
 
 @dataclass(frozen=True)
@@ -170,6 +178,11 @@ class ExtraContacts:
     points: tuple[Vector, ...] = ()
     foremost: int = 0
 
+    def __post_init__(self) -> None:
+        for index, point in enumerate(self.points):
+            frozen(f"points[{index}]", point, (3,), error=SettingError)
+        require_positive("foremost", self.foremost, zero=True)
+
 
 @dataclass(frozen=True)
 class Annotations:
@@ -197,6 +210,7 @@ class ClockRig:
         require_choice("stamp", self.stamp, ("header", "log"))
         for name in ("offset", "gap", "jump"):
             require_positive(name, getattr(self, name))
+            require_at_most(name, getattr(self, name), _LONGEST)
 
 
 @dataclass(frozen=True)

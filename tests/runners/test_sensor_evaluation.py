@@ -13,11 +13,10 @@ import yaml
 
 from chsel.errors import SettingError
 from chsel.evaluation.true_pose import TruePoseSettings
-from chsel.pose import compose, inverse, rotation_angle, rotation_vector
+from chsel.pose import compose, inverse, roll_pitch_yaw, rotation_angle, rotation_vector
 from replay.events import RigDescribed
 from replay.mcap.reader import read_recording
 from runners import evaluate
-from runners.align import roll_pitch_yaw
 from runners.cli import CONF
 from runners.evaluation.configurations import configurations_of
 from runners.evaluation.display import Display

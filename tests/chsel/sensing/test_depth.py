@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from chsel.sensing.depth import occlusion_edges, valid_pixels
 
@@ -41,3 +43,17 @@ def test_a_longer_reach_looks_across_a_gap() -> None:
     assert not occlusion_edges(depth, valid, 0.05).any()
     across = occlusion_edges(depth, valid, 0.05, reach=2)
     np.testing.assert_array_equal(np.flatnonzero(across.any(axis=0)), [3, 5])
+
+
+@pytest.mark.parametrize(("shape", "reach"), [((40, 57), 5), ((40, 57), 2), ((3, 4), 9)])
+def test_edges_are_those_of_the_filters_of_scipy(shape: tuple[int, int], reach: int) -> None:
+    stream = np.random.default_rng(reach)
+    depth, valid = stream.random(shape), stream.random(shape) < 0.8
+    depth[~valid] = np.nan
+    nearest = minimum_filter(np.where(valid, depth, np.inf), 2 * reach + 1, mode="nearest")
+    furthest = maximum_filter(np.where(valid, depth, -np.inf), 2 * reach + 1, mode="nearest")
+    jumps = np.maximum(furthest - depth, depth - nearest)
+    limit = float(np.quantile(jumps[valid], 0.5))
+    expected = valid & (jumps > limit)
+    assert 0 < expected.sum() < valid.sum()
+    np.testing.assert_array_equal(occlusion_edges(depth, valid, limit, reach=reach), expected)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from chsel.pose import compose, inverse
 from runners.sensors.rig import BoxRig, BubbleRig, CameraRig, ContactRig, HandRig, Rig
 from runners.twin.log_writer import LogWriter
 from runners.twin.pinhole import Pinhole
-from runners.twin.ros_messages import camera_info, image, transform
+from runners.twin.ros_messages import camera_info, image, joint_state, transform
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
@@ -50,12 +51,22 @@ RIG = Rig(
 )
 
 
+class Writer(Protocol):
+    """Takes the messages: a LogWriter, or whoever wants to see them."""
+
+    def add(
+        self, topic: str, kind: str, message: dict[str, Any], stamp: int, log_time: int
+    ) -> None:
+        """One message; times in nanoseconds."""
+
+
 @dataclass(frozen=True)
 class SphereLog:
     """How the log is written. marks: times in seconds and texts of the markers.
 
     unit: metres of a unit of the camera's images. camera_clock: seconds by which it is ahead.
     lost_transforms: seconds between which the hand sends none. left_out: topics without messages.
+    finger: metres at which a joint of this name stands; None: no joint is told of.
     """
 
     marks: tuple[tuple[float, str], ...] = (
@@ -68,26 +79,34 @@ class SphereLog:
     camera_clock: float = 0.0
     lost_transforms: tuple[float, float] = (0.0, 0.0)
     left_out: tuple[str, ...] = ()
+    finger: float | None = None
 
     def write(self, path: Path) -> Path:
-        """Five seconds: standing, a push onto the sphere, and one that passes it."""
+        """The log as a file."""
         with LogWriter(path) as writer:
-            for tick in range(101):
-                seconds = tick * 0.05
-                stamp = BEGIN + round(seconds * SECOND)
-                self._send(writer, tick, seconds, stamp)
-            for seconds, text in self.marks:
-                time = BEGIN + round(seconds * SECOND) + LATENCY
-                self._add(writer, "/probe", "std_msgs/String", {"data": text}, time, time)
+            self.send(writer)
         return path
 
-    def _send(self, writer: LogWriter, tick: int, seconds: float, stamp: int) -> None:
+    def send(self, writer: Writer) -> None:
+        """Five seconds: standing, a push onto the sphere, and one that passes it."""
+        for tick in range(101):
+            seconds = tick * 0.05
+            stamp = BEGIN + round(seconds * SECOND)
+            self._send(writer, tick, seconds, stamp)
+        for seconds, text in self.marks:
+            time = BEGIN + round(seconds * SECOND) + LATENCY
+            self._add(writer, "/probe", "std_msgs/String", {"data": text}, time, time)
+
+    def _send(self, writer: Writer, tick: int, seconds: float, stamp: int) -> None:
         hand = hand_pose(seconds)
         log = stamp + LATENCY
         lost, found = self.lost_transforms
         if not lost <= seconds < found:
             moving = {"transforms": [transform("world", "hand", hand, stamp)]}
             self._add(writer, "/tf", "tf2_msgs/TFMessage", moving, stamp, log)
+        if self.finger is not None:
+            joints = joint_state(["elbow", "finger"], [seconds, self.finger], stamp)
+            self._add(writer, "/joint_states", "sensor_msgs/JointState", joints, stamp, log)
         if tick == 0:
             fixed = [
                 transform("hand", "pad_frame", HAND_FROM_PAD, stamp),
@@ -104,7 +123,7 @@ class SphereLog:
 
     def _image(
         self,
-        writer: LogWriter,
+        writer: Writer,
         name: str,
         camera: Pinhole,
         values: np.ndarray,
@@ -118,7 +137,7 @@ class SphereLog:
         self._add(writer, f"/{name}/depth", "sensor_msgs/Image", sent, stamp, log)
 
     def _add(
-        self, writer: LogWriter, topic: str, kind: str, message: dict, stamp: int, log: int
+        self, writer: Writer, topic: str, kind: str, message: dict, stamp: int, log: int
     ) -> None:
         if topic not in self.left_out:
             writer.add(topic, kind, message, stamp, log)

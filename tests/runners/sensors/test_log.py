@@ -5,6 +5,7 @@ import shutil
 import struct
 import tracemalloc
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from mcap.writer import Writer as McapWriter
 
 from chsel.errors import SessionError
 from replay.file_digest import file_digest
-from runners.sensors import raw_reading
+from runners.sensors import raw_file, raw_reading
+from runners.sensors.catalogue import Channel
+from runners.sensors.file_merge import merged, most_at_once
 from runners.sensors.log import RawLog
 from runners.sensors.messages import (
     CameraInfoMessage,
@@ -26,6 +29,7 @@ from runners.sensors.messages import (
     Received,
     TransformMessage,
 )
+from runners.sensors.raw_reading import RawMessage
 from runners.twin.schemas import encode, schema_text
 from tests.runners.sensors.small_logs import (
     BEGIN,
@@ -187,7 +191,7 @@ def test_chunks_that_all_overlap_are_not_all_held(
     mixed = [sent[i] for i in np.random.default_rng(0).permutation(len(sent))]
     write_ros2(tmp_path / "log.mcap", mixed, chunk_size=300)
     ordered = Counter(texts(read(tmp_path / "log.mcap")))
-    monkeypatch.setattr(raw_reading, "_MOST_HELD", 1000)
+    monkeypatch.setattr(raw_file, "MOST_HELD", 1000)
     log = RawLog(tmp_path / "log.mcap")
     received = list(log.messages(log.topics))
     assert [one.log_time for one in received] != sorted(one.log_time for one in received)
@@ -461,6 +465,48 @@ def test_a_rosbag2_folder_is_one_log(tmp_path: Path, metadata: str | None) -> No
     assert any("metadata.yaml" in remark for remark in log.remarks) == (metadata is not None)
     digests = "".join(file_digest(file) + "\n" for file in log.files)
     assert log.digest() == hashlib.blake2b(digests.encode(), digest_size=16).hexdigest()
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_files_of_a_bag_that_hold_a_topic_each_are_read_in_order_of_time(
+    tmp_path: Path, finished: bool
+) -> None:
+    sent = [(*one[:3], one[3] + n) for n, one in enumerate(ros2_sent(6))]
+    whole, bag = tmp_path / "whole.mcap", tmp_path / "bag"
+    write_ros2(whole, sent, chunk_size=300)
+    bag.mkdir()
+    for number, topic in enumerate(dict.fromkeys(one[0] for one in sent)):
+        own = [one for one in sent if one[0] == topic]
+        write_ros2(bag / f"bag_{number}.mcap", own, chunk_size=1, finished=finished)
+    told: list[tuple[int, int]] = []
+    log = RawLog(bag)
+    both = [
+        [(one.log_time, one.topic, repr(one.content)) for one in of.messages(of.topics, progress=p)]
+        for of, p in ((log, lambda *done: told.append(done)), (RawLog(whole), None))
+    ]
+    assert len(both[0]) > 80
+    assert both[0] == both[1]
+    assert told[-1] == (log.size, log.size)
+    assert all(done <= log.size for done, _ in told)
+
+
+def test_of_successive_files_one_is_open_at_a_time() -> None:
+    opened: list[int] = []
+
+    def read(number: int) -> Iterator[RawMessage]:
+        opened.append(number)
+        for time in range(*spans[number]):
+            yield RawMessage(Channel(str(number), "", ""), time, b"")
+
+    spans = [(10, 20), (0, 8), (20, 30), (25, 40)]
+    times, at_once = [], []
+    for message in merged(spans, read):
+        times.append(message.log_time)
+        at_once.append(len(opened))
+    assert times == sorted([*range(8), *range(10, 30), *range(25, 40)])
+    assert opened == [1, 0, 2, 3]
+    assert [at_once[times.index(time)] for time in (7, 19, 24, 26)] == [1, 2, 3, 4]
+    assert [most_at_once(part) for part in (spans, spans[:2], [(0, 9)] * 5)] == [2, 1, 5]
 
 
 def test_a_missing_file_of_a_bag_is_said(tmp_path: Path) -> None:

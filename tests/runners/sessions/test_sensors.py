@@ -34,12 +34,15 @@ from runners.sensors.rig import (
     BubbleRig,
     CloudRig,
     ExtraContacts,
+    HandRig,
     ProbeTimes,
     Rig,
 )
 from runners.session_run import SessionRun
 from runners.sessions import session_settings
 from runners.sessions.sensors import SensorsSession, SensorsSettings
+from tests.replay.conftest import same_bits
+from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import ros2_cloud, ros2_transform, write_ros2
 from tests.runners.sensors.sphere_log import (
     BEGIN,
@@ -226,6 +229,15 @@ def test_annotations_leave_out_and_add_contacts(log: Path) -> None:
     assert "probe 0: contacts left out" in lines(events, "info")
 
 
+def test_contacts_that_a_rig_adds_must_be_finite_and_within_the_workspace(log: Path) -> None:
+    with pytest.raises(SettingError, match=r"points\[1\]\[1\] is not finite"):
+        ExtraContacts(0, points=((0.9, 0.0, 0.4), (0.9, float("nan"), 0.4)))
+    added = (ExtraContacts(1, points=((0.9, 0.0, 0.41), (9.0, 0.0, 0.4))),)
+    events = list(open_log(log, replace(RIG, annotations=Annotations((), added))).probes())
+    np.testing.assert_array_equal(probes(events)[1].contacts, [[0.9, 0.0, 0.41]])
+    assert "probe 1: a contact that the rig adds is left out, as it is out of" in lines(events)
+
+
 def test_the_references_ways_tell_less(log: Path, events: list[Any]) -> None:
     assert RIG.hand is not None
     scaled = replace(RIG.cameras[0], rays="scaled_images")
@@ -242,6 +254,58 @@ def test_the_references_ways_tell_less(log: Path, events: list[Any]) -> None:
     assert len(free) > 50
     assert -0.5 * SPACING < behind.min() - 0.02 < SPACING
     assert behind.max() < 0.15 + 0.012 + SPACING
+
+
+# The box of the rig, 2 cm aside of its place as long as the finger's joint is at 0.
+HAND_URDF = """<robot name="hand">
+  <link name="flange"/>
+  <link name="pad">
+    <collision><geometry><box size="0.04 0.06 0.08"/></geometry></collision>
+  </link>
+  <joint name="finger" type="prismatic">
+    <parent link="flange"/><child link="pad"/>
+    <origin xyz="0 -0.02 0.04"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/>
+  </joint>
+</robot>"""
+
+
+def test_a_hand_of_a_urdf_sweeps_what_its_boxes_sweep(tmp_path: Path) -> None:
+    pytest.importorskip("yourdfpy")
+    (tmp_path / "hand.urdf").write_text(HAND_URDF)
+    linked = HandRig("hand", urdf=str(tmp_path / "hand.urdf"), joints="/joint_states")
+    found = {}
+    for finger in (0.02, 0.05):
+        log = SphereLog(finger=finger).write(tmp_path / f"{finger}.mcap")
+        for hand in (RIG.hand, linked):
+            session = open_log(log, replace(RIG, cameras=(), hand=hand))
+            events = list(session.probes())
+            swept = session.report.total()["hand"].free
+            free = np.concatenate([probe.new_points.free for probe in probes(events)])
+            found[finger, hand] = swept, free, events[0].hand.centroid
+    boxes, same, aside = (found[key] for key in ((0.02, RIG.hand), (0.02, linked), (0.05, linked)))
+    assert boxes[0] == same[0] > 200
+    np.testing.assert_array_equal(boxes[1], same[1])
+    np.testing.assert_allclose(same[2], boxes[2], atol=1e-9)
+    np.testing.assert_allclose(aside[2], boxes[2] + [0.0, 0.03, 0.0], atol=1e-9)
+    assert not np.array_equal(aside[1], boxes[1])
+    with pytest.raises(SessionError, match=r"sphere names: /joint_states \(joints of the h"):
+        open_log(SphereLog().write(tmp_path / "log.mcap"), replace(RIG, hand=linked))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_log_of_foxgloves_messages_gives_the_same_to_the_bit(
+    events: list[Any], log: Path, tmp_path: Path, packed: bool
+) -> None:
+    other = in_foxgloves_messages(log, tmp_path / "foxglove.mcap", packed=packed)
+    session = open_log(other)
+    again = list(session.probes())
+    assert {topic.encoding for topic in session._log.topics.values()} == {"protobuf"}
+    assert again[0].source != events[0].source
+    again[0] = replace(again[0], source=events[0].source)
+    assert len(again) == len(events)
+    for one, before in zip(again, events, strict=True):
+        assert same_bits(one, before), f"{type(one).__name__} of probe {one.step}"
 
 
 def joined(path: Path, *parts: Path) -> Path:
@@ -533,6 +597,8 @@ def test_recordings_of_such_sessions_can_be_read_and_registered_again(
     recorder.record(SessionEnded(1, "finished"))
     recorder.close()
     assert [("best_cost" in row, row["contacts"]) for row in rows] == [(True, 50), (True, 50)]
+    with pytest.raises(SessionError, match=r"is a recording of a session, .* session=recorded"):
+        open_log(path)
     recording = read_recording(path)
     assert recording.rig is not None
     assert (recording.rig.name, recording.rig.source) == ("sphere", session.source)
