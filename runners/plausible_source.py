@@ -17,19 +17,19 @@ from mcap.stream_reader import StreamReader
 
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError
-from chsel.points import KnownPoints, Workspace
+from chsel.points import KnownPoints
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
-from replay.events import Event, Probe, RigDescribed
+from replay.events import Event, Probe, RigDescribed, SessionStarted
 from replay.file_digest import file_digest
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import PROFILE
 from runners.objects.loader import ObjectConfig, load_object
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sessions import open_session, session_settings
-from runners.sessions.points import PointsSession, PointsSettings
+from runners.sessions.session import Session
 
 _LONGEST_HEADER = 4096  # bytes
 
@@ -84,8 +84,10 @@ def open_source(
                 f"{path} is no recording; accepted for a raw log: session=sensors "
                 "session/rig=NAME object=NAME"
             )
-        return _raw(path, object_config, values, assets, seed)
-    return _points(path, object_config, values, assets, seed)
+        # Images are for the eye; a pose beside the log is what is sought here.
+        values |= {"pose": "none", "images": False}
+        return _of_session("sensors", path, object_config, values, assets, seed)
+    return _of_session("points", path, object_config, values, assets, seed)
 
 
 def _recorded(path: Path) -> Source:
@@ -97,14 +99,7 @@ def _recorded(path: Path) -> Source:
     problems: Problems = _RecordedProblems(recording)
     steps = recording.steps
     if not steps:  # nothing was registered, as where somebody else's method is to be measured
-        problems = _ProbedProblems(
-            recording.probes,
-            start.initial_points,
-            start.workspace,
-            start.sdf,
-            start.free_resolution,
-            start.seed,
-        )
+        problems = _ProbedProblems(recording.probes, start, start.sdf, start.seed)
         steps = problems.steps
     if not steps:
         raise RecordingError(f"recording {path} has no registration problem and no probe")
@@ -112,53 +107,34 @@ def _recorded(path: Path) -> Source:
     return Source(start.object, start.mesh, truth, epsilon, steps, problems, file_digest(path))
 
 
-def _raw(
+def _of_session(
+    kind: str,
     path: Path,
     object_config: Mapping[str, Any],
     session: Mapping[str, Any],
     assets: Path,
     seed: int,
 ) -> Source:
-    """A log of sensors, of which known points are made first."""
+    """A file of points, or a log of sensors, of which known points are made first."""
     model = load_object(build_settings(ObjectConfig, object_config, "object"), assets)
-    # Images are for the eye; a pose beside the log is what is sought here.
-    chosen = {**session, "path": str(path), "pose": "none", "images": False}
-    settings = session_settings("sensors", chosen)
-    sensors = open_session("sensors", settings, model, seed)
+    settings = session_settings(kind, {**session, "path": str(path)})
+    opened = open_session(kind, settings, model, seed)
     try:
-        events: list[Event] = list(sensors.probes())
+        events = list(opened.probes())
     finally:
-        sensors.close()
+        opened.close()
     sdf = SdfGrid.from_mesh(model.mesh, settings.object_resolution, padding=settings.object_padding)
-    problems = _ProbedProblems(
-        events, sensors.initial_points, sensors.workspace, sdf, sensors.free_resolution, seed
-    )
+    problems = _ProbedProblems(events, opened, sdf, seed)
     told = [event.source for event in events if isinstance(event, RigDescribed)]
-    digest = told[0] if told else file_digest(path)
-    return Source(model.name, model.mesh, None, model.epsilon, problems.steps, problems, digest)
-
-
-def _points(
-    path: Path,
-    object_config: Mapping[str, Any],
-    session: Mapping[str, Any],
-    assets: Path,
-    seed: int,
-) -> Source:
-    model = load_object(build_settings(ObjectConfig, object_config, "object"), assets)
-    settings = build_settings(PointsSettings, {**session, "path": str(path)}, "session")
-    points = PointsSession(settings, model)
-    sdf = SdfGrid.from_mesh(model.mesh, settings.object_resolution, padding=settings.object_padding)
-    problems = _ProbedProblems(
-        list(points.probes()),
-        points.initial_points,
-        points.workspace,
-        sdf,
-        points.free_resolution,
-        seed,
+    return Source(
+        model.name,
+        model.mesh,
+        opened.world_from_object,
+        model.epsilon,
+        problems.steps,
+        problems,
+        told[0] if told else file_digest(path),
     )
-    truth, digest = points.world_from_object, file_digest(path)
-    return Source(model.name, model.mesh, truth, model.epsilon, problems.steps, problems, digest)
 
 
 def _is_recording(path: Path) -> bool:
@@ -188,27 +164,20 @@ class _ProbedProblems:
     """All points up to a step; where a registration starts does not matter here."""
 
     def __init__(
-        self,
-        events: Sequence[Event],
-        initial_points: KnownPoints,
-        workspace: Workspace,
-        sdf: SdfGrid,
-        free_resolution: float,
-        seed: int,
+        self, events: Sequence[Event], of: Session | SessionStarted, sdf: SdfGrid, seed: int
     ) -> None:
         self._probes = [event for event in events if isinstance(event, Probe)]
-        self._initial, self._workspace = initial_points, workspace
-        self._sdf, self._free_resolution, self._seed = sdf, free_resolution, seed
+        self._of, self._sdf, self._seed = of, sdf, seed
         self.steps = tuple(probe.step for probe in self._probes)
 
     def problem(self, step: int) -> RegistrationProblem:
         news = [probe.new_points for probe in self._probes if probe.step <= step]
         return RegistrationProblem(
             self._sdf,
-            reduce(KnownPoints.merged, news, self._initial),
+            reduce(KnownPoints.merged, news, self._of.initial_points),
             np.eye(4)[None],
-            self._workspace,
-            self._free_resolution,
+            self._of.workspace,
+            self._of.free_resolution,
             StreamKey(self._seed, step),
         )
 

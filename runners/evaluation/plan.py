@@ -25,7 +25,6 @@ from runners.evaluation.configurations import (
 )
 from runners.evaluation.contenders import Contender
 from runners.evaluation.measure import MetricsConfig
-from runners.evaluation.sensor_logs import log_of
 from runners.objects.loader import ObjectConfig
 from runners.sessions import session_settings
 
@@ -103,7 +102,7 @@ class Plan:
         """The settings of the session of a trial, with its kind."""
         if self.kind == SENSORS:
             # A pose beside the log is a guess here, from which the true pose is sought.
-            return {**self.session, "path": str(log_of(self, trial)), "pose": "none"}
+            return {**self.session, "path": str(trial.log(self)), "pose": "none"}
         return {**self.session, "configuration": trial.configuration}
 
     def session_settings(self, trial: Trial) -> Any:
@@ -145,6 +144,12 @@ class Trial:
     def folder(self, plan: Plan) -> Path:
         """Where all about it is."""
         return plan.folder / "trials" / self.configuration / f"seed_{self.seed}"
+
+    def log(self, plan: Plan) -> Path:
+        """Its raw log, in sessions of sensors: a rosbag2 folder, or else an .mcap file."""
+        folder = plan.log_folder / self.configuration
+        bag = folder / f"seed_{self.seed}"
+        return bag if bag.is_dir() else folder / f"seed_{self.seed}.mcap"
 
 
 @dataclass(frozen=True, order=True)

@@ -3,39 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from chsel.arrays import FloatArray
 from chsel.errors import SettingError
 from chsel.pose import compose, roll_pitch_yaw
+from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
 from runners.twin.configurations import CABINET_CONFIGURATIONS
 from runners.twin.settings import TwinSettings
-
-if TYPE_CHECKING:  # a plan knows where its logs are
-    from runners.evaluation.plan import Plan, Trial
 
 TRUTH = ".truth.yaml"
 _POSITION_STEP = 0.01  # metres: about as well as a person sets a pose by hand
 _ANGLE_STEP = np.deg2rad(10.0)
 
 
-def log_of(plan: Plan, trial: Trial) -> Path:
-    """CONFIGURATION/seed_K.mcap in the folder of logs, or the rosbag2 folder CONFIGURATION/seed_K.
-
-    The file's name if there is neither.
-    """
-    folder = plan.log_folder / trial.configuration
-    bag = folder / f"seed_{trial.seed}"
-    return bag if bag.is_dir() else folder / f"seed_{trial.seed}.mcap"
-
-
 def check_log(plan: Plan, trial: Trial) -> None:
     """Raise SettingError unless a trial's log and a guess of its pose are there, or can be made."""
-    configuration, log = plan.configurations[trial.configuration], log_of(plan, trial)
+    configuration, log = plan.configurations[trial.configuration], trial.log(plan)
     if configuration.log_folder is None:
         return
     if not log.exists():
@@ -50,7 +37,7 @@ def check_log(plan: Plan, trial: Trial) -> None:
 
 def ensure_log(plan: Plan, trial: Trial) -> Path:
     """The log of a trial; one of the twin's configurations is simulated if it is missing."""
-    log = log_of(plan, trial)
+    log = trial.log(plan)
     if not is_missing(plan, trial):
         return log
     from runners.twin.simulation import simulate_log  # imports the physics engine
@@ -68,7 +55,7 @@ def ensure_log(plan: Plan, trial: Trial) -> Path:
 def is_missing(plan: Plan, trial: Trial) -> bool:
     """Whether a trial's log is still to be simulated."""
     recorded = plan.configurations[trial.configuration].log_folder is not None
-    return not recorded and not _is_usable(log_of(plan, trial))
+    return not recorded and not _is_usable(trial.log(plan))
 
 
 def guessed_pose(log: Path) -> FloatArray:

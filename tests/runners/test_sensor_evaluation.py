@@ -29,7 +29,6 @@ from runners.evaluation.sensor_logs import (
     check_log,
     guessed_pose,
     is_missing,
-    log_of,
 )
 from runners.evaluation.trial_session import open_recorded
 from runners.evaluation.true_poses import FoundPose, true_poses
@@ -119,15 +118,15 @@ def test_logs_of_ones_own_need_a_guess_and_the_twins_are_made(tmp_path: Path) ->
         check_log(plan, trial)
     with pytest.raises(SettingError, match=r"no .*seed_7.mcap; accepted: seeds of which"):
         check_log(plan, Trial(7, "shelf"))
-    write_pose(beside(log_of(plan, trial)), POSE, {})
+    write_pose(beside(trial.log(plan)), POSE, {})
     check_log(plan, trial)
-    np.testing.assert_allclose(guessed_pose(log_of(plan, trial)), POSE, atol=1e-12)
+    np.testing.assert_allclose(guessed_pose(trial.log(plan)), POSE, atol=1e-12)
     (logs / "shelf" / "seed_1").mkdir()
-    assert log_of(plan, Trial(1, "shelf")) == logs / "shelf" / "seed_1"
+    assert Trial(1, "shelf").log(plan) == logs / "shelf" / "seed_1"
     twin = sensors_plan(tmp_path)
     assert is_missing(twin, Trial(0, "cabinet_drill"))
     check_log(twin, Trial(0, "cabinet_drill"))
-    assert log_of(twin, trial) == twin.folder / "logs" / "shelf" / "seed_0.mcap"
+    assert trial.log(twin) == twin.folder / "logs" / "shelf" / "seed_0.mcap"
 
 
 def test_a_pose_set_by_hand_is_near_the_truth_but_not_it() -> None:
@@ -187,7 +186,7 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
     plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
     outcome = do_unit(plan, Unit(trial), set())
     assert (outcome.kind, outcome.reason) == ("done", "")
-    log = log_of(plan, trial)
+    log = trial.log(plan)
     assert {file.name for file in log.parent.iterdir()} == {"seed_0.mcap", f"seed_0{TRUTH}"}
     truth = read_pose(log.with_name(f"seed_0{TRUTH}"))
     recording = read_recording(trial.folder(plan) / "session.mcap")
