@@ -22,7 +22,7 @@ from hydra.errors import (
     MissingConfigException,
     OverrideParseException,
 )
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from chsel.errors import ChselError
@@ -155,8 +155,13 @@ def _unknown_key(key: str, config_name: str) -> str:
         node: Any = hydra.compose(config_name, groups)
     parts = key.split("@")[0].split(".")
     for depth, part in enumerate(parts):
+        where = ".".join(parts[:depth]) or config_name
+        if isinstance(node, ListConfig) and part.isdecimal() and int(part) < len(node):
+            node = node[int(part)]
+            continue
         if not isinstance(node, DictConfig) or part not in node:
-            where = ".".join(parts[:depth]) or config_name
+            if any(part.isdecimal() for part in parts[:depth]):
+                return f"{where} does not give {part!r}; accepted: +{key}=VALUE to add it"
             names = [str(name) for name in node] if isinstance(node, DictConfig) else []
             return _not_accepted(where, f"has no key {part!r}", part, names)
         node = OmegaConf.select(node, part)

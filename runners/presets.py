@@ -11,11 +11,14 @@ from chsel.errors import SettingError
 from chsel.methods import METHODS, OURS, preset_settings
 from chsel.presets import PRESETS
 from chsel.settings import settings_mapping
+from runners.sensors.rig import Rig
 from runners.sessions.probing import PROBING_PRESETS
 
 
 def store_presets() -> None:
     """Offer every preset as method/presets/METHOD/PRESET and session/presets/probing/PRESET.
+
+    session/presets/rig/default has all keys of a rig, so that each can be changed by its name.
 
     A method of an installed package is a choice of its own, as those of conf/method/ are.
     """
@@ -32,6 +35,9 @@ def store_presets() -> None:
         probing = settings_mapping(PROBING_PRESETS[preset])
         probing["configuration"] = "${configuration}"  # a key of the top file, for short commands
         store.store(group="session/presets/probing", name=preset, node=probing)
+    rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out
+    del rig["name"], rig["world"]
+    store.store(group="session/presets/rig", name="default", node=rig)
 
 
 def _store_presets_of(store: ConfigStore, method: str) -> None:

@@ -259,12 +259,20 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
             "session=kinematic object=ycb/drill assets.dir=/nowhere",
             "runners.fetch object=ycb/drill",
         ),
+        (
+            "session=sensors session.rig.cameras.0.edge_reach=3",
+            "accepted: +session.rig.cameras.0.edge_reach=VALUE to add it",
+        ),
+        (
+            "session=sensors session.path=no.mcap session.rig.contact.threshold=0.003",
+            "log no.mcap does not exist",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(
     points: tuple[str, ...], tmp_path: Path, override: str, message: str
 ) -> None:
-    chosen = () if "kinematic" in override else points
+    chosen = () if override.startswith("session=") else points
     overrides = [f"logs={tmp_path}", *chosen, *override.split()]
     if override.startswith("logs="):
         del overrides[0]
