@@ -16,10 +16,10 @@ from rich.console import Console
 from chsel.errors import SettingError
 from chsel.settings import build_settings, settings_mapping
 from runners.cli import command, plain
-from runners.evaluation.whole_file import whole_file
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.page import Page, as_html, as_markdown, page_of
 from runners.reporting.sections import SequenceConfig, sections_of
+from runners.whole_file import whole_file
 
 HTML, MARKDOWN = "report.html", "report.md"
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")

@@ -17,12 +17,12 @@ from chsel.errors import SettingError
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
 from runners.cli import command, plain
-from runners.evaluation.whole_file import WritingError, whole_file
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
 from runners.twin.configurations import CabinetConfiguration, find_cabinet_configuration
 from runners.twin.settings import TwinSettings
 from runners.twin.simulation import Push, SimulatedLog, probe_count, simulate_log
+from runners.whole_file import WritingError, whole_file
 
 EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here
 

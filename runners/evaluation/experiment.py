@@ -15,7 +15,7 @@ from replay.environment import environment
 from runners.evaluation.claims import claimed
 from runners.evaluation.configurations import SENSORS
 from runners.evaluation.plan import Plan
-from runners.evaluation.whole_file import whole_file
+from runners.whole_file import whole_file
 
 FILE = "experiment.json"
 FORMAT = 1

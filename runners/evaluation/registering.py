@@ -31,10 +31,10 @@ from runners.evaluation.judge import Judge, one_line
 from runners.evaluation.plan import OWN, Plan, Trial
 from runners.evaluation.table import ITERATIONS, RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded
-from runners.evaluation.whole_file import whole_file
 from runners.recording import RecordingConfig
 from runners.session_run import SessionRun
 from runners.sessions.recorded import RecordedSession
+from runners.whole_file import whole_file
 
 
 def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str]) -> None:

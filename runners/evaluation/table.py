@@ -11,7 +11,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from chsel.errors import RecordingError
-from runners.evaluation.whole_file import whole_file
+from runners.whole_file import whole_file
 
 Row = Mapping[str, Any]
 

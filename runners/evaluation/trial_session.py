@@ -18,8 +18,8 @@ from chsel.streams import StreamKey
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.session_recording import TRUTH, record_session
-from runners.evaluation.whole_file import WritingError, whole_file
 from runners.sessions.recorded import RecordedSession, RecordedSettings
+from runners.whole_file import WritingError, whole_file
 
 _ONE = OnlineSettings(hypotheses=1)
 

@@ -19,7 +19,7 @@ from runners.evaluation.plan import Plan, Unit
 from runners.evaluation.registering import register_trial
 from runners.evaluation.table import about_part, is_part
 from runners.evaluation.trial_session import has_session, make_session
-from runners.evaluation.whole_file import WritingError
+from runners.whole_file import WritingError
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}

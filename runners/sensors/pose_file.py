@@ -14,7 +14,7 @@ from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SessionError
 from chsel.pose import nearest_rigid
 from replay.new_file import new_file
-from runners.evaluation.whole_file import whole_file
+from runners.whole_file import whole_file
 
 SUFFIX = ".pose.yaml"
 KEY = "world_from_object"

@@ -13,7 +13,6 @@ import trimesh
 from chsel.arrays import FloatArray
 from chsel.errors import SettingError
 from chsel.streams import Purpose, StreamKey, normals
-from runners.evaluation.whole_file import whole_file
 from runners.twin import wrist
 from runners.twin.configurations import REST, CabinetConfiguration, stood_on_shelf
 from runners.twin.log_writer import LogWriter
@@ -21,6 +20,7 @@ from runners.twin.pads import Pads
 from runners.twin.recorder import TICK, Recorder
 from runners.twin.scene import Scene
 from runners.twin.settings import TwinSettings
+from runners.whole_file import whole_file
 
 HOME = (0.48, 0.0, 0.433)  # m: where the wrist is before and after all probes
 REACTION = 1  # ticks that the robot still moves on when its pads have felt something

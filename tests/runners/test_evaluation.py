@@ -34,9 +34,9 @@ from runners.evaluation.plan import OWN, Plan, Trial, Unit
 from runners.evaluation.schedule import Schedule
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
 from runners.evaluation.trial_session import open_recorded, problems
-from runners.evaluation.whole_file import WritingError, whole_file
 from runners.evaluation.work import do_unit
 from runners.sessions.probing import PROBING_PRESETS
+from runners.whole_file import WritingError, whole_file
 
 TRIAL = Trial(0, "mustard")
 FAST = {"chsel": {"descent": {"restarts": 1}, "emitter": {"iterations": 20}}}

@@ -11,7 +11,7 @@ from chsel.errors import ChselError, RecordingError
 
 
 class WritingError(ChselError):
-    """A file of an evaluation cannot be written, so that going on is of no use."""
+    """A file cannot be written, so that going on is of no use."""
 
 
 @contextmanager
