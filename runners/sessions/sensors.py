@@ -80,14 +80,12 @@ def open_sensors(
             images=settings.images,
         )
     session = SensorsSession(settings, seed, progress)
-    longest, side = (
-        object_model.mesh.extents.max(),
-        float(np.ptp(session.workspace.bounds, 0).max()),
-    )
-    if longest > side:
+    longest = float(object_model.mesh.extents.max())
+    side = float(np.ptp(session.workspace.bounds, 0).max())
+    if object_model.scale > 1.0 or longest > side:
         warnings.warn(
-            f"the object is {longest:.3g} m long and the workspace {side:.3g} m; objects of real "
-            f"size have object.scale=1, and this one has {object_model.scale:g}",
+            f"the object is {longest:.3g} m long at scale {object_model.scale:g}, the workspace "
+            f"{side:.3g} m; objects of real size have object.scale=1",
             stacklevel=2,
         )
     return session
