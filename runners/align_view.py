@@ -9,11 +9,10 @@ import rerun.blueprint as rrb
 import trimesh
 
 from chsel.arrays import FloatArray
-from chsel.errors import RecordingError
 from chsel.problem import RegistrationProblem
 from replay.rerun.blueprint import at_last_probe, scene_view
 from replay.rerun.clock import PROBE
-from replay.rerun.drawing import check_new
+from replay.rerun.file_stream import new_file_stream
 from replay.rerun.scene import Scene, display_mesh
 
 APPLICATION = "chsel alignment"
@@ -31,14 +30,7 @@ def save_view(
 
     Raises RecordingError if the file exists or cannot be written.
     """
-    check_new(path)
-    stream = rr.RecordingStream(APPLICATION, send_properties=False)
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    try:
-        stream.set_sinks(rr.FileSink(path))
-    except (OSError, RuntimeError) as error:
-        raise RecordingError(f"{path} cannot be written ({error}); accepted: a new .rrd") from None
+    stream = new_file_stream(path, APPLICATION)
     stream.set_time(PROBE, sequence=problem.key.step)
     view = scene_view(problem.workspace, name="The object where it was found; orange: the guess")
     stream.send_blueprint(at_last_probe(rrb.Vertical(view)))

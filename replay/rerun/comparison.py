@@ -25,7 +25,7 @@ from replay.rerun.comparison_layout import (
     comparison_blueprint,
     entity_names,
 )
-from replay.rerun.drawing import check_new
+from replay.rerun.file_stream import new_file_stream
 from replay.rerun.hypotheses import HypothesisMeshes, coarsened, shown_hypotheses
 from replay.rerun.legend import Legend
 from replay.rerun.plane import color_array, on_screen, texts
@@ -51,14 +51,7 @@ def save_comparison(
     if not steps:
         raise RecordingError("there is no result to compare; accepted: at least one")
     recording.checked_steps(sorted(steps))
-    check_new(path)
-    stream = rr.RecordingStream(APPLICATION, send_properties=False)
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    try:
-        stream.set_sinks(rr.FileSink(path))
-    except (OSError, RuntimeError) as error:
-        raise RecordingError(f"{path} cannot be written ({error}); accepted: a new .rrd") from None
+    stream = new_file_stream(path, APPLICATION)
     try:
         _draw(stream, recording, results, max(steps))
     except BaseException:
