@@ -15,6 +15,7 @@ from google.protobuf.message import DecodeError, Message
 
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
+from chsel.quaternions import quaternions
 from replay.mcap.wire import check_wire
 
 FOXGLOVE: Mapping[str, type[Message]] = {
@@ -64,8 +65,8 @@ def cloud_points(data: bytes, columns: int) -> FloatArray:
 def poses_in_world(world_from_body: FloatArray, time: int) -> bytes:
     """Poses (B, 4, 4) as positions and quaternions: for viewing, rounded."""
     message = PosesInFrame(frame_id=WORLD)
-    quaternions = _quaternions(world_from_body[:, :3, :3]).tolist()
-    for position, quaternion in zip(world_from_body[:, :3, 3].tolist(), quaternions, strict=True):
+    turned = quaternions(world_from_body[:, :3, :3]).tolist()
+    for position, quaternion in zip(world_from_body[:, :3, 3].tolist(), turned, strict=True):
         _set_pose(message.poses.add(), position, quaternion)
     return _stamped(message, time)
 
@@ -75,7 +76,7 @@ def object_in_world(world_from_object: FloatArray, time: int) -> bytes:
     message = FrameTransform(parent_frame_id=WORLD, child_frame_id=OBJECT)
     x, y, z = world_from_object[:3, 3].tolist()
     message.translation.x, message.translation.y, message.translation.z = x, y, z
-    _set_quaternion(message.rotation, _quaternions(world_from_object[None, :3, :3])[0].tolist())
+    _set_quaternion(message.rotation, quaternions(world_from_object[None, :3, :3])[0].tolist())
     return _stamped(message, time)
 
 
@@ -123,24 +124,3 @@ def _set_pose(message: Any, position: list[float], quaternion: list[float]) -> N
 
 def _set_quaternion(message: Any, quaternion: list[float]) -> None:
     message.x, message.y, message.z, message.w = quaternion
-
-
-def _quaternions(rotations: FloatArray) -> FloatArray:
-    """Unit quaternions (B, 4), as x y z w, of rotations (B, 3, 3).
-
-    Each row of the outer product of a quaternion with itself is a multiple of it, and all its
-    entries follow from the rotation without a root; the row of the largest entry is the stablest.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(rotations, 0, -1)
-    outer = np.array(
-        [
-            [1 + a - e - i, b + d, c + g, h - f],
-            [b + d, 1 - a + e - i, f + h, c - g],
-            [c + g, f + h, 1 - a - e + i, d - b],
-            [h - f, c - g, d - b, 1 + a + e + i],
-        ]
-    )  # (4, 4, B)
-    largest = np.argmax(np.diagonal(outer), axis=1)
-    rows = np.moveaxis(outer, -1, 0)[np.arange(len(rotations)), largest]
-    unit: FloatArray = rows / np.sqrt((rows**2).sum(axis=1, keepdims=True))
-    return unit

@@ -7,7 +7,6 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-import numpy as np
 from google.protobuf.message import DecodeError
 
 from chsel.errors import RecordingError
@@ -24,6 +23,7 @@ from runners.sensors.said import (
     intrinsics,
     joints,
     marker,
+    positions,
     require_length,
     stamp_of,
 )
@@ -124,16 +124,12 @@ def _rigid(pose: Any) -> Any:
 
 
 def _poses(message: Any) -> Iterator[Said]:
-    return _points(message, [pose.position for pose in message.poses])
+    positioned = [pose.position for pose in message.poses]
+    return _one(message, positions(message.frame_id, positioned))
 
 
 def _point(message: Any) -> Iterator[Said]:
-    return _points(message, [message.point])
-
-
-def _points(message: Any, points: list[Any]) -> Iterator[Said]:
-    values = np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
-    return _one(message, CloudMessage(frame_name(message.frame_id), values))
+    return _one(message, positions(message.frame_id, [message.point]))
 
 
 def _cloud(message: Any) -> Iterator[Said]:

@@ -1,4 +1,4 @@
-"""Unit quaternions, as x y z w, of the rotations in logs."""
+"""Rotations in logs, as quaternions x y z w: one at a time, as logs have hundreds a second."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from chsel.arrays import FloatArray
-from chsel.pose import compose
 from runners.sensors.unusable import UnusableMessage
 
 _FURTHEST = 1e9  # metres: no robot works further from the origin of its frame
-_NEARLY_EQUAL = 1.0 - 1e-9  # cosine from which a straight line is as good as an arc
 
 
 def rigid(position: Sequence[float], quaternion: Sequence[float]) -> FloatArray:
     """The transform (4, 4) of a position (3,), metres, and a quaternion (4,) of any length.
 
-    Plain numbers, as logs have hundreds of these a second. Raises UnusableMessage for a quaternion
-    of length 0 and for numbers that are not finite.
+    Raises UnusableMessage for a quaternion of length 0 and for numbers that are not finite.
     """
     x, y, z, w = quaternion
     largest = max(abs(x), abs(y), abs(z), abs(w))
@@ -53,33 +50,6 @@ def unit_quaternion(rows: Sequence[Sequence[float]]) -> tuple[float, float, floa
     length = math.sqrt(sum(value * value for value in outer))
     x, y, z, w = outer
     return x / length, y / length, z / length, w / length
-
-
-def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Quaternions (N, 4) at fractions (N,) of the shorter arcs from one to the other (N, 4)."""
-    cosine = (first * second).sum(axis=1)
-    second = np.where(cosine[:, None] < 0.0, -second, second)
-    angle = np.arccos(np.minimum(np.abs(cosine), _NEARLY_EQUAL))
-    sine = np.sin(angle)
-    straight = np.abs(cosine) >= _NEARLY_EQUAL
-    before = np.where(straight, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / sine)
-    after = np.where(straight, fraction, np.sin(fraction * angle) / sine)
-    between = before[:, None] * first + after[:, None] * second
-    unit: FloatArray = between / np.sqrt((between**2).sum(axis=1, keepdims=True))
-    return unit
-
-
-def transforms(positions: FloatArray, quaternions: FloatArray) -> FloatArray:
-    """The transforms (N, 4, 4) of positions (N, 3) and unit quaternions (N, 4)."""
-    x, y, z, w = quaternions.T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return compose(np.moveaxis(rotation, 2, 0), positions)
 
 
 def _shown(numbers: Sequence[float]) -> str:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
-import numpy as np
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
@@ -28,6 +27,7 @@ from runners.sensors.said import (
     intrinsics,
     joints,
     marker,
+    positions,
     require_length,
     stamp_of,
 )
@@ -153,16 +153,12 @@ def _pose(message: Any) -> Iterator[Said]:
 
 
 def _poses(message: Any) -> Iterator[Said]:
-    return _points(message, [pose.position for pose in message.poses])
+    positioned = [pose.position for pose in message.poses]
+    return _one(message, positions(message.header.frame_id, positioned))
 
 
 def _point(message: Any) -> Iterator[Said]:
-    return _points(message, [message.point])
-
-
-def _points(message: Any, points: list[Any]) -> Iterator[Said]:
-    values = np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
-    return _one(message, CloudMessage(frame_name(message.header.frame_id), values))
+    return _one(message, positions(message.header.frame_id, [message.point]))
 
 
 def _cloud(message: Any) -> Iterator[Said]:

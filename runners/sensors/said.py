@@ -5,9 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from typing import Any
+
+import numpy as np
 
 from replay.mcap.texts import LONGEST_NAME, one_line
-from runners.sensors.messages import CameraInfoMessage, Content, JointsMessage, MarkerMessage
+from runners.sensors.messages import (
+    CameraInfoMessage,
+    CloudMessage,
+    Content,
+    JointsMessage,
+    MarkerMessage,
+)
 from runners.sensors.unusable import UnusableMessage
 
 Said = tuple[int | None, Content | UnusableMessage]
@@ -74,3 +83,9 @@ def require_length(what: str, have: int, others: str, want: int) -> None:
     """Raise UnusableMessage unless two lists are as long as one another."""
     if have != want:
         raise UnusableMessage(f"it has {have} {what} for {want} {others}")
+
+
+def positions(frame: str, points: Iterable[Any]) -> CloudMessage:
+    """Points that have x, y and z, in a frame."""
+    values = np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
+    return CloudMessage(frame_name(frame), values)

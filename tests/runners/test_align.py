@@ -21,7 +21,7 @@ from runners.objects.models import MODELS
 from runners.sensors.pose_file import beside, read_pose, read_pose_file
 from runners.twin.configurations import CABINET_CONFIGURATIONS
 from runners.twin.settings import TwinBubbles, TwinCamera, TwinSettings
-from tests.runners.test_plausible import Done, run
+from tests.runners.in_process import Done, run
 
 YAW = 0.5
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(YAW)), np.array([0.1, 0.2, 0.3]))

@@ -18,7 +18,8 @@ from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, verify
 from runners import evaluate, plausible, probe
 from runners.evaluation.claims import ClaimedError, claimed
-from tests.runners.test_plausible import Done, rows, run
+from tests.runners.in_process import Done, run
+from tests.runners.test_plausible import rows
 
 SMALL = (
     "session=kinematic",

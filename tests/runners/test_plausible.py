@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import os
 import subprocess
 import sys
-import warnings
-from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +17,7 @@ from chsel.pose import apply, axis_angle, compose, inverse, rotation_vector
 from replay.mcap.reader import read_recording
 from runners import plausible, probe
 from runners.plausible import named_arguments
+from tests.runners.in_process import run
 
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 SMALL = (
@@ -59,30 +55,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (recording,) = (folder / "logs").rglob("recording.mcap")
     recording.rename(folder / "recording.mcap")
     return folder
-
-
-@dataclass(frozen=True)
-class Done:
-    """What a command left behind."""
-
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-def run(program: Callable[[], None], *arguments: str) -> Done:
-    """Run a command in this process, which spares it the imports."""
-    out, errors, status = io.StringIO(), io.StringIO(), 0
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
-        patch.setattr(sys, "argv", ["program", *arguments])
-        patch.setenv("COLUMNS", "160")
-        patch.setenv("HYDRA_FULL_ERROR", "0")
-        patch.setattr(warnings, "showwarning", warnings.showwarning)
-        try:
-            program()
-        except SystemExit as end:
-            status = int(end.code or 0)
-    return Done(status, out.getvalue(), errors.getvalue())
 
 
 def rows(output: str) -> list[list[str]]:

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
-import sys
-import warnings
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -18,6 +13,7 @@ from PIL import Image
 
 from runners import report
 from runners.reporting.evaluation_folder import open_evaluation
+from tests.runners.in_process import run
 from tests.runners.made_up_evaluations import (
     METHODS,
     add_recording,
@@ -39,29 +35,6 @@ PICTURES = [
     "times.png",
 ]
 _VOID = ("meta", "img", "link", "br")
-
-
-@dataclass(frozen=True)
-class Done:
-    """What a command left behind."""
-
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-def run(*arguments: str) -> Done:
-    """Run the command in this process, which spares it the imports."""
-    out, errors, status = io.StringIO(), io.StringIO(), 0
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
-        patch.setattr(sys, "argv", ["report", *arguments])
-        patch.setenv("HYDRA_FULL_ERROR", "0")
-        patch.setattr(warnings, "showwarning", warnings.showwarning)
-        try:
-            report.program()
-        except SystemExit as end:
-            status = int(end.code or 0)
-    return Done(status, out.getvalue(), errors.getvalue())
 
 
 class Page(HTMLParser):
@@ -113,7 +86,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_evaluation(folder, rows, moments, **planned, methods=methods)
     for method in ("chsel", "icp", "medial_constraint"):
         add_recording(folder, "clamp", 1, method, f"clamp_{method}")
-    done = run(str(folder))
+    done = run(report.program, str(folder))
     assert (done.returncode, done.stderr) == (0, "")
     assert "no picture" not in done.stdout
     return folder
@@ -158,7 +131,7 @@ def test_the_markdown_links_its_pictures_and_has_the_same_numbers(whole: Path) -
 
 
 def test_the_same_evaluation_gives_the_same_bytes(whole: Path, tmp_path: Path) -> None:
-    assert run(str(whole), f"out={tmp_path / 'again'}").returncode == 0
+    assert run(report.program, str(whole), f"out={tmp_path / 'again'}").returncode == 0
     for path in (whole / "report").iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
 
@@ -172,7 +145,7 @@ def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_pa
         for step, value in zip((4, 5, 6), found, strict=True)
     ]
     write_evaluation(tmp_path, rows)
-    assert run(str(tmp_path)).returncode == 0
+    assert run(report.program, str(tmp_path)).returncode == 0
     tables = page_of(tmp_path / "report").tables
     # 10, 20, 30, 60: the middle step of three is of the last half
     expected = ["can", "4", "25 [17.5, 37.5]", "50 [35, 75]"]
@@ -197,7 +170,7 @@ def test_what_has_no_number_is_left_out_and_said(tmp_path: Path) -> None:
     ]
     methods = {"chsel": {}, "icp": {}, "svgd": {}}
     write_evaluation(tmp_path, rows, configurations=["can"], seeds=[0, 1, 2], methods=methods)
-    assert run(str(tmp_path)).returncode == 0
+    assert run(report.program, str(tmp_path)).returncode == 0
     tables = page_of(tmp_path / "report").tables
     assert tables["PD in mm² by object"][1] == [
         "can",
@@ -236,7 +209,7 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
         ("icp", 3.0),
         ("svgd", 4.0),
     ]
-    assert run(str(tmp_path)).returncode == 0
+    assert run(report.program, str(tmp_path)).returncode == 0
     assert "no table of the whole" in (tmp_path / "report" / "report.md").read_text("utf-8")
 
 
@@ -255,7 +228,7 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
 )
 def test_pictures_that_cannot_be_drawn_say_why(tmp_path: Path, rows: list, drawn: list) -> None:
     write_evaluation(tmp_path, rows)
-    done = run(str(tmp_path))
+    done = run(report.program, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     found = {path.name for path in (tmp_path / "report").glob("*.png")}
     assert found == set(drawn)
@@ -272,14 +245,14 @@ def test_settings_of_the_sequence_choose_trial_methods_and_steps(
 ) -> None:
     out = f"out={tmp_path}"
     some = ["sequence.methods=[icp]", "sequence.steps=[11]", "sequence.view=xy"]
-    assert run(str(whole), out, "sequence.trial=clamp/1", *some).returncode == 0
+    assert run(report.program, str(whole), out, "sequence.trial=clamp/1", *some).returncode == 0
     text = (tmp_path / "report.md").read_text("utf-8")
     assert "seen from above" in text
     assert "sequence.trial=clamp/1 'sequence.methods=[icp]' 'sequence.steps=[11]'" in text
     assert "that ICP hold" in text
-    done = run(str(whole), out, "sequence.steps=[3]")
+    done = run(report.program, str(whole), out, "sequence.steps=[3]")
     assert "step 3 has no result of every method shown; accepted: 10, 11" in done.stdout
-    done = run(str(whole), out, "sequence.trial=mustard/seed_0")
+    done = run(report.program, str(whole), out, "sequence.trial=mustard/seed_0")
     assert "there is no recording of mustard, seed 0" in done.stdout
 
 
@@ -309,7 +282,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: st
     (tmp_path / "empty").mkdir()
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "experiment.json").write_text("{")
-    done = run(*(argument.format(tmp_path) for argument in arguments))
+    done = run(report.program, *(argument.format(tmp_path) for argument in arguments))
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
@@ -330,7 +303,7 @@ def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -
         folder = tmp_path / "trials" / name / f"seed_{seed}"
         folder.mkdir(parents=True)
         (folder / "session.json").write_text(json.dumps({"truth": truth}))
-    done = run(str(tmp_path))
+    done = run(report.program, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     table = page_of(tmp_path / "report").tables["True poses found"]
     assert [line[:2] for line in table[1:]] == [[names[0], "2"], [names[1], "1"], ["all", "3"]]

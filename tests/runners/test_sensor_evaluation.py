@@ -34,8 +34,8 @@ from runners.evaluation.trial_session import open_recorded
 from runners.evaluation.true_poses import FoundPose, true_poses
 from runners.evaluation.work import do_unit
 from runners.sensors.pose_file import beside, read_pose, write_pose
+from tests.runners.in_process import run
 from tests.runners.test_evaluation import plan_in
-from tests.runners.test_plausible import run
 
 CABINET = ["cabinet_drill", "cabinet_drill_opposite", "cabinet_mustard", "cabinet_mustard_sideways"]
 POSE = compose(rotation_vector(np.array([0.31, -0.4, 1.1])), np.array([0.913, -0.046, 0.338]))

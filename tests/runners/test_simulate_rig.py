@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import sys
-import warnings
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +24,7 @@ from runners.twin.configurations import (
 from runners.twin.membrane import CAP, CAP_BASE
 from runners.twin.recorder import WORLD, WRIST
 from runners.twin.settings import TwinSettings
+from tests.runners.in_process import run
 
 QUICK = (
     "probes=1",
@@ -40,33 +36,10 @@ QUICK = (
 )
 
 
-@dataclass(frozen=True)
-class Done:
-    """What a command left behind."""
-
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-def run(*arguments: str) -> Done:
-    """Run the command in this process, which spares it the imports."""
-    out, errors, status = io.StringIO(), io.StringIO(), 0
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
-        patch.setattr(sys, "argv", ["program", *arguments])
-        patch.setenv("HYDRA_FULL_ERROR", "0")
-        patch.setattr(warnings, "showwarning", warnings.showwarning)
-        try:
-            simulate_rig.main()
-        except SystemExit as error:
-            status = int(error.code or 0)
-    return Done(status, out.getvalue(), errors.getvalue())
-
-
 def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
     log = tmp_path / "new" / "log.mcap"
-    done = run(f"out={log}", "configuration=cabinet_mustard", "seed=4", *QUICK)
+    done = run(simulate_rig.main, f"out={log}", "configuration=cabinet_mustard", "seed=4", *QUICK)
     assert done.returncode == 0, done.stderr
     assert sorted(file.name for file in log.parent.iterdir()) == ["log.mcap", "log.truth.yaml"]
     truth = yaml.safe_load(log.with_suffix(".truth.yaml").read_text())
@@ -83,11 +56,18 @@ def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
     assert "nothing touched" in done.stdout
 
     before = log.read_bytes()
-    again = run(f"out={log}", "configuration=cabinet_mustard", "seed=5", *QUICK)
+    again = run(simulate_rig.main, f"out={log}", "configuration=cabinet_mustard", "seed=5", *QUICK)
     assert again.returncode == 2
     assert "exists; accepted: another out=FILE.mcap, or overwrite=true" in again.stderr
     assert log.read_bytes() == before
-    again = run(f"out={log}", "configuration=cabinet_mustard", "overwrite=true", "seed=5", *QUICK)
+    again = run(
+        simulate_rig.main,
+        f"out={log}",
+        "configuration=cabinet_mustard",
+        "overwrite=true",
+        "seed=5",
+        *QUICK,
+    )
     assert again.returncode == 0, again.stderr
     assert log.read_bytes() != before
 
@@ -110,7 +90,7 @@ def test_a_mistake_is_one_line(
     arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run(*arguments)
+    done = run(simulate_rig.main, *arguments)
     assert done.returncode == 2
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
@@ -120,7 +100,7 @@ def test_a_mistake_is_one_line(
 def test_a_log_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
     (tmp_path / "file").touch()
-    done = run(f"out={tmp_path / 'file' / 'x.mcap'}", *QUICK)
+    done = run(simulate_rig.main, f"out={tmp_path / 'file' / 'x.mcap'}", *QUICK)
     assert done.returncode == 2
     assert "x.mcap cannot be written" in done.stderr
     assert "out=FILE.mcap" in done.stderr

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from chsel.pose import axis_angle, compose, random_rotations
-from chsel.sensing.slerp import interpolated, quaternions, rotations
+from chsel.quaternions import quaternions, rotations
+from chsel.sensing.slerp import interpolated
 
 
 def test_quaternions_and_rotations_are_each_others_inverse() -> None:

@@ -1,0 +1,36 @@
+"""Commands run in this process, which spares them the imports."""
+
+from __future__ import annotations
+
+import io
+import sys
+import warnings
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+
+import pytest
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command left behind."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run(program: Callable[[], None], *arguments: str, columns: int = 160) -> Done:
+    """Run a command as a shell would, on a terminal of so many columns."""
+    out, errors, status = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
+        patch.setattr(sys, "argv", ["program", *arguments])
+        patch.setenv("COLUMNS", str(columns))
+        patch.setenv("HYDRA_FULL_ERROR", "0")
+        patch.setattr(warnings, "showwarning", warnings.showwarning)
+        try:
+            program()
+        except SystemExit as end:
+            status = int(end.code or 0)
+    return Done(status, out.getvalue(), errors.getvalue())
