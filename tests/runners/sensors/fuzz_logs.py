@@ -6,15 +6,10 @@ in faults; where checksums tell, no message may say what the original did not.
 
 from __future__ import annotations
 
-import argparse
-import faulthandler
 import sys
-import tempfile
 import time
-import traceback
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -37,8 +32,9 @@ from runners.sensors.messages import (
 )
 from runners.sensors.rig import ClockRig
 from runners.sensors.transforms import TransformError, TransformTree
-from tests.replay.fuzz import HANGS_AFTER, peak_memory
+from tests.replay.fuzz import HANGS_AFTER
 from tests.replay.mutations import Random, file_of, joined, packed, raw, records, split, unpacked
+from tests.runners.sensors.fuzzing import Tally, run_cases
 from tests.runners.sensors.small_logs import foxglove_sent, ros2_sent, write_foxglove, write_ros2
 
 LAYERS = ("raw", "cut", "records", "messages")
@@ -56,15 +52,6 @@ class Original:
 
     data: bytes
     said: frozenset[str]
-
-
-@dataclass
-class Tally:
-    """What the cases came to."""
-
-    outcomes: Counter[str] = field(default_factory=Counter)
-    slowest: float = 0.0
-    slowest_case: int = -1
 
 
 def originals(folder: Path) -> list[Original]:
@@ -216,33 +203,13 @@ def _other_content(content: bytes, random: Random) -> bytes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run cases, and print what they came to; 1 if any ended otherwise than it may."""
-    parser = argparse.ArgumentParser(prog="tests.runners.sensors.fuzz_logs", description=__doc__)
-    parser.add_argument("--cases", type=int, default=5_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--first", type=int, default=0, help="index of the first case")
-    given = parser.parse_args(arguments)
-    tally, wrong = Tally(), 0
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+
+    def prepare(folder: Path, tally: Tally) -> Callable[[int, int], None]:
         whole = originals(folder)
-        begun = time.perf_counter()
-        for index in range(given.first, given.first + given.cases):
-            faulthandler.dump_traceback_later(HANGS_AFTER, exit=True, file=sys.__stderr__)
-            try:
-                run_case(index, given.seed, whole, folder, tally)
-            except Exception as error:
-                wrong += 1
-                where = traceback.extract_tb(error.__traceback__)[-1]
-                place = f"{Path(where.filename).name}:{where.lineno}"
-                print(f"case {index}: {type(error).__name__}: {error} ({place})"[:500], flush=True)
-        faulthandler.cancel_dump_traceback_later()
-        seconds = time.perf_counter() - begun
-    print(f"{given.cases} cases in {seconds:.0f} s; {wrong} wrong")
-    print(f"slowest: case {tally.slowest_case}, {tally.slowest:.2f} s")
-    print(f"memory: {peak_memory():.0f} MB at most")
-    for text, count in sorted(tally.outcomes.items()):
-        print(f"{count:8}  {text}")
-    return 1 if wrong else 0
+        return lambda index, seed: run_case(index, seed, whole, folder, tally)
+
+    name = "tests.runners.sensors.fuzz_logs"
+    return run_cases(name, arguments, prepare, cases=5000, hangs_after=HANGS_AFTER)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,9 @@ inside the workspace, or in one line of a ChselError, within seconds and bounded
 
 from __future__ import annotations
 
-import argparse
 import copy
-import faulthandler
 import sys
-import tempfile
 import time
-import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -30,6 +26,7 @@ from runners.sessions.sensors import SensorsSession, SensorsSettings
 from runners.twin.log_writer import LogWriter
 from tests.replay.fuzz import peak_memory
 from tests.replay.mutations import Random, raw
+from tests.runners.sensors.fuzzing import Tally, run_cases
 from tests.runners.sensors.sphere_log import BEGIN, RIG, SECOND, SphereLog
 
 HANGS_AFTER = 10.0  # seconds of one case: the process ends with a traceback
@@ -65,17 +62,6 @@ class Collected:
     ) -> None:
         """One message."""
         self.messages.append(Message(topic, kind, message, stamp, log_time))
-
-
-@dataclass
-class Tally:
-    """What the cases came to. memory: MB that the process had held after the first."""
-
-    outcomes: Counter[str] = field(default_factory=Counter)
-    errors: Counter[str] = field(default_factory=Counter)
-    slowest: float = 0.0
-    slowest_case: int = -1
-    memory: float = 0.0
 
 
 def whole_log() -> list[Message]:
@@ -465,33 +451,13 @@ RIG_CHANGES: tuple[Callable[[Rig, Random], Rig], ...] = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run cases, and print what they came to; 1 if any ended otherwise than it may."""
-    parser = argparse.ArgumentParser(
-        prog="tests.runners.sensors.fuzz_sessions", description=__doc__
-    )
-    parser.add_argument("--cases", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--first", type=int, default=0, help="index of the first case")
-    given = parser.parse_args(arguments)
-    tally, wrong, whole = Tally(), 0, whole_log()
-    begun = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for index in range(given.first, given.first + given.cases):
-            faulthandler.dump_traceback_later(HANGS_AFTER, exit=True, file=sys.__stderr__)
-            try:
-                run_case(index, given.seed, whole, Path(folder), tally)
-            except Exception as error:
-                wrong += 1
-                where = traceback.extract_tb(error.__traceback__)[-1]
-                place = f"{Path(where.filename).name}:{where.lineno}"
-                print(f"case {index}: {type(error).__name__}: {error} ({place})"[:500], flush=True)
-    faulthandler.cancel_dump_traceback_later()
-    seconds = time.perf_counter() - begun
-    print(f"{given.cases} cases in {seconds:.0f} s; {wrong} wrong")
-    print(f"slowest: case {tally.slowest_case}, {tally.slowest:.2f} s")
-    print(f"memory: {peak_memory():.0f} MB at most")
-    for text, count in [*sorted(tally.outcomes.items()), *tally.errors.most_common(25)]:
-        print(f"{count:8}  {text}")
-    return 1 if wrong else 0
+
+    def prepare(folder: Path, tally: Tally) -> Callable[[int, int], None]:
+        whole = whole_log()
+        return lambda index, seed: run_case(index, seed, whole, folder, tally)
+
+    name = "tests.runners.sensors.fuzz_sessions"
+    return run_cases(name, arguments, prepare, cases=1000, hangs_after=HANGS_AFTER)
 
 
 if __name__ == "__main__":

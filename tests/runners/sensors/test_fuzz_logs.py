@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from tests.runners.sensors.fuzz_logs import Tally, originals, run_case
+from tests.runners.sensors.fuzz_logs import originals, run_case
+from tests.runners.sensors.fuzzing import Tally
 
 CASES = 160
 

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from tests.runners.sensors.fuzz_sessions import Tally, run_case, whole_log
+from tests.runners.sensors.fuzz_sessions import run_case, whole_log
+from tests.runners.sensors.fuzzing import Tally
 
 CASES = 16
 
