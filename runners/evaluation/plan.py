@@ -124,14 +124,12 @@ class Plan:
         return range(MOST_PROBES if probes is None else probes)
 
     def steps_of(self, configuration: str) -> tuple[int, ...]:
-        """The steps at which there may be a registration; none if the configuration has none."""
+        """The steps at which there may be a registration: those named that a configuration has."""
         every = self.probes_of(configuration)
-        try:
-            return chosen_steps(self.steps, every)
-        except SettingError:
-            if len(every) and self.steps is not None:
-                chosen_steps(self.steps, range(10_000))  # a text of another form is an error
-            return ()
+        if self.steps is None:
+            return tuple(every)
+        named = chosen_steps(self.steps, range(MOST_PROBES))
+        return tuple(step for step in every if step in set(named))
 
 
 @dataclass(frozen=True, order=True)

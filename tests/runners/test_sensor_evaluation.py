@@ -88,6 +88,8 @@ def test_objects_of_logs_are_of_real_size_unless_their_file_says_otherwise(tmp_p
     assert (own.object_config("c").scale, own.object_config("c").epsilon) == (0.001, 0.002)
     assert own.steps_of("a")[:2] == (0, 1)
     assert replace(own, steps="3..5").steps_of("a") == (3, 4, 5)
+    drill = replace(plan, steps="1,4,9")
+    assert drill.steps_of("cabinet_drill") == (1, 4), "those of the steps that it has"
 
 
 @pytest.mark.parametrize(
