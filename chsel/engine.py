@@ -69,6 +69,16 @@ class CompiledCost:
         resolution = problem.free_resolution
         return cls(problem.sdf, problem.points, settings, free_resolution=resolution)
 
+    def at_level(self, sdf: SdfGrid, level: float) -> Model:
+        """The model with another penetration tolerance, of direct free points without a lattice."""
+        lookup = self.settings.lookup
+        region = sdf.derived(("region", level, lookup), lambda: _region_below(sdf, level, lookup))
+        centre, radius = sdf.derived(("sphere", level, lookup), lambda: _sphere_of(region))
+        free = self.model.free._replace(
+            region=region, centre=centre, radius=radius, lattice=NO_LATTICE
+        )
+        return self.model._replace(free=free, alpha=level)
+
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
         return self.costs(poses_of(object_from_world))

@@ -30,6 +30,8 @@ class Purpose(IntEnum):
     PLAUSIBLE_ROTATIONS = 12
     METRIC_POINTS = 13
     CONTACT_POINTS = 14
+    ANCHORS = 15
+    WALKS = 16
 
 
 @dataclass(frozen=True)

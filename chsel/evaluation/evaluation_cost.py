@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import FloatArray, IntArray
+from chsel.arrays import FloatArray
 from chsel.engine import poses_of
 from chsel.evaluation.plausible_settings import EvaluationCostSettings
+from chsel.far_apart import far_apart
 from chsel.interior import VoxelGrid
 from chsel.kernels.arithmetic import require_ieee_arithmetic
 from chsel.kernels.field import field_of
@@ -99,21 +100,6 @@ def _inside(sdf: SdfGrid, level: float) -> FloatArray:
     nodes = nodes[:: max(1, len(nodes) // _MOST_CANDIDATES)]
     points = sdf.origin + nodes * sdf.resolution
     return points[far_apart(points, _MOST_INSIDE)].T.copy()
-
-
-def far_apart(points: FloatArray, most: int, *, given: int = 0) -> IntArray:
-    """Which of points (N, d) to take so that every next one is the farthest from those before.
-
-    given: so many of the first points come first, as they are.
-    """
-    chosen = np.zeros(min(most, len(points)), dtype=np.int64)
-    squared = np.full(len(points), np.inf)
-    for n in range(len(chosen)):
-        chosen[n] = n if n < given else int(np.argmax(squared))
-        difference = points - points[chosen[n]]
-        squared = np.minimum(squared, (difference * difference).sum(axis=1))
-        squared[chosen[n]] = -1.0
-    return chosen
 
 
 def _voxels(tree: Tree, resolution: float) -> tuple[Box, Any]:

@@ -127,16 +127,16 @@ def _slack_to_gather(free, pose, memory, most_slack):  # type: ignore[no-untyped
         slack = slack if rigid(pose) else np.inf
         memory[_SLACK] = -1.0
     else:
-        place, radius = _place(free.centre, pose), free.radius
-        stride = _travel(place, radius, pose, memory, _LAST)
-        if memory[_SLACK] < 0.0 or _travel(place, radius, pose, memory, _GATHERED) > memory[_SLACK]:
+        place, radius = place_in_world(free.centre, pose), free.radius
+        stride = travel(place, radius, pose, memory, _LAST)
+        if memory[_SLACK] < 0.0 or travel(place, radius, pose, memory, _GATHERED) > memory[_SLACK]:
             stride = stride if memory[_SLACK] >= 0.0 else np.inf
             memory[_SLACK] = min(STEPS_AHEAD * stride, most_slack) if stride < most_slack else 0.0
             slack = max(memory[_SLACK] + free.margin, free.slack)
-            _remember(place, pose, memory, _GATHERED)
+            remember(place, pose, memory, _GATHERED)
         else:
             slack = -1.0
-        _remember(place, pose, memory, _LAST)
+        remember(place, pose, memory, _LAST)
     return slack
 
 
@@ -277,7 +277,7 @@ def _moved(move, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @spliced
-def _travel(place, radius, pose, memory, at):  # type: ignore[no-untyped-def]
+def travel(place, radius, pose, memory, at):  # type: ignore[no-untyped-def]
     """How far in the world any point of the object's side moved since it was remembered.
 
     At most: as far as its centre, and for a turn D = R - R' by |D| radius; the spectral norm of
@@ -291,14 +291,14 @@ def _travel(place, radius, pose, memory, at):  # type: ignore[no-untyped-def]
 
 
 @spliced
-def _remember(place, pose, memory, at):  # type: ignore[no-untyped-def]
+def remember(place, pose, memory, at):  # type: ignore[no-untyped-def]
     memory[at], memory[at + 1], memory[at + 2] = place
     for i in range(9):
         memory[at + 3 + i] = pose[i]
 
 
 @spliced
-def _place(centre, pose):  # type: ignore[no-untyped-def]
+def place_in_world(centre, pose):  # type: ignore[no-untyped-def]
     """Where in the world the centre of the object's side is: R^T (c - t)."""
     x, y, z = centre[0] - pose[9], centre[1] - pose[10], centre[2] - pose[11]
     return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from chsel.errors import SettingError, require_choice
@@ -13,6 +13,7 @@ from chsel.methods.method import Method
 from chsel.presets import PRESETS
 from chsel.settings import build_settings, settings_mapping
 from replay.comparing.contenders import METHODS_HELP
+from runners.evaluation.draws import draw_label, require_draws
 
 _LABEL = re.compile(r"(?P<name>\w+)(@(?P<preset>\w+))?(#(?P<mark>[\w+-]+))?")
 _FILE_NAME = re.compile(r"[\w@#+-]{1,80}")
@@ -22,12 +23,16 @@ TAKEN = ("session",)
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """A registered method with all of its settings. label: what the table calls it."""
+    """A registered method with all of its settings.
+
+    label: what the table calls it. draw: which of several with other random numbers it is.
+    """
 
     label: str
     name: str
     preset: str
     settings: Mapping[str, Any]
+    draw: int = 0
 
     def method(self) -> Method:
         """The method itself."""
@@ -36,7 +41,8 @@ class Contender:
     @property
     def config(self) -> dict[str, Any]:
         """As experiment.json has it."""
-        return {"name": self.name, "preset": self.preset, "settings": dict(self.settings)}
+        told = {"name": self.name, "preset": self.preset, "settings": dict(self.settings)}
+        return told | ({"draw": self.draw} if self.draw else {})
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,27 @@ def chosen_contenders(
         _contender(entry, label, settings, preset)
         for entry, label in zip(entries, labels, strict=True)
     )
+
+
+def drawn(contenders: Sequence[Contender], draws: int) -> tuple[Contender, ...]:
+    """Every contender so many times, with other random numbers and a label for each.
+
+    Raises SettingError for a number of draws that there cannot be, and for a label that is taken.
+    """
+    require_draws(draws)
+    every = tuple(
+        replace(contender, label=draw_label(contender.label, draw), draw=draw)
+        for contender in contenders
+        for draw in range(draws)
+    )
+    labels = [contender.label for contender in every]
+    for label in labels:
+        require_label(label)
+        if labels.count(label) > 1:
+            raise SettingError(
+                f"methods has {label}, which draws={draws} makes, too; accepted: another label"
+            )
+    return every
 
 
 def require_label(label: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 from chsel.errors import ChselError
@@ -11,6 +12,7 @@ from chsel.evaluation.evaluation_cost import EvaluationCost
 from chsel.evaluation.plausible_set import PlausibleSet
 from chsel.evaluation.pose_error import pose_errors
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.streams import StreamKey
 from runners.evaluation.iterations import hypotheses_of
 from runners.evaluation.measure import Measure
 from runners.evaluation.plan import Plan, Trial
@@ -39,7 +41,8 @@ class Judge:
         if missing is not None:
             return None, f"no plausible set: {missing}"
         try:
-            return load_members(self._plan, self._trial, self._session, problem), ""
+            of_session = self._of_session(problem)
+            return load_members(self._plan, self._trial, self._session, of_session), ""
         except EvaluationError as error:
             return None, f"no plausible set: {one_line(error)}"
 
@@ -81,7 +84,11 @@ class Judge:
         cost = EvaluationCost(problem, self._settings.cost)
         below = cost.evaluate(found.object_from_world, limit=limit) < limit
         exact = {"exact_members": float(below.mean())} if len(below) else {}
-        return row | self._measure.of(problem, members, found) | exact
+        return row | self._measure.of(self._of_session(problem), members, found) | exact
+
+    def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
+        """The problem as all draws have it: measured are they by the same random numbers."""
+        return replace(problem, key=StreamKey(self._trial.seed, problem.key.step))
 
     def _numbers(self, found: Hypotheses) -> dict[str, Any]:
         """What hypotheses tell by themselves."""
@@ -110,7 +117,7 @@ class Judge:
         """The rows of a step's search, of a method with these settings."""
         for snapshot in snapshots:
             found = hypotheses_of(snapshot, problem, settings)
-            metrics = self._measure.of(problem, members, found, ranked=False)
+            metrics = self._measure.of(self._of_session(problem), members, found, ranked=False)
             metrics.pop("distinct", None)
             yield {
                 "configuration": self._trial.configuration,

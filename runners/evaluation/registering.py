@@ -27,6 +27,7 @@ from replay.file_digest import file_digest
 from replay.mcap.writer import McapRecorder
 from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender
+from runners.evaluation.draws import draw_seed
 from runners.evaluation.judge import Judge, one_line
 from runners.evaluation.plan import OWN, Plan, Trial
 from runners.evaluation.table import ITERATIONS, RESULTS, Row, write_part
@@ -56,7 +57,8 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
             recorder = McapRecorder(beside)
         recorder.record(_started(plan, trial, contender, session))
         following = _Following(recorder)
-        run = _EvaluatedRun(plan, trial, session, method, following)
+        seed = draw_seed(trial.seed, contender.draw)
+        run = _EvaluatedRun(plan, trial, session, method, following, seed)
         judge = Judge(plan, trial, session, contender.label, contender.preset)
         for _ in run.steps():
             if following.posed is not None:
@@ -165,13 +167,14 @@ class _EvaluatedRun(SessionRun):
         session: RecordedSession,
         method: _TimedMethod,
         recorder: Recorder,
+        seed: int,
     ) -> None:
         super().__init__(
             session,
             method,
             session.recorded.sdf,
             recorder,
-            seed=trial.seed,
+            seed=seed,
             start=session.start,
             recording=RecordingConfig(snapshot_interval=plan.every or 0),
             show=lambda *_: None,
