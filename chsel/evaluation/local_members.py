@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from chsel.arrays import FloatArray
-from chsel.evaluation.evaluation_cost import EvaluationCost, far_apart
+from chsel.evaluation.evaluation_cost import EvaluationCost
+from chsel.far_apart import far_apart
 from chsel.pose import compose, inverse, product, rotation_vector
 from chsel.streams import Purpose, StreamKey, normals, uniforms
 

@@ -19,7 +19,7 @@ from chsel.evaluation.plausible_set import PlausibleSet, rotation_seed
 from chsel.evaluation.plausible_settings import PlausibleSettings
 from chsel.pose import check_rigid
 from chsel.problem import RegistrationProblem
-from chsel.settings import build_settings, settings_mapping
+from chsel.settings import build_settings
 
 FORMAT = 1
 _UNREADABLE = (
@@ -56,7 +56,7 @@ def save_plausible(folder: Path, found: PlausibleSet) -> Path:
         "true_pose": found.truth,
         "true_cost": np.array(found.true_cost),
         "epsilon": np.array(found.settings.epsilon),
-        "settings": np.array(json.dumps(settings_mapping(found.settings), sort_keys=True)),
+        "settings": np.array(found.settings.text),
         "seed": np.array(found.seed, dtype=np.uint64),
         "points_digest": np.array(found.points_digest),
         "sdf_digest": np.array(found.sdf_digest),

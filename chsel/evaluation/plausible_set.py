@@ -16,10 +16,12 @@ import numpy as np
 from chsel.arrays import BoolArray, FloatArray, IntArray, digest, frozen
 from chsel.errors import PoseError
 from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.evaluation_cost import EvaluationCost, far_apart
+from chsel.evaluation.evaluation_cost import EvaluationCost
 from chsel.evaluation.local_members import local_members
+from chsel.evaluation.mode_search import CANDIDATES, modes_found, nearly_plausible
 from chsel.evaluation.plausible_settings import Offsets, PlausibleSettings, PoseGridSettings
 from chsel.evaluation.position_blocks import blocks_of, bounds_of
+from chsel.far_apart import far_apart
 from chsel.kernels.plausible import Blocks, Room, Scan, room_for, scan_rotations
 from chsel.kernels.tree import rounding_margin
 from chsel.pose import axis_angle, check_rigid, compose, inverse, random_rotations
@@ -30,6 +32,8 @@ from chsel.threads import spread
 MOST_MEMBERS = 2_000_000
 _CAPACITY = 50_000  # poses that a thread finds before it hands them over, at least
 _ROTATIONS_PER_THREAD = 200
+_FIRST_ROTATIONS = 60  # that are looked at for poses to climb from; then twice as many, and so on
+_PER_MODE = 4  # members that a mode gets, where there are few modes
 _MOST_TELLING = 256  # known points that are put in order
 _ROUNDING = 1e-9  # of a sum, that adding in another order may change
 
@@ -115,6 +119,8 @@ def plausible_set(
         problem.points.digest,
         problem.sdf.digest,
     )
+    if settings.modes is not None:
+        found = _with_modes(found, problem, cost, grid, limit)
     return _filled(found, cost, limit, problem.sdf.diameter)
 
 
@@ -265,20 +271,81 @@ def _kept(index: IntArray, most: int, seed: int) -> IntArray:
     return np.sort(np.argsort(drawn, kind="stable")[:most])
 
 
+def _with_modes(
+    found: PlausibleSet,
+    problem: RegistrationProblem,
+    cost: EvaluationCost,
+    grid: PoseGrid,
+    limit: float,
+) -> PlausibleSet:
+    """With members in modes that the grid passes by, in place of others if they are too many."""
+    settings, known = found.settings, len(found.cost)
+    assert settings.modes is not None
+    nearly = _nearly_plausible(problem, found.truth, grid, settings)
+    box = np.stack([grid.positions.min(axis=0), grid.positions.max(axis=0)])
+    room = max(settings.members - known, settings.members // 2)
+    poses, costs = modes_found(
+        problem,
+        cost,
+        limit,
+        members=found.world_from_object,
+        nearly=nearly,
+        box=box,
+        settings=settings.modes,
+        most=room,
+        seed=found.seed,
+    )
+    others = _kept(np.arange(1, known), settings.members - 1 - len(poses), found.seed) + 1
+    rows = np.concatenate([[0], others])
+    kept = replace(
+        found,
+        world_from_object=found.world_from_object[rows],
+        cost=found.cost[rows],
+        local=found.local[rows],
+    )
+    return _with(kept, poses, costs)
+
+
+def _nearly_plausible(
+    problem: RegistrationProblem, truth: FloatArray, grid: PoseGrid, settings: PlausibleSettings
+) -> FloatArray:
+    """Poses (N, 4, 4) of a grid to climb from, of as many of its rotations as give enough."""
+    assert settings.modes is not None
+    cost, limit = nearly_plausible(problem, truth, settings.cost, settings.modes)
+    most = max(1, MOST_MEMBERS // len(grid.positions))
+    poses, count, first, size = [], 0, 0, min(_FIRST_ROTATIONS, most)
+    while first < len(grid.rotations) and count < CANDIDATES:
+        part = PoseGrid(grid.centre, grid.offsets, grid.rotations[first : first + size])
+        index, _ = scan(cost, problem, part, limit)
+        poses.append(part.poses(index))
+        count, first, size = count + len(index), first + size, min(2 * size, most)
+    return np.concatenate(poses)
+
+
 def _filled(
     found: PlausibleSet, cost: EvaluationCost, limit: float, diameter: float
 ) -> PlausibleSet:
-    """With members off the grid, if there are too few on it."""
-    wanted = found.settings.fill_to - len(found.cost)
+    """With members off the grid around others, if there are too few, or too few in its modes."""
+    settings, members = found.settings, found.world_from_object
+    wanted = settings.fill_to - len(members)
+    if wanted <= 0:
+        members = members[found.local]  # one of each mode
+        room = settings.members - len(found.cost)
+        wanted = min(_PER_MODE * len(members), settings.fill_to, len(members) + room)
+        wanted -= len(members)
     if wanted <= 0:
         return found
-    members, seed = found.world_from_object, found.seed
     # As far as a turn by a radian moves the object's surface, about.
     lever = diameter / 4.0
-    more, costs = local_members(cost, members, limit, wanted, lever=lever, seed=seed)
+    more, costs = local_members(cost, members, limit, wanted, lever=lever, seed=found.seed)
+    return _with(found, more, costs)
+
+
+def _with(found: PlausibleSet, poses: FloatArray, costs: FloatArray) -> PlausibleSet:
+    """With members off the grid: poses (N, 4, 4), world_from_object, and their costs."""
     return replace(
         found,
-        world_from_object=np.concatenate([found.world_from_object, more]),
+        world_from_object=np.concatenate([found.world_from_object, poses]),
         cost=np.concatenate([found.cost, costs]),
-        local=np.concatenate([found.local, np.ones(len(more), dtype=bool)]),
+        local=np.concatenate([found.local, np.ones(len(poses), dtype=bool)]),
     )

@@ -17,6 +17,7 @@ from chsel.streams import StreamKey
 DEFINITIONS = ("default", "paper", "reference")
 MOST_POSITIONS = 100_000
 MOST_ROTATIONS = 1_000_000
+MOST_STARTS = 20_000
 Axis = tuple[tuple[float, float, int], ...]
 
 
@@ -109,12 +110,35 @@ class PoseGridSettings:
 
 
 @dataclass(frozen=True)
+class ModeSearchSettings:
+    """How members are sought in modes that the grid passes by, see chsel.evaluation.mode_search.
+
+    starts: how many poses climb, at most. They are poses of the grid whose mean over known points
+    is less than `distance` above the true pose's, and that violate few points by more than
+    `depth`, metres both. separation: how far the surface of a new mode is from that of all other
+    members, metres, root mean square.
+    """
+
+    starts: int = 1000
+    distance: float = 0.01
+    depth: float = 0.02
+    separation: float = 0.01
+
+    def __post_init__(self) -> None:
+        require_positive("starts", self.starts)
+        require_at_most("starts", self.starts, MOST_STARTS)
+        for name in ("distance", "depth", "separation"):
+            require_positive(name, getattr(self, name))
+
+
+@dataclass(frozen=True)
 class PlausibleSettings:
     """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V).
 
     epsilon: eps, metres. cost, grid: what C is, and which X are looked at. members: how many are
     kept for evaluation at most, a random subset. fill_to: where the grid has fewer members than
     this, others are sought around them, off the grid, see chsel.evaluation.local_members; 0: never.
+    modes: how to look for members far from all on the grid; None: not at all.
     rescan: look at all poses at every step; False: after the first step only at the members of the
     one before, which is exact only where C cannot fall as points are added, as with sums.
     """
@@ -125,6 +149,7 @@ class PlausibleSettings:
     members: int = 1000
     fill_to: int = 30
     rescan: bool = True
+    modes: ModeSearchSettings | None = None
 
     def __post_init__(self) -> None:
         require_positive("epsilon", self.epsilon)
@@ -134,10 +159,17 @@ class PlausibleSettings:
             raise SettingError(f"fill_to is {self.fill_to}; accepted: at most members")
 
     @property
+    def text(self) -> str:
+        """All settings as JSON; without modes as it was before there was a search for them."""
+        mapping = settings_mapping(self)
+        if self.modes is None:
+            del mapping["modes"]
+        return json.dumps(mapping, sort_keys=True)
+
+    @property
     def digest(self) -> str:
         """Digest of all settings."""
-        text = json.dumps(settings_mapping(self), sort_keys=True)
-        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        return hashlib.blake2b(self.text.encode(), digest_size=16).hexdigest()
 
 
 def plausible_settings(definition: str, epsilon: float) -> PlausibleSettings:

@@ -14,7 +14,7 @@ from chsel.errors import PoseError, SettingError
 from chsel.evaluation import plausible_set as module
 from chsel.evaluation import position_blocks
 from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.evaluation_cost import EvaluationCost, far_apart
+from chsel.evaluation.evaluation_cost import EvaluationCost
 from chsel.evaluation.plausible_set import grid_around, plausible_set, scan
 from chsel.evaluation.plausible_settings import (
     EvaluationCostSettings,
@@ -23,6 +23,7 @@ from chsel.evaluation.plausible_settings import (
     PoseGridSettings,
     plausible_settings,
 )
+from chsel.far_apart import far_apart
 from chsel.points import KnownPoints
 from chsel.pose import apply, compose, inverse, rotation_angle
 from chsel.problem import RegistrationProblem

@@ -1,0 +1,182 @@
+"""Modes that the grid passes by, on a ball: three contacts leave it one place on either side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chsel.arrays import FloatArray
+from chsel.errors import SettingError
+from chsel.evaluation.error import EvaluationError
+from chsel.evaluation.evaluation_cost import EvaluationCost
+from chsel.evaluation.plausible_file import load_plausible, save_plausible
+from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
+from chsel.evaluation.plausible_settings import (
+    DEFINITIONS,
+    EvaluationCostSettings,
+    ModeSearchSettings,
+    Offsets,
+    PlausibleSettings,
+    PoseGridSettings,
+    plausible_settings,
+)
+from chsel.points import KnownPoints
+from chsel.pose import inverse
+from chsel.problem import RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.settings import build_settings, settings_mapping
+from chsel.streams import StreamKey
+from chsel.threads import threads
+from tests.chsel.evaluation.scenes import WORKSPACE, ball
+
+OTHER = np.array([0.0, 0.0, -0.16])  # where the ball may be as well
+# The positions nearest to it are 8 mm off, along z.
+NEAR = Offsets(((0.0, 0.0, 1),), ((0.0, 0.0, 1),), ((-0.168, -0.168, 1), (0.0, 0.0, 1)))
+FAR = replace(NEAR, z=((-0.19, -0.19, 1), (0.0, 0.0, 1)))
+PLAIN = PlausibleSettings(
+    epsilon=0.004,
+    cost=EvaluationCostSettings(lookup="trilinear"),
+    grid=PoseGridSettings(NEAR, rotations=40, upright=0, extra="none"),
+    fill_to=20,
+)
+SEARCH = replace(PLAIN, modes=ModeSearchSettings(starts=30))
+
+
+def touched_ball(free: FloatArray | None = None, seed: int = 7) -> RegistrationProblem:
+    """A ball of radius 0.1 m around the origin, with three contacts 8 cm below its centre."""
+    angles = np.arange(3) * (2.0 * np.pi / 3.0)
+    ring = np.stack([0.06 * np.cos(angles), 0.06 * np.sin(angles), np.full(3, -0.08)], axis=1)
+    points = KnownPoints(known=ring, free=np.zeros((0, 3)) if free is None else free)
+    start = np.eye(4)[None]
+    return RegistrationProblem(ball(), points, start, WORKSPACE, 0.03, StreamKey(seed, 2))
+
+
+def below(found: PlausibleSet) -> FloatArray:
+    """The members (N, 4, 4) in the other mode."""
+    return found.world_from_object[found.world_from_object[:, 2, 3] < -0.08]
+
+
+def test_a_mode_between_the_poses_of_the_grid_is_found_and_filled() -> None:
+    problem, truth = touched_ball(), np.eye(4)
+    plain, found = (plausible_set(problem, truth, by) for by in (PLAIN, SEARCH))
+    assert len(below(plain)) == 0
+    members = below(found)
+    assert len(members) >= 3
+    np.testing.assert_allclose(members[:, :3, 3] - OTHER, 0.0, atol=0.012)
+    costs = EvaluationCost(problem, PLAIN.cost).evaluate(inverse(found.world_from_object))
+    np.testing.assert_array_equal(costs, found.cost)
+    assert (found.cost < found.true_cost + PLAIN.epsilon).all()
+    np.testing.assert_array_equal(found.index, plain.index)
+    np.testing.assert_array_equal(found.truth, truth)
+    # All of the grid are kept, as there is room, and what was added is said to be off the grid.
+    on_grid = found.world_from_object[~found.local]
+    np.testing.assert_array_equal(on_grid, plain.world_from_object[~plain.local])
+    assert found.local[found.world_from_object[:, 2, 3] < -0.08].all()
+
+
+def test_a_mode_that_is_ruled_out_is_not_found() -> None:
+    """By one free point in it; or as it is farther outside of the grid than the separation."""
+    seen_through = touched_ball(free=OTHER[None])
+    assert len(below(plausible_set(seen_through, np.eye(4), SEARCH))) == 0
+    above = replace(SEARCH, grid=replace(SEARCH.grid, offsets=replace(NEAR, z=((-0.145, 0.0, 2),))))
+    reached = replace(above, modes=ModeSearchSettings(30, distance=0.015, separation=0.02))
+    assert len(below(plausible_set(touched_ball(), np.eye(4), reached))) > 0
+    outside = replace(above, modes=ModeSearchSettings(30, distance=0.015, separation=0.005))
+    assert len(below(plausible_set(touched_ball(), np.eye(4), outside))) == 0
+
+
+def test_without_a_pose_to_climb_from_nothing_changes() -> None:
+    by = replace(SEARCH, grid=replace(SEARCH.grid, offsets=FAR))
+    plain = replace(by, modes=None)
+    problem, truth = touched_ball(), np.eye(4)
+    truth[0, 3] = 0.001  # no pose of the grid is the true one
+    found, other = (plausible_set(problem, truth, one) for one in (by, plain))
+    assert found.digest == other.digest
+
+
+def test_points_that_its_neighbours_violate_do_not_hide_a_mode() -> None:
+    """A layer of free points around the other ball: the pose 8 mm off it is in some of them."""
+    away = np.random.default_rng(0).normal(size=(300, 3))
+    layer = OTHER + 0.105 * away / np.sqrt((away**2).sum(axis=1))[:, None]
+    problem = touched_ball(free=layer[np.sqrt((layer**2).sum(axis=1)) > 0.12])
+    strict = replace(SEARCH, cost=replace(PLAIN.cost, tolerance=0.0))
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 2, 3] = 0.0, OTHER[2], NEAR.z[0][0]
+    costs = EvaluationCost(problem, strict.cost).evaluate(inverse(poses))
+    assert (costs[:2] < PLAIN.epsilon).all()
+    assert costs[2] > 10.0 * strict.cost.violation / len(problem.points.free)
+    assert len(below(plausible_set(problem, np.eye(4), strict))) > 0
+    shallow = replace(strict, modes=ModeSearchSettings(30, depth=1e-6))
+    assert len(below(plausible_set(problem, np.eye(4), shallow))) == 0
+
+
+def test_the_search_depends_on_the_problem_and_the_seed_alone() -> None:
+    alone = plausible_set(touched_ball(), np.eye(4), SEARCH)
+    with threads(2):
+        assert plausible_set(touched_ball(), np.eye(4), SEARCH).digest == alone.digest
+    assert plausible_set(touched_ball(seed=8), np.eye(4), SEARCH).digest != alone.digest
+
+
+def test_modes_take_the_places_of_others_where_there_are_too_many() -> None:
+    """All 40 rotations of a ball are members; 10 are kept."""
+    few = replace(SEARCH, members=10, fill_to=10)
+    found = plausible_set(touched_ball(), np.eye(4), few)
+    assert len(found.index) == 40
+    assert len(found.cost) == 10
+    assert len(below(found)) == found.local.sum() > 0
+    np.testing.assert_array_equal(found.truth, np.eye(4))
+
+
+def test_sets_without_a_search_keep_their_names() -> None:
+    """As files and evaluations from before there was one are found by this digest."""
+    digests = {name: plausible_settings(name, 0.001).digest for name in DEFINITIONS}
+    assert digests == {
+        "default": "9e9d529fee8cd42535e67929c57c0075",
+        "paper": "bf832c1245e3394032873ce1e366283b",
+        "reference": "d721b4c2811b591fa041b54762af51d0",
+    }
+    assert "modes" not in PLAIN.text
+    others = [SEARCH, replace(SEARCH, modes=ModeSearchSettings(31)), PLAIN]
+    assert len({one.digest for one in others}) == 3
+    assert build_settings(PlausibleSettings, settings_mapping(SEARCH), "definition") == SEARCH
+    empty = build_settings(PlausibleSettings, {"modes": {}}, "definition")
+    assert empty.modes == ModeSearchSettings()
+
+
+def test_a_set_with_modes_is_read_as_it_was_written(tmp_path: Path) -> None:
+    problem, truth = touched_ball(), np.eye(4)
+    found = plausible_set(problem, truth, SEARCH)
+    save_plausible(tmp_path, found)
+    assert load_plausible(tmp_path, problem, PLAIN) is None
+    read = load_plausible(tmp_path, problem, SEARCH, world_from_object=truth)
+    assert read is not None
+    assert (read.digest, read.settings) == (found.digest, SEARCH)
+
+
+def test_an_object_without_a_surface_is_one_clear_error() -> None:
+    """All of the grid is outside, and the points are known to be, too."""
+    problem = touched_ball()
+    sdf, known = problem.sdf, problem.points.known
+    lifted = SdfGrid(sdf.origin, sdf.resolution, sdf.values + 0.15, sdf.gradients)
+    points = KnownPoints(known=known, known_sdf=np.full(len(known), 0.15))
+    with pytest.raises(EvaluationError, match="modes cannot be told apart: no node"):
+        plausible_set(replace(problem, sdf=lifted, points=points), np.eye(4), SEARCH)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"starts": 0}, "definition.modes: starts is 0"),
+        ({"starts": 10**9}, "definition.modes: starts is 1000000000"),
+        ({"distance": 0.0}, "distance is 0.0"),
+        ({"depth": float("inf")}, "depth is inf"),
+        ({"separation": -0.01}, "separation is -0.01"),
+        ({"separations": 0.01}, "did you mean separation"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named(values: dict[str, float], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        build_settings(PlausibleSettings, {"modes": values}, "definition")
