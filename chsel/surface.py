@@ -9,7 +9,9 @@ import numpy as np
 from chsel.arrays import FloatArray, IntArray
 from chsel.errors import SdfError
 from chsel.sdf import SdfGrid
+from chsel.streams import Purpose, StreamKey
 
+_SHAPE_POINTS = 1000
 # The six tetrahedra of a cell, along its diagonal (Freudenthal, 1942): corners (6, 4, 3).
 _TETRAHEDRA = np.array(
     [np.cumsum([(0, 0, 0), *np.eye(3, dtype=np.int64)[list(p)]], 0) for p in permutations(range(3))]
@@ -46,6 +48,16 @@ def surface_points(sdf: SdfGrid, count: int, stream: np.random.Generator) -> Flo
     root = np.sqrt(root)[:, None]
     share = root * share[:, None]
     return _refined(sdf, corner[index] + (root - share) * u[index] + share * v[index])
+
+
+def object_shape(sdf: SdfGrid) -> tuple[FloatArray, FloatArray]:
+    """Mean (3,) and standard deviation (3,) of the surface of a grid, in the object frame."""
+    return sdf.derived("shape", lambda: _shape(sdf))
+
+
+def _shape(sdf: SdfGrid) -> tuple[FloatArray, FloatArray]:
+    points = surface_points(sdf, _SHAPE_POINTS, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
+    return points.mean(axis=0), points.std(axis=0)
 
 
 def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:

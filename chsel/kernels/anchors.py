@@ -66,11 +66,11 @@ def best_for(most: int) -> Best:
 
 
 @compiled
-def sample(coarse, space, anchors, draws, best, first, last):  # type: ignore[no-untyped-def]
+def sample(coarse, space, anchors, draws, before, first, last, best):  # type: ignore[no-untyped-def]
     """Keep the best of the poses that rows of draws (n, 8) from `first` to `last` make.
 
     Those of the least scores, and of equal ones the first: which they are does not depend on
-    how the rows are split.
+    how the rows are split. before: the number of poses drawn before the first row.
     """
     most = len(best.scores)
     for n in range(first, last):
@@ -79,8 +79,8 @@ def sample(coarse, space, anchors, draws, best, first, last):  # type: ignore[no
             full = best.state[0] == most
             limit = best.scores[0] if full else np.inf
             score = score_below(coarse, pose, limit)
-            if score < limit or (score == limit and score < np.inf and n < best.numbers[0]):
-                _put(best, score, n, pose, full)
+            if score < limit or (full and score == limit and before + n < best.numbers[0]):
+                _put(best, score, before + n, pose, full)
 
 
 @inner
@@ -168,7 +168,9 @@ def _turned(space, draw, vector):  # type: ignore[no-untyped-def]
     s, c = sine_cosine(_TURN * draw[5])
     sine, cosine = sine_cosine(_TURN * draw[6])
     inner_root, outer_root = np.sqrt(1.0 - draw[7]), np.sqrt(draw[7])
-    return matrix_of_quaternion(inner_root * s, inner_root * c, outer_root * sine, outer_root * cosine)
+    return matrix_of_quaternion(
+        inner_root * s, inner_root * c, outer_root * sine, outer_root * cosine
+    )
 
 
 @leaf
@@ -206,7 +208,11 @@ def _on_contact(anchors, draw, r):  # type: ignore[no-untyped-def]
     first, last = anchors.singles[single, 1], anchors.singles[single, 2]
     q = anchors.allowed[first + int(draw[2] * (last - first))]
     away = anchors.values[contact]
-    x, y, z = anchors.contacts[0, contact], anchors.contacts[1, contact], anchors.contacts[2, contact]
+    x, y, z = (
+        anchors.contacts[0, contact],
+        anchors.contacts[1, contact],
+        anchors.contacts[2, contact],
+    )
     u, v, w = _rotated(r, x, y, z)
     u = anchors.surface[0, q] + away * anchors.normals[0, q] - u
     v = anchors.surface[1, q] + away * anchors.normals[1, q] - v

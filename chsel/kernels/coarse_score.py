@@ -44,7 +44,7 @@ def score_below(coarse, pose, limit):  # type: ignore[no-untyped-def]
         u = a * p + b * q + c * r + x0
         v = d * p + e * q + f * r + y0
         w = g * p + h * q + i * r + z0
-        k, m, o = min(max(u, 0.0), most[0]), min(max(v, 0.0), most[1]), min(max(w, 0.0), most[2])
+        k, m, o = min(max(0.0, u), most[0]), min(max(0.0, v), most[1]), min(max(0.0, w), most[2])
         away = (abs(u - k) + abs(v - m) + abs(w - o)) / inverse
         s = values[int(np.rint(k) * across + np.rint(m) * along + np.rint(o))]
         total += coarse.scale * abs(s + away - known_sdf[n])
@@ -58,7 +58,7 @@ def score_below(coarse, pose, limit):  # type: ignore[no-untyped-def]
         k = (a * u + d * v + g * w - first[0]) * inverse
         m = (b * u + e * v + h * w - first[1]) * inverse
         o = (c * u + f * v + i * w - first[2]) * inverse
-        k, m, o = min(max(k, 0.0), most[0]), min(max(m, 0.0), most[1]), min(max(o, 0.0), most[2])
+        k, m, o = min(max(0.0, k), most[0]), min(max(0.0, m), most[1]), min(max(0.0, o), most[2])
         if flags[int(np.rint(k) * across + np.rint(m) * along + np.rint(o))]:
             total += weights[n]
             if not total <= limit:

@@ -8,21 +8,21 @@ from chsel.kernels.compiler import compiled
 
 
 @compiled
-def locate_facilities(points, weights, given, chosen, nearest, squares):  # type: ignore[no-untyped-def]
+def locate_facilities(points, given, chosen, nearest, apart):  # type: ignore[no-untyped-def]
     """Choose points (C, d) so that the mean distance of all to the nearest chosen is small.
 
-    Each choice takes off the most. The first `given` of chosen (B,) are there already. weights (C,):
-    of the points. nearest (C,), squares (C, C): scratch; the latter takes the distances.
+    Each choice takes off the most. The first `given` of chosen (B,) are there already. nearest
+    (C,), apart (C, C): scratch. Returns how many are chosen before all others are like them.
     """
     count, dimension = points.shape
     for i in range(count):
-        squares[i, i] = 0.0
+        apart[i, i] = 0.0
         nearest[i] = np.inf
         for j in range(i):
             total = 0.0
             for d in range(dimension):
                 total += (points[i, d] - points[j, d]) * (points[i, d] - points[j, d])
-            squares[i, j] = squares[j, i] = np.sqrt(total)
+            apart[i, j] = apart[j, i] = np.sqrt(total)
     for n in range(len(chosen)):
         if n >= given:
             best, least = -1, np.inf
@@ -31,12 +31,12 @@ def locate_facilities(points, weights, given, chosen, nearest, squares):  # type
                     continue
                 total = 0.0
                 for j in range(count):
-                    total += weights[j] * min(nearest[j], squares[i, j])
+                    total += min(nearest[j], apart[i, j])
                 if total < least:
                     best, least = i, total
             if best < 0:  # all are chosen, or alike
                 return n
             chosen[n] = best
         for j in range(count):
-            nearest[j] = min(nearest[j], squares[chosen[n], j])
+            nearest[j] = min(nearest[j], apart[chosen[n], j])
     return len(chosen)

@@ -133,7 +133,9 @@ def _squares(model, twists, pose, found, count, fit, with_normal):  # type: igno
             if residual < 0.0:
                 total += residual * residual
                 if with_normal:
-                    _add(twists, pose, found.x[n], found.y[n], found.z[n], nx, ny, nz, residual, fit)
+                    _add(
+                        twists, pose, found.x[n], found.y[n], found.z[n], nx, ny, nz, residual, fit
+                    )
     for n in range(model.known.shape[1]):
         x, y, z = model.known[0, n], model.known[1, n], model.known[2, n]
         s, nx, ny, nz = distance_with_gradient(field, pose, x, y, z)

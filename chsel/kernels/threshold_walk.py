@@ -1,4 +1,7 @@
-"""Random walks of poses below a limit on their energy (threshold accepting: Dueck and Scheuer, 1990)."""
+"""Random walks of poses below a limit on their energy.
+
+While the limit comes down: threshold accepting (Dueck and Scheuer, 1990).
+"""
 
 from __future__ import annotations
 
@@ -9,32 +12,31 @@ import numpy as np
 from chsel.arrays import FloatArray, IntArray
 from chsel.kernels.compiler import compiled, inner, leaf, spliced
 from chsel.kernels.cost import Model, place_in_world, remember, travel
+from chsel.kernels.elementary import exp
 from chsel.kernels.energy import found_around, known_below, with_free
 from chsel.kernels.levenberg_marquardt import moved_about
 from chsel.kernels.pose import pose_at
 from chsel.kernels.tree import Found, walk
 
 DRAWS = 9  # random numbers that a move takes
+_FIRST, _LEAST, _MOST = 0.01, 0.0003, 0.03  # metres: the size of moves
+_GROW, _SHRINK = 1.1, 0.97  # it, after a move that was accepted or refused
+_SMALLEST, _RANGE = 0.12589254117941673, 2.763102111592855  # a move's factor: 10^U(-0.9, 0.3)
+_PER_METRE = 6.0  # radians that go with a metre
+_ABOUT_CONTACT = 0.6  # share of the turns that are about a contact
+_DEVIATION = 3.4641016151377544  # uniform numbers of [-1/2, 1/2] times it have a deviation of 1
 _SLACKS = 6.0  # sizes of a step that gathered points should last
 _LEAST_SLACK, _MOST_SLACK = 0.004, 0.04  # metres
 
 
 class Stride(NamedTuple):
-    """How poses move: lengths in metres.
+    """How poses move.
 
-    first, least, most: of a step. grow, shrink: its factors after a move that was accepted or
-    refused. per_metre: radians of a turn per metre of a step. about_contact: the share of turns about
-    a contact, the others are about the pivot. axis: of all turns, zero for any;
-    shifts are across it. lower, upper (3,): where the object may be in the world.
+    planar: turns are about the axis alone, and shifts across it. pivot: the point of the object
+    about which it turns where it does not turn about a contact. lower, upper (3,): where the
+    object's origin may be in the world.
     """
 
-    first: float
-    least: float
-    most: float
-    grow: float
-    shrink: float
-    per_metre: float
-    about_contact: float
     planar: bool
     axis: tuple[float, float, float]
     pivot: tuple[float, float, float]
@@ -81,19 +83,20 @@ def chains_from(poses: FloatArray, energies: FloatArray, kept: int) -> Chains:
 
 
 @compiled
-def walk_below(model, stride, floor, chains, draws, first, last, steps):  # type: ignore[no-untyped-def]
-    """Move chains from `first` to `last` once for each of their draws (C, M, 9).
+def walk_below(model, stride, floor, chains, draws, before, first, last, steps):  # type: ignore[no-untyped-def]
+    """Move the chains after the first `before` once for each of their draws (C, M, 9).
 
     A move is accepted if its energy is at most the limit of its chain: the energy of the chain
     where that is above the floor, so that the limit comes down with it, else the floor.
     """
     moves, keep = draws.shape[1], chains.kept.shape[1]
-    for n in range(first, last):
-        pose, energy, size = pose_at(chains.poses, n), chains.energies[n], stride.first
+    for row in range(first, last):
+        n = before + row
+        pose, energy, size = pose_at(chains.poses, n), chains.energies[n], _FIRST
         slack, count, done = -1.0, 0, 0
         for m in range(moves):
             limit = max(energy, floor)
-            trial = _proposed(model, stride, pose, size, draws[n, m])
+            trial = _proposed(model, stride, pose, size, draws[row, m])
             accepted = False
             if _within(stride, trial):
                 total = known_below(model, trial, limit)
@@ -104,9 +107,9 @@ def walk_below(model, stride, floor, chains, draws, first, last, steps):  # type
             if accepted:
                 pose, energy = trial, total
                 chains.moved[n] += 1
-                size = min(size * stride.grow, stride.most)
+                size = min(size * _GROW, _MOST)
             else:
-                size = max(size * stride.shrink, stride.least)
+                size = max(size * _SHRINK, _LEAST)
             if keep > 0 and (m + 1) * keep >= (done + 1) * moves:
                 if energy <= floor:
                     chains.kept_energies[n, done] = energy
@@ -141,18 +144,19 @@ def _within(stride, pose):  # type: ignore[no-untyped-def]
 
 @inner
 def _proposed(model, stride, pose, size, draw):  # type: ignore[no-untyped-def]
-    """A pose near by: draw (9,) is a factor of the size, two choices, a turn, and a shift."""
-    size *= draw[0]
-    turn, known = stride.per_metre * size, model.known
-    a, b, c = turn * draw[3], turn * draw[4], turn * draw[5]
-    u, v, w = size * draw[6], size * draw[7], size * draw[8]
+    """A pose near by. draw (9,): of a factor of the size, two choices, a turn, and a shift."""
+    size *= _SMALLEST * exp(_RANGE * draw[0])
+    shift, turn, known = size * _DEVIATION, size * _DEVIATION * _PER_METRE, model.known
+    a, b, c = turn * (draw[3] - 0.5), turn * (draw[4] - 0.5), turn * (draw[5] - 0.5)
+    u, v, w = shift * (draw[6] - 0.5), shift * (draw[7] - 0.5), shift * (draw[8] - 0.5)
     if stride.planar:
         x, y, z = stride.axis
-        a, b, c = turn * draw[3] * x, turn * draw[3] * y, turn * draw[3] * z
+        b, c = a * y, a * z
+        a = a * x
         along = u * x + v * y + w * z
         u, v, w = u - along * x, v - along * y, w - along * z
     pivot = stride.pivot
-    if draw[1] < stride.about_contact and known.shape[1] > 0:
+    if draw[1] < _ABOUT_CONTACT and known.shape[1] > 0:
         n = int(draw[2] * known.shape[1])
         x, y, z = known[0, n], known[1, n], known[2, n]
         pivot = (

@@ -8,6 +8,7 @@ from typing import Any
 
 from chsel import presets
 from chsel.errors import SettingError, require_choice
+from chsel.methods.anchored import Anchored, preset_anchored
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
@@ -45,6 +46,7 @@ def _gradient_descent(preset: str) -> GradientDescentSettings:
 
 
 _OURS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
+    "anchored": (Anchored, preset_anchored),
     "chsel": (Chsel, _chsel),
     "chsel_cma_me": (Chsel, _chsel_cma_me),
     "gradient_descent": (GradientDescent, _gradient_descent),

@@ -1,46 +1,45 @@
-"""Contact-anchored search: our own method, for sets that are close to the plausible set."""
+"""Contact-anchored search: our own method, for hypotheses that are close to the plausible set."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from chsel.anchors import AnchorSettings, anchors_of
+from chsel.anchors import AnchorSettings, anchored_poses, bounds_of, in_telling_order
 from chsel.arrays import FloatArray, IntArray
-from chsel.cost_settings import CostSettings
+from chsel.diverse import representative, spaced
 from chsel.emitters import update_cells
-from chsel.engine import CompiledCost, poses_of
+from chsel.energy import Energy
+from chsel.engine import poses_of
 from chsel.errors import require_at_most, require_choice, require_positive
-from chsel.far_apart import far_apart
-from chsel.kernels.anchors import DRAWS, best_for, sample
-from chsel.interior import VoxelGrid
-from chsel.kernels.coarse_score import Coarse
-from chsel.kernels.cost import Model
-from chsel.kernels.energy import energies_below, found_around
-from chsel.kernels.facility import locate_facilities
-from chsel.kernels.levenberg_marquardt import Twists, fit_for, fit_poses
-from chsel.kernels.region import box_of, triple
-from chsel.kernels.threshold_walk import DRAWS as MOVE_DRAWS
-from chsel.kernels.threshold_walk import Stride, chains_from, steps_for, walk_below
 from chsel.measures import measure_named
-from chsel.objective import Objective
 from chsel.observer import NullObserver, Observer
 from chsel.online import OnlineSettings
-from chsel.points import KnownPoints
 from chsel.pose import compose
 from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
 from chsel.selection import ArchiveSettings, ranked_hypotheses, sized_archive
-from chsel.space import PlaneSettings, SE2Space, SearchSpace, search_space, transforms_of
-from chsel.streams import Purpose, StreamKey, normals, uniforms
-from chsel.surface import surface_points
-from chsel.threads import spread
+from chsel.space import PlaneSettings, search_space, transforms_of
+
+MOST = 100_000_000
+_KEPT = 6  # states of a chain
+_POOL = 400  # candidates to choose from
+_MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
+_MOST_CHOSEN = 300  # by facility location; more of them are taken evenly
+_MOST_GIVEN = 60  # of E_0 and E_l that are fitted
 
 
 @dataclass(frozen=True)
 class Effort:
+    """How much is done.
+
+    samples: poses drawn; kept: of them, those fitted by first_steps steps; refined: the better of
+    these, by steps more. descents, descent_moves: chains that come down to the limit, and their
+    moves. chains, moves: those that spread below it. evaluations: what may be spent on further
+    rounds of samples while the best energy is above `enough` noise levels, and by the first round
+    at least; 0: there is one.
+    """
+
     samples: int = 60_000
     kept: int = 200
     first_steps: int = 6
@@ -50,274 +49,224 @@ class Effort:
     descent_moves: int = 266
     chains: int = 96
     moves: int = 300
+    evaluations: int = 0
+    enough: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "kept", "refined", "descents", "chains", "enough"):
+            require_positive(name, getattr(self, name))
+        for name in ("first_steps", "steps", "descent_moves", "moves", "evaluations"):
+            require_positive(name, getattr(self, name), zero=True)
+        for name, value in vars(self).items():
+            require_at_most(name, value, MOST)
 
 
 EFFORTS = {
     "small": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150),
     "medium": Effort(),
     "large": Effort(250_000, 504, 6, 150, 15, 120, 500, 120, 1000),
+    "adaptive": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 2_000_000),
 }
-KEPT_STATES = 6
-POOL = 400
 
 
 @dataclass(frozen=True)
 class AnchoredSettings:
+    """All settings of the contact-anchored search.
+
+    size: an effort, of EFFORTS; effort: another one in its place. noise: the standard deviation of
+    known points, metres. penetration_tolerance: tau, the depth that free points may have, metres.
+    limit_noise, limit_ratio, limit_slack: candidates have energies below the larger of limit_noise
+    noise levels, and limit_ratio x lowest energy + limit_slack noise levels. plane: restricts the
+    poses to SE(2).
+    """
+
     size: str = "medium"
+    effort: Effort | None = None
     noise: float = 0.001
     penetration_tolerance: float = 0.0
-    coarse_level: float = -0.01
-    coarse_scale: float = 0.3
-    most_contacts: int = 32
-    fit_level: float = -0.003
-    limit_noise: float = 2.0
+    limit_noise: float = 1.0
     limit_ratio: float = 1.3
-    lever: float = 0.15
+    limit_slack: float = 0.5
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
-    effort: Effort | None = None
     archive: ArchiveSettings = ArchiveSettings(measure="object_xy", outliers="none")
     online: OnlineSettings = OnlineSettings(update="own")
     plane: PlaneSettings | None = None
 
+    def __post_init__(self) -> None:
+        require_choice("size", self.size, EFFORTS)
+        require_positive("noise", self.noise)
+        for name in ("penetration_tolerance", "limit_noise", "limit_ratio", "limit_slack"):
+            require_positive(name, getattr(self, name), zero=True)
+        measure_named(self.archive.measure, planar=self.plane is not None)
+
+
+def preset_anchored(preset: str) -> AnchoredSettings:
+    """The settings of a preset, one of chsel.presets.PRESETS: the method is in neither of two."""
+    return AnchoredSettings()
+
 
 class Anchored:
+    """Samples anchored on contacts, fitted, spread below a limit, and a diverse choice of them."""
+
     def __init__(self, settings: AnchoredSettings | None = None) -> None:
         self.settings = settings or AnchoredSettings()
 
     @property
     def online(self) -> OnlineSettings:
+        """How a session makes the next problem."""
         return self.settings.online
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
-        from time import perf_counter as pc
-        T = self.times = {}
-        t0 = pc()
-        settings = self.settings
-        effort = settings.effort or EFFORTS[settings.size]
-        sdf, key = problem.sdf, problem.key
-        space = search_space(settings.plane, sdf)
-        points = _in_telling_order(problem.points)
-        alpha = -settings.penetration_tolerance
-        known_scale = 1.0 / max(len(points.known), 1)
-        cost = CompiledCost(
-            sdf,
-            points,
-            CostSettings(
-                penetration_tolerance=-0.0,
-                free_scale=1.0,
-                occupied_scale=1.0,
-                known_scale=known_scale,
-                gradient="exact",
-            ),
-            free_resolution=problem.free_resolution,
-            way="tree",
+        """Hypotheses for the known points of a problem, best first; costs are energies."""
+        search = _Search(problem, self.settings, observer or NullObserver())
+        return search.chosen(*search.spread(*search.found()))
+
+
+class _Search:
+    """The stages of one registration. Poses are (B, 12): rotation row by row, then translation."""
+
+    def __init__(
+        self, problem: RegistrationProblem, settings: AnchoredSettings, observer: Observer
+    ) -> None:
+        self._problem, self._settings, self._observer = problem, settings, observer
+        self._effort = settings.effort or EFFORTS[settings.size]
+        self._space = search_space(settings.plane, problem.sdf)
+        self._known = in_telling_order(problem.points)
+        bounds = bounds_of(problem, self._space, settings.anchors.margin)
+        tolerance = settings.penetration_tolerance
+        self._energy = Energy(problem, self._known, self._space, tolerance, bounds)
+
+    def found(self) -> tuple[FloatArray, FloatArray]:
+        """Poses near minima with their energies, the lowest first, from as many rounds as it takes.
+
+        The best of E_0 and E_l join the first round.
+        """
+        effort, problem = self._effort, self._problem
+        given = poses_of(np.concatenate([problem.initial_set, problem.low_cost_set]))
+        given = given[np.argsort(self._energy.of(given), kind="stable")[:_MOST_GIVEN]]
+        poses, energies = given[:0], np.zeros(0)
+        spent = index = 0
+        while True:
+            drawn = self._drawn(index)
+            joined = drawn if index else np.concatenate([drawn, given])
+            more, more_energies = self._descended(*self._fitted(joined), index)
+            poses, energies = (
+                np.concatenate([poses, more]),
+                np.concatenate([energies, more_energies]),
+            )
+            spent += effort.samples + effort.kept * effort.first_steps
+            spent += effort.refined * effort.steps + effort.descents * effort.descent_moves
+            index += 1
+            self._observer.progress("search", min(spent, effort.evaluations), effort.evaluations)
+            good = float(energies.min()) <= effort.enough * self._settings.noise
+            if good or spent >= effort.evaluations:
+                break
+        order = np.argsort(energies, kind="stable")
+        return poses[order], energies[order]
+
+    def _drawn(self, index: int) -> FloatArray:
+        effort, settings = self._effort, self._settings
+        poses = anchored_poses(
+            self._problem,
+            self._known,
+            self._space,
+            settings.anchors,
+            samples=effort.samples,
+            most=effort.kept,
+            index=index,
         )
-        model = cost.model
-        coarse = cost.at_level(sdf, settings.coarse_level)
-        coarse = coarse._replace(free_scale=0.05)
-        fitting = cost.at_level(sdf, settings.fit_level)
-        centre, spread_matrix = shape_of(sdf)
-        T["build"] = pc() - t0; t0 = pc()
-        rough = rough_of(sdf, points, problem, settings)
-        T["rough"] = pc() - t0; t0 = pc()
-        anchors = anchors_of(sdf, points, problem.workspace, space, settings.anchors)
-        T["anchors"] = pc() - t0; t0 = pc()
-        draws = key.stream(Purpose.ANCHORS).random((effort.samples, DRAWS))
-        T["draws"] = pc() - t0; t0 = pc()
-        poses = sampled(rough, space, anchors, draws, effort.kept)
-        T["sample"] = pc() - t0; t0 = pc()
-        self.sampled = poses
-        given = np.concatenate([problem.initial_set, problem.low_cost_set])
-        if len(problem.low_cost_set):
-            more = poses_of(np.concatenate([problem.initial_set, problem.low_cost_set]))
-            e = energies(coarse, more)
-            more = more[np.argsort(e, kind="stable")[:60]]
-            poses = np.concatenate([poses, more])
-        basis = np.eye(6)
-        planar = isinstance(space, SE2Space)
-        if planar:
-            basis = np.zeros((3, 6))
-            basis[0, :3], basis[1, 3:], basis[2, 3:] = space.axis, space.e_u, space.e_v
-        basis[:, :3] /= settings.lever
-        twists = Twists(basis, triple(centre), 0.08, 0.5)
-        fit(fitting, twists, poses, effort.first_steps)
-        e = energies(model, poses)
-        order = np.argsort(e, kind="stable")
-        better = poses[order[: effort.refined]]
-        fit(fitting, twists, better, effort.steps)
-        poses = np.concatenate([better, poses[order[effort.refined :]]])
-        e = energies(model, poses)
-        order = np.argsort(e, kind="stable")
-        poses, e = poses[order], e[order]
-        T["fit"] = pc() - t0; t0 = pc()
-        self.fitted = e.copy()
-        bounds = problem.workspace.bounds
-        stride = Stride(
-            0.01, 0.0003, 0.03, 1.1, 0.97, 6.0, 0.6, planar,
-            triple(space.axis) if planar else (0.0, 0.0, 0.0), triple(centre),
-            triple(bounds[0] - settings.anchors.margin), triple(bounds[1] + settings.anchors.margin),
+        self._observer.progress("sample", effort.samples, effort.samples)
+        return poses
+
+    def _fitted(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """All fitted a little, and the better part of them some more; the lowest first."""
+        effort = self._effort
+        poses, _ = self._ordered(self._energy.fitted(poses, effort.first_steps))
+        better = self._energy.fitted(poses[: effort.refined], effort.steps)
+        poses, energies = self._ordered(np.concatenate([better, poses[effort.refined :]]))
+        self._tell("fit", poses, energies)
+        return poses, energies
+
+    def _ordered(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        energies = self._energy.of(poses)
+        order = np.argsort(energies, kind="stable")
+        return poses[order], energies[order]
+
+    def _descended(
+        self, poses: FloatArray, energies: FloatArray, index: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """The lowest walk down to the limit that holds so far."""
+        count, moves = self._effort.descents, self._effort.descent_moves
+        limit = self._limit(energies)
+        chains = self._energy.walked(
+            poses[:count], energies[:count], limit, moves, kept=0, index=1 + index
         )
-        # descend
-        n = min(effort.descents, len(poses))
-        draws = moves(key.stream(Purpose.WALKS, 0), n, effort.descent_moves)
-        T["draws"] += pc() - t0; t0 = pc()
-        floor = settings.limit_noise * settings.noise
-        chains = walked(model, stride, floor, poses[:n], e[:n], draws, 0)
-        poses = np.concatenate([chains.poses, poses[n:]])
-        e = np.concatenate([chains.energies, e[n:]])
-        T["descend"] = pc() - t0; t0 = pc()
-        least = float(e.min())
-        self.least = least
-        limit = max(settings.limit_noise * settings.noise, settings.limit_ratio * least + 0.5 * settings.noise)
-        below = e <= limit
-        starts, start_e = poses[below], e[below]
-        order = np.argsort(start_e, kind="stable")
-        starts, start_e = starts[order], start_e[order]
-        chosen = far_apart(embedded(starts, centre, spread_matrix), effort.chains)
-        chosen = np.resize(chosen, effort.chains)
-        draws = moves(key.stream(Purpose.WALKS, 1), effort.chains, effort.moves)
-        T["draws"] += pc() - t0; t0 = pc()
-        chains = walked(model, stride, limit, starts[chosen], start_e[chosen], draws, KEPT_STATES)
-        T["spread"] = pc() - t0; t0 = pc()
-        self.acceptance = chains.moved.mean() / effort.moves
-        kept, kept_e = chains.kept.reshape(-1, 12), chains.kept_energies.reshape(-1)
-        good = kept_e <= limit
-        pool = np.concatenate([starts, kept[good]])
-        pool_e = np.concatenate([start_e, kept_e[good]])
-        pick = [0, *(1 + np.floor(np.arange(min(POOL, len(pool)) - 1) * (len(pool) - 1) / max(min(POOL, len(pool)) - 1, 1)).astype(int))]
-        pool, pool_e = pool[pick], pool_e[pick]
-        self.pool = pool
-        count = min(len(problem.initial_set), len(pool))
-        chosen = facilities(embedded(pool, centre, spread_matrix), np.ones(len(pool)), count)
-        T["choose"] = pc() - t0; t0 = pc()
-        transforms = compose(pool[:, :9].reshape(-1, 3, 3), pool[:, 9:])
-        objective = Objective(cost, space)
-        vectors = space.encode(transforms)
-        measure = measure_named(settings.archive.measure, planar=planar)
+        poses = np.concatenate([chains.poses, poses[count:]])
+        energies = np.concatenate([chains.energies, energies[count:]])
+        self._tell("descend", poses, energies)
+        return poses, energies
+
+    def _limit(self, energies: FloatArray) -> float:
+        """The energy below which poses are candidates."""
+        settings, least = self._settings, float(energies.min())
+        relative = settings.limit_ratio * least + settings.limit_slack * settings.noise
+        return max(settings.limit_noise * settings.noise, relative)
+
+    def spread(self, poses: FloatArray, energies: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Candidates below the limit with their energies, the lowest first, by walks from poses."""
+        effort, count = self._effort, len(self._problem.initial_set)
+        limit = self._limit(energies)
+        below = energies <= limit
+        poses, energies = poses[below], energies[below]
+        wanted = max(effort.chains, -(-2 * count // _KEPT))
+        starts = np.resize(spaced(self._problem.sdf, poses, wanted), wanted)
+        chains = self._energy.walked(
+            poses[starts], energies[starts], limit, effort.moves, kept=_KEPT, index=0
+        )
+        kept = chains.kept_energies.reshape(-1) <= limit
+        poses = np.concatenate([poses, chains.kept.reshape(-1, 12)[kept]])
+        energies = np.concatenate([energies, chains.kept_energies.reshape(-1)[kept]])
+        self._tell("spread", poses, energies)
+        return poses, energies
+
+    def chosen(self, poses: FloatArray, energies: FloatArray) -> Hypotheses:
+        """As many hypotheses as E_0 has poses, of candidates; all of these go into the archive."""
+        problem, space, settings = self._problem, self._space, self._settings
+        count = len(problem.initial_set)
+        pool = _evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+        chosen = pool[representative(problem.sdf, poses[pool], min(count, _MOST_CHOSEN))]
+        if len(chosen) < count:
+            others = np.setdiff1d(np.arange(len(poses)), chosen)
+            more = others[_evenly(len(others), count - len(chosen))]
+            chosen = np.resize(np.concatenate([chosen, more]), count)
+        transforms = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
+        vectors, objective = space.encode(transforms), self._energy.objective
+        measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
         measures = objective.measures(measure, vectors)
-        archive = sized_archive(measure, measures, pool_e, settings.archive, len(points.known), space.dimension)
-        update_cells(archive, objective, vectors, pool_e)
+        archive = sized_archive(
+            measure,
+            measures,
+            energies,
+            settings.archive,
+            len(problem.points.known),
+            space.dimension,
+        )
+        update_cells(archive, objective, vectors, energies)
+        snapshot = archive.snapshot(0, 0)
+        self._observer.snapshot(snapshot)
         elites = transforms_of(space, archive.solutions)
         cells = archive.cells_of(measures[chosen])
-        found = ranked_hypotheses(objective, transforms[chosen], cells, elites, archive.snapshot(0, 0))
-        T["archive"] = pc() - t0; t0 = pc()
-        return found
+        hypotheses = transforms_of(space, vectors[chosen])
+        return ranked_hypotheses(objective, hypotheses, cells, elites, snapshot)
+
+    def _tell(self, stage: str, poses: FloatArray, energies: FloatArray) -> None:
+        vectors = self._space.encode(compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]))
+        self._observer.trace(stage, 0, vectors, energies.copy())
+        self._observer.progress(stage, 1, 1)
 
 
-def _in_telling_order(points: KnownPoints) -> KnownPoints:
-    order = far_apart(points.known, 64)
-    rest = np.ones(len(points.known), dtype=bool)
-    rest[order] = False
-    order = np.concatenate([order, np.flatnonzero(rest)])
-    return replace(points, known=points.known[order], known_sdf=points.sdf[order])
-
-
-def rough_of(sdf, points, problem, settings):
-    values, inside, depth = sdf.derived("rough", lambda: _rough(sdf))
-    n = min(len(points.known), settings.most_contacts)
-    free = points.free
-    reach = settings.anchors.margin + sdf.diameter
-    low, high = problem.workspace.bounds
-    near = ((free >= low - reach) & (free <= high + reach)).all(axis=1)
-    free = free[near]
-    box = box_of(sdf.origin, sdf.resolution, sdf.shape)
-    weights = settings.coarse_scale * depth * (300.0 / max(len(depth), 1))
-    if len(free):
-        voxels = VoxelGrid.around(free, problem.free_resolution)
-        vbox = box_of(voxels.origin, problem.free_resolution, voxels.flags.shape)
-        flags = voxels.flags.reshape(-1)
-    else:
-        vbox, flags, inside, weights = box, np.zeros(1, dtype=bool), inside[:0], weights[:0]
-    return Coarse(box, values, points.known[:n].T.copy(), points.sdf[:n].copy(), 1.0 / max(n, 1), inside.T.copy(), weights, vbox, flags)
-
-
-def _rough(sdf):
-    values = sdf.values.astype(np.float32).reshape(-1)
-    deepest = -sdf.values.min()
-    nodes = np.argwhere(sdf.values < -0.3 * deepest)
-    depth = -sdf.values[tuple(nodes.T)]
-    if len(nodes) > 4000:
-        pick = np.floor(np.arange(4000) * (len(nodes) / 4000)).astype(int)
-        nodes, depth = nodes[pick], depth[pick]
-    chosen = far_apart(nodes.astype(float), 150)
-    return values, sdf.origin + nodes[chosen] * sdf.resolution, depth[chosen]
-
-
-def shape_of(sdf: SdfGrid) -> tuple[FloatArray, FloatArray]:
-    return sdf.derived("shape", lambda: _shape(surface_points(sdf, 400, StreamKey(0, 0).stream(Purpose.ANCHORS))))
-
-
-def _shape(surface):
-    centre = surface.mean(axis=0)
-    away = surface - centre
-    covariance = away.T @ away / len(away)
-    return centre, np.linalg.cholesky(covariance + 1e-12 * np.eye(3))
-
-
-def embedded(poses: FloatArray, centre: FloatArray, root: FloatArray) -> FloatArray:
-    """world_from_object of the centre and the principal spread: |a - b|^2 = mean |x_a - x_b|^2."""
-    rotations = poses[:, :9].reshape(-1, 3, 3).swapaxes(1, 2)
-    position = ((centre - poses[:, 9:])[:, None, :] * rotations).sum(axis=2)
-    axes = (rotations[:, :, :, None] * root[None, None]).sum(axis=2)
-    return np.ascontiguousarray(np.concatenate([position, axes.reshape(-1, 9)], axis=1))
-
-
-def energies(model: Model, poses: FloatArray) -> FloatArray:
-    out = np.empty(len(poses))
-    spread(
-        lambda first, last, found: energies_below(model, poses, np.inf, out, first, last, found),
-        len(poses), lambda: found_around(model), least=50,
-    )
-    return out
-
-
-def sampled(rough, space, anchors, draws, most):
-    made = []
-
-    def scratch():
-        made.append(best_for(most))
-        return made[-1]
-
-    spread(
-        lambda first, last, best: sample(rough, space.arrays, anchors, draws, best, first, last),
-        len(draws), scratch, least=1000,
-    )
-    counts = [int(best.state[0]) for best in made]
-    scores = np.concatenate([best.scores[:count] for best, count in zip(made, counts)])
-    numbers = np.concatenate([best.numbers[:count] for best, count in zip(made, counts)])
-    poses = np.concatenate([best.poses[:count] for best, count in zip(made, counts)])
-    order = np.lexsort([numbers, scores])[:most]
-    return poses[order]
-
-
-def fit(model, twists, poses, steps):
-    spread(
-        lambda first, last, scratch: fit_poses(model, twists, poses, steps, first, last, scratch),
-        len(poses), lambda: fit_for(model, len(twists.basis)), least=8,
-    )
-
-
-def moves(stream, chains, count):
-    draws = 2.0 * stream.random((chains, count, MOVE_DRAWS)) - 1.0
-    draws[:, :, 3:] *= np.sqrt(3.0)
-    draws[:, :, 1:3] = 0.5 * draws[:, :, 1:3] + 0.5
-    draws[:, :, 0] = np.power(10.0, -0.3 + 0.6 * draws[:, :, 0])
-    return draws
-
-
-def walked(model, stride, floor, poses, e, draws, kept):
-    chains = chains_from(poses, e, kept)
-    spread(
-        lambda first, last, steps: walk_below(model, stride, floor, chains, draws, first, last, steps),
-        len(poses), lambda: steps_for(model), least=2,
-    )
-    return chains
-
-
-def facilities(points, weights, count):
-    chosen = np.zeros(count, dtype=np.int64)
-    size = len(points)
-    done = locate_facilities(points, weights, 1, chosen, np.empty(size), np.empty((size, size)))
-    return chosen[:done]
+def _evenly(size: int, count: int) -> IntArray:
+    """At most so many of the numbers below size, evenly spaced, the first among them."""
+    return np.arange(size) if size <= count else np.arange(count) * size // count
