@@ -21,12 +21,12 @@ from chsel.methods import METHODS
 from chsel.settings import build_settings
 from runners.cli import command, plain
 from runners.evaluation.configurations import SENSORS
-from runners.evaluation.contenders import chosen_contenders, require_label
+from runners.evaluation.contenders import chosen_contenders, drawn, require_label
 from runners.evaluation.display import Display
 from runners.evaluation.experiment import join_experiment, read_experiment
 from runners.evaluation.gathering import gather
 from runners.evaluation.measure import MetricsConfig
-from runners.evaluation.outside import outside_file, read_outside
+from runners.evaluation.outside import outside_file, outside_folders, read_outside
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
 from runners.evaluation.schedule import Progress, Schedule
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
@@ -73,6 +73,7 @@ class EvaluateConfig:
     objects: str = "models"
     steps: str | None = None
     starts: str = OWN
+    draws: int = 1
     recordings: bool = True
     workers: int | None = None
 
@@ -137,8 +138,9 @@ def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
 
 
 def _plan(config: EvaluateConfig) -> Plan:
-    outside = {str(name): Path(folder).expanduser() for name, folder in config.outside.items()}
+    given = {str(name): Path(folder).expanduser() for name, folder in config.outside.items()}
     chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
+    chosen = drawn(chosen, config.draws)
     logs = config.session.get("logs")
     return Plan(
         folder=Path(config.out).expanduser(),
@@ -153,7 +155,7 @@ def _plan(config: EvaluateConfig) -> Plan:
         recordings=config.recordings,
         assets=config.assets.folder,
         contenders={contender.label: contender for contender in chosen},
-        outside=outside,
+        outside=outside_folders(given),
         logs=Path(str(logs)).expanduser() if logs is not None else None,
         truth=config.truth,
     )

@@ -16,7 +16,11 @@ from rich.console import Console
 from chsel.errors import SettingError
 from chsel.settings import build_settings, settings_mapping
 from runners.cli import command, plain
+from runners.reporting.against_baseline import section_against
+from runners.reporting.completeness import planned_methods
+from runners.reporting.console_table import print_table
 from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.method_style import method_styles
 from runners.reporting.page import Page, as_html, as_markdown, page_of
 from runners.reporting.sections import SequenceConfig, sections_of
 from runners.whole_file import whole_file
@@ -32,6 +36,7 @@ class ReportConfig:
 
     sequence: SequenceConfig
     dir: str | None = None
+    baseline: str | None = None
     out: str | None = None
 
     def __post_init__(self) -> None:
@@ -47,11 +52,16 @@ def main(config: DictConfig) -> None:
     out = Path(checked.out).expanduser() if checked.out else folder / "report"
     evaluation = open_evaluation(folder)
     console, waiting = Console(highlight=False), Console(stderr=True)
+    if checked.baseline is not None:
+        styles = method_styles(planned_methods(evaluation))
+        for table in section_against(evaluation, styles, checked.baseline).tables:
+            print_table(console, table)
+            console.print()
     if waiting.is_terminal:
         with waiting.status("drawing"):
-            sections = sections_of(evaluation, checked.sequence)
+            sections = sections_of(evaluation, checked.sequence, checked.baseline)
     else:
-        sections = sections_of(evaluation, checked.sequence)
+        sections = sections_of(evaluation, checked.sequence, checked.baseline)
     _write(out, page_of(evaluation, sections, _command(checked)))
     for section in sections:
         if section.missing:
@@ -104,6 +114,8 @@ def _command(config: ReportConfig) -> str:
     chosen = settings_mapping(config.sequence)
     changed = {name: value for name, value in chosen.items() if value != usual[name]}
     settings = [f"sequence.{name}={_value(value)}" for name, value in changed.items()]
+    if config.baseline is not None:
+        settings.insert(0, f"baseline={config.baseline}")
     return shlex.join(["python", "-m", "runners.report", str(config.dir), *settings])
 
 

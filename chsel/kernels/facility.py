@@ -22,7 +22,7 @@ def locate_facilities(points, given, chosen, nearest, apart):  # type: ignore[no
             total = 0.0
             for d in range(dimension):
                 total += (points[i, d] - points[j, d]) * (points[i, d] - points[j, d])
-            apart[i, j] = apart[j, i] = np.sqrt(total)
+            apart[i, j] = apart[j, i] = total
     for n in range(len(chosen)):
         if n >= given:
             best, least = -1, np.inf

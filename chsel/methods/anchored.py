@@ -23,7 +23,7 @@ from chsel.space import PlaneSettings, search_space, transforms_of
 
 MOST = 100_000_000
 _KEPT = 6  # states of a chain
-_POOL = 400  # candidates to choose from
+_POOL = 800  # candidates to choose from
 _MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
 _MOST_CHOSEN = 300  # by facility location; more of them are taken evenly
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted

@@ -26,6 +26,10 @@ class BenchmarkError(ChselError):
     """The published package cannot be installed, started or run."""
 
 
+class RefusedError(BenchmarkError):
+    """The package cannot do what it was asked for; its process goes on."""
+
+
 @dataclass(frozen=True)
 class PackageConfig:
     """Where the published package is.
@@ -94,7 +98,7 @@ class PublishedPackage:
         if "error" in answer:
             text = " ".join(answer["error"].split())
             hint = "; on Debian, apt install libusb-1.0-0" if "libusb" in text else ""
-            raise BenchmarkError(f"{text}{hint}")
+            raise RefusedError(f"{text}{hint}")
         return answer
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -74,19 +75,23 @@ class Worker:
         origin, shape = self._data["sdf_origin"], self._data["sdf_values"].shape
         self._resolution = float(self._data["sdf_resolution"])
         last = origin + (np.array(shape) - 1) * self._resolution
-        self._sdf = self._volumetric.CachedSDF(
-            "object",
-            self._resolution,
-            list(zip(origin.tolist(), last.tolist(), strict=True)),
-            GridSdf(self._data),
-            cache_path=str(Path(tempfile.mkdtemp(dir=self._folder)) / "sdf.pkl"),
-        )
+        with tempfile.TemporaryDirectory(dir=self._folder) as folder:  # never read again
+            self._sdf = self._volumetric.CachedSDF(
+                "object",
+                self._resolution,
+                list(zip(origin.tolist(), last.tolist(), strict=True)),
+                GridSdf(self._data),
+                cache_path=str(Path(folder) / "sdf.pkl"),
+            )
         free, contacts = self._data["free"], self._data["contacts"]
+        occupied = self._data.get("occupied", np.zeros((0, 3)))
         classes = self._chsel.SemanticsClass
-        self._positions = torch.tensor(np.concatenate([free, contacts]), dtype=torch.float32)
-        self._semantics = torch.tensor(
-            [classes.FREE.value] * len(free) + [classes.SURFACE.value] * len(contacts)
-        )
+        points = np.concatenate([free, contacts, occupied])
+        self._positions = torch.tensor(points, dtype=torch.float32)
+        semantics = [classes.FREE.value] * len(free) + [classes.SURFACE.value] * len(contacts)
+        if len(occupied):
+            semantics += [classes.OCCUPIED.value] * len(occupied)
+        self._semantics = torch.tensor(semantics)
         self._initial_set = torch.tensor(self._data["initial_set"], dtype=torch.float32)
         return {"loaded": problem}
 
@@ -98,38 +103,71 @@ class Worker:
         Runs all `restarts` x `steps` steps: the package's own test for convergence is false for
         every cost when its threshold is not a number.
         """
-        torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002  (what the package draws from)
         block = functools.partial(
             self._descent, max_iterations=restarts, relative_rmse_thr=float("nan"), iterations=steps
         )
         self._chsel.sgd.volumetric_registration_sgd = block
         counted = _counting(getattr(self._chsel, _COSTS[cost]))
-        begun = time.perf_counter()
+        found = self._registered(seed, {"qd_iterations": search, "cost": counted}, {})
+        return {
+            "seconds": found.seconds,
+            "poses": _matrices(found.result.RTs.R, found.result.RTs.T),
+            "cost_calls": counted.calls,
+            "cost_calls_with_gradient": counted.calls_with_gradient,
+            "poses_evaluated": counted.poses,
+            "free_points": found.free_points,
+        }
+
+    def register_as_published(self, seed: int) -> dict[str, Any]:
+        """Construct and register once, all that the problem does not say as the package has it.
+
+        Gives seconds, those of the processor alone, poses (B, 4, 4) of object_from_world with
+        their cost (B,), and the poses (L, 4, 4) of the archive's elites: E_l of the next
+        registration.
+        """
+        self._chsel.sgd.volumetric_registration_sgd = self._descent
+        measure = self._chsel.measure.PositionMeasure(2)  # the package's own choice
+        given: dict[str, Any] = {}
+        if len(self._data["low_cost_set"]):
+            low_cost_set = torch.tensor(self._data["low_cost_set"], dtype=torch.float32)
+            vectors = measure.get_numpy_x(low_cost_set[:, :3, :3], low_cost_set[:, :3, 3])
+            given["low_cost_transform_set"] = vectors
+        known = torch.tensor(self._data["known_sdf"], dtype=torch.float32)
+        found = self._registered(seed, {"known_sdf_values": known}, given)
+        elites = measure.get_torch_RT(np.asarray(found.elites))
+        return {
+            "seconds": found.seconds,
+            "cpu_seconds": found.cpu_seconds,
+            "poses": _matrices(found.result.RTs.R, found.result.RTs.T),
+            "cost": found.result.rmse.tolist(),
+            "elites": _matrices(*elites),
+            "free_points": found.free_points,
+        }
+
+    def _registered(self, seed: int, construct: dict[str, Any], register: dict[str, Any]) -> Any:
+        """What the package finds, with more arguments for its constructor and for register."""
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002  (what the package draws from)
+        begun, cpu = time.perf_counter(), time.process_time()
         registration = self._chsel.CHSEL(
             self._sdf,
             self._positions,
             self._semantics,
             resolution=self._resolution,
             free_voxels_resolution=float(self._data["free_spacing"]),
-            qd_iterations=search,
-            cost=counted,
             savedir=self._folder,
+            **construct,
         )
-        result, _ = registration.register(
-            iterations=1, initial_tsf=self._initial_set, batch=len(self._initial_set)
+        result, elites = registration.register(
+            iterations=1, initial_tsf=self._initial_set, batch=len(self._initial_set), **register
         )
-        seconds = time.perf_counter() - begun
-        poses = torch.eye(4, dtype=torch.float64).repeat(len(result.RTs.R), 1, 1)
-        poses[:, :3, :3], poses[:, :3, 3] = result.RTs.R, result.RTs.T
-        return {
-            "seconds": seconds,
-            "poses": poses.tolist(),
-            "cost_calls": counted.calls,
-            "cost_calls_with_gradient": counted.calls_with_gradient,
-            "poses_evaluated": counted.poses,
-            "free_points": _free_points(registration.volumetric_cost.free_voxels),
-        }
+        return SimpleNamespace(
+            seconds=time.perf_counter() - begun,
+            cpu_seconds=time.process_time() - cpu,
+            result=result,
+            elites=elites,
+            free_points=_free_points(registration.volumetric_cost.free_voxels),
+        )
 
 
 def _counting(cost: Any) -> Any:
@@ -147,6 +185,13 @@ def _counting(cost: Any) -> Any:
             return super().__call__(R, T, s, other_info)
 
     return Counting
+
+
+def _matrices(rotation: Any, position: Any) -> list[Any]:
+    """Transforms (B, 4, 4) as nested lists."""
+    transforms = torch.eye(4, dtype=torch.float64).repeat(len(rotation), 1, 1)
+    transforms[:, :3, :3], transforms[:, :3, 3] = rotation, position
+    return transforms.tolist()
 
 
 def _free_points(voxels: Any) -> int:

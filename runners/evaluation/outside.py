@@ -19,6 +19,7 @@ from chsel.pose import inverse
 from chsel.problem import Hypotheses
 from chsel.selection import repeated
 from replay.file_digest import file_digest
+from runners.evaluation.draws import MOST_DRAWS, draw_label
 from runners.evaluation.judge import Judge
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.table import RESULTS, Row, write_part
@@ -26,6 +27,8 @@ from runners.evaluation.trial_session import open_recorded, problems
 
 PRESET = "outside"
 """What the table has for a preset."""
+DRAW_FOLDER = "draw_{}"
+"""Where further sets of the same sessions are, in the folder of the first ones."""
 SUFFIXES = (".npz", ".json")
 _TOLERANCE = 1e-5  # of the entries of R^T R - 1: transforms may have been written as text
 _KEY = re.compile(r"(step|cost|seconds)_(\d{1,10})")
@@ -55,6 +58,18 @@ class OutsideSet:
         poses = inverse(self.world_from_object)[order]
         cells = np.full(len(poses), -1, dtype=np.int64)
         return Hypotheses(poses, cost[order], repeated(poses), cells, poses)
+
+
+def outside_folders(given: Mapping[str, Path]) -> dict[str, Path]:
+    """Folders by label: those given, and under a label of its own every draw in them."""
+    found = dict(given)
+    for label, folder in given.items():
+        for draw in range(1, MOST_DRAWS):
+            of_draw = folder / DRAW_FOLDER.format(draw)
+            if not of_draw.is_dir():
+                break
+            found.setdefault(draw_label(label, draw), of_draw)
+    return found
 
 
 def outside_file(folder: Path, trial: Trial) -> Path | None:

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from chsel.errors import SettingError, require_choice
+from chsel.errors import require_choice
 from chsel.evaluation.plausible_settings import PlausibleSettings
 from chsel.evaluation.true_pose import TruePoseSettings
 from chsel.methods import build_method, preset_settings

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from chsel.errors import RecordingError
 from chsel.evaluation.error import EvaluationError
@@ -64,7 +65,11 @@ def make_session(plan: Plan, trial: Trial) -> None:
 
 def read_session(plan: Plan, trial: Trial) -> TrialSession:
     """What `make_session` wrote down. Raises RecordingError if the file is damaged."""
-    path = trial.folder(plan) / "session.json"
+    return read_told(trial.folder(plan) / "session.json")
+
+
+def read_told(path: Path) -> TrialSession:
+    """What a session.json tells. Raises RecordingError if it is damaged."""
     try:
         told = json.loads(path.read_text())
         failures = {int(step): str(text) for step, text in told["no_plausible_set"].items()}

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from runners.reporting.evaluation_folder import Evaluation, Trial
+from runners.evaluation.draws import draw_of
+from runners.reporting.evaluation_folder import Evaluation, Trial, asked_labels, named
 from runners.reporting.method_style import MethodStyle
 from runners.reporting.section import Cell, Table
 from runners.reporting.statistics import grouped, trial_of
@@ -19,7 +20,7 @@ _Reason = tuple[str, str, str]
 
 def planned_trials(evaluation: Evaluation) -> list[Trial]:
     """Configurations with seeds that were asked for; those that are there, if it is not told."""
-    configurations = _names(evaluation.experiment.get("configurations"))
+    configurations = named(evaluation.experiment.get("configurations"))
     seeds = evaluation.experiment.get("seeds")
     if not configurations or not isinstance(seeds, list):
         return sorted({trial_of(row) for row in evaluation.rows})
@@ -28,8 +29,9 @@ def planned_trials(evaluation: Evaluation) -> list[Trial]:
 
 def planned_methods(evaluation: Evaluation) -> list[str]:
     """Labels that were asked for, then those that are there besides."""
-    asked = [_names(evaluation.experiment.get(kind)) for kind in ("methods", "outside")]
-    return list(dict.fromkeys([*asked[0], *asked[1], *evaluation.methods]))
+    asked = asked_labels(evaluation.experiment)
+    without_draws = [draw_of(label, asked)[0] for label in asked]
+    return list(dict.fromkeys([*without_draws, *evaluation.methods]))
 
 
 def completeness_table(evaluation: Evaluation, styles: Styles) -> Table:
@@ -121,20 +123,6 @@ def _lines(
 
 def _failed(row: Mapping[str, Any]) -> bool:
     return str(row["status"]).startswith(_FAILED)
-
-
-def _names(value: Any) -> list[str]:
-    """Names in a list, of which some may be mappings with a label or a name, or in a mapping."""
-    if isinstance(value, str):
-        return [value]
-    if isinstance(value, Mapping):
-        return [str(name) for name in value]
-    if not isinstance(value, list):
-        return []
-    return [
-        str(entry.get("label") or entry.get("name")) if isinstance(entry, Mapping) else str(entry)
-        for entry in value
-    ]
 
 
 def _ranges(numbers: Iterable[int]) -> str:

@@ -14,6 +14,7 @@ import pyarrow
 import pyarrow.parquet
 
 from chsel.errors import ChselError
+from runners.evaluation.draws import draw_of
 
 EXPERIMENT = "experiment.json"
 RESULTS = "results.parquet"
@@ -38,9 +39,10 @@ class Evaluation:
     """An evaluation, as far as it has come.
 
     experiment: how it was asked for, plain values. rows: a mapping of every registration, None
-    where there is no finite number; sorted by object, configuration, seed, method, step.
-    iterations: the same of moments within registrations. gathered: whether the rows come from
-    finished parts, as there is no table of all yet.
+    where there is no finite number; sorted by object, configuration, seed, method, step, draw.
+    Draws of a method are told apart by their `draw` alone, 0 for the first. iterations: the same
+    of moments within registrations. gathered: whether the rows come from finished parts, as there
+    is no table of all yet.
     """
 
     folder: Path
@@ -82,10 +84,33 @@ def open_evaluation(folder: Path) -> Evaluation:
     experiment = _experiment(folder / EXPERIMENT)
     rows, gathered = _table(folder, RESULTS, "trials/*/seed_*/*.parquet")
     iterations, _ = _table(folder, ITERATIONS, "trials/*/seed_*/*.iterations.parquet")
+    labels = {str(row["method"]) for row in rows} | set(asked_labels(experiment))
+    for row in [*rows, *iterations]:
+        row["method"], row["draw"] = draw_of(row["method"], labels)
     order = ("object", "configuration", "seed", "method", "step")
-    rows.sort(key=lambda row: [_sortable(row[name]) for name in order])
-    iterations.sort(key=lambda row: [_sortable(row[name]) for name in (*order[1:], "iteration")])
+    rows.sort(key=lambda row: [_sortable(row[name]) for name in (*order, "draw")])
+    moments = (*order[1:], "iteration", "draw")
+    iterations.sort(key=lambda row: [_sortable(row[name]) for name in moments])
     return Evaluation(folder, experiment, rows, iterations, gathered)
+
+
+def asked_labels(experiment: Mapping[str, Any]) -> list[str]:
+    """Labels of methods and of sets from outside that were asked for, those of draws too."""
+    return [name for kind in ("methods", "outside") for name in named(experiment.get(kind))]
+
+
+def named(value: Any) -> list[str]:
+    """Names in a list, of which some may be mappings with a label or a name, or in a mapping."""
+    if isinstance(value, str):
+        return [value]
+    if isinstance(value, Mapping):
+        return [str(name) for name in value]
+    if not isinstance(value, list):
+        return []
+    return [
+        str(entry.get("label") or entry.get("name")) if isinstance(entry, Mapping) else str(entry)
+        for entry in value
+    ]
 
 
 def _experiment(path: Path) -> Mapping[str, Any]:

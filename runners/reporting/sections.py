@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from chsel.errors import require_choice
+from runners.reporting.against_baseline import section_against
 from runners.reporting.box_plots import picture_of_boxes
 from runners.reporting.completeness import (
     completeness_table,
@@ -62,8 +63,10 @@ class SequenceConfig:
                 raise ReportError(f"{name} is empty; accepted: at least one, or null")
 
 
-def sections_of(evaluation: Evaluation, sequence: SequenceConfig) -> list[Section]:
-    """The sections; a picture that cannot be drawn says why."""
+def sections_of(
+    evaluation: Evaluation, sequence: SequenceConfig, baseline: str | None = None
+) -> list[Section]:
+    """The sections; a picture that cannot be drawn says why. baseline: to compare all with."""
     styles = method_styles(planned_methods(evaluation))
     half = last_half(evaluation.rows)
     chsel_medial = ("chsel", "medial_constraint", "medial_constraint_cma_me")
@@ -80,6 +83,7 @@ def sections_of(evaluation: Evaluation, sequence: SequenceConfig) -> list[Sectio
             ),
         ),
         *true_pose_sections(evaluation),
+        *([] if baseline is None else [section_against(evaluation, styles, baseline)]),
         _over_probes(evaluation, styles),
         _boxes(half, styles),
         _times(evaluation, styles),

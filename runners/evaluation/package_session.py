@@ -1,0 +1,119 @@
+"""The published package on the recorded session of a trial, each step from the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.errors import PoseError
+from chsel.online import pose_problem
+from chsel.pose import inverse, nearest_rigid
+from chsel.presets import ONLINE
+from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.selection import repeated
+from chsel.streams import Purpose, StreamKey
+from runners.benchmarks.published import PublishedPackage, RefusedError
+from runners.sessions.recorded import RecordedSession, RecordedSettings
+
+HOW = replace(ONLINE["reference"], initial="so3")
+"""E_0 and E_l as the package's authors make them, but first from the starts that all others get."""
+
+
+@dataclass(frozen=True, eq=False)
+class PackageSet:
+    """What the package has found.
+
+    seconds: that it took, its constructor included. cpu_seconds: those of its one thread alone,
+    which are fewer where others keep the processor busy. free_points: that it knew of.
+    """
+
+    hypotheses: Hypotheses
+    seconds: float
+    cpu_seconds: float
+    free_points: int
+
+    @property
+    def world_from_object(self) -> FloatArray:
+        """The poses (B, 4, 4), best first."""
+        return inverse(self.hypotheses.object_from_world)
+
+
+@dataclass
+class PackageSession:
+    """Registers a session with the package, step by step.
+
+    seed: of all random numbers. warm: whether it has registered before; the first of all
+    registrations runs twice, so that no time holds what is loaded only once.
+    """
+
+    package: PublishedPackage
+    seed: int
+    warm: bool = False
+
+    def sets(self, path: Path, steps: Collection[int]) -> Iterator[tuple[int, PackageSet | str]]:
+        """What is found at each of the steps, or why nothing is. path: of the recording."""
+        session = RecordedSession(RecordedSettings(str(path)))
+        of, points = session.recorded, session.initial_points
+        previous: Hypotheses | None = None
+        for probe in session.probes():
+            points = points.merged(probe.new_points)
+            if probe.step not in steps:
+                continue
+            key, resolution = StreamKey(self.seed, probe.step), session.free_resolution
+            problem = pose_problem(
+                of.sdf, points, session.workspace, resolution, key, HOW, previous
+            )
+            try:
+                found = self._registered(problem, of.mesh)
+            except (RefusedError, PoseError) as error:
+                yield probe.step, " ".join(str(error).split())
+            else:
+                previous = found.hypotheses
+                yield probe.step, found
+
+    def _registered(self, problem: RegistrationProblem, mesh: trimesh.Trimesh) -> PackageSet:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "problem.npz"
+            save_problem(problem, mesh, path)
+            self.package.ask("load", problem=str(path))
+        # It draws from generators of its own, of one number that follows from ours.
+        seed = int(problem.key.stream(Purpose.EMITTER).integers(2**32))
+        if not self.warm:
+            self.package.ask("register_as_published", seed=seed)
+            self.warm = True
+        answer = self.package.ask("register_as_published", seed=seed)
+        poses = nearest_rigid("a pose of the package", np.array(answer["poses"]))
+        elites = nearest_rigid("an elite of the package", np.array(answer["elites"]))
+        cost = np.array(answer["cost"], dtype=np.float64)
+        if not np.isfinite(cost).all():
+            raise RefusedError("a cost of the package is not finite")
+        order = np.argsort(cost, kind="stable")
+        poses, cells = poses[order], np.full(len(poses), -1, dtype=np.int64)
+        found = Hypotheses(poses, cost[order], repeated(poses), cells, elites)
+        seconds, cpu = float(answer["seconds"]), float(answer["cpu_seconds"])
+        return PackageSet(found, seconds, cpu, int(answer["free_points"]))
+
+
+def save_problem(problem: RegistrationProblem, mesh: trimesh.Trimesh, path: Path) -> None:
+    """Write the arrays from which the package's process starts."""
+    np.savez(
+        path,
+        sdf_origin=problem.sdf.origin,
+        sdf_resolution=problem.sdf.resolution,
+        sdf_values=problem.sdf.values,
+        sdf_gradients=problem.sdf.gradients,
+        object_bounds=np.asarray(mesh.bounds, dtype=np.float64),
+        free=problem.points.free,
+        free_spacing=problem.free_resolution,
+        contacts=problem.points.known,
+        known_sdf=problem.points.sdf,
+        occupied=problem.points.occupied,
+        initial_set=problem.initial_set,
+        low_cost_set=problem.low_cost_set,
+    )

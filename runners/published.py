@@ -1,0 +1,153 @@
+"""`python -m runners.published`: the published package on the sessions of an evaluation."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from chsel.errors import SettingError
+from chsel.settings import build_settings
+from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
+from runners.cli import command, plain
+from runners.evaluation.display import Display
+from runners.evaluation.draws import draw_seed, require_draws
+from runners.evaluation.package_files import PackageFiles
+from runners.evaluation.package_session import PackageSession
+from runners.evaluation.plan import Trial
+from runners.evaluation.schedule import Progress
+from runners.evaluation.selection import chosen_seeds
+from runners.evaluation.trial_session import read_told
+
+_SEED = re.compile(r"seed_(\d{1,19})")
+
+
+@dataclass(frozen=True)
+class PublishedConfig:
+    """conf/published.yaml, checked. What is Any is checked by whoever it concerns."""
+
+    configurations: Any
+    seeds: Any
+    package: PackageConfig
+    dir: str | None = None
+    out: str | None = None
+    draws: int = 1
+
+    def __post_init__(self) -> None:
+        require_draws(self.draws)
+        if not self.dir:
+            raise SettingError("dir is missing; pass dir=FOLDER, of an evaluation")
+
+    @property
+    def folder(self) -> Path:
+        """Of the sets."""
+        evaluation = Path(self.dir or "").expanduser()
+        return Path(self.out).expanduser() if self.out else evaluation / "package"
+
+
+@command("published")
+def main(config: DictConfig) -> None:
+    """Register what is not registered yet."""
+    checked = build_settings(PublishedConfig, plain(config), "published")
+    trials = found_trials(checked)
+    display = Display()
+    with PublishedPackage(interpreter(checked.package, display.say)) as package:
+        files = [
+            PackageFiles(checked.folder, trial, draw, session, steps, package.versions)
+            for draw in range(checked.draws)
+            for trial, session in trials
+            if (steps := read_told(session.with_suffix(".json")).steps)
+        ]
+        try:
+            register(files, package, display)
+        finally:
+            display.close()
+    failed = [line for one in files for line in failures(one)]
+    for line in failed:
+        display.say(line)
+    display.say(f"sets of {len(files)} sessions, draws apart, are in {checked.folder}")
+    display.say(f"the evaluation's command ranks them with outside.package={checked.folder}")
+    if failed:
+        sys.exit(1)
+
+
+def register(files: Sequence[PackageFiles], package: PublishedPackage, display: Display) -> None:
+    """Write all files that are not there yet, and show how far it is."""
+    open_files = [one for one in files if one.finished() is None]
+    progress = Progress(len(files), finished=len(files) - len(open_files))
+    display.say(f"{len(files)} sessions, of which {progress.finished} are finished")
+    begun, warm = time.monotonic(), False
+    for one in open_files:
+        progress.running = [one.unit]
+        display.progress(progress)
+        run = PackageSession(package, draw_seed(one.trial.seed, one.draw), warm)
+        found = {}
+        for step, result in run.sets(one.session, one.steps):
+            found[step] = result
+            display.progress(progress)
+        one.write(found)
+        warm = run.warm
+        progress.done += 1
+        left = len(open_files) - progress.done
+        progress.seconds_left = left * (time.monotonic() - begun) / progress.done
+    progress.running = []
+    display.progress(progress)
+
+
+def failures(files: PackageFiles) -> list[str]:
+    """A line for every step at which the package has found nothing."""
+    about = files.finished() or {}
+    return [
+        f"failed: {files.unit}: step {step}: {reason}"
+        for step, reason in about.get("failed", {}).items()
+    ]
+
+
+def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
+    """Trials with a finished session and its recording, seed by seed.
+
+    Raises SettingError if the settings name none.
+    """
+    folder = Path(config.dir or "").expanduser()
+    found = []
+    for told in folder.glob("trials/*/seed_*/session.json"):
+        seed, session = _SEED.fullmatch(told.parent.name), told.with_suffix(".mcap")
+        if seed is not None and session.is_file():
+            found.append((Trial(int(seed[1]), told.parent.parent.name), session))
+    if not found:
+        raise SettingError(
+            f"dir {folder} has no sessions; accepted: a folder that runners.evaluate has written"
+        )
+    patterns = _patterns(config.configurations)
+    seeds = None if config.seeds is None else chosen_seeds(config.seeds)
+    chosen = [
+        (trial, session)
+        for trial, session in found
+        if any(fnmatchcase(trial.configuration, pattern) for pattern in patterns)
+        and (seeds is None or trial.seed in seeds)
+    ]
+    if not chosen:
+        names = ", ".join(sorted({trial.configuration for trial, _ in found}))
+        there = ", ".join(map(str, sorted({trial.seed for trial, _ in found})))
+        raise SettingError(
+            f"configurations={config.configurations} and seeds={config.seeds} name no session; "
+            f"accepted: all, patterns, or {names}; seeds {there}"
+        )
+    return sorted(chosen)
+
+
+def _patterns(value: Any) -> list[str]:
+    listed = value if isinstance(value, list | tuple) else [value]
+    texts = [text.strip() for part in listed for text in str(part).split(",")]
+    return ["*" if text == "all" else text for text in texts]
+
+
+if __name__ == "__main__":
+    main()
