@@ -3,6 +3,9 @@
 One thing differs from the paper in all of them: beyond the SDF grid, where the paper queries the
 mesh, distances come from the grid's border (see SdfGrid.query), so that a problem holds all that
 determines its result.
+
+What came to `default` later is off in the classes of the settings, so that recordings made before
+it give the same bits.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from chsel.descent import DescentSettings
 from chsel.emitters import EmitterSettings
 from chsel.online import OnlineSettings
 from chsel.selection import ArchiveSettings, OutputSettings
+from chsel.starts import AnchoredStarts
 
 PRESETS = ("default", "paper", "reference")
 
@@ -27,18 +31,25 @@ DESCENT = {
     "paper": DescentSettings(stop_below=None),
     "reference": DescentSettings(),
 }
+STARTS = {"default": AnchoredStarts(), "paper": None, "reference": None}
 ARCHIVE = {
-    "default": ArchiveSettings(),
+    "default": ArchiveSettings(measure="object_xy", bins=56),
     "paper": ArchiveSettings(outliers="none", least_deviation=1e-4),
     "reference": ArchiveSettings(least_deviation=1e-4, tolerance_per_point=0.0, tolerance=0.1),
 }
 EMITTER = {
-    "default": EmitterSettings(),
+    "default": EmitterSettings(sigma0=0.005, rate=0.01),
     "paper": EmitterSettings(start="initial"),
     "reference": EmitterSettings(start="initial", ribs_parity=True),
 }
 OUTPUT = {
-    "default": OutputSettings(),
+    "default": OutputSettings(
+        choice="representative",
+        ratio=1.3,
+        tolerance_per_point=5e-4,
+        free_tolerance=0.01,
+        margin=0.15,
+    ),
     "paper": OutputSettings(limit="none", shortage="fewer"),
     "reference": OutputSettings(limit="ratio", shortage="resample"),
 }

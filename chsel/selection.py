@@ -7,14 +7,23 @@ from typing import Protocol
 
 import numpy as np
 
+from chsel.anchors import bounds_of
 from chsel.archive import GridArchive
 from chsel.arrays import BoolArray, FloatArray, IntArray
+from chsel.diverse import representative
+from chsel.engine import poses_of
 from chsel.errors import ChselError, require_at_most, require_choice, require_positive
 from chsel.measures import MEASURES, Measure
-from chsel.problem import ArchiveSnapshot, Hypotheses
+from chsel.pose import inverse
+from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.sdf import SdfGrid
 from chsel.space import SearchSpace
+from chsel.surface import has_surface
 
 MOST_CELLS = 10_000_000
+_POOL = 400  # elites that are considered
+_MOST_POOL = 1200  # for many hypotheses
+_MOST_REPRESENTATIVE = 300
 
 
 @dataclass(frozen=True)
@@ -53,26 +62,35 @@ class ArchiveSettings:
 class OutputSettings:
     """How hypotheses are chosen from the archive.
 
+    choice: "lowest" for the lowest costs, "representative" for those below the limit that all
+    others below it are near to; it is "lowest" where no more than wanted are below.
     limit: "none" for the cells of lowest cost whatever it is, "ratio" for those below
     ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
     and lowest cost + tolerance_per_point x known points + free_tolerance.
     shortage: what fills a set of too few: "next_best" the next cells, then copies; "resample"
     copies drawn with replacement; "fewer" nothing.
+    margin: metres by which the object's origin may be beside the workspace, as long as any pose
+    is in there; None: it may be anywhere.
     """
 
+    choice: str = "lowest"
     limit: str = "noise"
     ratio: float = 5.0
     tolerance: float = 1e-6
     tolerance_per_point: float = 2e-3
     free_tolerance: float = 0.2
     shortage: str = "next_best"
+    margin: float | None = None
 
     def __post_init__(self) -> None:
+        require_choice("choice", self.choice, ("lowest", "representative"))
         require_choice("limit", self.limit, ("none", "ratio", "noise"))
         require_choice("shortage", self.shortage, ("next_best", "resample", "fewer"))
         require_positive("ratio", self.ratio)
         for name in ("tolerance", "tolerance_per_point", "free_tolerance"):
             require_positive(name, getattr(self, name), zero=True)
+        if self.margin is not None:
+            require_positive("margin", self.margin, zero=True)
 
 
 def sized_archive(
@@ -103,19 +121,63 @@ def _inliers(costs: FloatArray, settings: ArchiveSettings, known_count: int) -> 
 
 def select_elites(
     costs: FloatArray,
-    count: int,
+    elites: FloatArray,
+    problem: RegistrationProblem,
+    space: SearchSpace,
     settings: OutputSettings,
-    known_count: int,
     stream: np.random.Generator,
 ) -> IntArray:
-    """Indices (count,), or fewer if so set, of the elites with costs (C,) to return, best first."""
+    """Indices of as many elites as E_0 has, or fewer if so set, best first.
+
+    Of elites (C, 4, 4) with costs (C,).
+    """
+    count, known_count = len(problem.initial_set), len(problem.points.known)
     order = np.argsort(costs, kind="stable")
-    good = order[costs[order] <= _limit(costs, settings, known_count)]
+    order = order[within_workspace(elites[order], problem, space, settings.margin)]
+    good = order[costs[order] <= _limit(costs[order], settings, known_count)]
+    if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
+        return good[_representatives(problem.sdf, poses_of(elites[good]), count)]
     if len(good) >= count or settings.shortage == "fewer":
         return good[:count]
     if settings.shortage == "resample":
         return good[np.sort((stream.random(count) * len(good)).astype(np.int64))]
     return order[np.sort(np.resize(np.arange(len(order)), count))]
+
+
+def within_workspace(
+    object_from_world: FloatArray,
+    problem: RegistrationProblem,
+    space: SearchSpace,
+    margin: float | None,
+) -> BoolArray:
+    """True (B,) where the object's origin is in the workspace, widened by a margin in metres.
+
+    Of transforms (B, 4, 4). All True without a margin, or if there is no such pose.
+    """
+    everywhere = np.ones(len(object_from_world), dtype=bool)
+    if margin is None:
+        return everywhere
+    lower, upper = bounds_of(problem, space, margin)
+    position = inverse(object_from_world)[:, :3, 3]
+    inside: BoolArray = np.all((position >= lower) & (position <= upper), axis=1)
+    return inside if inside.any() else everywhere
+
+
+def _representatives(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
+    """Places (count,) in ascending order, the first among them, of poses (B, 12) in order of cost.
+
+    Of many, those that are considered, and of many wanted, those beyond, are taken evenly.
+    """
+    pool = _evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+    chosen = pool[representative(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
+    others = np.setdiff1d(np.arange(len(poses)), chosen)
+    more = others[_evenly(len(others), count - len(chosen))]
+    return np.sort(np.concatenate([chosen, more]))
+
+
+def _evenly(size: int, count: int) -> IntArray:
+    """At most so many of the numbers below size, evenly spaced, the first among them."""
+    return np.arange(size) if size <= count else np.arange(count) * size // count
 
 
 def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:

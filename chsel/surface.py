@@ -50,6 +50,12 @@ def surface_points(sdf: SdfGrid, count: int, stream: np.random.Generator) -> Flo
     return _refined(sdf, corner[index] + (root - share) * u[index] + share * v[index])
 
 
+def has_surface(sdf: SdfGrid) -> bool:
+    """Whether some nodes of a grid are inside of the object, and some are not."""
+    inside = sdf.values < 0.0
+    return bool(inside.any() and not inside.all())
+
+
 def object_shape(sdf: SdfGrid) -> tuple[FloatArray, FloatArray]:
     """Mean (3,) and standard deviation (3,) of the surface of a grid, in the object frame."""
     return sdf.derived("shape", lambda: _shape(sdf))

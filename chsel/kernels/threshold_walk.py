@@ -19,7 +19,7 @@ from chsel.kernels.pose import pose_at
 from chsel.kernels.tree import Found, walk
 
 DRAWS = 9  # random numbers that a move takes
-_FIRST, _LEAST, _MOST = 0.01, 0.0003, 0.03  # metres: the size of moves
+_FIRST, _LEAST, _MOST = 0.01, 0.00005, 0.03  # metres: the size of moves
 _GROW, _SHRINK = 1.1, 0.97  # it, after a move that was accepted or refused
 _SMALLEST, _RANGE = 0.12589254117941673, 2.763102111592855  # a move's factor: 10^U(-0.9, 0.3)
 _PER_METRE = 6.0  # radians that go with a metre

@@ -32,6 +32,7 @@ def _chsel(preset: str) -> ChselSettings:
         emitter=presets.EMITTER[preset],
         output=presets.OUTPUT[preset],
         online=presets.ONLINE[preset],
+        starts=presets.STARTS[preset],
     )
 
 

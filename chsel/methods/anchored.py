@@ -49,6 +49,8 @@ class Effort:
     descent_moves: int = 266
     chains: int = 96
     moves: int = 300
+    polished: int = 16
+    polish_moves: int = 300
     evaluations: int = 0
     enough: float = 2.0
 
@@ -62,10 +64,10 @@ class Effort:
 
 
 EFFORTS = {
-    "small": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150),
+    "small": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 8, 300),
     "medium": Effort(),
-    "large": Effort(250_000, 504, 6, 150, 15, 120, 500, 120, 1000),
-    "adaptive": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 2_000_000),
+    "large": Effort(250_000, 504, 6, 150, 15, 120, 500, 120, 1000, 32, 1000),
+    "adaptive": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 8, 300, 2_000_000),
 }
 
 
@@ -198,10 +200,19 @@ class _Search:
         self, poses: FloatArray, energies: FloatArray, index: int
     ) -> tuple[FloatArray, FloatArray]:
         """The lowest walk down to the limit that holds so far."""
-        count, moves = self._effort.descents, self._effort.descent_moves
+        effort = self._effort
+        count, moves = effort.descents, effort.descent_moves
         limit = self._limit(energies)
         chains = self._energy.walked(
-            poses[:count], energies[:count], limit, moves, kept=0, index=1 + index
+            poses[:count], energies[:count], limit, moves, kept=0, index=1 + 2 * index
+        )
+        poses = np.concatenate([chains.poses, poses[count:]])
+        energies = np.concatenate([chains.energies, energies[count:]])
+        order = np.argsort(energies, kind="stable")
+        poses, energies = poses[order], energies[order]
+        count, moves = effort.polished, effort.polish_moves
+        chains = self._energy.walked(
+            poses[:count], energies[:count], 0.0, moves, kept=0, index=2 + 2 * index
         )
         poses = np.concatenate([chains.poses, poses[count:]])
         energies = np.concatenate([chains.energies, energies[count:]])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from chsel.arrays import FloatArray
 from chsel.cost_settings import CostSettings
 from chsel.descent import DescentSettings, descend
@@ -22,8 +24,10 @@ from chsel.selection import (
     ranked_hypotheses,
     select_elites,
     sized_archive,
+    within_workspace,
 )
 from chsel.space import PlaneSettings, search_space, transforms_of
+from chsel.starts import AnchoredStarts, anchored_starts
 from chsel.streams import Purpose
 
 MOST_PASSES = 10_000
@@ -34,7 +38,8 @@ class ChselSettings:
     """All settings of CHSEL.
 
     search: "cma_mega" or "cma_me". passes: repetitions of the whole, each from a Gaussian around
-    the best members of the one before. plane: restricts the poses to SE(2).
+    the best members of the one before. starts: those beside E_0. plane: restricts the poses to
+    SE(2).
     """
 
     search: str = "cma_mega"
@@ -45,6 +50,7 @@ class ChselSettings:
     emitter: EmitterSettings = field(default_factory=EmitterSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
+    starts: AnchoredStarts | None = None
     plane: PlaneSettings | None = None
 
     def __post_init__(self) -> None:
@@ -100,8 +106,14 @@ class Chsel:
         """Algorithm 1, line by line."""
         settings, space, measure = self.settings, objective.space, self._measure
         known_count, count = len(problem.points.known), len(initial_set)
-        # 1: E' <- SGD on E_0 with C^
-        estimates, costs = descend(objective, initial_set, settings.descent, observer)
+        starts = initial_set
+        if settings.starts is not None:
+            more = anchored_starts(problem, space, settings.starts, index)
+            starts = np.concatenate([initial_set, more])
+        # 1: E' <- SGD on E_0, and on further starts if there are any, with C^
+        estimates, costs = descend(objective, starts, settings.descent, observer)
+        inside = within_workspace(estimates, problem, space, settings.output.margin)
+        estimates, costs = estimates[inside], costs[inside]
         # 2: P <- m(E')
         vectors = space.encode(estimates)
         measures = objective.measures(measure, vectors)
@@ -119,10 +131,11 @@ class Chsel:
         draws, watch = Draws(problem.key, index), ArchiveWatch(observer, index, settings.search)
         watch.start(archive)
         self._search(objective, archive, start, count, settings.emitter, draws, watch)
-        # 7: E <- cells of M with the |E_0| lowest costs
+        # 7: E <- |E_0| of the cells of M with the lowest costs
         stream = problem.key.stream(Purpose.RESAMPLE, index)
-        chosen = select_elites(archive.costs, count, settings.output, known_count, stream)
         elites = transforms_of(space, archive.solutions)
+        chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
         snapshot = archive.snapshot(settings.emitter.iterations, index)
         cells = archive.occupied[chosen]
-        return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)
+        kept = elites[within_workspace(elites, problem, space, settings.output.margin)]
+        return ranked_hypotheses(objective, elites[chosen], cells, kept, snapshot)

@@ -60,7 +60,7 @@ def preset_medial_constraint_cma_me(preset: str) -> MedialConstraintCmaMeSetting
         cost=MEDIAL_COST[preset],
         cma_es=CMA_ES[preset],
         archive=_ARCHIVE if ours else presets.ARCHIVE[preset],
-        emitter=replace(presets.EMITTER[preset], iterations=ITERATIONS),
+        emitter=_EMITTER if ours else replace(presets.EMITTER[preset], iterations=ITERATIONS),
         output=_OUTPUT if ours else presets.OUTPUT[preset],
         online=presets.ONLINE[preset],
     )
@@ -98,9 +98,8 @@ class MedialConstraintCmaMe:
         watch.start(archive)
         cma_me(objective, archive, start, count, settings.emitter, draws, watch, medial_cma_me)
         # E <- cells of M with the |E_0| lowest costs
-        stream, known_count = key.stream(Purpose.RESAMPLE), len(problem.points.known)
-        chosen = select_elites(archive.costs, count, settings.output, known_count, stream)
-        elites = transforms_of(space, archive.solutions)
+        stream, elites = key.stream(Purpose.RESAMPLE), transforms_of(space, archive.solutions)
+        chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
         snapshot = archive.snapshot(settings.emitter.iterations, 0)
         cells = archive.occupied[chosen]
         return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)

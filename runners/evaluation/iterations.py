@@ -18,9 +18,7 @@ def hypotheses_of(
     settings: with `output` and `plane`, as every method that keeps an archive has them.
     """
     space = search_space(settings.plane, problem.sdf)
-    count, known_count = len(problem.initial_set), len(problem.points.known)
     stream = problem.key.stream(Purpose.RESAMPLE, snapshot.refinement)
-    costs = -snapshot.objectives
-    chosen = select_elites(costs, count, settings.output, known_count, stream)
-    poses = transforms_of(space, snapshot.solutions)
+    costs, poses = -snapshot.objectives, transforms_of(space, snapshot.solutions)
+    chosen = select_elites(costs, poses, problem, space, settings.output, stream)
     return ranked(poses[chosen], costs[chosen], snapshot.cells[chosen], poses)

@@ -1,18 +1,60 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
+from chsel.arrays import FloatArray
+from chsel.errors import SettingError
 from chsel.measures import MEASURES
+from chsel.pose import compose, inverse
 from chsel.selection import ArchiveSettings, OutputSettings, repeated, select_elites, sized_archive
+from chsel.space import search_space
+from chsel.streams import StreamKey
 
 COSTS = np.array([3.0, 0.1, 9.0, 0.2, 0.4, 0.6])
 
 
-def chosen(count: int, **changes: object) -> list[int]:
+def ball(radius: float = 0.05) -> SdfGrid:
+    """A ball by its formula, with nodes 2 cm apart."""
+    origin = np.full(3, -0.1)
+    nodes = origin + np.indices((11, 11, 11)).transpose(1, 2, 3, 0) * 0.02
+    length = np.sqrt((nodes**2).sum(axis=-1))
+    return SdfGrid(origin, 0.02, length - radius, nodes / np.maximum(length, 1e-12)[..., None])
+
+
+def problem_of(count: int, sdf: SdfGrid | None = None) -> RegistrationProblem:
+    """One of so many hypotheses and 10 known points, in a workspace of a metre."""
+    return RegistrationProblem(
+        ball() if sdf is None else sdf,
+        KnownPoints(known=np.full((10, 3), 0.5)),
+        np.tile(np.eye(4), (count, 1, 1)),
+        Workspace((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+        0.05,
+        StreamKey(0, 0),
+    )
+
+
+def at(x: FloatArray) -> FloatArray:
+    """Transforms (B, 4, 4) of an object at (x, 0.5, 0.5), x (B,)."""
+    position = np.stack([x, np.full(len(x), 0.5), np.full(len(x), 0.5)], axis=1)
+    return inverse(compose(np.tile(np.eye(3), (len(x), 1, 1)), position))
+
+
+def selected(
+    costs: FloatArray, x: FloatArray, count: int, *, sdf: SdfGrid | None = None, **changes: object
+) -> list[int]:
+    """Which elites with such costs (C,), at x (C,), are chosen."""
     settings = OutputSettings(**changes)  # type: ignore[arg-type]
-    stream = np.random.default_rng(0)
-    return select_elites(COSTS, count, settings, 10, stream).tolist()
+    problem, stream = problem_of(count, sdf), np.random.default_rng(0)
+    space = search_space(None, problem.sdf)
+    return select_elites(costs, at(x), problem, space, settings, stream).tolist()
+
+
+def chosen(count: int, **changes: Any) -> list[int]:
+    return selected(COSTS, np.full(len(COSTS), 0.5), count, **changes)
 
 
 def test_the_lowest_costs_are_chosen_in_their_order() -> None:
@@ -64,3 +106,62 @@ def test_repetitions_are_flagged_after_the_first() -> None:
     poses = np.stack([np.eye(4), 2 * np.eye(4), np.eye(4), 2 * np.eye(4), 3 * np.eye(4)])
     assert repeated(poses).tolist() == [False, False, True, True, False]
     assert repeated(poses[:0]).tolist() == []
+
+
+GROUPS = np.array([0.1, 0.101, 0.102, 0.103, 0.5, 0.501, 0.502, 0.503, 0.9, 0.901, 0.902, 0.903])
+RISING = np.linspace(0.0, 0.011, len(GROUPS))  # costs: the first group has the lowest
+NEAR: dict[str, Any] = {"tolerance_per_point": 0.002, "free_tolerance": 0.0}  # a limit of 0.02
+
+
+def test_representatives_are_of_all_groups_below_the_limit() -> None:
+    lowest = selected(RISING, GROUPS, 3, **NEAR)
+    assert lowest == [0, 1, 2]
+    representative = selected(RISING, GROUPS, 3, choice="representative", **NEAR)
+    assert [i // 4 for i in representative] == [0, 1, 2]
+    costs = np.where(GROUPS < 0.8, RISING, 1.0)
+    below = selected(costs, GROUPS, 3, choice="representative", **NEAR)
+    assert sorted({i // 4 for i in below}) == [0, 1]
+
+
+def test_as_many_representatives_as_wanted_however_many_there_are() -> None:
+    x = np.linspace(0.0, 1.0, 3000)
+    costs = np.linspace(0.0, 0.01, 3000)
+    for count in (1, 30, 700):
+        found = selected(costs, x, count, choice="representative", **NEAR)
+        assert len(set(found)) == count
+        assert found == sorted(found)
+        gaps = np.diff(np.concatenate([[0.0], np.sort(x[found]), [1.0]]))
+        assert gaps.max() < 2.5 / count + 0.01
+
+
+def test_of_poses_that_are_alike_as_many_are_chosen() -> None:
+    costs = np.linspace(0.0, 0.01, 40)
+    alike = selected(costs, np.full(40, 0.3), 5, choice="representative", **NEAR)
+    assert len(set(alike)) == 5
+    assert alike[0] == 0
+
+
+def test_lowest_are_chosen_where_too_few_are_below_the_limit() -> None:
+    costs = np.where(GROUPS < 0.2, RISING, 1.0 + RISING)
+    assert selected(costs, GROUPS, 6, choice="representative", **NEAR) == [0, 1, 2, 3, 4, 5]
+
+
+def test_lowest_are_chosen_of_an_object_without_a_surface() -> None:
+    thin = ball(radius=-0.01)
+    assert selected(RISING, GROUPS, 3, sdf=thin, choice="representative", **NEAR) == [0, 1, 2]
+
+
+def test_poses_beside_the_workspace_are_not_chosen_unless_all_are() -> None:
+    x = np.array([1.3, 0.2, -0.3, 1.1, 0.9, 7.0])
+    assert selected(COSTS, x, 3) == [1, 3, 4]
+    assert selected(COSTS, x, 3, margin=0.15) == [1, 3, 4]
+    assert selected(COSTS, x, 3, margin=0.05) == [1, 1, 4]
+    assert selected(COSTS, x + 10.0, 3, margin=0.15) == [1, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"), [("choice", "best"), ("margin", -0.1), ("margin", float("nan"))]
+)
+def test_refused_output_settings(setting: str, value: object) -> None:
+    with pytest.raises(SettingError, match=f"{setting} is {value!r}; accepted"):
+        OutputSettings(**{setting: value})  # type: ignore[arg-type]

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
+from chsel.arrays import FloatArray
+from chsel.errors import SettingError
+from chsel.methods import build_method, preset_settings
+from chsel.methods.chsel import Chsel
+from chsel.observer import NullObserver
+from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.settings import settings_mapping
+from chsel.space import PlaneSettings, search_space
+from chsel.starts import AnchoredStarts, anchored_starts
+from chsel.streams import StreamKey
+from chsel.surface import has_surface
+
+BOX = trimesh.creation.box((0.2, 0.1, 0.05))
+GRID = SdfGrid.from_mesh(BOX, resolution=0.01)
+TRUE = inverse(compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(1.0)), np.full(3, 0.4)))
+WORKSPACE = Workspace((0.0, 0.0, 0.0), (0.8, 0.8, 0.8))
+FAR = inverse(compose(np.tile(np.eye(3), (5, 1, 1)), np.full((5, 3), 0.05)))
+STARTS = AnchoredStarts(samples=3000, kept=8)
+
+
+def posed(points: KnownPoints | None = None, sdf: SdfGrid = GRID) -> RegistrationProblem:
+    """A box touched on all sides, of which E_0 (5, 4, 4) knows nothing."""
+    if points is None:
+        surface = trimesh.sample.sample_surface(BOX, 40, seed=1)[0]
+        points = KnownPoints(known=apply(inverse(TRUE), surface))
+    return RegistrationProblem(sdf, points, FAR, WORKSPACE, 0.05, StreamKey(3, 2))
+
+
+def starts_of(
+    problem: RegistrationProblem, index: int = 0, plane: PlaneSettings | None = None
+) -> FloatArray:
+    space = search_space(plane, problem.sdf)
+    return anchored_starts(problem, space, STARTS, index)
+
+
+class Descents(NullObserver):
+    """Keeps the vectors of the first trace of every descent."""
+
+    def __init__(self) -> None:
+        self.first: list[FloatArray] = []
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        """Keep them."""
+        if (stage, iteration) == ("descent", 0):
+            self.first.append(vectors)
+
+
+def test_starts_are_nearer_to_the_contacts_than_e_0() -> None:
+    problem = posed()
+    starts = starts_of(problem)
+    assert starts.shape == (8, 4, 4)
+    np.testing.assert_allclose(inverse(starts) @ starts, np.tile(np.eye(4), (8, 1, 1)), atol=1e-12)
+    known = problem.points.known
+    away = [np.abs(GRID.query(apply(pose, known))[0].numpy()).mean() for pose in starts]
+    assert max(away) < 0.03
+    before = [np.abs(GRID.query(apply(pose, known))[0].numpy()).mean() for pose in FAR]
+    assert min(before) > 0.2
+
+
+def test_every_pass_draws_its_own() -> None:
+    problem = posed()
+    np.testing.assert_array_equal(starts_of(problem), starts_of(problem))
+    assert not np.isin(starts_of(problem, 1), starts_of(problem)).all()
+
+
+def test_starts_on_a_plane_stand_on_it() -> None:
+    world = inverse(starts_of(posed(), plane=PlaneSettings(plane_height=0.3)))
+    np.testing.assert_allclose(world[:, 2, 2], 1.0, atol=1e-12)
+    assert np.ptp(world[:, 2, 3]) < 1e-12
+
+
+def test_without_contacts_starts_are_anywhere_in_the_workspace() -> None:
+    free = np.stack(np.meshgrid(*[np.arange(0.025, 0.2, 0.05)] * 3), axis=-1).reshape(-1, 3)
+    position = inverse(starts_of(posed(KnownPoints(free=free))))[:, :3, 3]
+    assert (position > -0.15).all()
+    assert (position < 0.95).all()
+    assert position.std(axis=0).min() > 0.1
+
+
+def test_there_are_none_of_an_object_without_a_surface() -> None:
+    thin = SdfGrid(GRID.origin, GRID.resolution, np.abs(GRID.values) + 0.01, GRID.gradients)
+    assert has_surface(GRID)
+    assert not has_surface(thin)
+    assert starts_of(posed(sdf=thin)).shape == (0, 4, 4)
+    assert len(build_method("chsel").register(posed(sdf=thin)).cost) == 5
+
+
+@pytest.mark.parametrize("name", ["chsel", "chsel_cma_me"])
+def test_default_finds_what_e_0_is_too_far_from(name: str) -> None:
+    settings = preset_settings(name)
+    assert settings.starts is not None
+    quick = replace(settings, emitter=replace(settings.emitter, iterations=5))
+    observer, problem = Descents(), posed()
+    found = Chsel(replace(quick, starts=STARTS)).register(problem, observer)
+    assert [len(first) for first in observer.first] == [5 + 8]
+    assert len(found.cost) == len(FAR)
+    alone = Chsel(replace(quick, starts=None)).register(problem)
+    assert found.cost[0] < 0.5 * alone.cost[0]
+
+
+@pytest.mark.parametrize("preset", ["paper", "reference"])
+def test_starts_are_off_in_the_other_presets_and_in_older_recordings(preset: str) -> None:
+    settings = preset_settings("chsel", preset)
+    assert (settings.starts, settings.output.margin) == (None, None)
+    assert settings.output.choice == "lowest"
+    older = settings_mapping(settings)
+    del older["starts"], older["output"]["margin"], older["output"]["choice"]
+    assert build_method("chsel", older).settings == settings
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"), [("samples", 0), ("kept", 0), ("samples", 10**9), ("kept", 10**6)]
+)
+def test_refused_numbers(setting: str, value: int) -> None:
+    with pytest.raises(SettingError, match=f"{setting} is {value}; accepted"):
+        AnchoredStarts(**{setting: value})  # type: ignore[arg-type]
