@@ -23,7 +23,7 @@ from chsel.space import PlaneSettings, search_space, transforms_of
 
 MOST = 100_000_000
 _KEPT = 6  # states of a chain
-_POOL = 800  # candidates to choose from
+_POOL = 400  # candidates to choose from
 _MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
 _MOST_CHOSEN = 300  # by facility location; more of them are taken evenly
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
@@ -52,7 +52,7 @@ class Effort:
     polished: int = 16
     polish_moves: int = 300
     evaluations: int = 0
-    enough: float = 2.0
+    enough: float = 4.0
 
     def __post_init__(self) -> None:
         for name in ("samples", "kept", "refined", "descents", "chains", "enough"):
@@ -84,7 +84,7 @@ class AnchoredSettings:
 
     size: str = "medium"
     effort: Effort | None = None
-    noise: float = 0.001
+    noise: float = 0.0005
     penetration_tolerance: float = 0.0
     limit_noise: float = 1.0
     limit_ratio: float = 1.3
