@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.arrays import FloatArray, IntArray
-from chsel.kernels.compiler import compiled, inner, leaf, spliced
 from chsel.kernels.coarse_score import score_below
+from chsel.kernels.compiler import compiled, inner, leaf, spliced
 from chsel.kernels.elementary import sine_cosine
 from chsel.kernels.pose import decode
 
@@ -167,7 +167,7 @@ def _turned(space, draw, vector):  # type: ignore[no-untyped-def]
         return decode(space, vector)[:9]
     s, c = sine_cosine(_TURN * draw[5])
     sine, cosine = sine_cosine(_TURN * draw[6])
-    inner_root, outer_root = np.sqrt(1.0 - draw[7]), np.sqrt(draw[7])
+    inner_root, outer_root = np.sqrt(1.0 - draw[7]), np.sqrt(1.0 * draw[7])
     return matrix_of_quaternion(
         inner_root * s, inner_root * c, outer_root * sine, outer_root * cosine
     )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.arrays import FloatArray, IntArray
-from chsel.kernels.compiler import compiled, inner, leaf, spliced
+from chsel.kernels.compiler import compiled, inner, leaf
 from chsel.kernels.cost import Model, place_in_world, remember, travel
 from chsel.kernels.elementary import exp
 from chsel.kernels.energy import found_around, known_below, with_free

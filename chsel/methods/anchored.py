@@ -18,7 +18,7 @@ from chsel.observer import NullObserver, Observer
 from chsel.online import OnlineSettings
 from chsel.pose import compose
 from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.selection import ArchiveSettings, ranked_hypotheses, sized_archive
+from chsel.selection import ArchiveSettings, ranked_hypotheses, repeated, sized_archive
 from chsel.space import PlaneSettings, search_space, transforms_of
 
 MOST = 100_000_000
@@ -57,8 +57,9 @@ class Effort:
     def __post_init__(self) -> None:
         for name in ("samples", "kept", "refined", "descents", "chains", "enough"):
             require_positive(name, getattr(self, name))
-        for name in ("first_steps", "steps", "descent_moves", "moves", "evaluations"):
+        for name in ("first_steps", "steps", "descent_moves", "moves", "polished", "polish_moves"):
             require_positive(name, getattr(self, name), zero=True)
+        require_positive("evaluations", self.evaluations, zero=True)
         for name, value in vars(self).items():
             require_at_most(name, value, MOST)
 
@@ -146,7 +147,10 @@ class _Search:
         The best of E_0 and E_l join the first round.
         """
         effort, problem = self._effort, self._problem
-        given = poses_of(np.concatenate([problem.initial_set, problem.low_cost_set]))
+        given_set = np.concatenate([problem.initial_set, problem.low_cost_set])
+        if self._settings.plane is not None:  # moves keep to the plane, but do not lead onto it
+            given_set = transforms_of(self._space, self._space.encode(given_set))
+        given = poses_of(given_set)
         given = given[np.argsort(self._energy.of(given), kind="stable")[:_MOST_GIVEN]]
         poses, energies = given[:0], np.zeros(0)
         spent = index = 0
@@ -223,7 +227,7 @@ class _Search:
         """The energy below which poses are candidates."""
         settings, least = self._settings, float(energies.min())
         relative = settings.limit_ratio * least + settings.limit_slack * settings.noise
-        return max(settings.limit_noise * settings.noise, relative)
+        return max(settings.limit_noise * settings.noise, relative, least)
 
     def spread(self, poses: FloatArray, energies: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Candidates below the limit with their energies, the lowest first, by walks from poses."""
@@ -248,11 +252,13 @@ class _Search:
         count = len(problem.initial_set)
         pool = _evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
         chosen = pool[representative(problem.sdf, poses[pool], min(count, _MOST_CHOSEN))]
+        transforms = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
         if len(chosen) < count:
             others = np.setdiff1d(np.arange(len(poses)), chosen)
+            new = ~repeated(transforms[np.concatenate([chosen, others])])
+            others = others[new[len(chosen) :]]
             more = others[_evenly(len(others), count - len(chosen))]
             chosen = np.resize(np.concatenate([chosen, more]), count)
-        transforms = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
         vectors, objective = space.encode(transforms), self._energy.objective
         measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
         measures = objective.measures(measure, vectors)
@@ -265,12 +271,11 @@ class _Search:
             space.dimension,
         )
         update_cells(archive, objective, vectors, energies)
-        snapshot = archive.snapshot(0, 0)
-        self._observer.snapshot(snapshot)
+        self._observer.snapshot(archive.snapshot(0, 0))
         elites = transforms_of(space, archive.solutions)
         cells = archive.cells_of(measures[chosen])
         hypotheses = transforms_of(space, vectors[chosen])
-        return ranked_hypotheses(objective, hypotheses, cells, elites, snapshot)
+        return ranked_hypotheses(objective, hypotheses, cells, elites, archive.snapshot(0, 0))
 
     def _tell(self, stage: str, poses: FloatArray, energies: FloatArray) -> None:
         vectors = self._space.encode(compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]))

@@ -38,6 +38,8 @@ class Case:
         quick: dict[str, Any] = {"descent": {"restarts": 2, "iterations": 15}}
         quick |= {"emitter": {"iterations": 12}, "online": {"hypotheses": 12}}
         quick |= {"cma_es": {"generations": 25}, "iterations": 20, "max_iterations": 6}
+        quick["effort"] = {"samples": 3000, "kept": 24, "refined": 12, "steps": 8, "descents": 8}
+        quick["effort"] |= {"descent_moves": 40, "chains": 8, "moves": 60, "polish_moves": 40}
         if self.long:
             quick = {"descent": {"stop_below": None}}
         for changes in (quick, self.changes):
@@ -106,6 +108,15 @@ _BASELINES = {
     ),
     "medial, one start": Case("medial_constraint", changes={"cma_es": {"starts": "single"}}),
 }
+_ANCHORED = {
+    "anchored, all classes": Case("anchored", body="mallet", place="mallet", classes=ALL_CLASSES),
+    "anchored on a plane": Case("anchored", changes={"plane": OBLIQUE}, place="standing"),
+    "anchored, free points alone": Case("anchored", classes=("free",)),
+    "anchored, rounds": Case(
+        "anchored", changes={"effort": {"samples": 500, "kept": 4, "evaluations": 20_000}}
+    ),
+    "anchored, in full": Case("anchored", classes=ALL_CLASSES, steps=2, long=True),
+}
 _SESSIONS = {
     "two passes": Case(changes={"passes": 2}, body="mallet", place="mallet", steps=2),
     "two passes of CMA-ME": Case("chsel_cma_me", changes={"passes": 2}, body="mallet"),
@@ -157,6 +168,7 @@ CASES: dict[str, Case] = {
     **_PRODUCT,
     **_COSTS,
     **_BASELINES,
+    **_ANCHORED,
     **_SESSIONS,
     **_MEASURES,
     **_PLANES,

@@ -25,6 +25,9 @@ from chsel.kernels.compiler import compiled
 from chsel.kernels.gaussian_blur import splat
 from chsel.measures import MEASURES
 from chsel.problem import RegistrationProblem
+from chsel.sensing.camera import PinholeCamera
+from chsel.sensing.depth import occlusion_edges
+from chsel.sensing.free_space import FreeGrid
 from chsel.streams import Purpose, StreamKey
 from chsel.surface import surface_points
 from tests.determinism.cases import CASES
@@ -35,6 +38,7 @@ from tests.determinism.stages import run
 
 ENOUGH = ("chsel default", "contacts alone", "chsel reference", "plane_angle", "deep alpha")
 ENOUGH += ("icp default", "svgd default", "SVGD, median", "cvo default", "cvo reference")
+ENOUGH += ("anchored default", "anchored on a plane")
 ENOUGH += ("medial_constraint default", "medial_constraint_cma_me default", "medial, one start")
 EXACT = {"sqrt", "floor", "rint", "memset", "memcpy", "memmove"}  # by IEEE 754, or not of numbers
 OTHERS = {
@@ -58,6 +62,12 @@ def code() -> dict[str, str]:
     splat(np.zeros((1, 3)), np.zeros(3), 1.0, np.zeros((2, 2, 2)))
     where = scene(grid("bracket"), "bracket", ("contacts", "free"))
     key, first = StreamKey(11, 0), np.eye(4)[None]
+    space, camera = FreeGrid(where.workspace, 0.05), PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5)
+    depth, seen = np.ones((3, 4)), np.ones((3, 4), dtype=bool)
+    occlusion_edges(depth, seen, 0.1)
+    space.from_depth(depth, camera, first[0], seen)
+    space.along_rays(np.zeros(3), np.ones((1, 3)))
+    space.at(np.zeros((1, 3)))
     problem = RegistrationProblem(
         where.sdf, where.points, first, where.workspace, where.free_resolution, key
     )

@@ -33,6 +33,7 @@ _BASELINES: dict[str, list[str]] = {  # with what keeps those brief that take lo
     "cvo_no_free_space": ["method.max_iterations=20"],
     "medial_constraint": ["method.cma_es.generations=60"],
     "medial_constraint_cma_me": ["method.cma_es.generations=40", *_QUICK],
+    "anchored": ["method.size=small", "method.archive.bins=10"],
 }
 _OBJECTS = {  # with the session and the preset of CHSEL, CHSEL with CMA-ME, gradient descent
     "drill": ("simulated default", "simulated paper", "simulated reference"),

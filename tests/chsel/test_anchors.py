@@ -1,0 +1,143 @@
+"""Poses that put surface points onto contacts, and the best of many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.anchors import AnchorSettings, anchored_poses, bounds_of, in_telling_order
+from chsel.arrays import FloatArray
+from chsel.errors import SettingError
+from chsel.points import KnownPoints, Workspace
+from chsel.pose import apply, axis_angle, compose
+from chsel.problem import RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.space import PlaneSettings, search_space
+from chsel.streams import StreamKey
+from chsel.threads import threads
+
+MESH = trimesh.creation.box((0.2, 0.12, 0.08))
+GRID = SdfGrid.from_mesh(MESH, 0.01)
+TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
+WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
+CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(MESH, 12, seed=1)[0]))
+PAIRS, SINGLES = AnchorSettings(1.0, 0.0), AnchorSettings(0.0, 1.0)
+UNIFORM = AnchorSettings(0.0, 0.0)
+
+
+def drawn(
+    points: KnownPoints,
+    settings: AnchorSettings,
+    samples: int = 3000,
+    most: int = 3000,
+    plane: PlaneSettings | None = None,
+    index: int = 0,
+) -> FloatArray:
+    """The best poses (K, 12); all of them where most is as many."""
+    problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
+    space, known = search_space(plane, GRID), in_telling_order(points)
+    return anchored_poses(problem, known, space, settings, samples=samples, most=most, index=index)
+
+
+def distances(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """Signed distances (B, M) at world points."""
+    rotations = poses[:, :9].reshape(-1, 3, 3)
+    moved = np.einsum("nij,mj->nmi", rotations, points) + poses[:, None, 9:]
+    s = GRID.query(moved.reshape(-1, 3), lookup="trilinear")[0].numpy()
+    return s.reshape(len(poses), len(points))
+
+
+def test_pairs_put_the_surface_onto_two_contacts() -> None:
+    contacts = CONTACTS[[0, 1]]
+    poses = drawn(KnownPoints(known=contacts), PAIRS)
+    assert len(poses) > 300
+    off = np.abs(distances(poses, contacts)).max(axis=1)
+    assert off.max() < 0.006
+    assert np.median(off) < 0.002
+    uniform = np.abs(distances(drawn(KnownPoints(known=contacts), UNIFORM), contacts)).max(axis=1)
+    assert np.median(uniform) > 0.03
+
+
+def test_one_contact_is_met_by_every_pose_that_is_anchored_on_it() -> None:
+    poses = drawn(KnownPoints(known=CONTACTS[:1]), SINGLES)
+    assert len(poses) > 300
+    assert np.abs(distances(poses, CONTACTS[:1])).max() < 0.003
+
+
+@pytest.mark.parametrize("value", [0.02, -0.01])
+def test_a_point_of_known_distance_is_met_at_that_distance(value: float) -> None:
+    poses = drawn(KnownPoints(known=CONTACTS[:1], known_sdf=[value]), SINGLES)
+    off = np.abs(distances(poses, CONTACTS[:1]) - value)
+    assert np.quantile(off, 0.8) < 0.003
+
+
+def test_rotations_are_rigid_and_objects_within_bounds() -> None:
+    points = KnownPoints(known=CONTACTS)
+    problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
+    lower, upper = bounds_of(problem, search_space(None, GRID), 0.15)
+    np.testing.assert_allclose(lower, np.array(WORKSPACE.lower) - 0.15)
+    poses = drawn(points, AnchorSettings())
+    rotations = poses[:, :9].reshape(-1, 3, 3)
+    products = np.einsum("nij,nkj->nik", rotations, rotations)
+    np.testing.assert_allclose(products, np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-9)
+    origins = -np.einsum("nij,ni->nj", rotations, poses[:, 9:])
+    assert ((origins >= lower) & (origins <= upper)).all()
+
+
+def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads() -> None:
+    free = np.random.default_rng(0).uniform(-0.1, 0.5, (3000, 3))
+    points = KnownPoints(free=free, known=CONTACTS)
+    every = drawn(points, AnchorSettings(), 12_000, 12_000)
+    with threads(1):
+        one = drawn(points, AnchorSettings(), 12_000, 40)
+    with threads(2):
+        two = drawn(points, AnchorSettings(), 12_000, 40)
+    np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(one, every[:40])
+    assert np.abs(drawn(points, AnchorSettings(), 12_000, 40, index=1) - one).max() > 1e-3
+
+
+def test_the_best_fit_better_than_the_others() -> None:
+    poses = drawn(KnownPoints(known=CONTACTS), AnchorSettings(), 6000, 6000)
+    fits = np.abs(distances(poses, CONTACTS)).mean(axis=1)
+    assert fits[:20].max() < np.median(fits)
+    assert fits[:20].mean() < 0.5 * fits.mean()
+
+
+def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts() -> None:
+    turn = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5))
+    standing = compose(turn, np.array([0.2, 0.1, 0.3]))
+    contact = apply(standing, np.array([[0.1, 0.02, 0.01]]))
+    plane = PlaneSettings(plane_height=0.26)
+    poses = drawn(KnownPoints(known=contact), SINGLES, plane=plane)
+    assert len(poses) > 300
+    np.testing.assert_allclose(poses[:, [2, 5, 6, 7]], 0.0, atol=1e-9)
+    np.testing.assert_allclose(poses[:, 11], poses[0, 11], atol=1e-9)
+    assert np.abs(distances(poses, contact)).max() < 0.006
+
+
+def test_known_points_come_far_apart_first_and_none_is_lost() -> None:
+    random = np.random.default_rng(2)
+    known, values = random.standard_normal((200, 3)), random.standard_normal(200)
+    ordered = in_telling_order(KnownPoints(known=known, known_sdf=values))
+    rows = np.lexsort(known.T), np.lexsort(ordered.known.T)
+    np.testing.assert_array_equal(known[rows[0]], ordered.known[rows[1]])
+    np.testing.assert_array_equal(values[rows[0]], ordered.sdf[rows[1]])
+    first = ordered.known[:8]
+    gaps = np.sqrt(((first[:, None] - first[None]) ** 2).sum(axis=2)) + 9.0 * np.eye(8)
+    assert gaps.min() > 2.0
+
+
+@pytest.mark.parametrize(
+    ("shares", "message"),
+    [
+        ({"pairs": 0.8, "contacts": 0.3}, "pairs and contacts are 0.8 and 0.3; accepted: shares"),
+        ({"pairs": -0.1}, "pairs is -0.1; accepted"),
+        ({"margin": float("nan")}, "margin is nan; accepted"),
+    ],
+)
+def test_shares_out_of_bounds_are_refused(shares: dict[str, float], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        AnchorSettings(**shares)

@@ -1,0 +1,195 @@
+"""The energy of poses against its plain formula, and what lowers it or walks below a limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.anchors import bounds_of, in_telling_order
+from chsel.arrays import FloatArray
+from chsel.energy import Energy
+from chsel.engine import poses_of
+from chsel.kernels.energy import energies_below, found_around
+from chsel.kernels.threshold_walk import Chains
+from chsel.points import KnownPoints, Workspace
+from chsel.pose import apply, axis_angle, compose, inverse, random_rotations
+from chsel.problem import RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.space import PlaneSettings, search_space, transforms_of
+from chsel.streams import StreamKey
+from chsel.threads import threads
+
+MESH = trimesh.creation.box((0.2, 0.12, 0.08))
+GRID = SdfGrid.from_mesh(MESH, 0.01)
+TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
+WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
+RANDOM = np.random.default_rng(8)
+CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(MESH, 30, seed=1)[0]))
+LATTICE = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.04)] * 3, indexing="ij"), -1).reshape(-1, 3)
+FREE = LATTICE[GRID.query(apply(inverse(TRUTH), LATTICE))[0].numpy() > 0.005]
+POINTS = KnownPoints(
+    free=np.concatenate([FREE, [[5.0, 0.0, -3.0]]]),
+    occupied=apply(TRUTH, 0.03 * RANDOM.standard_normal((5, 3))),
+    known=np.concatenate([CONTACTS, [[2.0, -1.0, 0.5]]]),  # the last is outside of the grid
+    known_sdf=np.append(0.02 * RANDOM.standard_normal(len(CONTACTS)), 2.0),
+)
+TOUCHED = KnownPoints(free=FREE, known=CONTACTS)
+MARGIN = 0.15
+
+
+def energy_of(
+    points: KnownPoints, tolerance: float = 0.0, plane: PlaneSettings | None = None
+) -> tuple[Energy, tuple[FloatArray, FloatArray]]:
+    """The energy for points, and the bounds of its walks."""
+    problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
+    space = search_space(plane, GRID)
+    bounds = bounds_of(problem, space, MARGIN)
+    return Energy(problem, in_telling_order(points), space, tolerance, bounds), bounds
+
+
+def around(count: int, shift: float, turn: float) -> FloatArray:
+    """Poses (B, 12) around the truth."""
+    random = np.random.default_rng(count)
+    axes = random.standard_normal((count, 3))
+    axes /= np.sqrt((axes**2).sum(axis=1, keepdims=True))
+    moves = compose(axis_angle(axes, turn), shift * random.standard_normal((count, 3)))
+    return poses_of(inverse(np.stack([TRUTH @ move for move in moves])))
+
+
+def plainly(points: KnownPoints, poses: FloatArray, tau: float) -> FloatArray:
+    energies = []
+    for pose in poses:
+        transform = compose(pose[:9].reshape(3, 3), pose[9:])
+        known, free, occupied = (
+            GRID.query(apply(transform, part), lookup="trilinear")[0].numpy()
+            for part in (points.known, points.free, points.occupied)
+        )
+        mean = np.abs(known - points.sdf).mean() if len(known) else 0.0
+        depth = np.maximum(-tau - free, 0.0).sum() + np.maximum(occupied - tau, 0.0).sum()
+        energies.append(mean + depth)
+    return np.array(energies)
+
+
+def squares(points: KnownPoints, poses: FloatArray) -> FloatArray:
+    """What a fit lowers, without free points."""
+    residuals = []
+    for pose in poses:
+        transform = compose(pose[:9].reshape(3, 3), pose[9:])
+        known = GRID.query(apply(transform, points.known), lookup="trilinear")[0].numpy()
+        residuals.append(((known - points.sdf) ** 2).sum())
+    return np.array(residuals)
+
+
+def far_poses() -> FloatArray:
+    turns = random_rotations(np.random.default_rng(1), 40)
+    places = np.random.default_rng(2).uniform(-0.1, 0.5, (40, 3))
+    return poses_of(inverse(compose(turns, places)))
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.004])
+@pytest.mark.parametrize(
+    "points", [POINTS, TOUCHED, KnownPoints(free=FREE), KnownPoints(occupied=POINTS.occupied)]
+)
+def test_energy_is_the_plain_formula(points: KnownPoints, tau: float) -> None:
+    poses = np.concatenate([around(40, 0.02, 0.3), far_poses()])
+    energies = energy_of(points, tau)[0].of(poses)
+    np.testing.assert_allclose(energies, plainly(points, poses, tau), rtol=1e-12, atol=1e-9)
+
+
+def test_energies_that_a_walk_carries_along_are_the_plain_formula() -> None:
+    """Walks gather free points once for many moves."""
+    energy, _ = energy_of(POINTS, 0.002)
+    chains = walked(energy, around(12, 0.01, 0.1), 0.0, 120)
+    assert chains.moved.min() > 0
+    expected = plainly(POINTS, chains.poses, 0.002)
+    np.testing.assert_allclose(chains.energies, expected, rtol=1e-12, atol=1e-9)
+
+
+def test_energies_above_a_limit_are_infinite_and_others_as_they_are() -> None:
+    energy, _ = energy_of(POINTS)
+    model, poses = energy._model, np.concatenate([around(40, 0.02, 0.3), far_poses()])
+    energies, limited = energy.of(poses), np.empty(len(poses))
+    limit = float(np.sort(energies)[30])
+    energies_below(model, poses, limit, limited, 0, len(poses), found_around(model))
+    np.testing.assert_array_equal(limited, np.where(energies <= limit, energies, np.inf))
+
+
+def test_a_fit_recovers_a_pose_that_was_moved_a_little() -> None:
+    energy, _ = energy_of(TOUCHED)
+    poses = around(20, 0.01, 0.15)
+    fitted = energy.fitted(poses, 30)
+    assert (energy.of(fitted) < 0.0005).all()
+    assert (energy.of(poses) > 0.002).all()
+    truth = inverse(TRUTH)
+    np.testing.assert_allclose(fitted[:, 9:], np.tile(truth[:3, 3], (20, 1)), atol=0.004)
+    np.testing.assert_allclose(
+        fitted[:, :9], np.tile(truth[:3, :3].reshape(-1), (20, 1)), atol=0.03
+    )
+
+
+def test_no_fit_raises_the_sum_of_squares() -> None:
+    points = KnownPoints(known=CONTACTS)
+    energy, _ = energy_of(points)
+    poses = far_poses()
+    before, after = squares(points, poses), squares(points, energy.fitted(poses, 10))
+    assert (after <= before * (1.0 + 1e-9)).all()
+    assert np.median(after / before) < 0.1
+    np.testing.assert_array_equal(energy.fitted(poses, 0), poses)
+
+
+def walked(energy: Energy, poses: FloatArray, floor: float, moves: int, kept: int = 4) -> Chains:
+    return energy.walked(poses, energy.of(poses), floor, moves, kept=kept, index=3)
+
+
+def test_walks_stay_below_the_limit_and_within_bounds() -> None:
+    energy, (lower, upper) = energy_of(TOUCHED)
+    starts = energy.fitted(around(12, 0.01, 0.1), 30)
+    chains = walked(energy, starts, 0.01, 200)
+    kept = chains.kept.reshape(-1, 12)
+    assert np.isfinite(chains.kept_energies).all()
+    np.testing.assert_allclose(energy.of(kept), chains.kept_energies.reshape(-1), atol=1e-9)
+    assert chains.energies.max() <= 0.01
+    assert chains.kept_energies.max() <= 0.01
+    assert np.abs(kept[:, 9:] - np.repeat(starts[:, 9:], 4, axis=0)).max() > 0.002
+    rotations = kept[:, :9].reshape(-1, 3, 3)
+    products = np.einsum("nij,nkj->nik", rotations, rotations)
+    np.testing.assert_allclose(products, np.tile(np.eye(3), (len(kept), 1, 1)), atol=1e-10)
+    free = walked(energy_of(KnownPoints(known=CONTACTS[:1]))[0], starts, 10.0, 400)
+    origins = -np.einsum("nij,ni->nj", free.poses[:, :9].reshape(-1, 3, 3), free.poses[:, 9:])
+    assert (origins >= lower).all()
+    assert (origins <= upper).all()
+
+
+def test_walks_from_above_come_down_and_keep_nothing_on_the_way() -> None:
+    energy, _ = energy_of(TOUCHED)
+    poses = around(12, 0.02, 0.2)
+    chains = walked(energy, poses, 0.0, 200)
+    assert (chains.energies < 0.8 * energy.of(poses)).all()
+    assert np.isinf(chains.kept_energies).all()
+
+
+def test_neither_fits_nor_walks_depend_on_threads() -> None:
+    energy, _ = energy_of(POINTS)
+    poses = around(60, 0.02, 0.2)
+    results = []
+    for count in (1, 2):
+        with threads(count):
+            fitted = energy.fitted(poses, 4)
+            chains = walked(energy, fitted, 0.02, 40)
+            results.append([fitted, energy.of(fitted), *chains])
+    for one, two in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_on_a_plane_fits_and_walks_stay_on_it() -> None:
+    plane = PlaneSettings(plane_height=0.3)
+    energy, _ = energy_of(TOUCHED, plane=plane)
+    space = search_space(plane, GRID)
+    near = around(6, 0.01, 0.1)
+    vectors = space.encode(compose(near[:, :9].reshape(-1, 3, 3), near[:, 9:]))
+    poses = poses_of(transforms_of(space, vectors))
+    chains = walked(energy, energy.fitted(poses, 10), 0.0, 60)
+    again = space.encode(compose(chains.poses[:, :9].reshape(-1, 3, 3), chains.poses[:, 9:]))
+    np.testing.assert_allclose(poses_of(transforms_of(space, again)), chains.poses, atol=1e-9)
+    assert np.abs(chains.poses - poses).max() > 1e-3
