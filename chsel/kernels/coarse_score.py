@@ -15,8 +15,9 @@ class Coarse(NamedTuple):
     """What poses are scored by.
 
     box, values (nodes,): the signed distance grid, read at the nearest node. contacts (3, A),
-    known_sdf (A,): some of the known points, and scale: what a metre off costs. inside (3, P): points inside
-    of the object, weights (P,): what one in free space costs. voxels, flags (voxels,): free space.
+    known_sdf (A,): some of the known points; scale: what a metre off costs. inside (3, P): points
+    inside of the object; weights (P,): what each costs in free space. voxels, flags (voxels,):
+    free space.
     """
 
     box: Box

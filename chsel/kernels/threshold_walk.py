@@ -123,7 +123,7 @@ def walk_below(model, stride, floor, chains, draws, before, first, last, steps):
 
 @inner
 def _gathered(model, pose, trial, size, count, slack, steps):  # type: ignore[no-untyped-def]
-    """How many points around the trial were gathered, and the slack that they were gathered with."""
+    """How many points were gathered around the trial or one before, and with what slack."""
     free, memory = model.free, steps.memory
     place = place_in_world(free.centre, trial)
     if slack < 0.0 or travel(place, free.radius, trial, memory, 0) > slack:

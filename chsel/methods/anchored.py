@@ -71,6 +71,9 @@ EFFORTS = {
     "adaptive": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 8, 300, 2_000_000),
 }
 
+_ARCHIVE = ArchiveSettings(measure="object_xy", outliers="none")
+_ONLINE = OnlineSettings(update="own")
+
 
 @dataclass(frozen=True)
 class AnchoredSettings:
@@ -91,8 +94,8 @@ class AnchoredSettings:
     limit_ratio: float = 1.3
     limit_slack: float = 0.5
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
-    archive: ArchiveSettings = ArchiveSettings(measure="object_xy", outliers="none")
-    online: OnlineSettings = OnlineSettings(update="own")
+    archive: ArchiveSettings = _ARCHIVE
+    online: OnlineSettings = _ONLINE
     plane: PlaneSettings | None = None
 
     def __post_init__(self) -> None:
@@ -104,7 +107,7 @@ class AnchoredSettings:
 
 
 def preset_anchored(preset: str) -> AnchoredSettings:
-    """The settings of a preset, one of chsel.presets.PRESETS: the method is in neither of two."""
+    """The settings of any preset: the method is neither in the paper nor in its code."""
     return AnchoredSettings()
 
 

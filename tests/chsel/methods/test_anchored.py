@@ -239,7 +239,7 @@ def test_on_a_plane_every_hypothesis_stands_on_it() -> None:
 
 
 def test_on_a_plane_starts_off_it_count_by_where_they_stand() -> None:
-    """A start that fits where the object cannot be does not keep those out that fit on the plane."""
+    """One that fits where the object cannot be does not keep those out that fit on the plane."""
     method = anchored(plane=PlaneSettings(plane_height=0.2))
     problem = replace(posed(method), initial_set=np.tile(inverse(TRUTH), (5, 1, 1)))
     found = registered(method, problem)
