@@ -31,7 +31,7 @@ class Twists(NamedTuple):
     """The ways that a pose may move: basis (d, 6), turns by radians in its first three columns.
 
     pivot: the point of the object about which it turns. most_shift, most_turn: of a step, metres
-    and radians. damping of ...
+    and radians.
     """
 
     basis: FloatArray
@@ -41,7 +41,11 @@ class Twists(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Scratch of one thread."""
+    """Scratch of one thread.
+
+    found: free points around a pose; memory (12,): which one. normal (d, d), right (d,): of the
+    normal equations, below the diagonal. solved (d, d), row (d,): of their solution. twist (6,).
+    """
 
     found: Found
     memory: FloatArray
@@ -59,7 +63,7 @@ def fit_for(model: Model, dimension: int) -> Fit:
         np.empty(12),
         np.empty((dimension, dimension)),
         np.empty(dimension),
-        np.empty((dimension, dimension + 1)),
+        np.empty((dimension, dimension)),
         np.empty(6),
         np.empty(dimension),
     )

@@ -21,12 +21,16 @@ from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.selection import ArchiveSettings, ranked_hypotheses, repeated, sized_archive
 from chsel.space import PlaneSettings, search_space, transforms_of
 
-MOST = 100_000_000
+MOST_SAMPLES = 1_000_000_000
+MOST_POSES = 1_000_000
+MOST_MOVES = 100_000
 _KEPT = 6  # states of a chain
 _POOL = 400  # candidates to choose from
 _MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
 _MOST_CHOSEN = 300  # by facility location; more of them are taken evenly
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
+_ARCHIVE = ArchiveSettings(measure="object_xy", outliers="none")
+_ONLINE = OnlineSettings(update="own")
 
 
 @dataclass(frozen=True)
@@ -60,8 +64,11 @@ class Effort:
         for name in ("first_steps", "steps", "descent_moves", "moves", "polished", "polish_moves"):
             require_positive(name, getattr(self, name), zero=True)
         require_positive("evaluations", self.evaluations, zero=True)
-        for name, value in vars(self).items():
-            require_at_most(name, value, MOST)
+        require_at_most("samples", self.samples, MOST_SAMPLES)
+        for name in ("kept", "refined", "descents", "chains", "polished"):
+            require_at_most(name, getattr(self, name), MOST_POSES)
+        for name in ("first_steps", "steps", "descent_moves", "moves", "polish_moves"):
+            require_at_most(name, getattr(self, name), MOST_MOVES)
 
 
 EFFORTS = {
@@ -70,9 +77,6 @@ EFFORTS = {
     "large": Effort(250_000, 504, 6, 150, 15, 120, 500, 120, 1000, 32, 1000),
     "adaptive": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 8, 300, 2_000_000),
 }
-
-_ARCHIVE = ArchiveSettings(measure="object_xy", outliers="none")
-_ONLINE = OnlineSettings(update="own")
 
 
 @dataclass(frozen=True)

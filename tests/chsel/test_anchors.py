@@ -67,7 +67,7 @@ def test_one_contact_is_met_by_every_pose_that_is_anchored_on_it() -> None:
 
 @pytest.mark.parametrize("value", [0.02, -0.01])
 def test_a_point_of_known_distance_is_met_at_that_distance(value: float) -> None:
-    poses = drawn(KnownPoints(known=CONTACTS[:1], known_sdf=[value]), SINGLES)
+    poses = drawn(KnownPoints(known=CONTACTS[:1], known_sdf=np.array([value])), SINGLES)
     off = np.abs(distances(poses, CONTACTS[:1]) - value)
     assert np.quantile(off, 0.8) < 0.003
 

@@ -37,9 +37,9 @@ EFFORT = Effort(4000, 24, 5, 12, 8, 8, 30, 12, 60, 4, 40)
 def l_shape() -> trimesh.Trimesh:
     """A body without symmetry."""
     parts = [
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.2, 0.06, 0.05]]),
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.14, 0.05]]),
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.06, 0.1]]),
+        trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [0.2, 0.06, 0.05]])),
+        trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [0.06, 0.14, 0.05]])),
+        trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [0.06, 0.06, 0.1]])),
     ]
     return trimesh.boolean.union(parts, engine="manifold")
 
@@ -176,10 +176,10 @@ def test_a_good_pose_of_the_last_step_is_not_lost() -> None:
         KnownPoints(occupied=INSIDE),
         KnownPoints(known=POINTS.known[:1]),
         KnownPoints(known=np.repeat(POINTS.known[:1], 20, axis=0)),
-        KnownPoints(known=POINTS.known[:4], known_sdf=[0.05, -0.01, 0.0, 0.3]),
+        KnownPoints(known=POINTS.known[:4], known_sdf=np.array([0.05, -0.01, 0.0, 0.3])),
         known_points(TRUTH, 400),
         KnownPoints(free=POINTS.free + 1e6, known=POINTS.known + 1e6),
-        KnownPoints(free=[[1e200, 0.0, 0.0]], known=[[1e150, 0.0, 0.0]]),
+        KnownPoints(free=np.array([[1e200, 0.0, 0.0]]), known=np.array([[1e150, 0.0, 0.0]])),
         KnownPoints(free=POINTS.known, known=POINTS.known),
     ],
     ids=[
@@ -283,7 +283,7 @@ def test_a_grid_without_a_node_inside_is_one_clear_error() -> None:
 def test_energies_beyond_all_numbers_are_an_error_that_says_so() -> None:
     method = anchored()
     with pytest.raises(ChselError, match=r"has a finite cost; accepted"):
-        method.register(posed(method, KnownPoints(known=[[1e200, 0.0, 0.0]])))
+        method.register(posed(method, KnownPoints(known=np.array([[1e200, 0.0, 0.0]]))))
 
 
 def test_settings_survive_a_plain_mapping() -> None:
