@@ -24,6 +24,7 @@ from chsel.space import PlaneSettings, search_space, transforms_of
 MOST_SAMPLES = 1_000_000_000
 MOST_POSES = 1_000_000
 MOST_MOVES = 100_000
+MOST_WORK = 1_000_000_000  # of the two
 _KEPT = 6  # states of a chain
 _POOL = 400  # candidates to choose from
 _MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
@@ -39,9 +40,9 @@ class Effort:
 
     samples: poses drawn; kept: of them, those fitted by first_steps steps; refined: the better of
     these, by steps more. descents, descent_moves: chains that come down to the limit, and their
-    moves. chains, moves: those that spread below it. evaluations: what may be spent on further
-    rounds of samples while the best energy is above `enough` noise levels, and by the first round
-    at least; 0: there is one.
+    moves. polished, polish_moves: the lowest, which come down as far as they can. chains, moves:
+    those that spread below the limit. evaluations: how many may be spent, in rounds of all but
+    the last stage, while the lowest energy is above `enough` noise levels; 0: one round.
     """
 
     samples: int = 60_000
@@ -69,6 +70,10 @@ class Effort:
             require_at_most(name, getattr(self, name), MOST_POSES)
         for name in ("first_steps", "steps", "descent_moves", "moves", "polish_moves"):
             require_at_most(name, getattr(self, name), MOST_MOVES)
+        require_at_most("evaluations", self.evaluations, MOST_SAMPLES)
+        require_at_most("descents x descent_moves", self.descents * self.descent_moves, MOST_WORK)
+        require_at_most("polished x polish_moves", self.polished * self.polish_moves, MOST_WORK)
+        require_at_most("chains x moves", self.chains * self.moves, MOST_WORK)
 
 
 EFFORTS = {
@@ -210,25 +215,31 @@ class _Search:
     def _descended(
         self, poses: FloatArray, energies: FloatArray, index: int
     ) -> tuple[FloatArray, FloatArray]:
-        """The lowest walk down to the limit that holds so far."""
-        effort = self._effort
-        count, moves = effort.descents, effort.descent_moves
-        limit = self._limit(energies)
-        chains = self._energy.walked(
-            poses[:count], energies[:count], limit, moves, kept=0, index=1 + 2 * index
-        )
-        poses = np.concatenate([chains.poses, poses[count:]])
-        energies = np.concatenate([chains.energies, energies[count:]])
+        """The lowest walk down to the limit that holds so far, and the lowest of all further."""
+        effort, limit = self._effort, self._limit(energies)
+        amount = effort.descents, effort.descent_moves
+        found = self._walked_down(poses, energies, limit, *amount, 1 + 2 * index)
+        amount = effort.polished, effort.polish_moves
+        found = self._walked_down(*found, 0.0, *amount, 2 + 2 * index)
+        self._tell("descend", *found)
+        return found
+
+    def _walked_down(
+        self,
+        poses: FloatArray,
+        energies: FloatArray,
+        floor: float,
+        count: int,
+        moves: int,
+        index: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Poses in order of their energies before the `count` lowest walked down to a floor."""
         order = np.argsort(energies, kind="stable")
         poses, energies = poses[order], energies[order]
-        count, moves = effort.polished, effort.polish_moves
-        chains = self._energy.walked(
-            poses[:count], energies[:count], 0.0, moves, kept=0, index=2 + 2 * index
-        )
+        first = poses[:count], energies[:count]
+        chains = self._energy.walked(*first, floor, moves, kept=0, index=index)
         poses = np.concatenate([chains.poses, poses[count:]])
-        energies = np.concatenate([chains.energies, energies[count:]])
-        self._tell("descend", poses, energies)
-        return poses, energies
+        return poses, np.concatenate([chains.energies, energies[count:]])
 
     def _limit(self, energies: FloatArray) -> float:
         """The energy below which poses are candidates."""
