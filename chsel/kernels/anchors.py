@@ -10,7 +10,7 @@ from chsel.arrays import FloatArray, IntArray
 from chsel.kernels.coarse_score import score_below
 from chsel.kernels.compiler import compiled, inner, leaf, spliced
 from chsel.kernels.elementary import sine_cosine
-from chsel.kernels.pose import decode
+from chsel.kernels.pose import decode, origin_within
 
 DRAWS = 8  # random numbers that a pose takes
 _TURN = 2.0 * np.pi
@@ -144,19 +144,7 @@ def _pose_of(space, anchors, draw, vector):  # type: ignore[no-untyped-def]
             pose = _placed(anchors, draw, r)
         if space.planar:
             pose = _on_plane(space, pose)
-    x, y, z = _position(pose)
-    low, high = anchors.lower, anchors.upper
-    fits = low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
-    return pose, fits
-
-
-@leaf
-def _position(pose):  # type: ignore[no-untyped-def]
-    """Where the object's origin is in the world: -R^T t."""
-    x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
-    y = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
-    z = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
-    return x, y, z
+    return pose, origin_within(pose, anchors.lower, anchors.upper)
 
 
 @leaf

@@ -9,7 +9,7 @@ import numpy as np
 
 from chsel.kernels.compiler import compiled, inner, leaf
 from chsel.kernels.cost import Model
-from chsel.kernels.field import continued
+from chsel.kernels.field import continued, interpolated
 from chsel.kernels.pose import pose_at
 from chsel.kernels.region import locate
 from chsel.kernels.tree import Found, found_for, walk
@@ -91,7 +91,7 @@ def distance_with_gradient(field, pose, x, y, z):  # type: ignore[no-untyped-def
     across, along = int(box.across), int(box.along)
     at = int(i) * across + int(j) * along + int(k)
     s = _value(table, at, across, along, u, v, w)
-    nx, ny, nz = _gradient(table, at, across, along, u, v, w)
+    _, nx, ny, nz = interpolated(box, table, at, u, v, w)
     if a != d or b != e or c != f:
         s, nx, ny, nz = continued(field.box_distance, box, (s, nx, ny, nz), a, b, c)
     return s, nx, ny, nz
@@ -107,19 +107,6 @@ def _value(table, at, across, along, u, v, w):  # type: ignore[no-untyped-def]
     c = low * table[at, 0] + high * table[at + 1, 0]
     d = low * table[at + along, 0] + high * table[at + along + 1, 0]
     return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * d)
-
-
-@leaf
-def _gradient(table, at, across, along, u, v, w):  # type: ignore[no-untyped-def]
-    nx = ny = nz = 0.0
-    for corner in range(8):
-        a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
-        weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
-        n = at + a * across + b * along + c
-        nx += weight * table[n, 1]
-        ny += weight * table[n, 2]
-        nz += weight * table[n, 3]
-    return nx, ny, nz
 
 
 @compiled

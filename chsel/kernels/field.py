@@ -36,13 +36,14 @@ def field_of(sdf: SdfGrid, lookup: str, outside: str) -> Field:
 def sample(trilinear, box, table, places, n):  # type: ignore[no-untyped-def]
     """Signed distance and its gradient (s, n_x, n_y, n_z) at a place in the box."""
     if trilinear:
-        return _interpolated(box, table, places.cell[n], places.u[n], places.v[n], places.w[n])
+        return interpolated(box, table, places.cell[n], places.u[n], places.v[n], places.w[n])
     at = places.cell[n]
     return table[at, 0], table[at, 1], table[at, 2], table[at, 3]
 
 
 @leaf
-def _interpolated(box, table, base, u, v, w):  # type: ignore[no-untyped-def]
+def interpolated(box, table, base, u, v, w):  # type: ignore[no-untyped-def]
+    """The same in the cell of the node `base`, at u, v, w of its sides."""
     across, along = int(box.across), int(box.along)
     s = nx = ny = nz = 0.0
     for corner in range(8):

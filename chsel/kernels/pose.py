@@ -172,6 +172,15 @@ def pose_at(poses, n):  # type: ignore[no-untyped-def]
     return a, b, c, d, e, f, g, h, poses[n, 8], poses[n, 9], poses[n, 10], poses[n, 11]
 
 
+@leaf
+def origin_within(pose, low, high):  # type: ignore[no-untyped-def]
+    """Whether a pose has the object's origin, -R^T t in the world, in a box."""
+    x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
+    y = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
+    z = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
+    return low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
+
+
 @compiled
 def decode_all(space, vectors, poses):  # type: ignore[no-untyped-def]
     """Fill poses (B, 12) from search vectors (B, d)."""

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.arrays import FloatArray, IntArray
-from chsel.kernels.compiler import compiled, inner, leaf
+from chsel.kernels.compiler import compiled, inner
 from chsel.kernels.cost import Model, place_in_world, remember, travel
 from chsel.kernels.elementary import exp
 from chsel.kernels.energy import found_around, known_below, with_free
 from chsel.kernels.levenberg_marquardt import moved_about
-from chsel.kernels.pose import pose_at
+from chsel.kernels.pose import origin_within, pose_at
 from chsel.kernels.tree import Found, walk
 
 DRAWS = 9  # random numbers that a move takes
@@ -98,7 +98,7 @@ def walk_below(model, stride, floor, chains, draws, before, first, last, steps):
             limit = max(energy, floor)
             trial = _proposed(model, stride, pose, size, draws[row, m])
             accepted = False
-            if _within(stride, trial):
+            if origin_within(trial, stride.lower, stride.upper):
                 total = known_below(model, trial, limit)
                 if total <= limit:
                     count, slack = _gathered(model, pose, trial, size, count, slack, steps)
@@ -131,15 +131,6 @@ def _gathered(model, pose, trial, size, count, slack, steps):  # type: ignore[no
         remember(place, trial, memory, 0)
         count = walk(free.tree, free.region, trial, slack + free.margin, steps.found)
     return count, slack
-
-
-@leaf
-def _within(stride, pose):  # type: ignore[no-untyped-def]
-    x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
-    y = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
-    z = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
-    low, high = stride.lower, stride.upper
-    return low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
 
 
 @inner
