@@ -47,7 +47,6 @@ def _gradient_descent(preset: str) -> GradientDescentSettings:
 
 
 _OURS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
-    "anchored": (Anchored, preset_anchored),
     "chsel": (Chsel, _chsel),
     "chsel_cma_me": (Chsel, _chsel_cma_me),
     "gradient_descent": (GradientDescent, _gradient_descent),
@@ -57,6 +56,7 @@ _OURS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
     "cvo_no_free_space": (Cvo, preset_cvo_no_free_space),
     "medial_constraint": (MedialConstraint, preset_medial_constraint),
     "medial_constraint_cma_me": (MedialConstraintCmaMe, preset_medial_constraint_cma_me),
+    "anchored": (Anchored, preset_anchored),
 }
 OURS = tuple(_OURS)
 METHODS = (*OURS, *(name for name in installed_names() if name not in OURS))

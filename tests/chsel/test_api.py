@@ -86,7 +86,7 @@ def test_points_far_outside_of_the_workspace_cost_their_distance() -> None:
         ({"surface": [[0, 0, np.nan]]}, r"surface\[0\] is not finite"),
         ({"free": [[0, 0]]}, r"free has shape \(1, 2\); accepted: \(any, 3\)"),
         ({"known": POINT}, "known has 1 points and known_sdf 0"),
-        ({"surface": POINT, "method": "magic"}, "method is 'magic'; accepted: anchored, chsel"),
+        ({"surface": POINT, "method": "magic"}, "method is 'magic'; accepted: chsel"),
         ({"surface": POINT, "preset": "best"}, "preset is 'best'; accepted: default"),
         ({"surface": POINT, "hypotheses": 0}, "hypotheses is 0"),
         ({"surface": POINT, "settings": {"alpha": 1}}, "method.alpha does not exist"),

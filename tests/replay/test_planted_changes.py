@@ -78,8 +78,8 @@ PLANTS = {
     ),
     "the choice of hypotheses": Plant(
         "chsel/selection.py",
-        'order = np.argsort(costs, kind="stable")\n    good',
-        'order = np.argsort(costs, kind="stable")[1:]\n    good',
+        'order = np.argsort(costs, kind="stable")',
+        'order = np.argsort(costs, kind="stable")[1:]',
         "cracker_box_chsel",
         "choosing the hypotheses",
     ),
