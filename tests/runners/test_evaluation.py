@@ -130,7 +130,7 @@ def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry() -> N
     settings = {"chsel": {"passes": 2}, "chsel@paper#bins": {"archive": {"bins": 9}}}
     plain, marked, small = chosen_contenders(entries, settings, "default")
     assert [one.label for one in (plain, marked, small)] == ["chsel", "chsel@paper#bins", "small"]
-    assert [one.settings["archive"]["bins"] for one in (plain, marked, small)] == [40, 9, 8]
+    assert [one.settings["archive"]["bins"] for one in (plain, marked, small)] == [56, 9, 8]
     assert [one.settings["passes"] for one in (plain, marked, small)] == [2, 2, 2]
     assert [one.preset for one in (plain, marked, small)] == ["default", "paper", "default"]
     assert marked.settings["cost"]["lookup"] == "nearest"
