@@ -235,7 +235,7 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
         ("+method.typo=3", "method.typo does not exist; accepted: archive"),
         ("method.cst.alpha=1", "method has no key 'cst'; did you mean cost? accepted: "),
         ("methd=chsel", "probe has no key 'methd'; did you mean method? accepted: "),
-        ("method=chsl", "method has no option 'chsl'; did you mean chsel? accepted: anchored, chsel, "),
+        ("method=chsl", "method has no option 'chsl'; did you mean chsel? accepted: anchored, "),
         ("object=ycb/dril", "object has no option 'ycb/dril'; did you mean ycb/drill? accepted: "),
         ("preset=papr", "preset has no option 'papr'; did you mean paper?"),
         (
