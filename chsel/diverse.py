@@ -43,3 +43,8 @@ def representative(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
     squares = np.empty((size, size))
     done = locate_facilities(points, 1, chosen, np.empty(size), squares)
     return chosen[:done]
+
+
+def evenly(size: int, count: int) -> IntArray:
+    """At most so many of the numbers below size, evenly spaced, the first among them."""
+    return np.arange(size) if size <= count else np.arange(count) * size // count

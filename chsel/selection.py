@@ -10,7 +10,7 @@ import numpy as np
 from chsel.anchors import bounds_of
 from chsel.archive import GridArchive
 from chsel.arrays import BoolArray, FloatArray, IntArray
-from chsel.diverse import representative
+from chsel.diverse import evenly, representative
 from chsel.engine import poses_of
 from chsel.errors import ChselError, require_at_most, require_choice, require_positive
 from chsel.measures import MEASURES, Measure
@@ -168,16 +168,11 @@ def _representatives(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
 
     Of many, those that are considered, and of many wanted, those beyond, are taken evenly.
     """
-    pool = _evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+    pool = evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
     chosen = pool[representative(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
     others = np.setdiff1d(np.arange(len(poses)), chosen)
-    more = others[_evenly(len(others), count - len(chosen))]
+    more = others[evenly(len(others), count - len(chosen))]
     return np.sort(np.concatenate([chosen, more]))
-
-
-def _evenly(size: int, count: int) -> IntArray:
-    """At most so many of the numbers below size, evenly spaced, the first among them."""
-    return np.arange(size) if size <= count else np.arange(count) * size // count
 
 
 def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:

@@ -9,7 +9,7 @@ from chsel.kernels.compiler import compiled
 
 @compiled
 def locate_facilities(points, given, chosen, nearest, apart):  # type: ignore[no-untyped-def]
-    """Choose points (C, d) so that the mean distance of all to the nearest chosen is small.
+    """Choose points (C, d) so that all are near to a chosen one: by the mean square.
 
     Each choice takes off the most. The first `given` of chosen (B,) are there already. nearest
     (C,), apart (C, C): scratch. Returns how many are chosen before all others are like them.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from chsel.anchors import AnchorSettings, anchored_poses, bounds_of, in_telling_order
-from chsel.arrays import FloatArray, IntArray
-from chsel.diverse import representative, spaced
+from chsel.arrays import FloatArray
+from chsel.diverse import evenly, representative, spaced
 from chsel.emitters import update_cells
 from chsel.energy import Energy
 from chsel.engine import poses_of
@@ -268,14 +268,14 @@ class _Search:
         """As many hypotheses as E_0 has poses, of candidates; all of these go into the archive."""
         problem, space, settings = self._problem, self._space, self._settings
         count = len(problem.initial_set)
-        pool = _evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+        pool = evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
         chosen = pool[representative(problem.sdf, poses[pool], min(count, _MOST_CHOSEN))]
         transforms = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
         if len(chosen) < count:
             others = np.setdiff1d(np.arange(len(poses)), chosen)
             new = ~repeated(transforms[np.concatenate([chosen, others])])
             others = others[new[len(chosen) :]]
-            more = others[_evenly(len(others), count - len(chosen))]
+            more = others[evenly(len(others), count - len(chosen))]
             chosen = np.resize(np.concatenate([chosen, more]), count)
         vectors, objective = space.encode(transforms), self._energy.objective
         measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
@@ -299,8 +299,3 @@ class _Search:
         vectors = self._space.encode(compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]))
         self._observer.trace(stage, 0, vectors, energies.copy())
         self._observer.progress(stage, 1, 1)
-
-
-def _evenly(size: int, count: int) -> IntArray:
-    """At most so many of the numbers below size, evenly spaced, the first among them."""
-    return np.arange(size) if size <= count else np.arange(count) * size // count
