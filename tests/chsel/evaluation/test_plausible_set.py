@@ -149,6 +149,15 @@ def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_ab
     assert len(found.index) == (~found.local).sum()  # the true pose itself is on this grid
 
 
+def test_a_thin_set_is_filled_too() -> None:
+    problem, truth = touched_box()
+    by = replace(BOX, epsilon=0.0005, fill_to=300)
+    found = plausible_set(problem, truth, by)
+    assert len(found.cost) == by.fill_to
+    assert (found.cost < found.true_cost + by.epsilon).all()
+    assert len(np.unique(found.world_from_object.reshape(-1, 16), axis=0)) == by.fill_to
+
+
 def test_threads_change_nothing() -> None:
     problem, truth = touched_box()
     by = replace(BOX, grid=replace(SMALL, rotations=1000), epsilon=0.03)
