@@ -15,7 +15,7 @@ _DRAWN = 4000  # poses a round
 _ENOUGH = 20  # times as many as wanted, to choose from
 _POSITION, _ANGLE = 0.01, 0.1  # standard deviations at first, metres and radians
 _SHRINK = 0.5
-_LEAST_SCALE = 1.0 / 32.0
+_LEAST_SCALE = _SHRINK ** (_ROUNDS - 1)
 _FEW = 0.02  # members among those drawn, of which a later round makes steps shorter
 
 

@@ -47,8 +47,8 @@ def test_every_reported_probe_survives_hundreds_of_kills() -> None:
         assert figures is not None, output
         kills, without, ended, reported, recovered = map(int, figures.groups())
         assert kills == KILLS
-        assert without + ended < 0.8 * kills  # many kills came in between, however busy it is
-        assert kills / 4 < reported <= recovered
+        assert without + ended < 0.7 * kills  # most kills came in between
+        assert kills < reported <= recovered
 
 
 @pytest.fixture(scope="module")

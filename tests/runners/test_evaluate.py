@@ -17,7 +17,9 @@ import pytest
 from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, verify
 from runners import evaluate, plausible, probe
+from runners.cli import CONF
 from runners.evaluation.claims import ClaimedError, claimed
+from runners.evaluation.plan import Plan, Trial
 from tests.runners.in_process import Done, run
 from tests.runners.test_plausible import rows
 
@@ -55,6 +57,28 @@ def evaluated(folder: Path, *arguments: str) -> Done:
 
 def table(folder: Path, name: str = "results") -> list[dict[str, object]]:
     return pa.parquet.read_table(folder / f"{name}.parquet").to_pylist()
+
+
+@pytest.mark.parametrize("path", sorted(CONF.glob("experiment/*.yaml")), ids=lambda path: path.stem)
+def test_every_experiment_can_be_planned(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned: list[tuple[Plan, list[Trial]]] = []
+
+    def instead(plan: Plan, trials: list[Trial], workers: int) -> bool:
+        planned.append((plan, trials))
+        return False
+
+    monkeypatch.setattr(evaluate, "evaluate", instead)
+    done = run(evaluate.program, f"experiment={path.stem}", f"out={tmp_path}")
+    assert (done.returncode, done.stderr) == (0, "")
+    ((plan, trials),) = planned
+    assert plan.contenders
+    assert trials
+    if path.stem == "anchored_10mm":  # what it is for, beside what it takes from `anchored`
+        settings = plan.plausible_settings(0.001)
+        assert (settings.cost.tolerance, settings.fill_to) == (0.01, 300)
+        assert plan.contenders["anchored#small+2"].settings["penetration_tolerance"] == 0.01
 
 
 def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder: Path) -> None:
