@@ -24,33 +24,17 @@ from chsel.presets import PRESETS
 from chsel.problem import ArchiveSnapshot
 from chsel.settings import settings_mapping
 from chsel.streams import StreamKey
+from tests.chsel.methods.l_shape import GRID, MESH, TRUTH
 
-WORLD_FROM_OBJECT = compose(
-    axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3])
-)
 WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
-
-
-def l_shape() -> trimesh.Trimesh:
-    """A body without symmetry."""
-    parts = [
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.2, 0.06, 0.05]]),
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.14, 0.05]]),
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.06, 0.1]]),
-    ]
-    return trimesh.boolean.union(parts, engine="manifold")
-
-
-MESH = l_shape()
-GRID = SdfGrid.from_mesh(MESH, 0.01)
 
 
 def known_points(contacts: int = 60) -> KnownPoints:
     surface = trimesh.sample.sample_surface(MESH, contacts, seed=1)[0]
     lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.05)] * 3, indexing="ij"), -1)
     free = lattice.reshape(-1, 3)
-    sdf, _ = GRID.query(apply(inverse(WORLD_FROM_OBJECT), free))
-    return KnownPoints(free=free[sdf.numpy() > 0.02], known=apply(WORLD_FROM_OBJECT, surface))
+    sdf, _ = GRID.query(apply(inverse(TRUTH), free))
+    return KnownPoints(free=free[sdf.numpy() > 0.02], known=apply(TRUTH, surface))
 
 
 QUICK = {
@@ -120,7 +104,7 @@ def test_a_method_finds_the_pose_of_an_object_touched_all_over(name: str) -> Non
         GRID, known_points(), WORKSPACE, 0.05, StreamKey(0, 0), method.online, None
     )
     found = method.register(problem)
-    position, rotation = pose_errors(found.object_from_world, WORLD_FROM_OBJECT)
+    position, rotation = pose_errors(found.object_from_world, TRUTH)
     assert position[0] < 0.005
     assert rotation[0] < 0.05
 

@@ -19,45 +19,16 @@ from chsel.methods.anchored import EFFORTS, Anchored, AnchoredSettings, Effort
 from chsel.observer import NullObserver
 from chsel.online import pose_problem
 from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, axis_angle, check_rigid, compose, inverse
+from chsel.pose import apply, check_rigid, inverse
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.settings import build_settings, settings_mapping
 from chsel.space import PlaneSettings, search_space, transforms_of
 from chsel.streams import StreamKey
 from chsel.threads import threads
+from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
-TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
-STANDING = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(2.0)), np.array([0.2, 0.1, 0.3]))
-WORKSPACE = Workspace((-0.1, -0.2, 0.0), (0.5, 0.4, 0.6))
-SIDE = 0.025
 EFFORT = Effort(4000, 24, 5, 12, 8, 8, 30, 12, 60, 4, 40)
-
-
-def l_shape() -> trimesh.Trimesh:
-    """A body without symmetry."""
-    parts = [
-        trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [0.2, 0.06, 0.05]])),
-        trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [0.06, 0.14, 0.05]])),
-        trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], [0.06, 0.06, 0.1]])),
-    ]
-    return trimesh.boolean.union(parts, engine="manifold")
-
-
-MESH = l_shape()
-GRID = SdfGrid.from_mesh(MESH, 0.01)
-
-
-def known_points(world_from_object: FloatArray, contacts: int) -> KnownPoints:
-    """Contacts, and the free voxels around them that miss the object."""
-    surface = trimesh.sample.sample_surface(MESH, contacts, seed=1)[0]
-    lower, upper = WORKSPACE.bounds
-    counts = np.rint((upper - lower) / SIDE).astype(int)
-    free = lower + SIDE * (0.5 + np.indices(counts).reshape(3, -1).T)
-    sdf, _ = GRID.query(apply(inverse(world_from_object), free))
-    return KnownPoints(free=free[sdf.numpy() > SIDE], known=apply(world_from_object, surface))
-
-
 POINTS = known_points(TRUTH, 40)
 FEW = replace(POINTS, known=POINTS.known[:2], known_sdf=None)
 INSIDE = apply(TRUTH, np.array([[0.03, 0.03, 0.03], [0.15, 0.03, 0.025]]))

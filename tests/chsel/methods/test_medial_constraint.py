@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 
 from chsel.cma_es import CmaEsSettings
 from chsel.errors import ChselError, SettingError
@@ -22,49 +21,17 @@ from chsel.methods.medial_constraint_cma_me import (
     preset_medial_constraint_cma_me,
 )
 from chsel.online import pose_problem
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.points import KnownPoints
+from chsel.pose import inverse
 from chsel.presets import PRESETS
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
 from chsel.settings import build_settings, settings_mapping
 from chsel.space import PlaneSettings
 from chsel.streams import StreamKey
+from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
-WORLD_FROM_OBJECT = compose(
-    axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3])
-)
-STANDING = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(2.0)), np.array([0.2, 0.1, 0.3]))
-WORKSPACE = Workspace((-0.1, -0.2, 0.0), (0.5, 0.4, 0.6))
-SIDE = 0.025
 Maker = Callable[[str], Any]
-
-
-def l_shape() -> trimesh.Trimesh:
-    """A body without symmetry."""
-    parts = [
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.2, 0.06, 0.05]]),
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.14, 0.05]]),
-        trimesh.creation.box(bounds=[[0, 0, 0], [0.06, 0.06, 0.1]]),
-    ]
-    return trimesh.boolean.union(parts, engine="manifold")
-
-
-MESH = l_shape()
-GRID = SdfGrid.from_mesh(MESH, 0.01)
-
-
-def known_points(world_from_object: np.ndarray, contacts: int) -> KnownPoints:
-    """Contacts, and the free voxels around them that miss the object."""
-    surface = trimesh.sample.sample_surface(MESH, contacts, seed=1)[0]
-    lower, upper = WORKSPACE.bounds
-    counts = np.rint((upper - lower) / SIDE).astype(int)
-    free = lower + SIDE * (0.5 + np.indices(counts).reshape(3, -1).T)
-    sdf, _ = GRID.query(apply(inverse(world_from_object), free))
-    return KnownPoints(free=free[sdf.numpy() > SIDE], known=apply(world_from_object, surface))
-
-
-POINTS = known_points(WORLD_FROM_OBJECT, 60)
+POINTS = known_points(TRUTH, 60)
 
 
 def plain(preset: str = "default", **changes: Any) -> MedialConstraint:
