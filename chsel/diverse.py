@@ -2,34 +2,52 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.far_apart import far_apart
-from chsel.kernels.facility import locate_facilities
+from chsel.kernels.facility import distances_from_surface, locate_facilities
+from chsel.kernels.field import field_of
 from chsel.sdf import SdfGrid
-from chsel.surface import object_shape
+from chsel.streams import Purpose, StreamKey
+from chsel.surface import surface_points
+from chsel.threads import spread
+
+_PLACES = 64
 
 
-def embedded(sdf: SdfGrid, poses: FloatArray) -> FloatArray:
-    """Points (B, 12) whose distances are about the rms distances of the object's surface points.
+def outlined(sdf: SdfGrid, poses: FloatArray) -> FloatArray:
+    """How far fixed places in the world are from the object's surface, (B, 64), metres.
 
-    Of poses (B, 12): where the object's centre is in the world, and its axes, as long as the
-    surface's deviations along them; exact if these are principal axes.
+    Of poses (B, 12). The places lie on the surface in some of these poses, so that poses differ in
+    them as much as their surfaces do: not at all where the object is symmetric.
     """
-    centre, deviation = object_shape(sdf)
-    turned = poses[:, :9].reshape(-1, 3, 3)  # its rows are the object's axes in the world
-    away = centre - poses[:, 9:]
-    position = (away[:, 0, None] * turned[:, 0] + away[:, 1, None] * turned[:, 1]) + away[
+    surface = sdf.derived("outline", lambda: _points(sdf))
+    some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
+    away = surface - some[:, 9:]
+    turned = some[:, :9].reshape(-1, 3, 3)  # its rows are the object's axes in the world
+    places = (away[:, 0, None] * turned[:, 0] + away[:, 1, None] * turned[:, 1]) + away[
         :, 2, None
     ] * turned[:, 2]
-    axes = turned * deviation[:, None]
-    return np.concatenate([position, axes.reshape(-1, 9)], axis=1)
+    field = field_of(sdf, "trilinear", "surface_point")
+    distances = np.empty((len(poses), _PLACES))
+
+    def run(first: int, last: int, _: Any) -> None:
+        distances_from_surface(field, poses, places, distances, first, last)
+
+    spread(run, len(poses), lambda: None, least=100)
+    return distances
+
+
+def _points(sdf: SdfGrid) -> FloatArray:
+    return surface_points(sdf, _PLACES, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
 
 
 def spaced(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
     """Which of poses (B, 12) to take so that each next one is the farthest from those before."""
-    return far_apart(embedded(sdf, poses), count)
+    return far_apart(outlined(sdf, poses), count)
 
 
 def representative(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
@@ -37,11 +55,11 @@ def representative(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
 
     Fewer than count where all others are the same as chosen ones.
     """
-    points = embedded(sdf, poses)
-    size = len(points)
+    size = len(poses)
     chosen = np.zeros(min(count, size), dtype=np.int64)
     squares = np.empty((size, size))
-    done = locate_facilities(points, 1, chosen, np.empty(size), squares)
+    outlines = np.ascontiguousarray(outlined(sdf, poses).T)
+    done = locate_facilities(outlines, chosen, np.empty(size), squares)
     return chosen[:done]
 
 

@@ -5,26 +5,37 @@ from __future__ import annotations
 import numpy as np
 
 from chsel.kernels.compiler import compiled
+from chsel.kernels.energy import distance_at
+from chsel.kernels.pose import pose_at
 
 
 @compiled
-def locate_facilities(points, given, chosen, nearest, apart):  # type: ignore[no-untyped-def]
-    """Choose points (C, d) so that all are near to a chosen one: by the mean square.
+def distances_from_surface(field, poses, places, out, first, last):  # type: ignore[no-untyped-def]
+    """Fill out (B, K) with the distances of world points (K, 3) in poses (B, 12), first to last."""
+    for b in range(first, last):
+        pose = pose_at(poses, b)
+        for k in range(len(places)):
+            out[b, k] = distance_at(field, pose, places[k, 0], places[k, 1], places[k, 2])
 
-    Each choice takes off the most. The first `given` of chosen (B,) are there already. nearest
-    (C,), apart (C, C): scratch. Returns how many are chosen before all others are like them.
+
+@compiled
+def locate_facilities(points, chosen, nearest, apart):  # type: ignore[no-untyped-def]
+    """Choose points (d, C) so that all are near to a chosen one: by the mean square.
+
+    The first, then what takes off the most. nearest (C,), apart (C, C): scratch. Returns how many
+    of chosen (B,) there are before all others are like them.
     """
-    count, dimension = points.shape
+    dimension, count = points.shape
+    apart[:] = 0.0
     for i in range(count):
-        apart[i, i] = 0.0
         nearest[i] = np.inf
-        for j in range(i):
-            total = 0.0
-            for d in range(dimension):
-                total += (points[i, d] - points[j, d]) * (points[i, d] - points[j, d])
-            apart[i, j] = apart[j, i] = total
+        row = apart[i]
+        for d in range(dimension):
+            of_all, own = points[d], points[d, i]
+            for j in range(count):
+                row[j] += (own - of_all[j]) * (own - of_all[j])
     for n in range(len(chosen)):
-        if n >= given:
+        if n > 0:
             best, least = -1, np.inf
             for i in range(count):
                 if nearest[i] == 0.0:

@@ -90,9 +90,10 @@ class AnchoredSettings:
 
     size: an effort, of EFFORTS; effort: another one in its place. noise: the standard deviation of
     known points, metres. penetration_tolerance: tau, the depth that free points may have, metres.
-    limit_noise, limit_ratio, limit_slack: candidates have energies below the larger of limit_noise
-    noise levels, and limit_ratio x lowest energy + limit_slack noise levels. plane: restricts the
-    poses to SE(2).
+    limit_noise, limit_ratio, limit_slack: most candidates have energies below the larger of
+    limit_noise noise levels, and limit_ratio x lowest energy + limit_slack noise levels.
+    outer_share, outer_noise: that share of the chains may be so many noise levels above it.
+    plane: restricts the poses to SE(2).
     """
 
     size: str = "medium"
@@ -102,6 +103,8 @@ class AnchoredSettings:
     limit_noise: float = 1.0
     limit_ratio: float = 1.3
     limit_slack: float = 0.5
+    outer_share: float = 0.25
+    outer_noise: float = 1.0
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
     archive: ArchiveSettings = _ARCHIVE
     online: OnlineSettings = _ONLINE
@@ -110,8 +113,16 @@ class AnchoredSettings:
     def __post_init__(self) -> None:
         require_choice("size", self.size, EFFORTS)
         require_positive("noise", self.noise)
-        for name in ("penetration_tolerance", "limit_noise", "limit_ratio", "limit_slack"):
+        for name in (
+            "penetration_tolerance",
+            "limit_noise",
+            "limit_ratio",
+            "limit_slack",
+            "outer_share",
+            "outer_noise",
+        ):
             require_positive(name, getattr(self, name), zero=True)
+        require_at_most("outer_share", self.outer_share, 1.0)
         measure_named(self.archive.measure, planar=self.plane is not None)
 
 
@@ -218,9 +229,9 @@ class _Search:
         """The lowest walk down to the limit that holds so far, and the lowest of all further."""
         effort, limit = self._effort, self._limit(energies)
         amount = effort.descents, effort.descent_moves
-        found = self._walked_down(poses, energies, limit, *amount, 1 + 2 * index)
+        found = self._walked_down(poses, energies, limit, *amount, 2 + 2 * index)
         amount = effort.polished, effort.polish_moves
-        found = self._walked_down(*found, 0.0, *amount, 2 + 2 * index)
+        found = self._walked_down(*found, 0.0, *amount, 3 + 2 * index)
         self._tell("descend", *found)
         return found
 
@@ -248,21 +259,34 @@ class _Search:
         return max(settings.limit_noise * settings.noise, relative, least)
 
     def spread(self, poses: FloatArray, energies: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Candidates below the limit with their energies, the lowest first, by walks from poses."""
-        effort, count = self._effort, len(self._problem.initial_set)
-        limit = self._limit(energies)
+        """Candidates with their energies: poses below the limit, and walks there from these.
+
+        And walks below a higher one: which energies the contacts allow is not known that well.
+        """
+        settings, limit = self._settings, self._limit(energies)
+        outer_limit = limit + settings.outer_noise * settings.noise
+        wanted = max(self._effort.chains, -(-2 * len(self._problem.initial_set) // _KEPT))
+        outer = int(settings.outer_share * wanted)
+        inner = self._wandered(poses, energies, limit, wanted - outer, 0)
+        further = self._wandered(poses, energies, outer_limit, outer, 1)
         below = energies <= limit
-        poses, energies = poses[below], energies[below]
-        wanted = max(effort.chains, -(-2 * count // _KEPT))
-        starts = np.resize(spaced(self._problem.sdf, poses, wanted), wanted)
-        chains = self._energy.walked(
-            poses[starts], energies[starts], limit, effort.moves, kept=_KEPT, index=0
-        )
-        kept = chains.kept_energies.reshape(-1) <= limit
-        poses = np.concatenate([poses, chains.kept.reshape(-1, 12)[kept]])
-        energies = np.concatenate([energies, chains.kept_energies.reshape(-1)[kept]])
+        poses = np.concatenate([poses[below], inner[0], further[0]])
+        energies = np.concatenate([energies[below], inner[1], further[1]])
         self._tell("spread", poses, energies)
         return poses, energies
+
+    def _wandered(
+        self, poses: FloatArray, energies: FloatArray, limit: float, chains: int, index: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """States of chains below a limit, with their energies, from poses that are far apart."""
+        below = energies <= limit
+        poses, energies = poses[below], energies[below]
+        starts = np.resize(spaced(self._problem.sdf, poses, chains), chains)
+        walked = self._energy.walked(
+            poses[starts], energies[starts], limit, self._effort.moves, kept=_KEPT, index=index
+        )
+        kept = walked.kept_energies.reshape(-1) <= limit
+        return walked.kept.reshape(-1, 12)[kept], walked.kept_energies.reshape(-1)[kept]
 
     def chosen(self, poses: FloatArray, energies: FloatArray) -> Hypotheses:
         """As many hypotheses as E_0 has poses, of candidates; all of these go into the archive."""

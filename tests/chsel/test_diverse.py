@@ -6,9 +6,14 @@ import numpy as np
 import trimesh
 
 from chsel.arrays import FloatArray, IntArray
-from chsel.diverse import embedded, representative, spaced
+from chsel.diverse import outlined, representative, spaced
 from chsel.engine import poses_of
-from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.evaluation.surface_distance import (
+    SQUARE_MILLIMETRES,
+    DistanceSettings,
+    SurfaceDistance,
+)
+from chsel.pose import axis_angle, compose, inverse
 from chsel.sdf import SdfGrid
 from chsel.streams import Purpose, StreamKey
 from chsel.surface import surface_points
@@ -31,19 +36,32 @@ def squared_distances(points: FloatArray, chosen: IntArray) -> FloatArray:
     return ((points[:, None] - points[chosen][None]) ** 2).sum(axis=2).min(axis=1)
 
 
-def test_distances_of_points_are_the_rms_distances_of_the_surface() -> None:
-    poses = transforms(20)
-    surface = surface_points(GRID, 20_000, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
-    moved = np.stack([apply(pose, surface) for pose in inverse(poses)])
-    rms = np.sqrt(((moved[1:] - moved[0]) ** 2).sum(axis=2).mean(axis=1))
-    points = embedded(GRID, poses_of(poses))
-    distances = np.sqrt(((points[1:] - points[0]) ** 2).sum(axis=1))
-    np.testing.assert_allclose(distances, rms, rtol=0.03)
+def test_outlines_differ_about_as_much_as_surfaces_do() -> None:
+    poses = transforms(30)
+    surface = surface_points(GRID, 2000, StreamKey(0, 0).stream(Purpose.METRIC_POINTS))
+    settings = DistanceSettings(len(surface), "grid", bidirectional=True)
+    apart = SurfaceDistance(GRID, None, surface, settings).between(poses, inverse(poses))
+    outlines = outlined(GRID, poses_of(poses))
+    squares = ((outlines[:, None] - outlines[None]) ** 2).mean(axis=2) * SQUARE_MILLIMETRES
+    near = (apart > 1.0) & (apart < 400.0)
+    assert near.sum() > 100
+    ratio = np.sqrt(squares[near] / apart[near])
+    assert 0.5 < np.quantile(ratio, 0.05) < np.quantile(ratio, 0.95) < 1.6
+
+
+def test_poses_that_a_symmetry_makes_alike_stand_for_each_other() -> None:
+    turns = axis_angle(np.broadcast_to([0.0, 0.0, 1.0], (30, 3)), np.pi * (np.arange(30) % 2))
+    places = np.repeat(0.02 * np.arange(15.0)[:, None] * [1.0, 0.5, 0.0], 2, axis=0)
+    poses = poses_of(inverse(compose(turns, places)))  # a box looks the same after half a turn
+    outlines = outlined(GRID, poses)
+    np.testing.assert_allclose(outlines[::2], outlines[1::2], atol=3e-4)
+    chosen = representative(GRID, poses, 15)
+    assert sorted(chosen // 2) == list(range(15))
 
 
 def test_chosen_poses_stand_for_all_better_than_the_first_ones_do() -> None:
     poses = poses_of(transforms(200))
-    points = embedded(GRID, poses)
+    points = outlined(GRID, poses)
     chosen = representative(GRID, poses, 8)
     assert chosen[0] == 0
     assert len(set(chosen)) == 8
@@ -55,7 +73,7 @@ def test_chosen_poses_stand_for_all_better_than_the_first_ones_do() -> None:
 
 def test_each_choice_is_the_one_that_takes_off_the_most() -> None:
     poses = poses_of(transforms(40))
-    points = embedded(GRID, poses)
+    points = outlined(GRID, poses)
     chosen = representative(GRID, poses, 6)
     for n in range(1, 6):
         means = [
@@ -73,7 +91,7 @@ def test_copies_are_chosen_once() -> None:
 
 def test_every_next_pose_is_the_farthest_from_those_before() -> None:
     poses = poses_of(transforms(60))
-    points, order = embedded(GRID, poses), spaced(GRID, poses, 60)
+    points, order = outlined(GRID, poses), spaced(GRID, poses, 60)
     assert order[0] == 0
     assert sorted(order) == list(range(60))
     reached = [
