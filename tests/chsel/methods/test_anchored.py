@@ -112,9 +112,20 @@ def test_few_contacts_leave_many_distinct_poses_below_the_limit() -> None:
     method = anchored()
     found = registered(method, posed(method, FEW))
     assert found.distinct == 30
-    assert found.cost.max() <= max(0.0005, 1.3 * found.cost.min() + 0.00025) + 1e-9
+    assert found.cost.max() <= 0.0012
     spread = np.ptp(inverse(found.object_from_world)[:, :3, 3], axis=0)
     assert spread.max() > 0.03
+
+
+def test_some_chains_may_be_above_the_limit() -> None:
+    one_level = {"limit_ratio": 0.0, "limit_slack": 0.0}
+    below = anchored(outer_share=0.0, **one_level)
+    assert registered(below, posed(below, FEW)).cost.max() <= 0.0005
+    beyond = anchored(outer_share=0.5, outer_noise=2.0, **one_level)
+    cost = registered(beyond, posed(beyond, FEW)).cost
+    assert cost.min() <= 0.0005 < cost.max() <= 0.0015
+    all_beyond = anchored(outer_share=1.0, **one_level)
+    registered(all_beyond, posed(all_beyond, FEW))
 
 
 def test_the_archive_leads_on_to_the_next_step() -> None:
@@ -293,6 +304,8 @@ def test_efforts_out_of_bounds_are_refused(name: str, value: Any) -> None:
         ("limit_noise", float("inf")),
         ("limit_ratio", -1.0),
         ("limit_slack", float("nan")),
+        ("outer_share", 1.1),
+        ("outer_noise", -1.0),
     ],
 )
 def test_settings_out_of_bounds_are_refused(name: str, value: Any) -> None:
