@@ -10,6 +10,7 @@ from chsel.arrays import FloatArray, IntArray
 from chsel.far_apart import far_apart
 from chsel.kernels.facility import distances_from_surface, locate_facilities
 from chsel.kernels.field import field_of
+from chsel.pose import rotated
 from chsel.sdf import SdfGrid
 from chsel.streams import Purpose, StreamKey
 from chsel.surface import surface_points
@@ -26,11 +27,8 @@ def outlined(sdf: SdfGrid, poses: FloatArray) -> FloatArray:
     """
     surface = sdf.derived("outline", lambda: _points(sdf))
     some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
-    away = surface - some[:, 9:]
-    turned = some[:, :9].reshape(-1, 3, 3)  # its rows are the object's axes in the world
-    places = (away[:, 0, None] * turned[:, 0] + away[:, 1, None] * turned[:, 1]) + away[
-        :, 2, None
-    ] * turned[:, 2]
+    axes = some[:, :9].reshape(-1, 3, 3)  # of the object in the world, row by row
+    places = rotated(np.swapaxes(axes, 1, 2), surface - some[:, 9:])
     field = field_of(sdf, "trilinear", "surface_point")
     distances = np.empty((len(poses), _PLACES))
 

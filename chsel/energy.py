@@ -18,7 +18,7 @@ from chsel.points import KnownPoints
 from chsel.problem import RegistrationProblem
 from chsel.space import SE2Space, SearchSpace
 from chsel.streams import Purpose
-from chsel.surface import object_shape
+from chsel.surface import object_centre
 from chsel.threads import spread
 
 _FIT_LEVEL = -0.003  # metres: free points at less depth do not push
@@ -64,7 +64,7 @@ class Energy:
             basis = np.zeros((3, 6))
             basis[0, :3], basis[1, 3:], basis[2, 3:] = space.axis, space.e_u, space.e_v
         basis[:, :3] /= _LEVER
-        centre = triple(object_shape(sdf)[0])
+        centre = triple(object_centre(sdf))
         self._twists = Twists(basis, centre, _MOST_SHIFT, _MOST_TURN)
         self._stride = Stride(
             planar=planar,

@@ -11,7 +11,7 @@ from chsel.errors import SdfError
 from chsel.sdf import SdfGrid
 from chsel.streams import Purpose, StreamKey
 
-_SHAPE_POINTS = 1000
+_CENTRE_POINTS = 1000
 # The six tetrahedra of a cell, along its diagonal (Freudenthal, 1942): corners (6, 4, 3).
 _TETRAHEDRA = np.array(
     [np.cumsum([(0, 0, 0), *np.eye(3, dtype=np.int64)[list(p)]], 0) for p in permutations(range(3))]
@@ -56,14 +56,15 @@ def has_surface(sdf: SdfGrid) -> bool:
     return bool(inside.any() and not inside.all())
 
 
-def object_shape(sdf: SdfGrid) -> tuple[FloatArray, FloatArray]:
-    """Mean (3,) and standard deviation (3,) of the surface of a grid, in the object frame."""
-    return sdf.derived("shape", lambda: _shape(sdf))
+def object_centre(sdf: SdfGrid) -> FloatArray:
+    """The mean (3,) of points on the surface of a grid, in the object frame."""
+    return sdf.derived("centre", lambda: _centre(sdf))
 
 
-def _shape(sdf: SdfGrid) -> tuple[FloatArray, FloatArray]:
-    points = surface_points(sdf, _SHAPE_POINTS, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
-    return points.mean(axis=0), points.std(axis=0)
+def _centre(sdf: SdfGrid) -> FloatArray:
+    stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
+    centre: FloatArray = surface_points(sdf, _CENTRE_POINTS, stream).mean(axis=0)
+    return centre
 
 
 def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
