@@ -101,6 +101,7 @@ def main(config: DictConfig) -> None:
         (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
         found = _run(checked, package, folder, console)
     report.show(console, found)
+    report.write_markdown(folder / "speed.md", found)
     draw(found, folder / "benchmark.png")
     say(f"written: {folder}")
 
