@@ -43,6 +43,7 @@ from replay.mcap.reader import read_recording
 from replay.mcap.schemas import RECORDS, message_class
 from replay.mcap.writer import McapRecorder
 from tests.replay.mutations import file_of, joined, packed, split, unpacked
+from tests.replay.seals import resealed
 
 Records = list[tuple[int, bytes]]
 Change = Callable[[Records], None]
@@ -58,7 +59,7 @@ def refused(
         path = write(make_events(steps=2, elites=3, free=3))
         everything = split(path.read_bytes()[8:-8])
         change(everything)
-        path.write_bytes(file_of(everything))
+        path.write_bytes(file_of(resealed(everything)))
         with pytest.raises(RecordingError, match=message) as caught:
             read_recording(path)
         assert "\n" not in str(caught.value)
@@ -398,7 +399,7 @@ def test_an_older_recording_without_newer_topics_and_optional_fields_is_read(
         if not (opcode == Opcode.CHANNEL and any(topic in content for topic in late))
     ]
     everything[place] = (Opcode.CHUNK, packed(joined(inside)))
-    path.write_bytes(file_of(everything))
+    path.write_bytes(file_of(resealed(everything)))
     assert_same(read_recording(path).events(), events)
 
 
@@ -413,7 +414,7 @@ def test_unknown_fields_of_a_message_are_passed_by(
         message.MergeFromString(b"\xfa\x3e\x03new")  # field 1007
 
     changed_message("/probe", longer)(everything)
-    path.write_bytes(file_of(everything))
+    path.write_bytes(file_of(resealed(everything)))
     assert_same(read_recording(path).events(), events)
 
 
