@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from replay.mcap.encoding import decode
 from replay.mcap.file import StoredMessage
 from replay.mcap.index import McapIndex
 from replay.mcap.plain_config import config_from_json
-from replay.mcap.schemas import FORMAT_VERSION
+from replay.mcap.schemas import FORMAT_VERSION, MESSAGES
 from replay.mcap.texts import check_name
 from replay.standard_json import standard
 
@@ -219,9 +219,7 @@ def _rig(path: Path, values: Mapping[str, Any]) -> dict[str, str]:
 
 def _rows(columns: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     """A mapping for each row of the columns of `Contents`."""
-    from replay.mcap.contents import Row
-
-    names = tuple(column.name for column in fields(Row))
+    names = tuple(name for name in MESSAGES["Contents"] if name not in ("session", "digest"))
     rows = zip(*(columns[name].tolist() for name in names), strict=True)
     return tuple(dict(zip(names, row, strict=True)) for row in rows)
 

@@ -87,6 +87,7 @@ class McapFile:
         self.damage: str | None = None
         self._topics = Topics(schemas)
         self._partial = partial
+        self._repeated: list[Schema | Channel] = []
         self._count = 0  # messages met so far
         self._most_messages = _PLAUSIBLE_MESSAGES
         self._data_ended = False
@@ -153,7 +154,7 @@ class McapFile:
                 self.attachments[record.name] = record.data
                 self.chain.attach(record)
             case Schema() | Channel():  # of the summary, where they stand once more
-                self._topics.describe(record)
+                self._repeated.append(record)
             case Message():
                 raise ValueError("a message stands outside of a chunk")
             case Chunk():
@@ -197,6 +198,11 @@ class McapFile:
         summary = file.read(length)
         if zlib.crc32(summary) != self._footer.summary_crc:
             return self._stop_at("damaged: the checksum of its summary is wrong")
+        try:
+            for part in self._repeated:
+                self._topics.describe(part)
+        except ValueError as error:
+            return self._stop_at(f"damaged: in its summary, {error}")
         if self.chain.session and self.chain.is_open:
             return self._stop_at("damaged: records follow its last seal")
         return None

@@ -27,6 +27,12 @@ PROFILE = "chsel"
 STEP_TIME = 10**9
 """Nanoseconds of log time from one step to the next; step k begins at k + 1 times this."""
 
+BEFORE_ALL_STEPS = -1
+"""The step of a session's start."""
+
+MESH, SDF_GRID = "mesh.ply", "sdf_grid"
+"""Names of attachments."""
+
 # A field is a protobuf scalar, a message of this table, or an array with its type and shape. In a
 # shape, a letter is a length that is the same wherever it stands in the message. "?" after a field
 # says that it may be absent, "*" that it repeats. "f8~" is

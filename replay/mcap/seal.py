@@ -16,10 +16,8 @@ from typing import Any
 from mcap.records import Attachment, Channel, Message, Schema
 
 from chsel.errors import ChselError
-from replay.mcap.attachments import MESH, SDF_GRID
 from replay.mcap.encoding import decode
-from replay.mcap.event_order import BEFORE_ALL_STEPS
-from replay.mcap.schemas import STEP_TIME
+from replay.mcap.schemas import BEFORE_ALL_STEPS, MESH, SDF_GRID, STEP_TIME
 from replay.mcap.texts import one_line
 
 SEAL, CONTENTS = "/seal", "/contents"

@@ -29,6 +29,8 @@ def run(given: argparse.Namespace) -> int:
     path, out = given.file.expanduser(), given.out.expanduser()
     found = recover(path, out)
     console = Console(highlight=False, soft_wrap=True)
+    if found.damage is None:
+        console.print("nothing is lost: the recording is whole")
     kept = f"{len(found.probes)} probes, {len(found.problems)} registration problems, "
     images = f", {found.images} images" if found.images else ""
     console.print(f"kept: {kept}{len(found.results)} results{images}")
@@ -39,7 +41,6 @@ def run(given: argparse.Namespace) -> int:
 
 def _tell_losses(console: Console, found: Recovered) -> None:
     if found.damage is None:
-        console.print("nothing is lost: the recording is whole")
         return
     console.print(f"the file was not whole: it {found.damage}", markup=False)
     if found.damages:

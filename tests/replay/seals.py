@@ -9,16 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Message, Schema
 
 from chsel.errors import ChselError
 from replay.mcap.encoding import decode, encode
+from replay.mcap.schemas import STEP_TIME
 from replay.mcap.seal import CONTENTS, SEAL, Chain
 from tests.replay.mutations import Record, file_of, joined, packed, split, unpacked
 
 _HEAD = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
-_MALFORMED = (ChselError, ValueError, KeyError, struct.error, EOFError, OverflowError)
+_MALFORMED = (ChselError, McapError, ValueError, KeyError, struct.error, OverflowError)
 
 
 def reseal_file(path: Path) -> Path:
@@ -59,6 +61,8 @@ def _sealed(chain: Chain, topics: dict[int, str], opcode: int, content: bytes) -
         elif topic == CONTENTS:
             ends = {"session": chain.session, "digest": chain.last}
             data = encode("Contents", decode("Contents", data) | ends)
+            log_time = log_time // STEP_TIME * STEP_TIME + sequence
+            content = _HEAD.pack(number, sequence, log_time, log_time)
         else:
             chain.write(topic, Message(number, log_time, data, publish_time, sequence))
         content = content[: _HEAD.size] + data

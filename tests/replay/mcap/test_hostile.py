@@ -219,7 +219,6 @@ def number(field: str, place: int, value: float) -> Callable[[Any], None]:
         ("/trace", set_field("median_cost", float("nan")), "accepted: lowest, median, highest"),
         ("/trace", set_field("stage", "a\x07b"), "without control characters"),
         ("/problem", number("initial_set", 5, 7.0), "initial set of step 1.* is not a rigid"),
-        ("/problem", set_field("points_digest", "a\nb"), "all points before the problem of step 1"),
         ("/problem", set_field("sdf_digest", "0"), "the SDF grid of the problem of step 1"),
         ("/problem", set_field("free_resolution", 0.0), "free_resolution is 0.0"),
         ("/measured", repeat_name("values"), "measured has a name twice"),

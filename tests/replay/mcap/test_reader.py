@@ -399,6 +399,13 @@ def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write, change
         list(recording.events())
 
 
+def test_a_problem_of_other_points_than_recorded_is_refused(events, write):
+    change = edited("/problem", points_digest="a\nb")
+    recording = read_recording(rewritten(write(events), change))
+    with pytest.raises(RecordingError, match="all points of step 1 has digest .* not a b as rec"):
+        recording.problem(1)
+
+
 def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):
     """Measured values are in no digest; that they are all there follows from their numbering."""
     path = write(events)
