@@ -53,7 +53,8 @@ class Recording:
         attachments: Mapping[str, int],
     ) -> None:
         if not entries or not isinstance(entries[0], SessionStarted):
-            raise RecordingError(f"recording {path} has no session in it")
+            why = "" if damage is None else f": it is {damage}"
+            raise RecordingError(f"recording {path} has no session in it{why}")
         self.path = path
         self.damage = damage
         self.version = version

@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Message, Schema
 
 from chsel.errors import ChselError
+from replay.mcap.chunk_records import DAMAGE
 from replay.mcap.encoding import decode, encode
 from replay.mcap.schemas import STEP_TIME
 from replay.mcap.seal import CONTENTS, SEAL, Chain
 from tests.replay.mutations import Record, file_of, joined, packed, split, unpacked
 
 _HEAD = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
-_MALFORMED = (ChselError, McapError, ValueError, KeyError, struct.error, OverflowError)
+_MALFORMED = (*DAMAGE, ChselError, KeyError)
 
 
 def reseal_file(path: Path) -> Path:
