@@ -76,17 +76,26 @@ class McapFile:
 
     schemas: the full name of the message on every topic that matters; others are skipped.
     partial: take what is whole from an unfinished or damaged file, up to the first damage.
+    check_seals: whether what was changed since it was written counts as damage.
     attachments: by name, those met so far. chain: follows the seals of the file.
     damage: what ended a partial reading, or None.
     """
 
-    def __init__(self, path: Path, schemas: Mapping[str, str], *, partial: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        schemas: Mapping[str, str],
+        *,
+        partial: bool = False,
+        check_seals: bool = True,
+    ) -> None:
         self.path = path
         self.attachments: dict[str, bytes] = {}
         self.chain = Chain()
         self.damage: str | None = None
         self._topics = Topics(schemas)
         self._partial = partial
+        self._check_seals = check_seals
         self._repeated: list[Schema | Channel] = []
         self._count = 0  # messages met so far
         self._most_messages = _PLAUSIBLE_MESSAGES
@@ -152,7 +161,8 @@ class McapFile:
                 raise ValueError(f"the attachment {record.name!r} stands in it twice")
             case Attachment():
                 self.attachments[record.name] = record.data
-                self.chain.attach(record)
+                if self._check_seals:
+                    self.chain.attach(record)
             case Schema() | Channel():  # of the summary, where they stand once more
                 self._repeated.append(record)
             case Message():
@@ -174,7 +184,8 @@ class McapFile:
         match part:
             case Schema() | Channel():
                 self._topics.describe(part)
-                self.chain.describe(part)
+                if self._check_seals:
+                    self.chain.describe(part)
             case Message():
                 if part.sequence != self._count:
                     raise ValueError(f"message {self._count} is missing, {part.sequence} follows")
@@ -182,7 +193,8 @@ class McapFile:
                 if self._count > self._most_messages:
                     raise ValueError(f"it holds more than {self._most_messages} messages")
                 stored = self._topics.stored(part)
-                self.chain.read(stored.topic, part)
+                if self._check_seals:
+                    self.chain.read(stored.topic, part)
                 return stored if self._topics.matters(stored) else None
         return None
 

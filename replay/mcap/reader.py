@@ -150,7 +150,9 @@ class Recording:
         """The images in the file; others are passed by."""
         topic = "/sensor_image"
         schemas = {topic: message_class(RECORDS[topic]).DESCRIPTOR.full_name}
-        for message in McapFile(self.path, schemas, partial=self.damage is not None).messages():
+        partial = self.damage is not None
+        file = McapFile(self.path, schemas, partial=partial, check_seals=False)  # they were
+        for message in file.messages():
             if steps is None or message.log_time // STEP_TIME - 1 in steps:
                 with _blaming(self.path):
                     found = image(decode(RECORDS[topic], message.data))
