@@ -123,7 +123,7 @@ class Recording:
         """Whether the registration of a step ended with hypotheses."""
         return step in self._results
 
-    @property
+    @cached_property
     def has_timings(self) -> bool:
         """Whether wall-clock times were recorded."""
         return any(isinstance(entry, Timed) for entry in self._entries)
