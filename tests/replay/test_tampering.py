@@ -75,7 +75,11 @@ def smaller_error(values: tuple[dict[str, Any], ...]) -> list[dict[str, Any]]:
 TAMPERED: dict[str, tuple[str, int, Change]] = {
     "measured errors": ("/measured", 1, edited(values=smaller_error)),
     "no measured errors": ("/measured", 1, dropped),
-    "the true pose": ("/session", -1, edited(world_from_object=lambda pose: np.eye(4)[[1, 2, 0, 3]])),
+    "the true pose": (
+        "/session",
+        -1,
+        edited(world_from_object=lambda pose: np.eye(4)[[1, 2, 0, 3]]),
+    ),
     "the object's name": ("/session", -1, edited(object="another")),
     "the configuration": ("/session", -1, edited(config=lambda text: '{"b": 1,' + text[1:])),
     "the environment": ("/session", -1, edited(environment=[{"name": "numpy", "value": "9"}])),

@@ -35,8 +35,8 @@ def rewritten(
 ) -> Path:
     """A whole, checksummed copy of a recording with other messages or attachments.
 
-    reseal: whether its seals are right as well. `change` gets topic or attachment name and the bytes, and gives new bytes or None to leave out.
-    Topics named in `topics` are left out altogether.
+    reseal: whether its seals are right as well. `change` gets topic or attachment name and the bytes,
+    and gives new bytes or None to leave out. Topics named in `topics` are left out altogether.
     """
     copy = path.with_suffix(".changed.mcap")
     with path.open("rb") as source, copy.open("wb") as target:
@@ -402,7 +402,7 @@ def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write, change
 def test_a_problem_of_other_points_than_recorded_is_refused(events, write):
     change = edited("/problem", points_digest="a\nb")
     recording = read_recording(rewritten(write(events), change))
-    with pytest.raises(RecordingError, match="all points of step 1 has digest .* not a b as rec"):
+    with pytest.raises(RecordingError, match=r"all points of step 1 has digest .* not a b as rec"):
         recording.problem(1)
 
 
