@@ -35,8 +35,8 @@ def rewritten(
 ) -> Path:
     """A whole, checksummed copy of a recording with other messages or attachments.
 
-    reseal: whether its seals are right as well. `change` gets topic or attachment name and the bytes,
-    and gives new bytes or None to leave out. Topics named in `topics` are left out altogether.
+    reseal: whether its seals are right as well. `change` gets topic or attachment name and the
+    bytes, and gives new bytes or None to leave out. Topics in `topics` are left out altogether.
     """
     copy = path.with_suffix(".changed.mcap")
     with path.open("rb") as source, copy.open("wb") as target:
