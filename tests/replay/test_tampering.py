@@ -129,6 +129,8 @@ def with_change(path: Path, whole: bytes, topic: str, step: int, change: Change)
 
 
 def step_of(topic: str, data: bytes) -> int:
+    if topic == "/contents":
+        return -1
     if topic in RECORDS:
         return int(decode(RECORDS[topic], data).get("step", -1))
     message: Any = FOXGLOVE[topic].FromString(data)
@@ -193,15 +195,97 @@ def test_a_changed_schema_is_named(whole: bytes, tmp_path: Path, place: str) -> 
         read_recording(path)
 
 
-def test_a_step_left_out_or_put_elsewhere_is_named(whole: bytes, tmp_path: Path) -> None:
+def test_a_step_left_out_is_named(whole: bytes, tmp_path: Path) -> None:
     everything = split(whole[8:-8])
     chunks = [i for i, (opcode, _) in enumerate(everything) if opcode == Opcode.CHUNK]
-    topics = topics_of(everything)
-    path = tmp_path / "a.mcap"
+    assert len(chunks) == 5  # the start, the rig, two steps, the end
     without = [part for i, part in enumerate(everything) if i != chunks[2]]
-    numbered = changed_messages(without, topics, lambda topic, number, data: data)
+    numbered = changed_messages(without, topics_of(everything), lambda topic, number, data: data)
+    path = tmp_path / "a.mcap"
     path.write_bytes(file_of(numbered))
     with pytest.raises(RecordingError, match=r"order or times of messages was changed .* step 1"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("chunk", "step", "message"),
+    [
+        (2, 0, "step 1 does not follow the step before it, which was changed"),
+        (3, 1, "step 1 does not follow the step before it, which was changed"),
+        (4, 1, "its contents have another digest than its last step"),
+    ],
+)
+def test_one_seal_made_again_does_not_fit_the_next(
+    whole: bytes, tmp_path: Path, chunk: int, step: int, message: str
+) -> None:
+    """A changed step with a right seal of its own, and all other seals as they were."""
+    topic, change = ("/session_ended", "the end") if chunk == 4 else ("/probe", "contact normals")
+    path = with_change(tmp_path / "a.mcap", whole, topic, step, TAMPERED[change][2])
+    changed, original = split(reseal_file(path).read_bytes()[8:-8]), split(whole[8:-8])
+    place = [i for i, (opcode, _) in enumerate(original) if opcode == Opcode.CHUNK][chunk]
+    if chunk == 4:  # the contents are as they were as well
+        inside, last = (split(unpacked(part[place][1])) for part in (changed, original))
+        original[place] = (Opcode.CHUNK, packed(joined([*inside[:-1], last[-1]])))
+    else:
+        original[place] = changed[place]
+    path.write_bytes(file_of(original))
+    with pytest.raises(RecordingError, match=message):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("topic", "values", "message"),
+    [
+        ("/seal", {"digest": "0" * 32}, "the seal of step 1 was changed after it was written"),
+        ("/seal", {"previous": ""}, "step 1 does not follow the step before it"),
+        ("/seal", {"session": "0" * 32}, "step 1 belongs to another recording"),
+        ("/seal", {"parts": lambda parts: [*parts, parts[0]]}, "the seal of step 1 has a name tw"),
+        ("/contents", {"session": "0" * 32}, "its contents belong to another recording"),
+        ("/contents", {"digest": ""}, "its contents have another digest than its last step"),
+        ("/contents", {"free": lambda free: free + 1}, "its contents, as read, have another free"),
+    ],
+)
+def test_seals_and_contents_are_compared(
+    whole: bytes, tmp_path: Path, topic: str, values: dict[str, Any], message: str
+) -> None:
+    step = 1 if topic == "/seal" else -1
+    path = with_change(tmp_path / "a.mcap", whole, topic, step, edited(**values))
+    with pytest.raises(RecordingError, match=message):
+        read_recording(path)
+
+
+def test_the_time_of_the_contents_is_compared(whole: bytes, tmp_path: Path) -> None:
+    everything = split(whole[8:-8])
+    place = max(i for i, (opcode, _) in enumerate(everything) if opcode == Opcode.CHUNK)
+    inside = split(unpacked(everything[place][1]))
+    head = bytearray(inside[-1][1])
+    head[6] ^= 1  # of its log time
+    inside[-1] = (inside[-1][0], bytes(head))
+    everything[place] = (Opcode.CHUNK, packed(joined(inside)))
+    path = tmp_path / "a.mcap"
+    path.write_bytes(file_of(everything))
+    with pytest.raises(RecordingError, match="the time of its contents was changed"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize("how", ["no seal at all", "a step without a seal"])
+def test_messages_without_a_seal_are_refused(whole: bytes, tmp_path: Path, how: str) -> None:
+    everything = split(whole[8:-8])
+    topics, seen = topics_of(everything), []
+
+    def without_seals(topic: str, number: int, data: bytes) -> bytes | None:
+        if topic == "/contents" and how == "no seal at all":
+            return encode("Contents", decode("Contents", data) | {"session": "", "digest": ""})
+        if topic == "/seal":
+            seen.append(number)
+            return None if how == "no seal at all" or len(seen) == 5 else data
+        return data
+
+    path = tmp_path / "a.mcap"
+    path.write_bytes(file_of(changed_messages(everything, topics, without_seals)))
+    assert len(seen) == 5
+    message = "has no seals" if how == "no seal at all" else "its contents|records follow"
+    with pytest.raises(RecordingError, match=message):
         read_recording(path)
 
 
