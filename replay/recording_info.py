@@ -61,8 +61,8 @@ class RecordingInfo:
         if self.damage is not None:
             return f"{self.damage}; what is whole was read, and {recover_hint(self.path)}"
         if self.checked:
-            seals = "checksums and digests" if self.digest else "checksums"
-            return f"finished; everything was read, all {seals} are right"
+            seals = "" if self.digest else "; a format before 3 has no seals"
+            return f"finished; everything was read, all checksums and digests are right{seals}"
         return "finished; checksums of what was read are right (--check reads everything)"
 
     def plain(self) -> dict[str, Any]:
