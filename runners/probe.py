@@ -23,6 +23,7 @@ from chsel.settings import build_settings
 from chsel.streams import StreamKey
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
+from replay.recording_info import recording_digest
 from runners.cli import command, plain
 from runners.display import Display, reading_bar
 from runners.interrupt import Interrupt
@@ -257,6 +258,7 @@ def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: 
         "method": started.method,
         "seed": started.seed,
         "outcome": outcome,
+        "recording_digest": recording_digest(folder / "recording.mcap"),
         "steps": rows,
         "bytes": _sizes(folder),
         "environment": dict(started.environment),

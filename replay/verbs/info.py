@@ -94,10 +94,12 @@ def _facts(info: RecordingInfo) -> Table:
         "rig": "" if info.rig is None else f"{info.rig['name']}, raw log {info.rig['source']}",
         "true pose": "known" if session["true_pose"] else "unknown",
         "outcome": info.outcome or "not told: the session did not end",
+        "lost": ", ".join(session["lost"]),
         "size": f"{decimal(info.size)}, of that, uncompressed: {files}",
         "messages": _messages(info),
         "environment": _environment(session["environment"]),
         "format": f"version {session['format_version']}",
+        "digest": info.digest,
         "integrity": info.integrity,
     }
     table = Table.grid(padding=(0, 2))

@@ -29,19 +29,20 @@ def run(given: argparse.Namespace) -> int:
     path, out = given.file.expanduser(), given.out.expanduser()
     found = recover(path, out)
     console = Console(highlight=False, soft_wrap=True)
-    _tell_losses(console, found)
+    if found.damage is None:
+        console.print("nothing is lost: the recording is whole")
     kept = f"{len(found.probes)} probes, {len(found.problems)} registration problems, "
     images = f", {found.images} images" if found.images else ""
     console.print(f"kept: {kept}{len(found.results)} results{images}")
     console.print(str(out), markup=False)
+    _tell_losses(console, found)
     return 0
 
 
 def _tell_losses(console: Console, found: Recovered) -> None:
     if found.damage is None:
-        console.print("nothing is lost: the recording is whole")
         return
-    console.print(found.damage, markup=False)
+    console.print(f"the file was not whole: it {found.damage}", markup=False)
     if found.damages:
         table = Table(title="bytes lost", title_justify="left", box=SIMPLE_HEAD)
         table.add_column("from", justify="right")
@@ -60,6 +61,10 @@ def _tell_losses(console: Console, found: Recovered) -> None:
         console.print(f"lost probes: {doubt}those of step {', '.join(spans)}")
     _tell_steps(console, "lost registration problems", found.lost_problems)
     _tell_steps(console, "lost results", found.lost_results)
+    for name in found.remade:
+        console.print(f"{name} was lost and is there again, made from the mesh, to the bit")
+    for name in found.attachments:
+        console.print(f"lost: {name}; what needs it says so")
     for event in found.events:
         console.print(f"lost: {event}", markup=False)
     if not found.complete:

@@ -61,6 +61,8 @@ def _tell(console: Console, file: FileVerdict) -> None:
     without = len(file.verdicts) - len(compared)
     if without:
         line += f", {without} without a result"
+    if file.digest:
+        line += f", digest {file.digest}"
     console.print(line)
     for verdict in compared:
         if file.status == 1 and verdict.outcome != "equal":
