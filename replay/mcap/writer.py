@@ -35,17 +35,26 @@ from replay.events import (
 )
 from replay.mcap.attachments import MEDIA_TYPES, MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
 from replay.mcap.contents import Contents
+from replay.mcap.cumulative_points import CumulativePoints
 from replay.mcap.encoding import encode
 from replay.mcap.event_checks import check_event
 from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
 from replay.mcap.foxglove_messages import (
     FOXGLOVE,
+    POINT_CLASSES,
     log_line,
     object_in_world,
     point_cloud,
     poses_in_world,
 )
 from replay.mcap.plain_config import config_to_json
+from replay.mcap.scene_messages import (
+    POINT_COLORS,
+    STARTING_EMPTY,
+    SceneMessages,
+    colored_cloud,
+    empty_cloud,
+)
 from replay.mcap.schemas import (
     PROFILE,
     RECORDS,
@@ -55,6 +64,7 @@ from replay.mcap.schemas import (
     message_class,
 )
 from replay.mcap.sensor_messages import image_values, rig_values
+from replay.mcap.simple_mesh import simple_mesh
 
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
 _FIRST_VERSION = 1
@@ -123,6 +133,7 @@ class McapRecorder(Recorder):
         self._count = 0  # messages written so far
         self._channels: dict[str, int] = {}
         self._points: KnownPoints | None = None  # all that is known, once a session has started
+        self._cumulative = {name: CumulativePoints() for name in POINT_CLASSES}
         self._sdf_digest = ""
         self._last_snapshot = b""
         self._last_elites: FloatArray | None = None
@@ -202,6 +213,7 @@ class McapRecorder(Recorder):
         for name, data in ((MESH, mesh_to_ply(event.mesh)), (SDF_GRID, sdf_to_bytes(event.sdf))):
             self._writer.add_attachment(0, 0, name, MEDIA_TYPES[name], data)
         self._sdf_digest = event.sdf.digest
+        self._scene = SceneMessages(simple_mesh(event.mesh))
         named = ("runner", "object", "session", "method", "seed", "free_resolution")
         values = {name: getattr(event, name) for name in (*named, "world_from_object")}
         values["format_version"] = self._version
@@ -212,10 +224,16 @@ class McapRecorder(Recorder):
         values["sdf_digest"] = event.sdf.digest
         values["source"] = event.source
         self._record("/session", BEFORE_ALL_STEPS, values)
+        for topic in STARTING_EMPTY:
+            time = self._time(BEFORE_ALL_STEPS)
+            self._add(topic, time, empty_cloud(time))
         self._write_points(BEFORE_ALL_STEPS, KnownPoints(), event.initial_points)
         if event.world_from_object is not None:
             time = self._time(BEFORE_ALL_STEPS)
             self._add("/object_pose", time, object_in_world(event.world_from_object, time))
+            for name in ("object_mesh", "object_surface"):
+                time = self._time(BEFORE_ALL_STEPS)
+                self._add(f"/{name}", time, getattr(self._scene, name)(time))
         self._writer.flush()
 
     def _write_probe(self, event: Probe) -> None:
@@ -242,6 +260,16 @@ class McapRecorder(Recorder):
             values[name] = len(getattr(self._points, name))
         values |= {"new_digest": new.digest, "digest": self._points.digest}
         self._record("/known_points", step, values)
+        self._write_all_points(step, new)
+
+    def _write_all_points(self, step: int, new: KnownPoints) -> None:
+        """For viewers: the clouds of all points so far that change with new ones."""
+        for name, cumulative in self._cumulative.items():
+            points = getattr(new, name)
+            for level, cloud in cumulative.add(points).items() if len(points) else ():
+                time = self._time(step)
+                topic = f"/all_points/{name}/{level}"
+                self._add(topic, time, colored_cloud(cloud, POINT_COLORS[name], time))
 
     def _write_problem(self, event: ProblemPosed) -> None:
         problem = event.problem
@@ -286,6 +314,9 @@ class McapRecorder(Recorder):
         if len(found.object_from_world) > 0:
             time, poses = self._time(event.step), inverse(found.object_from_world)
             self._add("/hypothesis_poses", time, poses_in_world(poses, time))
+            for name in ("hypothesis_meshes", "hypothesis_surfaces"):
+                time = self._time(event.step)
+                self._add(f"/{name}", time, getattr(self._scene, name)(found, time))
 
     def _record(self, topic: str, step: int, values: dict[str, Any]) -> bytes:
         """Write a message of the project's own; its bytes."""
