@@ -111,14 +111,24 @@ def _facts(info: RecordingInfo) -> Table:
 
 def _messages(info: RecordingInfo) -> str:
     """How many on each topic, with bytes where they are known, the most first."""
-    sizes = info.message_bytes
-    if sizes is None:
-        ordered = sorted(info.messages.items(), key=lambda item: -item[1])
+    counts = _grouped(info.messages)
+    if info.message_bytes is None:
+        ordered = sorted(counts.items(), key=lambda item: -item[1])
         return ", ".join(f"{count} {topic}" for topic, count in ordered)
+    sizes = _grouped(info.message_bytes)
     return ", ".join(
-        f"{info.messages[topic]} {topic} ({decimal(size)})"
+        f"{counts[topic]} {topic} ({decimal(size)})"
         for topic, size in sorted(sizes.items(), key=lambda item: -item[1])
     )
+
+
+def _grouped(numbers: Mapping[str, int]) -> dict[str, int]:
+    """Sums over the topics that are parts of one cloud."""
+    sums: dict[str, int] = {}
+    for topic, number in numbers.items():
+        name = "/all_points" if topic.startswith("/all_points/") else topic
+        sums[name] = sums.get(name, 0) + number
+    return sums
 
 
 def _environment(environment: Mapping[str, str]) -> str:
