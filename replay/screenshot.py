@@ -13,6 +13,7 @@ from typing import IO
 from rerun.experimental import ViewerClient
 
 from chsel.errors import RecordingError
+from replay.console import print_error
 from replay.rerun.clock import PROBE
 from replay.rerun.live import HOST, is_listening, viewer_program
 from replay.rerun.viewer import free_port
@@ -95,7 +96,7 @@ def main() -> int:
     try:
         save_screenshot(given.rrd, given.png, step=given.step, width=width, height=height)
     except RecordingError as error:
-        print(error, file=sys.stderr)
+        print_error(str(error))
         return 2
     return 0
 

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 import yaml
 from omegaconf import DictConfig
-from rich.console import Console
 
 from chsel.device import device_named, gpus
 from chsel.errors import require_choice, require_positive
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
+from replay.console import Console
 from runners.benchmarks import report
 from runners.benchmarks.alone import MEASURES
 from runners.benchmarks.comparison import WHAT, compare
@@ -92,7 +92,7 @@ def main(config: DictConfig) -> None:
     if checked.quick:
         checked = checked.shortened()
     torch.set_num_threads(1)
-    console = Console(highlight=False)
+    console = Console()
     say = partial(console.print, soft_wrap=True)
     with ExitStack() as stack:
         python = None if checked.package.skip else interpreter(checked.package, say)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
+from replay.console import Console
 from runners.benchmarks.ours import PRESETS
 
 Values = Mapping[str, Any]
@@ -26,7 +26,8 @@ def show(console: Console, report: Values) -> None:
     for line in _machine(report["machine"]):
         console.print(line, soft_wrap=True)
     if report["comparison"]:
-        console.print(f"\n{report['what']}\n")
+        for line in ("", report["what"], ""):
+            console.print(line)
         _show_comparison(console, report["comparison"])
         _show_calls(console, report["problems"])
     if report["alone"]:
@@ -93,7 +94,8 @@ def _show_calls(console: Console, problems: Mapping[str, Values]) -> None:
     }
     if calls:
         counts = ", ".join(f"{name} {count}" for name, count in calls.items())
-        console.print(f"cost calls of the package, counted: {counts}\n")
+        console.print(f"cost calls of the package, counted: {counts}")
+        console.print()
 
 
 def _show_alone(console: Console, rows: Sequence[Values]) -> None:
