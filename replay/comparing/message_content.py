@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import DecodeError, Message
 
 from chsel.errors import RecordingError
@@ -113,8 +112,6 @@ def _foxglove_values(message: StoredMessage) -> dict[str, Any]:
     except DecodeError:
         raise RecordingError(f"a message is no valid {kind.DESCRIPTOR.full_name}") from None
     values: dict[str, Any] = {}
-    if isinstance(parsed, SceneUpdate):
-        return _scene_values(parsed, message.log_time)
     if not parsed.HasField("timestamp"):
         values["timestamp"] = None
     elif parsed.timestamp.seconds * 10**9 + parsed.timestamp.nanos == message.log_time:
@@ -127,27 +124,6 @@ def _foxglove_values(message: StoredMessage) -> dict[str, Any]:
         values["poses"] = np.array([_pose(pose) for pose in parsed.poses]).reshape(-1, 7)
         parsed.ClearField("poses")
     return values | _plain(parsed)
-
-
-def _scene_values(scene: Any, log_time: int) -> dict[str, Any]:
-    """The fields of a scene; meshes as arrays, and stamps only where they are not the log time."""
-    values: dict[str, Any] = {"entities": {}}
-    for index, entity in enumerate(scene.entities):
-        meshes = {
-            f"triangles{number}": {
-                "pose": np.array(_pose(mesh.pose)),
-                "color": np.array([mesh.color.r, mesh.color.g, mesh.color.b, mesh.color.a]),
-                "points": np.array([(p.x, p.y, p.z) for p in mesh.points]).reshape(-1, 3),
-                "indices": np.array(mesh.indices, dtype=np.int64),
-            }
-            for number, mesh in enumerate(entity.triangles)
-        }
-        if entity.timestamp.seconds * 10**9 + entity.timestamp.nanos == log_time:
-            entity.ClearField("timestamp")
-        entity.ClearField("triangles")
-        values["entities"][f"{index}"] = _plain(entity) | meshes
-    scene.ClearField("entities")
-    return values | _plain(scene)
 
 
 def _pose(pose: Any) -> list[float]:

@@ -24,7 +24,7 @@ from replay.differences import apart, difference
 from replay.mcap.attachments import MESH, SDF_GRID
 from replay.mcap.encoding import decode
 from replay.mcap.file import McapFile, StoredMessage
-from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.foxglove_messages import FOXGLOVE, SCENE
 from replay.mcap.schemas import MESSAGES, RECORDS, message_class
 
 BOTH, FIRST, SECOND = "both", "first", "second"
@@ -149,6 +149,8 @@ def recording_diff(
 ) -> RecordingDiff:
     """Compare two recordings, each read twice and never held as a whole.
 
+    What is drawn for viewers alone (`SCENE`) is left out: it follows from the rest.
+
     keep: how many differences to keep beside those of the session's start; None: all. Raises
     RecordingError if a file cannot be read, or one of its checksums is wrong.
     """
@@ -181,7 +183,7 @@ class _Survey:
         file = McapFile(self.path, {topic: kind.full_name for topic, kind in schemas.items()})
         numbers: Counter[tuple[str, int, str]] = Counter()
         for message in file.messages():
-            if not self._ignored.topic(message.topic):
+            if message.topic not in SCENE and not self._ignored.topic(message.topic):
                 kind = (message.topic, step_of(message), _about(message))
                 yield Key(*kind, numbers[kind]), message
                 numbers[kind] += 1

@@ -21,15 +21,20 @@ from replay.mcap.cumulative_points import LEVELS
 from replay.mcap.wire import check_wire
 
 POINT_CLASSES = ("free", "occupied", "known")
-VIEWS: Mapping[str, type[Message]] = {
-    "/object_pose": FrameTransform,
-    "/gripper_path": PosesInFrame,
-    "/hypothesis_poses": PosesInFrame,
+SCENE: Mapping[str, type[Message]] = {
     "/object_mesh": SceneUpdate,
     "/object_surface": PointCloud,
     "/hypothesis_meshes": SceneUpdate,
     "/hypothesis_surfaces": PointCloud,
     **{f"/all_points/{kind}/{n}": PointCloud for kind in POINT_CLASSES for n in range(LEVELS)},
+}
+"""Topics of `scene_messages`, which recordings of older programs do not have."""
+
+VIEWS: Mapping[str, type[Message]] = {
+    "/object_pose": FrameTransform,
+    "/gripper_path": PosesInFrame,
+    "/hypothesis_poses": PosesInFrame,
+    **SCENE,
 }
 """Topics for viewers alone: they repeat what other messages say, and our reader ignores them."""
 

@@ -43,7 +43,7 @@ def session_markdown(started: SessionStarted) -> str:
 
 def _literal(text: Any) -> str:
     """Text that Markdown takes for nothing else."""
-    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", str(text))
+    return re.sub(r"([\\`*_\[\]<>|#~$&])", r"\\\1", str(text))
 
 
 def _find(config: Mapping[str, Any], name: str) -> Any:

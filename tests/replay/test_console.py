@@ -210,6 +210,6 @@ def test_the_text_of_a_session_in_rerun_takes_no_name_for_markdown(make_events) 
     )
     text = replay.rerun.text.session_markdown(start)
     row = next(line for line in text.splitlines() if line.startswith("| object"))
-    assert row == r"| object | **a \| \[b\]\(http\:\/\/c\) \*d\* \`e\`** |"
+    assert row == r"| object | **a \| \[b\](http://c) \*d\* \`e\`** |"
     fences = [line for line in text.splitlines() if line and set(line) == {"`"}]
     assert fences.count("`````") == 2

@@ -19,9 +19,10 @@ import replay
 from chsel.points import KnownPoints
 from chsel.pose import inverse
 from chsel.quaternions import rotations
+from replay.comparing.recording_diff import recording_diff
 from replay.events import Event, HypothesesFound, Probe, SessionStarted
 from replay.mcap.cumulative_points import CumulativePoints
-from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, VIEWS
+from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, SCENE, VIEWS
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
 from replay.mcap.simple_mesh import simple_mesh
@@ -183,12 +184,13 @@ def test_readers_do_not_look_at_what_viewers_get(events, write, assert_same, mon
     )
     path = write(events)
     monkeypatch.undo()
-    assert {data for topic, _, data in messages(path) if topic in VIEWS} == {b"\xff"}
+    assert {data for topic, _, data in messages(path) if topic in SCENE} == {b"\xff"}
     assert_same(read_recording(path).events(), events)
+    assert recording_diff(path, write(events)).is_equal
 
 
 def _with_nonsense_for_viewers(self: Any, topic: str, time: int, data: bytes) -> None:
-    data = b"\xff" if topic in VIEWS else data
+    data = b"\xff" if topic in SCENE else data
     self._writer.add_message(self._channels[topic], time, data, time, sequence=self._count)
     self._count += 1
 
