@@ -27,7 +27,7 @@ from runners.benchmarks.problems import PROBLEMS
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
 from runners.benchmarks.scope import Scope
 from runners.cli import command, plain
-from runners.recording import make_run_folder
+from runners.recording import make_run_folder, write_in_run_folder
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def main(config: DictConfig) -> None:
         python = None if checked.package.skip else interpreter(checked.package, say)
         package = None if python is None else stack.enter_context(PublishedPackage(python))
         folder = make_run_folder(Path(checked.logs) / "benchmark", "drill")
-        (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+        write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         found = _run(checked, package, folder, console)
     report.show(console, found)
     draw(found, folder / "benchmark.png")

@@ -17,6 +17,7 @@ from chsel.mesh import mesh_digest
 from chsel.points import KnownPoints
 from chsel.pose import inverse
 from chsel.problem import ArchiveSnapshot
+from replay.disk import sync_folder
 from replay.events import (
     Event,
     HypothesesFound,
@@ -116,7 +117,10 @@ class McapRecorder(Recorder):
                 self._check_in_place()
 
     def close(self) -> None:
-        """Write contents and checksums. Until then, and after a failure, the file is unfinished."""
+        """Write contents and checksums, and wait until all is on the disk.
+
+        Until then, and after a failure, the file is unfinished.
+        """
         if not self._closed:
             with self._writing():
                 if self._points is not None:
@@ -124,8 +128,10 @@ class McapRecorder(Recorder):
                 self._writer.finish()
                 self._file.flush()
                 self._check_in_place()
+                os.fsync(self._file.fileno())
                 self._file.close()
             self._closed = True
+            sync_folder(self._path.parent)
 
     def _begin(self, version: int) -> None:
         """Start a file, of a version that has all topics that its events will need."""

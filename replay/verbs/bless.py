@@ -14,6 +14,7 @@ from rich.table import Table
 from chsel.errors import RecordingError
 from replay.blessing import Change, changes, write_blessed
 from replay.console import Console
+from replay.disk import sync_folder
 from replay.file_verification import recordings_in
 from replay.mcap.reader import read_recording
 from replay.verification import environment_differences
@@ -50,6 +51,7 @@ def _bless(path: Path, *, ask: bool) -> int:
             console.print(f"{path}: left as it was")
             return 1
         new.replace(path)
+        sync_folder(path.parent)
         console.print(f"{path}: {len(differing)} of {len(found)} results are new")
         return 0
     finally:

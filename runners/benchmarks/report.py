@@ -12,13 +12,14 @@ from rich.table import Table
 
 from replay.console import Console
 from runners.benchmarks.ours import PRESETS
+from runners.recording import write_in_run_folder
 
 Values = Mapping[str, Any]
 
 
 def write(path: Path, report: Values) -> None:
     """The report as JSON."""
-    path.write_text(json.dumps(report, indent=2) + "\n")
+    write_in_run_folder(path, json.dumps(report, indent=2) + "\n")
 
 
 def show(console: Console, report: Values) -> None:
