@@ -6,18 +6,21 @@ import argparse
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
 from rerun.experimental import ViewerClient
 
 from chsel.errors import RecordingError
+from replay.console import print_error
 from replay.rerun.clock import PROBE
 from replay.rerun.live import HOST, is_listening, viewer_program
 from replay.rerun.viewer import free_port
 
-START_SECONDS = 60.0
+LIMIT_SECONDS = 120.0  # for everything: the viewer gives up a picture after 15 s, and may hang
 SETTLE_SECONDS = 8.0  # until the layout stands and the notice of the start is gone
 
 
@@ -26,8 +29,9 @@ def save_screenshot(
 ) -> None:
     """Save what the viewer shows of `rrd` at probe `step` (None: the last), in points of a screen.
 
-    Needs Vulkan: a graphics card's, or the software one (Debian: mesa-vulkan-drivers). Raises
-    RecordingError if the file does not exist or no picture could be taken, with the reason.
+    Needs Vulkan: a graphics card's, or the software one (Debian: mesa-vulkan-drivers). On a busy
+    machine the viewer may not paint in its own time; it is asked again. Raises RecordingError if
+    the file does not exist or no picture could be taken within LIMIT_SECONDS, with the reason.
     """
     if not rrd.is_file():
         raise RecordingError(f"recording {rrd} does not exist; accepted: a .rrd file")
@@ -38,9 +42,13 @@ def save_screenshot(
         viewer = subprocess.Popen(
             [*command, str(rrd.resolve())], stdin=subprocess.DEVNULL, stdout=output, stderr=output
         )
+        # A call to a viewer that hangs has no time limit of its own: it ends with the viewer.
+        late = threading.Timer(LIMIT_SECONDS + 1.0, viewer.kill)
+        late.start()
         try:
             picture = _picture(viewer, port, step, output)
         finally:
+            late.cancel()
             viewer.kill()
             viewer.wait()
     png.parent.mkdir(parents=True, exist_ok=True)
@@ -51,8 +59,9 @@ def _picture(
     viewer: subprocess.Popen[bytes], port: int, step: int | None, output: IO[str]
 ) -> bytes:
     """The picture as PNG; asks again until the viewer is ready or its time is over."""
-    deadline = time.monotonic() + START_SECONDS
     reason = "it does not answer"
+    deadline = time.monotonic() + LIMIT_SECONDS
+    settled: float | None = None  # when that is, once the viewer has painted
     while time.monotonic() < deadline and viewer.poll() is None:
         time.sleep(0.5)
         if not is_listening(port):
@@ -65,12 +74,16 @@ def _picture(
                 continue
             if step is not None:
                 client.set_time(PROBE, sequence=step, play_state="paused")
-            client.take_screenshot()
-            time.sleep(SETTLE_SECONDS)
+            if settled is None:
+                client.take_screenshot()
+                settled = time.monotonic() + SETTLE_SECONDS
+            time.sleep(max(0.0, settled - time.monotonic()))
             return client.take_screenshot()
-        except (RuntimeError, ConnectionError, ValueError) as error:
-            reason = str(error)
-    if viewer.poll() is not None:
+        except (RuntimeError, OSError, ValueError) as error:  # of them, time-outs are OSErrors
+            reason = " ".join(str(error).split()) or type(error).__name__
+    if time.monotonic() >= deadline:
+        reason = f"after {LIMIT_SECONDS:.0f} s, {reason}"
+    elif viewer.poll() is not None:
         output.seek(0)
         reason = _reason(output.read())
     raise RecordingError(f"the Rerun viewer gave no picture: {reason}")
@@ -83,19 +96,19 @@ def _reason(text: str) -> str:
     return f"it ended: {' '.join(text.split())[-300:]}"
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """`python -m replay.screenshot FILE.rrd OUT.png`."""
     parser = argparse.ArgumentParser(prog="replay.screenshot", description=__doc__)
     parser.add_argument("rrd", type=Path)
     parser.add_argument("png", type=Path)
     parser.add_argument("--step", type=int, help="probe to show; by default the last")
     parser.add_argument("--size", type=int, nargs=2, default=(1600, 900))
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
     width, height = given.size
     try:
         save_screenshot(given.rrd, given.png, step=given.step, width=width, height=height)
-    except RecordingError as error:
-        print(error, file=sys.stderr)
+    except (RecordingError, OSError) as error:
+        print_error(str(error))
         return 2
     return 0
 

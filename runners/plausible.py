@@ -13,8 +13,6 @@ import numpy as np
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from chsel.arrays import FloatArray
@@ -32,6 +30,7 @@ from chsel.problem import RegistrationProblem
 from chsel.settings import build_settings, settings_mapping
 from chsel.streams import StreamKey
 from chsel.threads import threads
+from replay.console import Console, Progress
 from replay.step_ranges import chosen_steps
 from runners.cli import command, plain
 from runners.evaluation.measure import Measure, MetricsConfig
@@ -79,7 +78,7 @@ def main(config: DictConfig) -> None:
     steps = chosen_steps(checked.steps, source.steps)
     settings = _settings(checked.definition, source)
     folder = Path(checked.out).expanduser() if checked.out else path.parent / "plausible"
-    console = Console(highlight=False)
+    console = Console()
     with threads(checked.threads):
         truth = _truth(checked, source, settings, console)
         rows, failures = _rows(checked, source, steps, settings, truth, folder)
@@ -87,8 +86,8 @@ def main(config: DictConfig) -> None:
     if rows:
         console.print(_table(rows))
     for failure in failures:
-        console.print(failure, soft_wrap=True, markup=False)
-    console.print(f"{folder}  {len(rows)} sets", soft_wrap=True, markup=False)
+        console.print(failure, soft_wrap=True)
+    console.print(f"{folder}  {len(rows)} sets", soft_wrap=True)
     if failures:
         sys.exit(1)
 
@@ -120,10 +119,10 @@ def _truth(
     found = find_true_pose(problem, np.array(config.guess))
     console.print(
         f"true pose found near the guess, which costs {found.guess_cost:.4g}: it costs "
-        f"{found.cost:.4g}\n{found.world_from_object.tolist()}",
+        f"{found.cost:.4g}",
         soft_wrap=True,
-        markup=False,
     )
+    console.print(str(found.world_from_object.tolist()), soft_wrap=True)
     return found.world_from_object
 
 
@@ -136,7 +135,7 @@ def _aligned(path: Path, console: Console) -> FloatArray:
             f"that `python -m runners.align {path} position=[x,y,z] rotation=[roll,pitch,yaw]` "
             "finds, guess=[[...],[...],[...],[0,0,0,1]] near it, or a file with world_from_object"
         )
-    console.print(f"true pose: that of {there}", soft_wrap=True, markup=False)
+    console.print(f"true pose: that of {there}", soft_wrap=True)
     return read_pose(there)
 
 

@@ -24,7 +24,7 @@ from replay.differences import apart, difference
 from replay.mcap.attachments import MESH, SDF_GRID
 from replay.mcap.encoding import decode
 from replay.mcap.file import McapFile, StoredMessage
-from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.foxglove_messages import FOXGLOVE, SCENE
 from replay.mcap.schemas import MESSAGES, RECORDS, message_class
 from replay.mcap.seal import CONTENTS, SEAL
 
@@ -150,6 +150,8 @@ def recording_diff(
 ) -> RecordingDiff:
     """Compare two recordings, each read twice and never held as a whole.
 
+    What is drawn for viewers alone (`SCENE`) is left out: it follows from the rest.
+
     keep: how many differences to keep beside those of the session's start; None: all. Raises
     RecordingError if a file cannot be read, or one of its checksums is wrong.
     """
@@ -178,7 +180,7 @@ class _Survey:
     def messages(self) -> Iterator[tuple[Key, StoredMessage]]:
         """All messages that are not left out, in their order, as the file has them.
 
-        Seals follow from the messages that they close.
+        Seals follow from the messages that they close, and what viewers draw from the rest.
         """
         schemas = {topic: message_class(name).DESCRIPTOR for topic, name in RECORDS.items()}
         schemas |= {topic: kind.DESCRIPTOR for topic, kind in FOXGLOVE.items()}
@@ -186,7 +188,8 @@ class _Survey:
         file = McapFile(self.path, names, check_seals=False)  # to see what was changed
         numbers: Counter[tuple[str, int, str]] = Counter()
         for message in file.messages():
-            if message.topic != SEAL and not self._ignored.topic(message.topic):
+            derived = message.topic == SEAL or message.topic in SCENE
+            if not derived and not self._ignored.topic(message.topic):
                 kind = (message.topic, step_of(message), _about(message))
                 yield Key(*kind, numbers[kind]), message
                 numbers[kind] += 1

@@ -37,7 +37,7 @@ from replay.mcap.encoding import decode
 from replay.mcap.event_checks import check_event, check_free_resolution, check_poses
 from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
 from replay.mcap.file import StoredMessage
-from replay.mcap.foxglove_messages import cloud_points, log_level_and_text
+from replay.mcap.foxglove_messages import VIEWS, cloud_points, log_level_and_text
 from replay.mcap.plain_config import config_from_json
 from replay.mcap.schemas import (
     FORMAT_VERSION,
@@ -51,7 +51,6 @@ from replay.mcap.seal import CONTENTS, SEAL
 from replay.mcap.sensor_messages import ImagePlace, check_image, plausible_pixels, rig
 from replay.mcap.wire import check_wire
 
-_VIEWS = ("/object_pose", "/gripper_path", "/hypothesis_poses")  # they repeat what records say
 _CLOUDS = {"/points/free": 3, "/points/occupied": 3, "/points/known": 4}  # columns
 
 
@@ -115,7 +114,7 @@ class EventReader:
     def take(self, message: StoredMessage) -> None:
         """Read one message. Raises RecordingError if it is malformed or out of place."""
         topic, data = message.topic, message.data
-        if topic in _VIEWS:
+        if topic in VIEWS:
             return
         if topic == SEAL and self.version >= SEALED_SINCE and not self.closed:
             return  # compared by whoever reads the file

@@ -204,7 +204,8 @@ def read_recording(
         raise DamagedRecordingError(path, f"ends within an event on {events.within}")
     if not events.closed and events.entries and file.damage is None:
         raise DamagedRecordingError(path, "ends without its contents")
-    if events.version >= SEALED_SINCE and not file.chain.session and file.damage is None:
+    sealed = bool(file.chain.session) or not events.entries
+    if events.version >= SEALED_SINCE and not sealed and file.damage is None:
         raise DamagedRecordingError(path, "has no seals; accepted: those of its format")
     sizes = {name: len(data) for name, data in file.attachments.items()}
     return Recording(

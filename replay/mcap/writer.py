@@ -18,6 +18,7 @@ from chsel.mesh import mesh_digest
 from chsel.points import GrowingPoints, KnownPoints
 from chsel.pose import inverse
 from chsel.problem import ArchiveSnapshot
+from replay.disk import sync_folder
 from replay.events import (
     Event,
     HypothesesFound,
@@ -37,17 +38,26 @@ from replay.events import (
 from replay.lost_attachment import LostAttachment, is_lost
 from replay.mcap.attachments import MEDIA_TYPES, MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
 from replay.mcap.contents import Contents
+from replay.mcap.cumulative_points import CumulativePoints
 from replay.mcap.encoding import encode
 from replay.mcap.event_checks import check_event
 from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
 from replay.mcap.foxglove_messages import (
     FOXGLOVE,
+    POINT_CLASSES,
     log_line,
     object_in_world,
     point_cloud,
     poses_in_world,
 )
 from replay.mcap.plain_config import config_to_json
+from replay.mcap.scene_messages import (
+    POINT_COLORS,
+    STARTING_EMPTY,
+    SceneMessages,
+    colored_cloud,
+    empty_cloud,
+)
 from replay.mcap.schemas import (
     FORMAT_VERSION,
     PROFILE,
@@ -58,6 +68,7 @@ from replay.mcap.schemas import (
 )
 from replay.mcap.seal import CONTENTS, SEAL, Chain
 from replay.mcap.sensor_messages import image_values, rig_values
+from replay.mcap.simple_mesh import simple_mesh
 
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
 _NEVER = 2**62  # the size at which the library would end a chunk by itself, without a seal
@@ -84,6 +95,7 @@ class McapRecorder(Recorder):
         self._unflushed = 0  # bytes of messages in the chunk in progress
         self._channels: dict[str, int] = {}
         self._points: GrowingPoints | None = None  # all that is known, once a session has started
+        self._cumulative = {name: CumulativePoints() for name in POINT_CLASSES}
         self._sdf_digest = ""
         self._last_snapshot = b""
         self._last_elites: FloatArray | None = None
@@ -118,7 +130,10 @@ class McapRecorder(Recorder):
                 self._check_in_place()
 
     def close(self) -> None:
-        """Write contents and checksums. Until then, and after a failure, the file is unfinished."""
+        """Write contents and checksums, and wait until all is on the disk.
+
+        Until then, and after a failure, the file is unfinished.
+        """
         if not self._closed:
             with self._writing():
                 if self._points is not None:
@@ -128,8 +143,10 @@ class McapRecorder(Recorder):
                 self._writer.finish()
                 self._file.flush()
                 self._check_in_place()
+                os.fsync(self._file.fileno())
                 self._file.close()
             self._closed = True
+            sync_folder(self._path.parent)
 
     def _begin(self) -> None:
         """Start the file, with a description of every topic, used or not."""
@@ -197,6 +214,7 @@ class McapRecorder(Recorder):
         if not is_lost(event.sdf):
             self._attach(SDF_GRID, sdf_to_bytes(event.sdf))
         self._sdf_digest = event.sdf.digest
+        self._scene = None if is_lost(event.mesh) else SceneMessages(simple_mesh(event.mesh))
         named = ("runner", "object", "session", "method", "seed", "free_resolution")
         values = {name: getattr(event, name) for name in (*named, "world_from_object")}
         values["format_version"] = FORMAT_VERSION
@@ -210,11 +228,17 @@ class McapRecorder(Recorder):
         lost = [part for part in (event.mesh, event.sdf) if isinstance(part, LostAttachment)]
         values["lost"] = [part.name for part in lost]
         self._record("/session", BEFORE_ALL_STEPS, values)
+        for topic in STARTING_EMPTY:
+            time = self._time(BEFORE_ALL_STEPS)
+            self._add(topic, time, empty_cloud(time))
         self._points = GrowingPoints(KnownPoints())
         self._write_points(BEFORE_ALL_STEPS, event.initial_points)
         if event.world_from_object is not None:
             time = self._time(BEFORE_ALL_STEPS)
             self._add("/object_pose", time, object_in_world(event.world_from_object, time))
+            for name in ("object_mesh", "object_surface") if self._scene else ():
+                time = self._time(BEFORE_ALL_STEPS)
+                self._add(f"/{name}", time, getattr(self._scene, name)(time))
         self._end_chunk()
 
     def _attach(self, name: str, data: bytes) -> None:
@@ -245,6 +269,16 @@ class McapRecorder(Recorder):
             values[name] = getattr(self._points, name)
         values |= {"new_digest": new.digest, "digest": ""}
         self._record("/known_points", step, values)
+        self._write_all_points(step, new)
+
+    def _write_all_points(self, step: int, new: KnownPoints) -> None:
+        """For viewers: the clouds of all points so far that change with new ones."""
+        for name, cumulative in self._cumulative.items():
+            points = getattr(new, name)
+            for level, cloud in cumulative.add(points).items() if len(points) else ():
+                time = self._time(step)
+                topic = f"/all_points/{name}/{level}"
+                self._add(topic, time, colored_cloud(cloud, POINT_COLORS[name], time))
 
     def _write_problem(self, event: ProblemPosed) -> None:
         problem = event.problem
@@ -290,6 +324,9 @@ class McapRecorder(Recorder):
         if len(found.object_from_world) > 0:
             time, poses = self._time(event.step), inverse(found.object_from_world)
             self._add("/hypothesis_poses", time, poses_in_world(poses, time))
+            for name in ("hypothesis_meshes", "hypothesis_surfaces") if self._scene else ():
+                time = self._time(event.step)
+                self._add(f"/{name}", time, getattr(self._scene, name)(found, time))
 
     def _record(self, topic: str, step: int, values: dict[str, Any]) -> bytes:
         """Write a message of the project's own; its bytes."""

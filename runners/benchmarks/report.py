@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from rich.box import MARKDOWN, SIMPLE_HEAD, Box
-from rich.console import Console
 from rich.table import Table
 
+from replay.console import Console
 from runners.benchmarks.ours import PRESETS
+from runners.recording import write_in_run_folder
 
 Values = Mapping[str, Any]
 _PAGE_WIDTH = 160  # characters: no table is wider
@@ -20,15 +21,17 @@ _PAGE_WIDTH = 160  # characters: no table is wider
 
 def write(path: Path, report: Values) -> None:
     """The report as JSON."""
-    path.write_text(json.dumps(report, indent=2) + "\n")
+    write_in_run_folder(path, json.dumps(report, indent=2) + "\n")
 
 
 def show(console: Console, report: Values, box: Box = SIMPLE_HEAD) -> None:
     """The report as tables."""
     for line in _machine(report["machine"]):
-        console.print(line, "\n", sep="", soft_wrap=True)
+        console.print(line, soft_wrap=True)
+        console.print()
     if report["comparison"]:
-        console.print(report["what"], "\n", sep="", soft_wrap=True)
+        console.print(report["what"], soft_wrap=box is MARKDOWN)
+        console.print()
         _show_comparison(console, report["comparison"], box)
         _show_calls(console, report["problems"])
     if report["alone"]:
@@ -38,11 +41,10 @@ def show(console: Console, report: Values, box: Box = SIMPLE_HEAD) -> None:
 def write_markdown(path: Path, report: Values) -> None:
     """The same tables as a page: docs/speed.md is one of them."""
     page = StringIO()
-    show(Console(file=page, width=_PAGE_WIDTH, highlight=False), report, MARKDOWN)
+    show(Console(file=page, width=_PAGE_WIDTH), report, MARKDOWN)
     lines = [line.rstrip() for line in page.getvalue().splitlines()]
-    path.write_text(
-        "\n".join(["# Speed", "", "Written by `python -m runners.benchmark`.", "", *lines, ""])
-    )
+    lines = ["# Speed", "", "Written by `python -m runners.benchmark`.", "", *lines, ""]
+    write_in_run_folder(path, "\n".join(lines))
 
 
 def number(value: float) -> str:
@@ -82,8 +84,8 @@ def _show_comparison(console: Console, rows: Sequence[Values], box: Box) -> None
     title = "one registration in ms"
     if compared:
         title += "; x ref, pap, def: times ours in preset reference, paper, default"
-    title += "\ncost: of the best pose, by Eq. 7 with nearest lookup for all"
-    console.print(title, "\n", sep="", soft_wrap=True)
+    for line in (title, "cost: of the best pose, by Eq. 7 with nearest lookup for all", ""):
+        console.print(line, soft_wrap=True)
     table = Table(box=box, show_edge=box is MARKDOWN, collapse_padding=True)
     for name in ("problem", "registration"):
         table.add_column(name, no_wrap=True)
@@ -106,11 +108,13 @@ def _show_calls(console: Console, problems: Mapping[str, Values]) -> None:
     }
     if calls:
         counts = ", ".join(f"{name} {count}" for name, count in calls.items())
-        console.print(f"\ncost calls of the package, counted: {counts}\n", soft_wrap=True)
+        for line in ("", f"cost calls of the package, counted: {counts}", ""):
+            console.print(line)
 
 
 def _show_alone(console: Console, rows: Sequence[Values], box: Box) -> None:
-    console.print("this library alone: median and quartiles\n")
+    console.print("this library alone: median and quartiles")
+    console.print()
     table = Table(box=box, show_edge=box is MARKDOWN, collapse_padding=True)
     for name in ("measure", "case", "preset"):
         table.add_column(name)

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn
 from rich.table import Table
 
+from replay.console import Console, Progress, TextColumn
 from runners.evaluation import schedule
 from runners.evaluation.true_poses import FoundPose
 
@@ -26,7 +26,7 @@ class Display:
     """A bar with what is at work, or a line a minute where there is no terminal; then a table."""
 
     def __init__(self) -> None:
-        self._console = Console(highlight=False)
+        self._console = Console()
         terminal = self._console.is_terminal
         self._bar = Progress(
             TextColumn("{task.completed}/{task.total} units"),
@@ -41,7 +41,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """A line of its own."""
-        self._console.print(text, soft_wrap=True, markup=False)
+        self._console.print(text, soft_wrap=True)
 
     def progress(self, state: schedule.Progress) -> None:
         """Show how far it is."""

@@ -111,7 +111,7 @@ def _markdown_cell(cell: Cell) -> str:
 
 def _text(text: str) -> str:
     """Text that Markdown takes for nothing else."""
-    return re.sub(r"([\\`*_<>|#])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"([\\`*_<>|#]|(?<=\])\()", r"\\\1", " ".join(text.split()))
 
 
 def _made(experiment: Mapping[str, Any]) -> list[Table]:
