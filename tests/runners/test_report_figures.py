@@ -184,13 +184,14 @@ def test_numbers_over_iterations_are_medians_and_quartiles_and_costs_of_one_kind
     ]
 
 
-def normals_at(recording: Recording, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+def section_at(
+    recording: Recording, x: FloatArray, z: FloatArray, lookup: str
+) -> tuple[FloatArray, FloatArray]:
     """Signed distances (N,) and normals (N, 2) in the drawn plane, of the object's SDF grid."""
     sdf = recording.start.sdf
     inside = (sdf.values < 0.0).sum(axis=(0, 2))
     y = sdf.origin[1] + sdf.resolution * int(np.argmax(inside))
     points = np.stack([x, np.full(len(x), y), z], axis=1)
-    lookup = recorded_cost(recording.start.config, recording.start.method).lookup
     values, gradients = sdf.query(points, lookup=lookup)
     return np.asarray(values), np.asarray(gradients)[:, [0, 2]]
 
@@ -199,7 +200,8 @@ def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surf
     figures: list[Figure],
 ) -> None:
     recording = read_recording(DRILL)
-    tolerance = recorded_cost(recording.start.config, "chsel").penetration_tolerance
+    settings = recorded_cost(recording.start.config, "chsel")
+    tolerance = settings.penetration_tolerance
     picture_of_gradients(DRILL, "gradients.png")
     (figure,) = figures
     free, occupied, known = (axes for axes in figure.axes)
@@ -213,7 +215,7 @@ def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surf
         (arrows,) = (one for one in axes.collections if isinstance(one, Quiver))
         drawn = np.column_stack([arrows.U, arrows.V])
         assert len(drawn) > 20
-        distances, normals = normals_at(recording, arrows.X, arrows.Y)
+        distances, normals = section_at(recording, arrows.X, arrows.Y, settings.lookup)
         assert violated(distances).all(), axes.get_title()
         push = strength(distances)[:, None] * normals
         along = (drawn * push).sum(axis=1)
@@ -226,6 +228,24 @@ def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surf
         "occupied points enter it",
         "surface points go to its surface",
     ]
+
+
+def test_lines_of_a_section_are_the_surface_and_the_tolerance_of_each_class(
+    figures: list[Figure],
+) -> None:
+    recording = read_recording(DRILL)
+    tolerance = recorded_cost(recording.start.config, "chsel").penetration_tolerance
+    picture_of_gradients(DRILL, "gradients.png")
+    levels = {0: [0.0, tolerance], 1: [0.0, -tolerance], 2: [0.0]}
+    for panel, axes in enumerate(figures[0].axes):
+        contours = [one for one in axes.collections if isinstance(one, QuadContourSet)]
+        assert len(contours) == len(levels[panel])
+        for contour, level in zip(contours, levels[panel], strict=True):
+            vertices = np.concatenate([path.vertices for path in contour.get_paths()])
+            assert len(vertices) > 20
+            distances, _ = section_at(recording, *vertices.T, lookup="trilinear")
+            np.testing.assert_allclose(distances, level, atol=1e-9)
+        assert axes.get_xlabel() == "x in m"
 
 
 def outlines_of(axes: Axes) -> list[tuple[FloatArray, str, str]]:
@@ -252,7 +272,9 @@ def test_a_probing_sequence_shows_poses_in_the_world_and_the_contacts_so_far(
     picture_of_sequence({"chsel": HAMMER}, styles, "sequence.png", steps=shown, view="xz")
     (figure,) = figures
     assert [axes.get_title() for axes in figure.axes] == [f"step {step}" for step in shown]
+    assert figure.axes[0].get_ylabel() == "CHSEL\nz in m"
     for axes, step in zip(figure.axes, shown, strict=True):
+        assert axes.get_xlabel() == "x in m"
         check_outlines(axes, recording, step, styles["chsel"].color)
         check_contacts(axes, recording, step)
 
