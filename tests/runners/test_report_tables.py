@@ -17,9 +17,9 @@ from tests.runners.test_report import Page, page_of
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two trials of a can and one of a box; the last half of each is its step 5 alone."""
+    """Two trials of a can and two of a box; the last half of each is its step 5 alone."""
     folder = tmp_path_factory.mktemp("evaluation")
-    places = [("can", 0), ("can_fallen", 0), ("box", 3)]
+    places = [("can", 0), ("can_fallen", 0), ("box", 3), ("box", 4)]
     numbers = {  # diversity, rank, share of members at step 5
         "chsel": (90.0, 0.2, 0.75),
         "icp": (50.0, 0.6, 0.25),
@@ -46,30 +46,30 @@ def page(folder: Path) -> Page:
 def test_objects_have_their_trials_steps_and_plausible_sets_counted(page: Page) -> None:
     assert page.tables["Objects"] == [
         ["object", "configurations", "trials", "steps", "steps with a plausible set"],
-        ["box", "box", "1", "2", "1"],
+        ["box", "box", "2", "4", "2"],
         ["can", "can, can_fallen", "2", "4", "2"],
     ]
 
 
 def test_ranks_and_shares_of_members_are_those_of_the_last_half(folder: Path, page: Page) -> None:
     assert page.tables["Rank of the true pose among the hypotheses"][1:] == [
-        ["box", "1", "0.2 [0.2, 0.2]", "0.6 [0.6, 0.6]"],
+        ["box", "2", "0.2 [0.2, 0.2]", "0.6 [0.6, 0.6]"],
         ["can", "2", "0.2 [0.2, 0.2]", "0.6 [0.6, 0.6]"],
     ]
     assert page.tables["Share of hypotheses in the plausible set"][1:] == [
-        ["box", "1", "0.75 [0.75, 0.75]", "0.25 [0.25, 0.25]"],
+        ["box", "2", "0.75 [0.75, 0.75]", "0.25 [0.25, 0.25]"],
         ["can", "2", "0.75 [0.75, 0.75]", "0.25 [0.25, 0.25]"],
     ]
     text = (folder / "report" / "report.md").read_text(encoding="utf-8")
     ranks = text.split("Rank of the true pose")[1].split("Share of hypotheses")[0]
     shares = text.split("Share of hypotheses")[1]
     assert "**0." not in ranks  # no rank is better than another
-    assert "| box | 1 | **0.75** [0.75, 0.75] | 0.25 [0.25, 0.25] |" in shares  # most is best
+    assert "| box | 2 | **0.75** [0.75, 0.75] | 0.25 [0.25, 0.25] |" in shares  # most is best
 
 
 def test_the_lead_counts_methods_trials_objects_and_registrations(folder: Path) -> None:
     text = (folder / "report" / "report.md").read_text(encoding="utf-8")
-    assert "2 methods on 3 trials of 2 objects: 12 registrations." in text
+    assert "2 methods on 4 trials of 2 objects: 16 registrations." in text
 
 
 def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path: Path) -> None:
