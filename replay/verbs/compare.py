@@ -87,7 +87,8 @@ def run(given: argparse.Namespace) -> int:
         outcomes = _compared(recording, methods, steps, cost, sets)
     console = Console(highlight=False)
     each = given.each or len(steps) <= _FEW_STEPS
-    _tell(console, recording, methods, outcomes, cost, each=each, count=given.threads)
+    of_sets = f"plausible sets by definition {given.definition}"
+    _tell(console, recording, methods, outcomes, cost, of_sets, each=each, count=given.threads)
     _save(given, recording, methods, outcomes, cost)
     for path in (given.save_csv, given.save_plot, given.save_rerun):
         if path is not None:
@@ -138,16 +139,17 @@ def _tell(
     methods: Sequence[Contender],
     outcomes: Sequence[Outcome],
     cost: CommonCost,
+    of_sets: str,
     *,
     each: bool,
     count: int,
 ) -> None:
     columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
-    of_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
+    to_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
     of_all = tuple(column for column in columns if column.name not in PLAUSIBLE)
     _tell_tables(console, _costs(cost), of_all, outcomes, each=each)
-    if of_sets:
-        _tell_tables(console, "plausible sets", of_sets, outcomes, each=each)
+    if to_sets:
+        _tell_tables(console, of_sets, to_sets, outcomes, each=each)
     console.print(_legend(columns, count))
     for method in methods:
         if method.changes:

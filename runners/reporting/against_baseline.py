@@ -106,10 +106,12 @@ def _summary(
     )
     note = (
         "Ratio: the geometric mean of all. Members: the mean share of hypotheses that are members "
-        "of the plausible set by its definition. Distinct: poses, the mean. Misses: registrations "
-        f"whose best energy is above {1000.0 * MISSED:g} mm, where the cost is an energy."
+        f"of the plausible set by its definition, {evaluation.definition_text}. Distinct: poses, "
+        f"the mean. Misses: registrations whose best energy is above {1000.0 * MISSED:g} mm, where "
+        "the cost is an energy."
     )
-    return Table("PD and its ratios over all registrations", header, tuple(lines), note=note)
+    title = f"PD and its ratios over all registrations, by {evaluation.definition}"
+    return Table(title, header, tuple(lines), note=note)
 
 
 def _ratios(
