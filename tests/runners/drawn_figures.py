@@ -6,9 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from chsel.arrays import FloatArray
 from runners.reporting.method_style import MethodStyle
 
 Bands = dict[float, tuple[float, float, float]]
@@ -45,3 +47,16 @@ def legend_of(figure: Figure) -> dict[str, tuple[object, object, object]]:
         text.get_text(): (line.get_color(), line.get_marker(), line.get_linestyle())
         for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)
     }
+
+
+def outlines_of(axes: Axes) -> list[tuple[FloatArray, str, str]]:
+    """Vertices (N, 2), color and line style of every outline, in the order of drawing."""
+    return [
+        (
+            np.concatenate([path.vertices for path in outline.get_paths()]),
+            to_hex(outline.get_edgecolor()[0]),
+            "solid" if outline.get_linestyles()[0][1] is None else "dashed",
+        )
+        for outline in axes.collections
+        if isinstance(outline, QuadContourSet)
+    ]

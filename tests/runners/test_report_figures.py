@@ -26,7 +26,7 @@ from runners.reporting.over_iterations import picture_over_iterations, tables_ov
 from runners.reporting.over_probes import picture_over_probes
 from runners.reporting.probing_sequence import CONTACT, picture_of_sequence
 from runners.reporting.registration_times import picture_of_times
-from tests.runners.drawn_figures import bands_of, legend_of, line_of
+from tests.runners.drawn_figures import bands_of, legend_of, line_of, outlines_of
 from tests.runners.made_up_evaluations import REPLAYS, row, write_evaluation
 
 DRILL, HAMMER = REPLAYS / "drill_chsel.mcap", REPLAYS / "hammer_chsel.mcap"
@@ -246,19 +246,6 @@ def test_lines_of_a_section_are_the_surface_and_the_tolerance_of_each_class(
             distances, _ = section_at(recording, *vertices.T, lookup="trilinear")
             np.testing.assert_allclose(distances, level, atol=1e-9)
         assert axes.get_xlabel() == "x in m"
-
-
-def outlines_of(axes: Axes) -> list[tuple[FloatArray, str, str]]:
-    """Vertices (N, 2), color and line style of every outline, in the order of drawing."""
-    return [
-        (
-            np.concatenate([path.vertices for path in outline.get_paths()]),
-            to_hex(outline.get_edgecolor()[0]),
-            "solid" if outline.get_linestyles()[0][1] is None else "dashed",
-        )
-        for outline in axes.collections
-        if isinstance(outline, QuadContourSet)
-    ]
 
 
 def test_a_probing_sequence_shows_poses_in_the_world_and_the_contacts_so_far(
