@@ -252,7 +252,7 @@ def _save(
     cost: CommonCost,
 ) -> None:
     if given.save_csv is not None:
-        write_csv(given.save_csv, outcomes, methods, cost)
+        write_csv(given.save_csv, outcomes, methods, cost, given.definition)
     if given.save_plot is not None:
         from replay.comparing.plot import write_plot
 
