@@ -33,6 +33,7 @@ from chsel.threads import threads
 from replay.console import Console, Progress
 from replay.step_ranges import chosen_steps
 from runners.cli import command, plain
+from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig
 from runners.plausible_source import Source, open_source
@@ -93,16 +94,12 @@ def main(config: DictConfig) -> None:
 
 
 def _settings(definition: Any, source: Source) -> PlausibleSettings:
-    values = dict(definition)
-    values.pop("name", None)
-    if values.get("epsilon") is None:
-        if source.epsilon is None:
-            raise SettingError(
-                "definition.epsilon is missing, as the recording names none of its object; "
-                "accepted: metres above 0, such as 0.001"
-            )
-        values["epsilon"] = source.epsilon
-    return build_settings(PlausibleSettings, values, "definition")
+    if definition.get("epsilon") is None and source.epsilon is None:
+        raise SettingError(
+            "definition.epsilon is missing, as the recording names none of its object; "
+            "accepted: metres above 0, such as 0.001"
+        )
+    return definition_settings(definition, source.epsilon)
 
 
 def _truth(
@@ -189,10 +186,9 @@ def _title(
     config: PlausibleConfig, source: Source, settings: PlausibleSettings, truth: FloatArray
 ) -> str:
     position = ", ".join(f"{value:.3f}" for value in truth[:3, 3])
-    name = config.definition.get("name", "own")
     return (
-        f"{source.object}, plausible sets by definition {name}, epsilon "
-        f"{1000.0 * settings.epsilon:g} mm, around ({position}) m"
+        f"{source.object}, plausible sets by definition {definition_label(config.definition)}, "
+        f"epsilon {1000.0 * settings.epsilon:g} mm, around ({position}) m"
     )
 
 

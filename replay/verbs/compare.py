@@ -86,7 +86,8 @@ def run(given: argparse.Namespace) -> int:
         outcomes = _compared(recording, methods, steps, cost, sets)
     console = Console()
     each = given.each or len(steps) <= _FEW_STEPS
-    _tell(console, recording, methods, outcomes, cost, each=each, count=given.threads)
+    of_sets = f"plausible sets by definition {given.definition}"
+    _tell(console, recording, methods, outcomes, cost, of_sets, each=each, count=given.threads)
     _save(given, recording, methods, outcomes, cost)
     for path in (given.save_csv, given.save_plot, given.save_rerun):
         if path is not None:
@@ -137,16 +138,17 @@ def _tell(
     methods: Sequence[Contender],
     outcomes: Sequence[Outcome],
     cost: CommonCost,
+    of_sets: str,
     *,
     each: bool,
     count: int,
 ) -> None:
     columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
-    of_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
+    to_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
     of_all = tuple(column for column in columns if column.name not in PLAUSIBLE)
     _tell_tables(console, _costs(cost), of_all, outcomes, each=each)
-    if of_sets:
-        _tell_tables(console, "plausible sets", of_sets, outcomes, each=each)
+    if to_sets:
+        _tell_tables(console, of_sets, to_sets, outcomes, each=each)
     console.print(_legend(columns, count))
     for method in methods:
         if method.changes:
@@ -247,7 +249,7 @@ def _save(
     cost: CommonCost,
 ) -> None:
     if given.save_csv is not None:
-        write_csv(given.save_csv, outcomes, methods, cost)
+        write_csv(given.save_csv, outcomes, methods, cost, given.definition)
     if given.save_plot is not None:
         from replay.comparing.plot import write_plot
 

@@ -66,8 +66,11 @@ class Display:
         if len(shown) < len(state.failed):
             self.say(f"and {len(state.failed) - len(shown)} more, see the table")
 
-    def summary(self, results: pa.Table, methods: Sequence[str]) -> None:
-        """Median PD by object and method, and milliseconds a registration."""
+    def summary(self, results: pa.Table, methods: Sequence[str], definition: str) -> None:
+        """Median PD by object and method, and milliseconds a registration.
+
+        definition: of the plausible sets, as text.
+        """
         names = np.array(results["object"].to_pylist(), dtype=object)
         labels = np.array(results["method"].to_pylist(), dtype=object)
         there = [label for label in methods if (labels == label).any()]
@@ -87,6 +90,7 @@ class Display:
             table.add_row(label, *cells, _median(1000.0 * seconds[own]))
         self.say("medians over all steps of all trials: PD in mm² by object, ms a registration")
         self._console.print(table)
+        self.say(f"plausible sets: {definition}")
 
     def true_poses(self, found: Sequence[FoundPose]) -> None:
         """How far the true poses that were sought are from guesses, and from a simulated truth."""

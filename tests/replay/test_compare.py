@@ -399,7 +399,9 @@ def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(
     save_plausible(tmp_path / "plausible", members)
     arguments = ["compare", str(path), "--steps", "8,9", "--methods", "icp"]
     assert main([*arguments, "--save-csv", str(tmp_path / "out.csv")]) == 0
-    assert "PD" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "PD" in shown
+    assert "each step, plausible sets by definition default" in shown
     rows = list(csv.DictReader((tmp_path / "out.csv").open()))
     (recorded,) = (row for row in rows if row["step"] == "9" and row["label"] != "icp")
     points = surface_points(start.mesh, 500, StreamKey(start.seed, 0))
@@ -410,6 +412,7 @@ def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(
     assert float(recorded["diversity_mm2"]) == pytest.approx(expected.diversity, rel=1e-6)
     assert float(recorded["coverage_mm2"]) == pytest.approx(expected.coverage, rel=1e-6)
     assert {row["diversity_mm2"] for row in rows if row["step"] == "8"} == {""}
+    assert {(row["step"], row["definition"]) for row in rows} == {("8", ""), ("9", "default")}
     assert main([*arguments, "--definition", "paper", "--each"]) == 0
     assert "PD" not in capsys.readouterr().out
     assert main([*arguments, "--plausible", str(tmp_path / "nowhere")]) == 2
