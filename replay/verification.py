@@ -25,7 +25,12 @@ from replay.events import (
 from replay.mcap.reader import Recording
 from replay.mcap.recovery import tells_loss
 from replay.recorder import ListRecorder
-from replay.registration import NamedMethod, recorded_method, register_recorded
+from replay.registration import (
+    NamedMethod,
+    recorded_method,
+    register_recorded,
+    symmetry_for_errors,
+)
 
 EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
 LOST: Literal["lost"] = "lost"  # of a result that a damaged recording does not tell
@@ -159,6 +164,7 @@ def _verified(
             method.method,
             watching,
             start.world_from_object,
+            symmetry_for_errors(start),
             snapshot_interval=snapshot_interval(snapshots),
         )
         found, seconds = registered.hypotheses, registered.total_seconds

@@ -43,20 +43,20 @@ class RotatedSurface:
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         """Only centre and radius are set for a mesh without an area."""
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+        corners, normals = _corners_normals(vertices, faces)
+        areas = np.sqrt((normals**2).sum(axis=1))  # twice the areas of faces
+        self.centre, self.radius = corners.reshape(-1, 3).mean(axis=0), 0.0
+        if not areas.sum() > 0.0:
+            return
+        self.centre = (areas[:, None] * corners.mean(axis=1)).sum(axis=0) / areas.sum()
         if len(faces) > _MOST_FACES:
             vertices, faces = _merged(vertices, faces)
-        corners = vertices[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        doubled = np.sqrt((normals**2).sum(axis=1))  # twice the areas
-        total = doubled.sum()
-        self.centre, self.radius = corners.reshape(-1, 3).mean(axis=0), 0.0
-        if not total > 0.0:
-            return
-        self.centre = (doubled[:, None] * corners.mean(axis=1)).sum(axis=0) / total
+            corners, normals = _corners_normals(vertices, faces)
+            areas = np.sqrt((normals**2).sum(axis=1))
         self.radius = float(np.sqrt(((corners - self.centre) ** 2).sum(axis=-1)).max())
         self.corners = (corners - self.centre) / self.radius
-        self.normals = normals / np.maximum(doubled, 1e-300)[:, None]
-        self.areas = doubled / total
+        self.normals = normals / np.maximum(areas, 1e-300)[:, None]
+        self.areas = areas / areas.sum()
         self._vertices = np.ascontiguousarray((vertices - self.centre) / self.radius)
         self._faces = np.ascontiguousarray(faces, dtype=np.int64)
         unit = trimesh.Trimesh(self._vertices, self._faces, process=False)
@@ -121,6 +121,13 @@ def _cells(points: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
     """Indices of the cells in which points (..., 3) of the unit ball are."""
     index = np.clip(((points + 1.0) * (_CELLS / 2)).astype(np.int64), 0, _CELLS - 1)
     return index[..., 0], index[..., 1], index[..., 2]
+
+
+def _corners_normals(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Corners (F, 3, 3) of faces, and normals (F, 3) as long as twice their areas."""
+    corners = vertices[faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    return corners, np.cross(sides[:, 0], sides[:, 1])
 
 
 def _merged(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:

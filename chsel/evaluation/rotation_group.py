@@ -55,4 +55,5 @@ def generated(turns: FloatArray) -> FloatArray | None:
         means = np.einsum("jba,jkbc->kac", turns, turns[table])
         left, _, right = np.linalg.svd(means)
         turns = left @ right
+    turns[0] = np.eye(3)  # without the rounding
     return turns

@@ -34,7 +34,7 @@ from replay.comparing.contenders import contenders
 from replay.events import Probe, ProblemPosed, SessionEnded, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
-from replay.registration import register_recorded
+from replay.registration import register_recorded, symmetry_for_errors
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 
@@ -93,7 +93,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
             previous,
         )
         found = _Last(recorder)
-        register_recorded(ProblemPosed(step, problem), method, found, start.world_from_object)
+        posed, truth = ProblemPosed(step, problem), start.world_from_object
+        register_recorded(posed, method, found, truth, symmetry_for_errors(start))
         previous = found.last.hypotheses
     recorder.record(SessionEnded(2, "finished"))
     recorder.close()
