@@ -96,7 +96,7 @@ def changes(recorded: Recording, new: Recording) -> list[Change]:
             pair = recorded.hypotheses(step), new.hypotheses(step)
             numbers = [sets.numbers(event.problem, result) for result in pair]
             equal = before[step] == after[step]
-            change = _change(step, *pair, truth, symmetry, numbers, equal=equal)
+            change = _change(step, *pair, truth, numbers, symmetry=symmetry, equal=equal)
             found.append(change)
     return found
 
@@ -160,9 +160,9 @@ def _change(
     recorded: Hypotheses,
     new: Hypotheses,
     truth: FloatArray | None,
-    symmetry: ObjectSymmetry,
     numbers: Sequence[Mapping[str, float]],
     *,
+    symmetry: ObjectSymmetry,
     equal: bool,
 ) -> Change:
     position = rotation = float("nan")
