@@ -151,10 +151,8 @@ def test_how_far_true_poses_are_off_is_told(capsys: pytest.CaptureFixture[str]) 
     Display().true_poses([near, far, own])
     told = capsys.readouterr().out
     assert "sought in 3 trials: mean |SDF| of contacts 0.40 mm, 3 free points inside" in told
-    assert (
-        "simulated truth of 2, modulo symmetries: 4.0 mm in the mean, 6.0 mm at worst; 1.0 and 1.0 deg"
-        in told
-    )
+    assert "simulated truth of 2, modulo symmetries: 4.0 mm in the mean" in told
+    assert "6.0 mm at worst; 1.0 and 1.0 deg" in told
 
 
 @pytest.mark.parametrize(
