@@ -12,8 +12,7 @@ from chsel.evaluation.surface_distance import surface_points
 from chsel.quaternions import rotations
 from chsel.streams import StreamKey
 
-TOLERANCE = 0.0085  # of the diameter, root mean square
-FARTHEST, FAR_SHARE = 0.03, 0.01  # of the diameter, and the share of points that may be beyond
+TOLERANCE = 0.0085  # of the diameter
 _TESTED = 1000  # points by which a rotation is judged
 _POINTS = 20_000  # points that mark the cells of the coarse grid
 _CELLS = 48  # of the coarse grid, along each axis
@@ -27,11 +26,11 @@ _DAMPING = 1e-4
 class RotatedSurface:
     """The surface of a mesh about its centroid, at unit radius.
 
-    A rotation matches if points of the surface, once rotated, are within 0.85 % of the diameter of
-    the surface (root mean square), and 99 % of them within 3 %. The diameter is twice the distance
-    from the centroid to the farthest vertex. Scans of boxes, cans and bottles that are symmetric by
-    design have up to 0.66 % and 2.1 %. A hammer rotated by half a turn about its handle has 1.1 %
-    and 4.5 %, a tapered can turned upside down 1.2 % and 4.0 %.
+    A rotation matches if the root mean square distance from the surface, of points of it that are
+    rotated, is at most 0.85 % of the diameter, which is twice the distance from the centroid to the
+    farthest vertex. Scans of boxes, cans and bottles that are symmetric by design have up to
+    0.66 %. A hammer rotated by half a turn about its handle has 1.1 %, a tapered can turned upside
+    down 1.2 %.
     """
 
     centre: FloatArray  # (3,), the surface's centroid in the frame of the mesh, m
@@ -65,11 +64,9 @@ class RotatedSurface:
         self._tree.init(self._vertices, self._faces)
 
     def errors(self, turns: FloatArray, count: int = _TESTED) -> FloatArray:
-        """How far rotations (T, 3, 3) are from a match (T,): up to 1 is within the tolerance."""
-        distances = np.sqrt(self._closest(turns, count)[1]) / 2.0  # (T, count), of the diameter
-        typical = np.sqrt((distances**2).mean(axis=1))
-        far = np.quantile(distances, 1.0 - FAR_SHARE, axis=1)
-        return np.maximum(typical / TOLERANCE, far / FARTHEST)
+        """Root mean square distances (T,) under rotations (T, 3, 3), in units of the tolerance."""
+        _, squared, _, _ = self._closest(turns, count)
+        return np.sqrt(squared.mean(axis=1)) / (2.0 * TOLERANCE)
 
     def aligned(self, turns: FloatArray, *, steps: int, count: int) -> FloatArray:
         """Rotations (T, 3, 3) moved to the nearest one by which the surface matches itself best.
