@@ -1,4 +1,4 @@
-"""CMA-ES on the Medial Constraint cost, from every start or from one (CHSEL, Sec. V-C)."""
+"""CMA-ES on the Medial Constraint cost, from every start or from one (CHSEL, Sec. V-D)."""
 
 from __future__ import annotations
 

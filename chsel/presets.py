@@ -1,8 +1,17 @@
 """Three sets of settings: `paper` as printed, `reference` as its authors ran it, `default` ours.
 
-One thing differs from the paper in all of them: beyond the SDF grid, where the paper queries the
-mesh, distances come from the grid's border (see SdfGrid.query), so that a problem holds all that
-determines its result.
+`paper` differs from the print in these points, so that its results keep their bits; docs/presets.md
+has them all, with the reasons, and every setting in which the presets differ:
+
+- Beyond the SDF grid, where the paper queries the mesh, distances are bounds from the grid's border
+  (see SdfGrid.query), so that a problem holds all that determines its result.
+- The noise of Algorithm 2 acts on world_from_object, the inverse of the paper's T.
+- E_l has the solutions of all cells, as Sec. IV-D says; Algorithm 2 has those of E alone.
+- The deviation that sizes the archive is at least `archive.least_deviation`, 0.1 mm.
+- ICP draws its surface points anew for every registration, not for every trial.
+- CVO searches along its flow for a step that gains, and compares all pairs of points. It anneals
+  its length scale in `default` alone.
+- Medial Constraint's balls come from exact clearances of free voxels; E_l seeds its CMA-ME, too.
 
 What came to `default` later is off in the classes of the settings, so that recordings made before
 it give the same bits.

@@ -11,6 +11,7 @@ from pathlib import Path
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
 from chsel.online import pose_problem
 from chsel.pose import inverse
 from chsel.problem import Hypotheses
@@ -31,7 +32,7 @@ from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import tells_loss
 from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
-from replay.registration import recorded_method, register_recorded
+from replay.registration import recorded_method, register_recorded, symmetry_for_errors
 from replay.verification import snapshot_interval
 
 _RESULTS = (SnapshotTaken, Traced, HypothesesFound, Measured, Timed)
@@ -44,7 +45,8 @@ class Change:
     equal: to the bit, with all stages on the way. ulps: the most between two of the costs or
     poses, if there are as many. Pairs are recorded and new. position, rotation: from the recorded
     best pose to the new one, metres and radians, NaN if a result has no pose. position_error,
-    rotation_error: of the best, where the truth is known. diversity: PD in mm^2, where the
+    rotation_error: of the best, where the truth is known. All are modulo the object's symmetries,
+    at its centre. diversity: PD in mm^2, where the
     plausible set of the step lies beside the recording.
     """
 
@@ -85,6 +87,7 @@ def write_blessed(recording: Recording, path: Path) -> Recording:
 def changes(recorded: Recording, new: Recording) -> list[Change]:
     """What differs, step by step, between results that are there in both."""
     sets, truth = PlausibleSets(recorded), recorded.start.world_from_object
+    symmetry = object_symmetry(recorded.start.mesh)
     before, after = _outputs(recorded), _outputs(new)
     found = []
     for event in recorded.events(images=False):
@@ -92,7 +95,8 @@ def changes(recorded: Recording, new: Recording) -> list[Change]:
             step = event.step
             pair = recorded.hypotheses(step), new.hypotheses(step)
             numbers = [sets.numbers(event.problem, result) for result in pair]
-            change = _change(step, *pair, truth, numbers, equal=before[step] == after[step])
+            equal = before[step] == after[step]
+            change = _change(step, *pair, truth, numbers, symmetry=symmetry, equal=equal)
             found.append(change)
     return found
 
@@ -140,6 +144,7 @@ def _todays_events(recording: Recording) -> Iterator[Event]:
                 method.method,
                 kept,
                 start.world_from_object,
+                symmetry_for_errors(start),
                 snapshot_interval=snapshot_interval(recording.snapshots(event.step)),
             )
             previous = registered.hypotheses
@@ -157,16 +162,19 @@ def _change(
     truth: FloatArray | None,
     numbers: Sequence[Mapping[str, float]],
     *,
+    symmetry: ObjectSymmetry,
     equal: bool,
 ) -> Change:
     position = rotation = float("nan")
     errors: list[tuple[float, float]] | None = None  # of position, of rotation
     if len(recorded.cost) > 0 and len(new.cost) > 0:
         world_from_recorded = inverse(recorded.object_from_world[0])
-        shift, turn = pose_errors(new.object_from_world[:1], world_from_recorded)
+        shift, turn = pose_errors(new.object_from_world[:1], world_from_recorded, symmetry)
         position, rotation = float(shift[0]), float(turn[0])
         if truth is not None:
-            before, after = (pose_errors(h.object_from_world[:1], truth) for h in (recorded, new))
+            before, after = (
+                pose_errors(h.object_from_world[:1], truth, symmetry) for h in (recorded, new)
+            )
             errors = [
                 (float(old[0]), float(now[0])) for old, now in zip(before, after, strict=True)
             ]

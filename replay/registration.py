@@ -12,12 +12,14 @@ import yaml
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError
 from chsel.evaluation.result_numbers import result_numbers
+from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.presets import PRESETS
 from chsel.problem import Hypotheses
 from chsel.settings import settings_mapping
-from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder
+from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder, SessionStarted
+from replay.lost_attachment import is_lost
 from replay.mcap.reader import Recording
 from replay.step_observer import StepObserver
 
@@ -85,18 +87,27 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
     return _named(name or recorded, settings)
 
 
+def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
+    """The symmetries of a session's object; None without a true pose, or if its mesh is lost."""
+    if start.world_from_object is None or is_lost(start.mesh):
+        return None
+    return object_symmetry(start.mesh)
+
+
 def register_recorded(
     posed: ProblemPosed,
     method: Method,
     recorder: Recorder,
     world_from_object: FloatArray | None,
+    symmetry: ObjectSymmetry | None,
     *,
     snapshot_interval: int = 0,
     show: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Registered:
     """Register a problem, and record it with all that the registration gives.
 
-    world_from_object (4, 4): the true pose, where known. show: gets stage, iteration and total.
+    world_from_object (4, 4): the true pose, where known. symmetry: of the object, for the errors to
+    the true pose; see `result_numbers`. show: gets stage, iteration and total.
     """
     recorder.record(posed)
     observer = StepObserver(recorder, posed.step, snapshot_interval, show)
@@ -105,7 +116,7 @@ def register_recorded(
     seconds = dict(observer.seconds)
     seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
     recorder.record(HypothesesFound(posed.step, hypotheses))
-    numbers = result_numbers(hypotheses, posed.problem, world_from_object)
+    numbers = result_numbers(hypotheses, posed.problem, world_from_object, symmetry)
     recorder.record(Measured(posed.step, numbers))
     return Registered(hypotheses, numbers, seconds)
 

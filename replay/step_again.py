@@ -16,7 +16,7 @@ from replay.file_digest import file_digest
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.writer import McapRecorder
 from replay.new_file import new_file
-from replay.registration import NamedMethod, register_recorded
+from replay.registration import NamedMethod, register_recorded, symmetry_for_errors
 from replay.verification import snapshot_interval
 
 
@@ -76,6 +76,7 @@ def register_step_again(
                 method.method,
                 recorder,
                 start.world_from_object,
+                symmetry_for_errors(start),
                 snapshot_interval=interval,
             )
             recorder.record(SessionEnded(step, "finished"))

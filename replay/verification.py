@@ -29,7 +29,12 @@ from replay.mcap.recovery import tells_loss
 from replay.mcap.schemas import SEALED_SINCE
 from replay.measured import measured_differences
 from replay.recorder import ListRecorder
-from replay.registration import NamedMethod, recorded_method, register_recorded
+from replay.registration import (
+    NamedMethod,
+    recorded_method,
+    register_recorded,
+    symmetry_for_errors,
+)
 
 EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
 LOST: Literal["lost"] = "lost"  # of a result that a damaged recording does not tell
@@ -174,6 +179,7 @@ def _verified(
             method.method,
             watching,
             start.world_from_object,
+            symmetry_for_errors(start),
             snapshot_interval=snapshot_interval(snapshots),
         )
         found, seconds = registered.hypotheses, registered.total_seconds

@@ -16,6 +16,7 @@ from rich.table import Table
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError, require_positive
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
 from chsel.evaluation.true_pose import TruePose, TruePoseSettings, find_true_pose
 from chsel.pose import compose, inverse, roll_pitch_yaw
 from chsel.problem import RegistrationProblem
@@ -109,12 +110,13 @@ def main(config: DictConfig) -> None:
     }
     console.print(_title(source, problem), style="bold", soft_wrap=True)
     console.print(_table(fits))
-    moved = _between(found.world_from_object, guess)
+    symmetry = object_symmetry(source.mesh)
+    moved = _between(found.world_from_object, guess, symmetry)
     console.print(f"moved from the guess by {_apart(*moved)}")
     if source.world_from_object is not None:
-        apart = _apart(*_between(found.world_from_object, source.world_from_object))
+        apart = _apart(*_between(found.world_from_object, source.world_from_object, symmetry))
         console.print(f"from the true pose that the recording has: {apart}")
-    for warning in _warnings(found, guess, fits["found"], checked.search):
+    for warning in _warnings(found, guess, moved[1], fits["found"], checked.search):
         console.print(f"warning: {warning}", soft_wrap=True)
     pose_path.parent.mkdir(parents=True, exist_ok=True)
     about = _about(checked, source, found, guess, fits["found"])
@@ -163,9 +165,9 @@ def _table(fits: dict[str, Fit]) -> Table:
     return table
 
 
-def _between(one: FloatArray, other: FloatArray) -> tuple[float, float]:
-    """Metres and radians between two world_from_object (4, 4)."""
-    position, rotation = pose_errors(inverse(one)[None], other)
+def _between(one: FloatArray, other: FloatArray, symmetry: ObjectSymmetry) -> tuple[float, float]:
+    """Metres and radians between two world_from_object (4, 4), as `pose_errors` defines them."""
+    position, rotation = pose_errors(inverse(one)[None], other, symmetry)
     return float(position[0]), float(rotation[0])
 
 
@@ -173,8 +175,10 @@ def _apart(position: float, rotation: float) -> str:
     return f"{1000.0 * position:.1f} mm, {degrees(rotation):.1f} degrees"
 
 
-def _warnings(found: TruePose, guess: FloatArray, fit: Fit, search: TruePoseSettings) -> list[str]:
-    """What speaks against the result."""
+def _warnings(
+    found: TruePose, guess: FloatArray, turned: float, fit: Fit, search: TruePoseSettings
+) -> list[str]:
+    """What speaks against the result. turned: from the guess, radians."""
     warnings = []
     offset = np.abs(found.world_from_object[:3, 3] - guess[:3, 3])
     if offset.max() > search.reach - search.spacing:
@@ -183,7 +187,6 @@ def _warnings(found: TruePose, guess: FloatArray, fit: Fit, search: TruePoseSett
             f"the pose found is at the edge of the search along {axis}: start again from it, "
             f"pose=FILE.pose.yaml overwrite=true, or with search.reach above {search.reach:g} m"
         )
-    _, turned = _between(found.world_from_object, guess)
     if turned > 3.0 * search.angle:
         warnings.append(
             f"the pose found is turned from the guess by {degrees(turned):.1f} degrees, further "

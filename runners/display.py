@@ -95,7 +95,10 @@ class Display:
         truth = "best_position_error" in rows[-1]
         title = "registrations"
         if truth:
-            title += "; errors to the true pose: best hypothesis, closest one"
+            title += (
+                "; errors to the true pose modulo the object's symmetries, at its centre: "
+                "best hypothesis, closest one"
+            )
         table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
         names = ["probe", "contacts", "best cost", "distinct"]
         errors = ["mm", "°", "mm", "°"] if truth else []

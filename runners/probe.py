@@ -24,6 +24,7 @@ from chsel.streams import StreamKey
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.recording_info import recording_digest
+from replay.registration import symmetry_for_errors
 from runners.cli import command, plain
 from runners.display import Display, reading_bar
 from runners.interrupt import Interrupt
@@ -192,6 +193,7 @@ def run(
         method,
         scene.sdf,
         recorder,
+        symmetry=symmetry_for_errors(started),
         seed=config.seed,
         start=scene.start,
         recording=config.recording,

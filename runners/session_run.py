@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.methods.method import Method
 from chsel.online import pose_problem
 from chsel.points import GrowingPoints
@@ -36,14 +37,18 @@ class SessionRun:
         sdf: SdfGrid,
         recorder: Recorder,
         *,
+        symmetry: ObjectSymmetry | None,
         seed: int,
         start: tuple[int, int],
         recording: RecordingConfig,
         show: Callable[[str, int, int], None],
     ) -> None:
-        """start: a registration needs so many contacts, and this probe index."""
+        """symmetry: of the object, for errors to the true pose; None where that is not known.
+
+        start: a registration needs so many contacts, and this probe index.
+        """
         self._session, self._method, self._sdf, self._recorder = session, method, sdf, recorder
-        self._seed = seed
+        self._symmetry, self._seed = symmetry, seed
         self._start = start
         self._snapshot_interval = recording.snapshot_interval
         self._timings = recording.timings
@@ -92,6 +97,7 @@ class SessionRun:
             self._method,
             self._recorder,
             self._session.world_from_object,
+            self._symmetry,
             snapshot_interval=self._snapshot_interval,
             show=self._show,
         )

@@ -1,4 +1,4 @@
-"""The Medial Constraint cost of one pose (CHSEL, Sec. V-C; after Haugo and Stahl, 2020)."""
+"""The Medial Constraint cost of one pose (CHSEL, Sec. V-D; after Haugo and Stahl, 2020)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Medial Constraint: CMA-ES on balls of free space and contacts (baseline of CHSEL, Sec. V-C)."""
+"""Medial Constraint: CMA-ES on balls of free space and contacts (baseline of CHSEL, Sec. V-D)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quality-diversity search on the Medial Constraint cost (CHSEL, Sec. VI-D)."""
+"""Quality-diversity search on the Medial Constraint cost (CHSEL, Sec. V-H)."""
 
 from __future__ import annotations
 

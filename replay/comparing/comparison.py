@@ -11,6 +11,7 @@ from chsel.cost_settings import CostSettings
 from chsel.engine import CompiledCost
 from chsel.errors import ChselError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import object_symmetry
 from chsel.presets import COST
 from chsel.problem import Hypotheses
 from replay.comparing.contenders import Contender, recorded_or_none
@@ -93,7 +94,7 @@ def numbers_under(
     """Numbers about hypotheses, judged by a cost that may be another than their method's.
 
     Best is the one of the lowest cost, closest the one nearest to the true pose in position.
-    Errors in metres and radians.
+    Errors in metres and radians, modulo the object's symmetries, at its centre.
     """
     poses = hypotheses.object_from_world
     numbers = {"hypotheses": float(len(poses)), "distinct": float(hypotheses.distinct)}
@@ -104,7 +105,9 @@ def numbers_under(
     numbers["best_cost"] = float(costs[best])
     numbers["median_cost"] = float(np.median(costs))
     if start.world_from_object is not None:
-        position, rotation = pose_errors(poses, start.world_from_object)
+        position, rotation = pose_errors(
+            poses, start.world_from_object, object_symmetry(start.mesh)
+        )
         for name, index in (("best", best), ("closest", int(np.argmin(position)))):
             numbers[f"{name}_position_error"] = float(position[index])
             numbers[f"{name}_rotation_error"] = float(rotation[index])
@@ -158,8 +161,8 @@ def _again(
     """Run a method; whatever goes wrong in it is its own failure, and the others go on."""
     try:
         if not warm:
-            register_recorded(posed, method.named.method, NullRecorder(), None)
-        registered = register_recorded(posed, method.named.method, NullRecorder(), None)
+            register_recorded(posed, method.named.method, NullRecorder(), None, None)
+        registered = register_recorded(posed, method.named.method, NullRecorder(), None, None)
         found = registered.hypotheses
         numbers = numbers_under(judge, found, start) | {"seconds": registered.total_seconds}
         if plausible is not None:

@@ -193,7 +193,8 @@ def _legend(columns: Sequence[Column], count: int) -> str:
     """What the numbers of a table are about."""
     text = "problems as recorded, with their E_0 and E_l; "
     if any(column.name.endswith("_error") for column in columns):
-        text += "mm, °: to the true pose, of the best hypothesis by cost and of the nearest; "
+        text += "mm, °: to the true pose, modulo the object's symmetries, at its centre, "
+        text += "of the best hypothesis by cost and of the nearest; "
     return text + f"ms: of one registration by {count} thread{'s' if count > 1 else ''}"
 
 

@@ -92,7 +92,10 @@ def _table(recording: Recording, again: StepAgain) -> Table:
     truth = recording.start.world_from_object is not None
     title = f"cost: {cost.name}"
     if truth:
-        title += "; errors to the true pose: best hypothesis, closest one"
+        title += (
+            "; errors to the true pose modulo the object's symmetries, at its centre: "
+            "best hypothesis, closest one"
+        )
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
     table.add_column("method")
     errors = ("mm", "°", "mm", "°") if truth else ()

@@ -106,7 +106,7 @@ class Display:
             positions = [1000.0 * (one.position_error or 0.0) for one in simulated]
             rotations = [degrees(one.rotation_error or 0.0) for one in simulated]
             self.say(
-                f"from the simulated truth of {len(simulated)}: "
+                f"from the simulated truth of {len(simulated)}, modulo symmetries: "
                 f"{np.mean(positions):.1f} mm in the mean, {max(positions):.1f} mm at worst; "
                 f"{np.mean(rotations):.1f} and {max(rotations):.1f} degrees"
             )

@@ -11,6 +11,7 @@ from chsel.evaluation.error import EvaluationError
 from chsel.evaluation.evaluation_cost import EvaluationCost
 from chsel.evaluation.plausible_set import PlausibleSet
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import object_symmetry
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.streams import StreamKey
 from runners.evaluation.iterations import hypotheses_of
@@ -34,6 +35,7 @@ class Judge:
         self._settings = plausible_settings_of(plan, session)
         mesh, truth = session.recorded.mesh, session.world_from_object
         self._measure, self._truth = Measure(plan.metrics, mesh, truth), truth
+        self._symmetry = object_symmetry(mesh)
 
     def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
         """The plausible set of a problem; else why there is none, as a status."""
@@ -100,7 +102,8 @@ class Judge:
         }
         if len(found.cost) == 0:
             return row
-        position, rotation = pose_errors(found.object_from_world[:1], self._truth)
+        best = found.object_from_world[:1]
+        position, rotation = pose_errors(best, self._truth, self._symmetry)
         return row | {
             "best_cost": float(found.cost[0]),
             "mean_cost": float(found.cost.mean()),

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
+from chsel.evaluation.symmetry import object_symmetry
 from chsel.methods.method import Method
 from chsel.observer import Observer
 from chsel.online import OnlineSettings
@@ -174,6 +175,7 @@ class _EvaluatedRun(SessionRun):
             method,
             session.recorded.sdf,
             recorder,
+            symmetry=object_symmetry(session.recorded.mesh),
             seed=seed,
             start=session.start,
             recording=RecordingConfig(snapshot_interval=plan.every or 0),

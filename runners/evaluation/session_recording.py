@@ -46,7 +46,7 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
             # The true pose stands at the beginning, and is found with what is known at the end.
             events = list(events)
             problem = known_at_the_end(trial, session, sdf, events)
-            truth, config[TRUTH] = find_truth(plan, problem, log)
+            truth, config[TRUTH] = find_truth(plan, problem, model.mesh, log)
             config["session"]["path"] = f"{trial.configuration}/{log.name}"
         recorder.record(
             SessionStarted(

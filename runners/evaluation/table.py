@@ -40,8 +40,9 @@ RESULTS = pa.schema(
     ]
 )
 """A row a (configuration, seed, method, step). Lengths in metres, angles in radians, but coverage,
-plausibility and diversity (PD) in mm^2 and root, of PD, in mm. status: "ok", "failed: REASON" or
-"no plausible set: REASON"; what a row does not have is null."""
+plausibility and diversity (PD) in mm^2 and root, of PD, in mm. position_error, rotation_error: of
+the best hypothesis, modulo the object's symmetries, at its centre. status: "ok", "failed: REASON"
+or "no plausible set: REASON"; what a row does not have is null."""
 ITERATIONS = pa.schema(
     [
         *_KEYS[1:],

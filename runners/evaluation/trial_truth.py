@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.errors import SessionError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
 from chsel.evaluation.true_pose import TruePose, find_true_pose
 from chsel.points import KnownPoints
 from chsel.pose import inverse
@@ -49,21 +51,23 @@ def known_at_the_end(
 
 
 def find_truth(
-    plan: Plan, problem: RegistrationProblem, log: Path
+    plan: Plan, problem: RegistrationProblem, mesh: trimesh.Trimesh, log: Path
 ) -> tuple[FloatArray, dict[str, Any]]:
     """T* as world_from_object (4, 4), and what is to be told about it, plain values.
 
     Of the problem of a trial's last step: the pose of least evaluation cost near the guess that
-    belongs to the log. Distances are in metres and radians.
+    belongs to the log. mesh: of the object, m. Distances are in metres and radians, modulo the
+    object's symmetries, at its centre.
     """
     guess, truth = guessed_pose(log), twin_truth(log)
     found = find_true_pose(problem, guess, plan.truth)
-    return found.world_from_object, _told(plan, problem, found, guess, truth)
+    return found.world_from_object, _told(plan, problem, object_symmetry(mesh), found, guess, truth)
 
 
 def _told(
     plan: Plan,
     problem: RegistrationProblem,
+    symmetry: ObjectSymmetry,
     found: TruePose,
     guess: FloatArray,
     truth: FloatArray | None,
@@ -75,14 +79,14 @@ def _told(
         "violations": fit.violations,
         "guess": guess.tolist(),
         "guess_cost": found.guess_cost,
-        "from_guess": _between(found.world_from_object, guess),
+        "from_guess": _between(found.world_from_object, guess, symmetry),
     }
     if truth is not None:
         told["simulated"] = truth.tolist()
-        told["from_simulated"] = _between(found.world_from_object, truth)
+        told["from_simulated"] = _between(found.world_from_object, truth, symmetry)
     return told
 
 
-def _between(one: FloatArray, other: FloatArray) -> dict[str, float]:
-    position, rotation = pose_errors(inverse(one)[None], other)
+def _between(one: FloatArray, other: FloatArray, symmetry: ObjectSymmetry) -> dict[str, float]:
+    position, rotation = pose_errors(inverse(one)[None], other, symmetry)
     return {"position": float(position[0]), "rotation": float(rotation[0])}

@@ -16,7 +16,8 @@ class FoundPose:
 
     cost, guess_cost: by the evaluation cost. mean_distance: of contacts from the surface.
     violations: free points inside of the object. moved, turned: from the guess. position_error,
-    rotation_error: from the truth, where a simulation knows it.
+    rotation_error: from the truth, where a simulation knows it. Distances and angles between poses
+    are modulo the object's symmetries, at its centre.
     """
 
     configuration: str

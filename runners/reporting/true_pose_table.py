@@ -38,7 +38,10 @@ def true_pose_sections(evaluation: Evaluation) -> list[Section]:
     rows = [_line(name, [one for one in found if one.configuration == name]) for name in names]
     rows += [_line("all", found)] if len(names) > 1 else []
     header = ("configuration", "trials", *(name for name, _ in _COLUMNS))
-    note = "Means over trials, and the greatest in brackets."
+    note = (
+        "Means over trials, and the greatest in brackets. Distances and angles between poses are "
+        "modulo the object's symmetries, at its centre."
+    )
     table = Table("True poses found", header, tuple(rows), note=note)
     return [Section("true-poses", "True poses", text, tables=(table,))]
 

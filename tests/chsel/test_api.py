@@ -11,6 +11,7 @@ import trimesh
 
 import chsel
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.methods import preset_settings
 from chsel.pose import apply, axis_angle, compose, inverse
 
@@ -127,7 +128,7 @@ def test_pose_errors_are_distance_and_angle() -> None:
         axis_angle(np.array([0.0, 1.0, 0.0]), np.array(0.3)), np.array([0.0, 0.03, 0.04])
     )
     estimates = np.stack([inverse(POSE), inverse(POSE @ shift)])
-    position, rotation = pose_errors(estimates, POSE)
+    position, rotation = pose_errors(estimates, POSE, ObjectSymmetry())
     np.testing.assert_allclose(position, [0.0, 0.05], atol=1e-12)
     np.testing.assert_allclose(rotation, [0.0, 0.3], atol=1e-12)
 

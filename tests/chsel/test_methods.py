@@ -15,6 +15,7 @@ from chsel.cost import RelaxedCost
 from chsel.cost_settings import CostSettings
 from chsel.errors import ChselError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
@@ -104,7 +105,7 @@ def test_a_method_finds_the_pose_of_an_object_touched_all_over(name: str) -> Non
         GRID, known_points(), WORKSPACE, 0.05, StreamKey(0, 0), method.online, None
     )
     found = method.register(problem)
-    position, rotation = pose_errors(found.object_from_world, TRUTH)
+    position, rotation = pose_errors(found.object_from_world, TRUTH, ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
 
@@ -242,7 +243,7 @@ def test_on_a_plane_every_hypothesis_stands_on_it(measure: str) -> None:
     world = inverse(found.object_from_world)
     np.testing.assert_allclose(world[:, 2, 3], 0.3, atol=1e-3)
     np.testing.assert_allclose(world[:, 2, 2], 1.0, atol=1e-12)
-    position, rotation = pose_errors(found.object_from_world[:1], standing)
+    position, rotation = pose_errors(found.object_from_world[:1], standing, ObjectSymmetry())
     assert position[0] < 0.01
     assert rotation[0] < 0.05
 

@@ -15,6 +15,7 @@ from chsel import online
 from chsel.evaluation.plausible_file import save_plausible
 from chsel.evaluation.plausible_set import plausible_set
 from chsel.evaluation.plausible_settings import plausible_settings
+from chsel.evaluation.symmetry import object_symmetry
 from chsel.pose import axis_angle, inverse
 from chsel.problem import Hypotheses
 from replay.__main__ import main
@@ -100,7 +101,8 @@ def test_results_without_poses_are_compared_as_well(stored: Path) -> None:
     )
     truth = recording.start.world_from_object
     for pair in [(found, nothing), (nothing, found), (nothing, nothing)]:
-        change = _change(9, *pair, truth, [{}, {}], equal=False)
+        symmetry = object_symmetry(recording.start.mesh)
+        change = _change(9, *pair, truth, [{}, {}], symmetry=symmetry, equal=False)
         assert np.isnan(change.position)
         assert change.position_error is None
         assert change.distinct == tuple(one.distinct for one in pair)

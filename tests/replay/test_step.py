@@ -25,7 +25,7 @@ from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SessionEn
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
-from replay.registration import NamedMethod, other_method, register_recorded
+from replay.registration import NamedMethod, other_method, register_recorded, symmetry_for_errors
 from replay.verification import EQUAL, verify
 
 QUICK = {
@@ -74,7 +74,12 @@ def session_events(method: NamedMethod) -> list[Event]:
             )
             posed = ProblemPosed(step, problem)
             register_recorded(
-                posed, method.method, recorder, start.world_from_object, snapshot_interval=4
+                posed,
+                method.method,
+                recorder,
+                start.world_from_object,
+                symmetry_for_errors(start),
+                snapshot_interval=4,
             )
             found = [event for event in recorder.events if isinstance(event, HypothesesFound)]
             previous = found[-1].hypotheses

@@ -12,11 +12,13 @@ import yaml
 
 from chsel.evaluation.evaluation_cost import EvaluationCost
 from chsel.evaluation.plausible_settings import EvaluationCostSettings
+from chsel.evaluation.symmetry import object_symmetry
 from chsel.mesh import clean_mesh
 from chsel.pose import apply, axis_angle, compose, inverse, roll_pitch_yaw
 from replay.file_digest import file_digest
 from replay.mcap.reader import read_recording
 from runners import align, plausible, probe
+from runners.evaluation import trial_truth
 from runners.objects.models import MODELS
 from runners.sensors.pose_file import beside, read_pose, read_pose_file
 from runners.twin.configurations import CABINET_CONFIGURATIONS
@@ -182,3 +184,15 @@ def test_roll_pitch_and_yaw_turn_about_the_axes_of_the_world_in_this_order() -> 
     np.testing.assert_allclose(turned.T, [y, z, x], atol=1e-12)
     pitched = roll_pitch_yaw(np.array([0.0, np.pi / 2, 0.0])) @ x
     np.testing.assert_allclose(pitched, -z, atol=1e-12)
+
+
+def test_distances_between_poses_are_modulo_symmetries_at_the_centre() -> None:
+    mesh = trimesh.creation.box((0.06, 0.1, 0.14))
+    mesh.apply_translation([0.5, 0.0, 0.0])
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    half_turn[:3, 3] = [1.0, 0.002, 0.0]  # about the box's own axis, and 2 mm aside
+    symmetry = object_symmetry(mesh)
+    for between in (align._between, lambda *poses: trial_truth._between(*poses).values()):
+        position, rotation = between(POSE @ half_turn, POSE, symmetry)
+        assert position == pytest.approx(0.002, abs=1e-9)
+        assert rotation == pytest.approx(0.0, abs=1e-6)

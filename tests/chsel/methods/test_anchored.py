@@ -15,6 +15,7 @@ from chsel.energy import Energy
 from chsel.engine import poses_of
 from chsel.errors import ChselError, SettingError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.methods.anchored import EFFORTS, Anchored, AnchoredSettings, Effort
 from chsel.observer import NullObserver
 from chsel.online import pose_problem
@@ -102,7 +103,7 @@ class Costs(NullObserver):
 def test_the_object_is_found_where_it_was_touched() -> None:
     method = anchored()
     found = registered(method, posed(method))
-    position, rotation = pose_errors(found.object_from_world[:1], TRUTH)
+    position, rotation = pose_errors(found.object_from_world[:1], TRUTH, ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
     assert found.distinct == 30
@@ -158,7 +159,8 @@ def test_a_good_pose_of_the_last_step_is_not_lost() -> None:
     """Even if hardly any samples are drawn."""
     method = anchored(replace(EFFORT, samples=10))
     problem = replace(posed(method), low_cost_set=inverse(TRUTH)[None])
-    position, _ = pose_errors(registered(method, problem).object_from_world[:1], TRUTH)
+    best = registered(method, problem).object_from_world[:1]
+    position, _ = pose_errors(best, TRUTH, ObjectSymmetry())
     assert position[0] < 0.005
 
 
@@ -228,7 +230,7 @@ def test_on_a_plane_every_hypothesis_stands_on_it() -> None:
     again = transforms_of(space, space.encode(found.object_from_world))
     np.testing.assert_allclose(again, found.object_from_world, atol=1e-12)
     np.testing.assert_allclose(inverse(found.object_from_world)[:, 2, 3], 0.3, atol=1e-3)
-    position, rotation = pose_errors(found.object_from_world[:1], STANDING)
+    position, rotation = pose_errors(found.object_from_world[:1], STANDING, ObjectSymmetry())
     assert position[0] < 0.01
     assert rotation[0] < 0.05
 

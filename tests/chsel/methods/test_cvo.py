@@ -12,6 +12,7 @@ from chsel.arrays import FloatArray
 from chsel.engine import poses_of
 from chsel.errors import SettingError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.kernels import cvo as kernels
 from chsel.kernels.cvo import DONE, VALUE, Ascent, Product, climb, products, scratch
 from chsel.methods.cvo import Cvo, CvoSettings, preset_cvo, preset_cvo_no_free_space
@@ -153,7 +154,7 @@ def test_a_cloud_matches_itself(name: str) -> None:
     )
     found = Cvo(settings).register(alike)
     assert found.cost[0] == pytest.approx(0.0, abs=2e-3)
-    position, rotation = pose_errors(found.object_from_world, np.eye(4))
+    position, rotation = pose_errors(found.object_from_world, np.eye(4), ObjectSymmetry())
     assert position[0] < 1e-3
     assert rotation[0] < 1e-2
 
@@ -198,7 +199,7 @@ def around_truth(count: int) -> FloatArray:
 def test_without_free_space_contacts_all_over_place_the_object() -> None:
     method = Cvo(preset_cvo_no_free_space("default"))
     found = method.register(problem(touched_all_over(), around_truth(8)))
-    position, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT)
+    position, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, ObjectSymmetry())
     assert position[0] < 0.004
     assert found.cost[0] < 0.05
 
@@ -207,8 +208,8 @@ def test_an_object_in_a_hole_of_free_space_ends_up_there() -> None:
     method: Method = Cvo(replace(preset_cvo("default"), balanced=True))
     starts = around_truth(4)
     found = method.register(problem(touched_all_over(), starts))
-    before, _ = pose_errors(starts, WORLD_FROM_OBJECT)
-    after, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT)
+    before, _ = pose_errors(starts, WORLD_FROM_OBJECT, ObjectSymmetry())
+    after, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, ObjectSymmetry())
     assert after.max() < 0.01 < before.min()
 
 

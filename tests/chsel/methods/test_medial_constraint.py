@@ -12,6 +12,7 @@ import pytest
 from chsel.cma_es import CmaEsSettings
 from chsel.errors import ChselError, SettingError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.methods.medial_constraint import (
     MedialConstraint,
     preset_medial_constraint,
@@ -124,7 +125,7 @@ def test_on_a_plane_every_hypothesis_stands_on_it(make: Maker) -> None:
     method = make("default", plane=PlaneSettings(plane_height=0.3))
     found = method.register(posed(method, points=known_points(STANDING, 40)))
     np.testing.assert_allclose(inverse(found.object_from_world)[:, 2, 3], 0.3, atol=1e-3)
-    position, rotation = pose_errors(found.object_from_world[:1], STANDING)
+    position, rotation = pose_errors(found.object_from_world[:1], STANDING, ObjectSymmetry())
     assert position[0] < 0.01
     assert rotation[0] < 0.05
 

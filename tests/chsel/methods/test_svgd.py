@@ -14,6 +14,7 @@ from chsel import KnownPoints, RegistrationProblem, RelaxedCost, SdfGrid, Worksp
 from chsel.arrays import FloatArray
 from chsel.errors import ChselError, SettingError
 from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.kernels import svgd as kernels
 from chsel.kernels.svgd import Particles, direct, particles_at
 from chsel.methods.svgd import Svgd, SvgdSettings, preset_svgd
@@ -184,7 +185,7 @@ def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
 def test_the_object_is_found_where_it_was_touched_all_over() -> None:
     problem = posed()
     found = Svgd().register(problem)
-    position, rotation = pose_errors(found.object_from_world, TRUTH)
+    position, rotation = pose_errors(found.object_from_world, TRUTH, ObjectSymmetry())
     assert position[0] < 0.005
     assert rotation[0] < 0.05
     assert (np.diff(found.cost) >= 0.0).all()

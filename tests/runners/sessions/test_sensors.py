@@ -599,6 +599,7 @@ def test_recordings_of_such_sessions_can_be_read_and_registered_again(
         build_method("icp", {}),
         sdf,
         recorder,
+        symmetry=None,
         seed=0,
         start=(4, 0),
         recording=RecordingConfig(),

@@ -1,0 +1,112 @@
+"""Pose errors modulo symmetries, at the object's centre."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.result_numbers import result_numbers
+from chsel.evaluation.symmetry import object_symmetry
+from chsel.points import KnownPoints, Workspace
+from chsel.pose import axis_angle, compose, inverse, rotation_vector
+from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.sdf import SdfGrid
+from chsel.streams import StreamKey
+from runners.objects.models import MODELS
+
+TRUTH = compose(rotation_vector(np.array([0.7, -0.4, 1.1])), np.array([0.3, -0.2, 0.9]))
+CENTRE = np.array([0.4, -0.2, 0.6])  # far from the origin of the mesh
+BOX = trimesh.creation.box((0.06, 0.16, 0.21))
+BOX.apply_translation(CENTRE)
+SYMMETRY = object_symmetry(BOX)
+X, Y, Z = np.eye(3)
+
+
+def about_centre(axis: FloatArray, angle: float, shift: FloatArray | None = None) -> FloatArray:
+    """A rigid motion (4, 4) of the object in its own frame: a rotation about its centre."""
+    rotation = axis_angle(axis, np.array(angle))
+    shift = np.zeros(3) if shift is None else shift
+    return compose(rotation, CENTRE - rotation @ CENTRE + shift)
+
+
+def hypothesis(motion: FloatArray) -> FloatArray:
+    """object_from_world (1, 4, 4) of the object moved before it is placed at the true pose."""
+    return inverse(TRUTH @ motion)[None]
+
+
+def test_a_right_pose_turned_by_a_symmetry_has_no_error() -> None:
+    motions = [about_centre(axis, np.pi) for axis in (X, Y, Z)]
+    poses = np.concatenate([hypothesis(motion) for motion in motions])
+    position, rotation = pose_errors(poses, TRUTH, SYMMETRY)
+    np.testing.assert_allclose(position, 0.0, atol=1e-9)
+    np.testing.assert_allclose(rotation, 0.0, atol=1e-7)
+    origins = np.linalg.norm(inverse(poses)[:, :3, 3] - TRUTH[:3, 3], axis=1)
+    assert origins.min() > 0.5
+
+
+def test_errors_near_a_symmetric_pose_are_from_there() -> None:
+    shift = np.array([0.003, 0.0, -0.004])
+    tilt = about_centre(np.array([0.6, 0.8, 0.0]), 0.1, shift)
+    for motion in (tilt, tilt @ about_centre(Z, np.pi), about_centre(X, np.pi) @ tilt):
+        position, rotation = pose_errors(hypothesis(motion), TRUTH, SYMMETRY)
+        np.testing.assert_allclose(position, 0.005, atol=1e-9)
+        np.testing.assert_allclose(rotation, 0.1, atol=1e-6)
+
+
+def test_half_way_between_two_symmetric_poses_the_error_is_largest() -> None:
+    position, rotation = pose_errors(hypothesis(about_centre(Z, np.pi / 2)), TRUTH, SYMMETRY)
+    assert position[0] == pytest.approx(0.0, abs=1e-9)
+    assert rotation[0] == pytest.approx(np.pi / 2, abs=1e-6)
+    angles = [100.0, 170.0, 190.0, 350.0]
+    poses = np.concatenate([hypothesis(about_centre(Z, np.deg2rad(a))) for a in angles])
+    _, rotation = pose_errors(poses, TRUTH, SYMMETRY)
+    np.testing.assert_allclose(np.rad2deg(rotation), [80.0, 10.0, 10.0, 10.0], atol=1e-4)
+
+
+def test_a_mirror_image_is_not_a_symmetry() -> None:
+    """A quarter turn of a box is an error, and so is half a turn of a drill."""
+    drill = object_symmetry(MODELS["drill"]())
+    turned = TRUTH @ compose(axis_angle(Z, np.array(np.pi)), np.zeros(3))
+    _, rotation = pose_errors(inverse(turned)[None], TRUTH, drill)
+    assert rotation[0] == pytest.approx(np.pi)
+
+
+def test_about_an_axis_of_revolution_any_angle_is_right() -> None:
+    can = trimesh.creation.cylinder(0.033, 0.1)
+    can.apply_translation(CENTRE)
+    symmetry = object_symmetry(can)
+    upside_down = about_centre(X, np.pi)
+    poses = [about_centre(Z, 1.0), about_centre(Z, 2.5) @ upside_down]
+    poses += [about_centre(Y, 0.2) @ about_centre(Z, 1.0), about_centre(Y, 3.0)]
+    found = np.concatenate([hypothesis(pose) for pose in poses])
+    position, rotation = pose_errors(found, TRUTH, symmetry)
+    np.testing.assert_allclose(position, 0.0, atol=1e-9)
+    np.testing.assert_allclose(rotation, [0.0, 0.0, 0.2, np.pi - 3.0], atol=1e-6)
+
+
+def problem_of(mesh: trimesh.Trimesh, poses: FloatArray) -> RegistrationProblem:
+    sdf = SdfGrid.from_mesh(mesh, 0.01)
+    points = KnownPoints(known=[[0.0, 0.0, 0.0]], known_sdf=[0.0])
+    workspace = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    return RegistrationProblem(sdf, points, poses, workspace, 0.01, StreamKey(0, 1))
+
+
+def test_numbers_of_a_result_are_modulo_symmetries_with_or_without_a_mesh() -> None:
+    motions = [about_centre(Z, np.pi, np.array([0.0, 0.02, 0.0])), about_centre(X, 0.5)]
+    poses = np.concatenate([hypothesis(motion) for motion in motions])
+    found = Hypotheses(
+        poses, np.zeros(2), np.zeros(2, dtype=bool), np.full(2, -1), np.zeros((0, 4, 4))
+    )
+    problem = problem_of(BOX, poses)
+    numbers = result_numbers(found, problem, TRUTH, SYMMETRY)
+    assert numbers["best_position_error"] == pytest.approx(0.02, abs=1e-9)
+    assert numbers["best_rotation_error"] == pytest.approx(0.0, abs=1e-6)
+    assert numbers["closest_position_error"] == pytest.approx(0.0, abs=1e-9)
+    assert numbers["closest_rotation_error"] == pytest.approx(0.5, abs=1e-6)
+    without = result_numbers(found, problem, TRUTH, None)
+    assert without["best_position_error"] == pytest.approx(0.02, abs=0.005)
+    assert without["best_rotation_error"] == pytest.approx(np.pi, abs=1e-6)
+    assert "best_position_error" not in result_numbers(found, problem, None, None)

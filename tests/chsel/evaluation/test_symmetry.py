@@ -1,0 +1,314 @@
+"""Symmetries of objects against closed forms, and on real scans."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.optimize import brentq
+
+from chsel.arrays import FloatArray
+from chsel.evaluation.rotated_surface import RotatedSurface
+from chsel.evaluation.rotation_group import generated
+from chsel.evaluation.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
+from chsel.mesh import load_mesh
+from chsel.pose import axis_angle, compose, rotation_vector
+from chsel.sdf import SdfGrid
+from runners.objects.models import MODELS
+
+ANYWHERE = compose(rotation_vector(np.array([0.7, -0.4, 1.1])), np.array([0.3, -2.0, 0.9]))
+X, Y, Z = np.eye(3)
+SCANS = {
+    "003_cracker_box": 4,
+    "006_mustard_bottle": 2,
+    "010_potted_meat_can": 2,
+    "035_power_drill": 1,
+    "048_hammer": 1,
+    "050_medium_clamp": 1,
+}
+
+
+def half_turn(axis: FloatArray) -> FloatArray:
+    return 2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)
+
+
+def turns_about(axis: FloatArray, count: int) -> FloatArray:
+    angles = np.arange(float(count)) * (2.0 * np.pi / count)
+    return axis_angle(np.tile(axis, (count, 1)), angles)
+
+
+def dihedral(count: int, across: FloatArray = X) -> FloatArray:
+    about = turns_about(Z, count)
+    return np.concatenate([about, about @ half_turn(across)])
+
+
+def cube_rotations() -> FloatArray:
+    signed = [
+        np.eye(3)[list(order)] * signs
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+    return np.array([one for one in signed if np.linalg.det(one) > 0.0])
+
+
+def assert_same_set(found: FloatArray, expected: FloatArray, within: float = 1e-6) -> None:
+    assert len(found) == len(expected)
+    apart = np.abs(found[:, None] - expected).max(axis=(2, 3))
+    assert (apart.min(axis=0) < within).all()
+
+
+def mug() -> trimesh.Trimesh:
+    """A cup with a bottom and a handle."""
+    outer = trimesh.creation.cylinder(0.04, 0.1)
+    inner = trimesh.creation.cylinder(0.036, 0.1)
+    inner.apply_translation([0.0, 0.0, 0.004])
+    handle = trimesh.creation.torus(0.025, 0.005)
+    handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, X))
+    handle.apply_translation([0.04, 0.0, 0.0])
+    solid = trimesh.boolean.union([outer, handle], engine="manifold")
+    return trimesh.boolean.difference([solid, inner], engine="manifold")
+
+
+def tetrahedron() -> trimesh.Trimesh:
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.05
+    return trimesh.convex.convex_hull(corners)
+
+
+FINITE = {
+    "box": (trimesh.creation.box((0.1, 0.2, 0.3)), dihedral(2)),
+    "cube": (trimesh.creation.box((0.2, 0.2, 0.2)), cube_rotations()),
+    "square prism": (trimesh.creation.box((0.1, 0.1, 0.3)), dihedral(4)),
+    "prism of 6": (trimesh.creation.cylinder(0.05, 0.2, sections=6), dihedral(6)),
+    "prism of 3": (trimesh.creation.cylinder(0.05, 0.1, sections=3), dihedral(3)),
+    "sheet": (trimesh.creation.box((0.2, 0.1, 0.0005)), dihedral(2)),
+    "mug": (mug(), np.eye(3)[None]),
+    "drill": (MODELS["drill"](), np.eye(3)[None]),
+}
+
+
+@pytest.mark.parametrize("name", FINITE)
+def test_finite_groups_are_found_in_any_frame(name: str) -> None:
+    mesh, expected = FINITE[name]
+    for pose in (np.eye(4), ANYWHERE):
+        turned = mesh.copy().apply_transform(pose)
+        found = object_symmetry(turned)
+        back = pose[:3, :3].T @ found.rotations @ pose[:3, :3]
+        assert_same_set(back, expected)
+        np.testing.assert_array_equal(found.rotations[0], np.eye(3))
+        assert found.axis is None
+        assert not found.sphere
+
+
+@pytest.mark.parametrize(
+    ("mesh", "count"),
+    [(tetrahedron(), 12), (trimesh.creation.icosahedron(), 60)],
+)
+def test_groups_of_regular_bodies_are_complete(mesh: trimesh.Trimesh, count: int) -> None:
+    found = object_symmetry(mesh).rotations
+    assert len(found) == count
+    again = generated(found)
+    assert again is not None
+    assert_same_set(again, found)
+    corners = mesh.vertices - mesh.vertices.mean(axis=0)
+    for rotation in found:
+        apart = np.linalg.norm((corners @ rotation.T)[:, None] - corners, axis=2)
+        assert apart.min(axis=1).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("mesh", "ends_swap"),
+    [
+        (trimesh.creation.cylinder(0.03, 0.2), True),
+        (trimesh.creation.annulus(0.03, 0.05, 0.1), True),
+        (trimesh.creation.torus(0.1, 0.03), True),
+        (trimesh.creation.capsule(0.2, 0.05), True),
+        (trimesh.creation.cone(0.05, 0.2), False),
+    ],
+)
+def test_axes_of_revolution_are_found(mesh: trimesh.Trimesh, ends_swap: bool) -> None:
+    found = object_symmetry(mesh.copy().apply_transform(ANYWHERE))
+    assert found.axis is not None
+    assert abs(found.axis @ ANYWHERE[:3, 2]) == pytest.approx(1.0, abs=1e-9)
+    assert len(found.rotations) == 1 + ends_swap
+    if ends_swap:
+        np.testing.assert_allclose(found.rotations[1] @ found.axis, -found.axis, atol=1e-9)
+
+
+def moments(mesh: trimesh.Trimesh) -> FloatArray:
+    """Second moments (3, 3) of a surface about the origin: edge middles are exact for squares."""
+    middles = (mesh.triangles + np.roll(mesh.triangles, 1, axis=1)) / 2.0
+    return np.einsum("f,fki,fkj->ij", mesh.area_faces, middles, middles)
+
+
+def test_an_axis_is_found_where_all_moments_of_inertia_are_equal() -> None:
+    def difference(height: float) -> float:
+        found = moments(trimesh.creation.cylinder(0.05, height))
+        return float(found[2, 2] - found[0, 0])
+
+    can = trimesh.creation.cylinder(0.05, brentq(difference, 0.05, 0.1, xtol=1e-15))
+    spread = np.linalg.eigvalsh(moments(can))
+    assert np.ptp(spread) < 1e-12 * spread[0]
+    found = object_symmetry(can.apply_transform(ANYWHERE))
+    assert found.axis is not None
+    assert abs(found.axis @ ANYWHERE[:3, 2]) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_an_axis_is_found_in_a_scan_whose_normals_are_noise() -> None:
+    can = trimesh.creation.cylinder(0.033, 0.1, sections=64)
+    for _ in range(4):
+        can = can.subdivide()
+    noise = 3e-4 * np.random.default_rng(0).normal(size=can.vertices.shape)
+    found = object_symmetry(trimesh.Trimesh(can.vertices + noise, can.faces, process=False))
+    assert found.axis is not None
+    assert abs(found.axis[2]) > np.cos(0.01)
+    assert len(found.rotations) == 2
+
+
+def test_a_sheet_without_a_thickness_turns_over() -> None:
+    """Points that stay within its borders do not show small rotations in its plane."""
+    square = trimesh.Trimesh([X * 0, X, X + Y, Y], [[0, 1, 2], [0, 2, 3]], process=False)
+    assert_same_set(object_symmetry(square).rotations, dihedral(4), within=2e-3)
+
+
+def test_a_sphere_has_all_rotations() -> None:
+    found = object_symmetry(trimesh.creation.icosphere(3, 0.1))
+    assert found.sphere
+    assert found.rotation_errors(rotation_vector(np.array([[0.0, 1.0, 2.0]]))).tolist() == [0.0]
+
+
+def test_an_open_end_is_not_the_other_end() -> None:
+    can = trimesh.creation.cylinder(0.05, 0.2)
+    can.update_faces(can.triangles_center[:, 2] < 0.099)
+    found = object_symmetry(can)
+    assert found.axis is not None
+    assert len(found.rotations) == 1
+
+
+def test_the_tolerance_is_a_share_of_the_diameter() -> None:
+    """A quarter turn of a bar whose sides differ by 3 and by 8 parts in 100."""
+    assert len(object_symmetry(trimesh.creation.box((1.0, 1.03, 3.0))).rotations) == 8
+    assert len(object_symmetry(trimesh.creation.box((1.0, 1.08, 3.0))).rotations) == 4
+
+
+def test_a_small_knob_is_seen_and_a_tiny_one_is_not() -> None:
+    for size, seen in ((0.006, False), (0.02, True)):
+        knob = trimesh.creation.box((size, size, size))
+        knob.apply_translation([0.05, 0.0, 0.0])
+        body = trimesh.creation.cylinder(0.05, 0.1)
+        found = object_symmetry(trimesh.boolean.union([body, knob], engine="manifold"))
+        assert (found.axis is None) == seen
+
+
+def test_the_centre_is_where_every_symmetry_leaves_it() -> None:
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    mesh.apply_translation([7.0, -3.0, 0.5])
+    np.testing.assert_allclose(object_symmetry(mesh).centre, [7.0, -3.0, 0.5], atol=1e-12)
+    cone = trimesh.creation.cone(0.3, 0.4, sections=256)  # from z = 0 to 0.4, slant 0.5
+    areas, heights = np.array([0.3**2, 0.3 * 0.5]), np.array([0.0, 0.4 / 3])
+    expected = [0.0, 0.0, areas @ heights / areas.sum()]
+    np.testing.assert_allclose(object_symmetry(cone).centre, expected, atol=1e-5)
+
+
+def test_size_does_not_matter() -> None:
+    for size in (1e-6, 1.0, 1e3):
+        mesh = trimesh.creation.box((0.1 * size, 0.2 * size, 0.3 * size))
+        assert_same_set(object_symmetry(mesh).rotations, dihedral(2))
+
+
+@pytest.mark.parametrize(
+    "vertices", [[[1.0, 2.0, 3.0]] * 3, [[0.0, 2.0, 3.0], [1.0, 2.0, 3.0], [2.0, 2.0, 3.0]]]
+)
+def test_a_mesh_without_an_area_has_no_symmetry(vertices: list[list[float]]) -> None:
+    found = object_symmetry(trimesh.Trimesh(vertices, [[0, 1, 2]], process=False))
+    assert_same_set(found.rotations, np.eye(3)[None])
+    np.testing.assert_allclose(found.centre, [1.0, 2.0, 3.0])
+
+
+def test_vertices_of_no_face_do_not_count() -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    vertices = np.concatenate([box.vertices, [[99.0, 0.0, 0.0]]])
+    found = object_symmetry(trimesh.Trimesh(vertices, box.faces, process=False))
+    assert_same_set(found.rotations, dihedral(2))
+
+
+def test_a_mesh_of_a_million_faces_is_merged_first() -> None:
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    for _ in range(8):
+        mesh = mesh.subdivide()
+    assert len(mesh.faces) > 700_000
+    assert len(RotatedSurface(mesh).areas) < 200_000
+    found = object_symmetry(mesh)
+    assert len(found.rotations) == 4
+    np.testing.assert_allclose(found.centre, 0.0, atol=1e-9)
+
+
+def test_the_same_mesh_gives_the_same_bits() -> None:
+    from chsel.evaluation import symmetry
+
+    first = object_symmetry(MODELS["spam_can"]())
+    symmetry._found.cache_clear()
+    second = object_symmetry(MODELS["spam_can"]())
+    assert second is not first
+    np.testing.assert_array_equal(first.rotations, second.rotations)
+    np.testing.assert_array_equal(first.centre, second.centre)
+    assert object_symmetry(MODELS["spam_can"]()) is second
+
+
+@pytest.mark.parametrize(("name", "count"), SCANS.items())
+def test_models_and_scans_have_the_symmetries_of_their_objects(
+    name: str, count: int, ycb_directory: Path
+) -> None:
+    mesh = load_mesh(ycb_directory / name / "google_16k" / "nontextured.ply")
+    found = object_symmetry(mesh)
+    assert len(found.rotations) == count
+    assert found.axis is None
+    for rotation in found.rotations[1:]:  # half turns
+        np.testing.assert_allclose(rotation @ rotation, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [("cracker_box", 4), ("mustard", 2), ("spam_can", 2), ("hammer", 1), ("clamp", 1)],
+)
+def test_our_models_have_the_symmetries_of_the_objects(name: str, count: int) -> None:
+    assert len(object_symmetry(MODELS[name]()).rotations) == count
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "round_about"),
+    [("icub_cylinder", 2, True), ("icub_lego", 1, False), ("ycbv_gelatin_box", 4, False)],
+)
+def test_meshes_of_real_measurements(
+    name: str, count: int, round_about: bool, real_directory: Path
+) -> None:
+    found = object_symmetry(load_mesh(real_directory / f"{name}.obj"))
+    assert (len(found.rotations), found.axis is not None) == (count, round_about)
+
+
+def test_without_a_mesh_there_is_the_centre_of_the_grid_alone() -> None:
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    mesh.apply_translation([0.4, 0.0, 0.1])
+    found = grid_symmetry(SdfGrid.from_mesh(mesh, 0.01))
+    assert_same_set(found.rotations, np.eye(3)[None])
+    np.testing.assert_allclose(found.centre, [0.4, 0.0, 0.1], atol=0.005)
+    thin = SdfGrid(np.zeros(3), 0.1, np.ones((2, 3, 4)), np.ones((2, 3, 4, 3)))
+    np.testing.assert_allclose(grid_symmetry(thin).centre, [0.05, 0.1, 0.15])
+
+
+def test_angles_about_an_axis_are_those_between_axes() -> None:
+    """Against the least angle over many rotations about it."""
+    axis = np.array([0.36, 0.48, 0.8])
+    errors = rotation_vector(np.random.default_rng(0).normal(size=(20, 3)))
+    cone = ObjectSymmetry(axis=axis)
+    can = ObjectSymmetry(
+        rotations=np.array([np.eye(3), half_turn(np.array([0.8, -0.6, 0.0]))]), axis=axis
+    )
+    about = turns_about(axis, 20_000)
+    for symmetry in (cone, can):
+        all_of_them = (symmetry.rotations[:, None] @ about).reshape(-1, 3, 3)
+        traces = np.einsum("bij,sji->bs", errors, all_of_them)
+        expected = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)).min(axis=1)
+        np.testing.assert_allclose(symmetry.rotation_errors(errors), expected, atol=1e-3)
