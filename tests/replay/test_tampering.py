@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -284,8 +286,19 @@ def test_messages_without_a_seal_are_refused(whole: bytes, tmp_path: Path, how: 
     path = tmp_path / "a.mcap"
     path.write_bytes(file_of(changed_messages(everything, topics, without_seals)))
     assert len(seen) == 5
-    message = "has no seals" if how == "no seal at all" else "its contents|records follow"
+    message = "has no seals" if how == "no seal at all" else "its contents have another digest"
     with pytest.raises(RecordingError, match=message):
+        read_recording(path)
+
+
+def test_an_attachment_behind_the_last_seal_is_refused(whole: bytes, tmp_path: Path) -> None:
+    everything = split(whole[8:-8])
+    end = next(i for i, (opcode, _) in enumerate(everything) if opcode == Opcode.DATA_END)
+    body = bytes(16) + b"\5\0\0\0extra" + bytes(4) + bytes(8)
+    everything.insert(end, (Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body))))
+    path = tmp_path / "a.mcap"
+    path.write_bytes(file_of(everything))
+    with pytest.raises(RecordingError, match="records follow its last seal"):
         read_recording(path)
 
 
