@@ -10,7 +10,9 @@ import numpy as np
 import trimesh
 
 from chsel.arrays import digest, frozen
+from chsel.complete_file import check_complete
 from chsel.errors import MeshError, require_positive
+from chsel.special_file import refuse_special_file
 
 SMALLEST = 0.005  # m: the largest extent of anything that a gripper probes is above this
 LARGEST = 10.0  # m: above this, a file is in millimetres rather than metres
@@ -24,6 +26,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     in the errors raised, as `clean_mesh`; MeshError also if the file is not found or not readable.
     """
     path = Path(path).expanduser()
+    refuse_special_file(f"mesh file {path}", path, MeshError)
     if not path.is_file():
         kind = "is a folder" if path.is_dir() else "does not exist"
         raise MeshError(f"mesh file {path} {kind}; accepted: {_accepted_files()}")
@@ -76,6 +79,7 @@ def _read(path: Path) -> trimesh.Trimesh:
     if kind not in _mesh_formats():
         raise MeshError(f"mesh file {path} is of no known kind; accepted: {_accepted_files()}")
     try:
+        check_complete(path, kind)
         loaded = trimesh.load(
             str(path), file_type=kind, force="mesh", process=False, skip_materials=True
         )

@@ -12,6 +12,9 @@ from chsel.arrays import FloatArray
 from chsel.errors import SettingError
 from chsel.kernels.elementary import logs, sines_cosines
 
+LAST_STEP = 2**32 - 1
+"""The last step of a session that random streams tell apart."""
+
 
 class Purpose(IntEnum):
     """What random numbers are for. Values are part of every recording: never renumber them."""
@@ -44,7 +47,7 @@ class StreamKey:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**64:
             raise SettingError(f"seed is {self.seed}; accepted: an integer from 0 to 2**64 - 1")
-        if not 0 <= self.step < 2**32:
+        if not 0 <= self.step <= LAST_STEP:
             raise SettingError(f"step is {self.step}; accepted: an integer from 0 to 2**32 - 1")
 
     def stream(self, purpose: Purpose, index: int = 0) -> np.random.Generator:
