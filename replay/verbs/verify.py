@@ -1,6 +1,6 @@
 """Run every registration of recordings again and compare hypotheses, costs and archives.
 
-Status 0 if all bits are equal, 1 if not, 2 if a file cannot be used.
+Status 0 if all bits are equal, 1 if not, 2 if a file cannot be used or holds no result.
 """
 
 from __future__ import annotations
