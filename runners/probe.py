@@ -15,12 +15,13 @@ import trimesh
 import yaml
 from omegaconf import DictConfig
 
-from chsel.errors import RecordingError, require_positive
+from chsel.errors import RecordingError
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.sdf import SdfGrid
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
+from chsel.threads import require_threads
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from runners.cli import command, plain
@@ -64,7 +65,7 @@ class ProbeConfig:
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
-        require_positive("threads", self.threads)
+        require_threads("threads", self.threads)
 
 
 @dataclass

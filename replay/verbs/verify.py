@@ -12,7 +12,7 @@ import time
 from rich.console import Console
 from rich.progress import Progress
 
-from chsel.errors import SettingError
+from chsel.threads import require_threads
 from replay.file_verification import FileVerdict, recordings_in, verified_files
 from replay.verification import NO_RESULT
 
@@ -28,8 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Print a line for each file, and a report for each step that differs."""
-    if given.jobs < 1:
-        raise SettingError(f"--jobs is {given.jobs}; accepted: at least 1")
+    require_threads("--jobs", given.jobs)
     console = Console(highlight=False, soft_wrap=True)
     paths = recordings_in(given.files)
     begun, status, equal, total = time.perf_counter(), 0, 0, 0
