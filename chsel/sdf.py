@@ -77,10 +77,7 @@ class SdfGrid:
 
     def __post_init__(self) -> None:
         require_positive("SDF resolution", self.resolution)
-        if not FINEST <= self.resolution <= COARSEST:
-            raise SdfError(
-                f"SDF resolution is {self.resolution}; accepted: {FINEST:g} to {COARSEST:g} (m)"
-            )
+        _check_resolution(self.resolution)
         values = frozen("SDF values", self.values, (None, None, None), error=SdfError)
         if min(values.shape) < 2:
             raise SdfError(f"SDF values have shape {values.shape}; accepted: at least 2 per axis")
@@ -107,6 +104,7 @@ class SdfGrid:
         """
         require_positive("SDF resolution", resolution)
         require_positive("SDF padding", padding)
+        _check_resolution(resolution)
         lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
         origin = lower - padding
         shape = tuple(int(n) + 2 for n in np.floor((upper + padding - origin) / resolution))
@@ -249,6 +247,11 @@ class SdfGrid:
     def _flat(self, index: Tensor) -> Tensor:
         _, ny, nz = self.shape
         return ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).to(torch.int64)
+
+
+def _check_resolution(resolution: float) -> None:
+    if not FINEST <= resolution <= COARSEST:
+        raise SdfError(f"SDF resolution is {resolution}; accepted: {FINEST:g} to {COARSEST:g} (m)")
 
 
 def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
