@@ -23,6 +23,8 @@ MAX_NODES = 50_000_000
 FINEST, COARSEST = 1e-6, 1e3  # m: of a grid's nodes, so that no node's place is lost to rounding
 FARTHEST = 1e6  # m: of a grid's first node
 Derived = TypeVar("Derived")
+_PART_NODES = 250_000  # of a grid that are sampled at once, at least
+_PART_FACES = 5  # and one for so many faces: preparing 1.3 million costs as much as 65 000 nodes
 _NORMAL_RANGE = 1e-3  # nearer than this to the surface, the face normal is the better gradient
 
 
@@ -96,11 +98,18 @@ class SdfGrid:
 
     @classmethod
     def from_mesh(
-        cls, mesh: trimesh.Trimesh, resolution: float = 0.01, *, padding: float = 0.05
+        cls,
+        mesh: trimesh.Trimesh,
+        resolution: float = 0.01,
+        *,
+        padding: float = 0.05,
+        progress: Callable[[int, int], None] | None = None,
     ) -> SdfGrid:
         """Sample the exact signed distance of a mesh over its padded bounding box.
 
         Values are rounded to 32 bits (nanometres), which halves what a recording holds.
+        progress: called with the number of nodes done and of all, before each part of a large
+        grid; it changes no bit.
         """
         require_positive("SDF resolution", resolution)
         require_positive("SDF padding", padding)
@@ -114,7 +123,13 @@ class SdfGrid:
                 f"nodes; accepted: at most {MAX_NODES:.0e}, so a coarser resolution"
             )
         nodes = origin + np.indices(shape).reshape(3, -1).T * resolution
-        values, gradients = (_rounded(part) for part in mesh_sdf(mesh, nodes))
+        parts, done = [], 0
+        for part in _parts(nodes, len(mesh.faces)):
+            if progress is not None:
+                progress(done, len(nodes))
+            parts.append(mesh_sdf(mesh, part))
+            done += len(part)
+        values, gradients = (_rounded(np.concatenate(part)) for part in zip(*parts, strict=True))
         return cls(origin, resolution, values.reshape(shape), gradients.reshape(*shape, 3))
 
     @property
@@ -247,6 +262,12 @@ class SdfGrid:
     def _flat(self, index: Tensor) -> Tensor:
         _, ny, nz = self.shape
         return ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).to(torch.int64)
+
+
+def _parts(nodes: FloatArray, face_count: int) -> list[FloatArray]:
+    """The nodes (N, 3) in parts, each so large that preparing the mesh anew costs little of it."""
+    size = max(_PART_NODES, face_count // _PART_FACES)
+    return [nodes[first : first + size] for first in range(0, len(nodes), size)]
 
 
 def _check_resolution(resolution: float) -> None:

@@ -133,7 +133,10 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
     object_model = load_object(config.object, config.assets.folder)
     session = open_session(kind, settings, object_model, config.seed, watcher)
     sdf = SdfGrid.from_mesh(
-        object_model.mesh, settings.object_resolution, padding=settings.object_padding
+        object_model.mesh,
+        settings.object_resolution,
+        padding=settings.object_padding,
+        progress=lambda done, total: watcher("signed distance grid, nodes", done, total),
     )
     start = (settings.start_contacts, settings.start_probe)
     return Scene(session, object_model.name, object_model.mesh, sdf, start, watcher)

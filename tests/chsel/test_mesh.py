@@ -90,6 +90,16 @@ def test_an_open_mesh_is_kept_with_a_warning_that_names_it(box, tmp_path):
     assert not mesh.is_watertight
 
 
+def test_a_mesh_of_many_faces_is_kept_with_a_warning_that_names_its_size(box, monkeypatch):
+    monkeypatch.setattr("chsel.mesh.MANY_FACES", 12)
+    clean_mesh(box.vertices, box.faces)
+    finer = box.subdivide().subdivide()
+    message = r"^bowl has 192 faces: .* signed distance grid .*; a decimated mesh of 50,000 faces"
+    with pytest.warns(UserWarning, match=message):
+        mesh = clean_mesh(finer.vertices, finer.faces, name="bowl")
+    assert len(mesh.faces) == 192
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(MeshError, match=r"nowhere\.obj does not exist; accepted: .*\.obj.*\.stl"):
         load_mesh(tmp_path / "nowhere.obj")
