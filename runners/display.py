@@ -39,7 +39,6 @@ class Bar:
         if self._task is None:
             self._progress.start()
             self._task = self._progress.add_task(stage, completed=done, total=total)
-            self._progress.refresh()  # the work that begins may keep the thread that would do it
         self._progress.update(self._task, description=stage, completed=done, total=total)
 
     def clear(self) -> None:
