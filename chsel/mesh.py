@@ -11,7 +11,7 @@ import trimesh
 
 from chsel.arrays import digest, frozen
 from chsel.complete_file import check_complete
-from chsel.errors import MeshError, require_positive
+from chsel.errors import MeshError, quoted, require_positive
 from chsel.special_file import refuse_special_file
 
 SMALLEST = 0.005  # m: the largest extent of anything that a gripper probes is above this
@@ -28,6 +28,8 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     Scenes are joined to one mesh. `scale` multiplies the file's units into metres. Otherwise, and
     in the errors raised, as `clean_mesh`; MeshError also if the file is not found or not readable.
     """
+    if not isinstance(path, str | Path):
+        raise MeshError(f"mesh file is {quoted(path)}; accepted: the path of a file")
     path = Path(path).expanduser()
     refuse_special_file(f"mesh file {path}", path, MeshError)
     if not path.is_file():

@@ -14,7 +14,7 @@ import trimesh
 from torch import Tensor
 
 from chsel.arrays import FloatArray, IntArray, digest, frozen
-from chsel.errors import SdfError, require_choice, require_positive
+from chsel.errors import MeshError, SdfError, quoted, require_choice, require_positive
 from chsel.pose import as_tensor
 
 LOOKUPS = ("nearest", "trilinear")
@@ -111,6 +111,9 @@ class SdfGrid:
         progress: called with the number of nodes done and of all, before each part of a large
         grid; it changes no bit.
         """
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            accepted = "a Trimesh with faces, such as chsel.load_mesh(path)"
+            raise MeshError(f"mesh is {quoted(mesh)}; accepted: {accepted}")
         require_positive("SDF resolution", resolution)
         require_positive("SDF padding", padding)
         _check_resolution(resolution)

@@ -105,6 +105,8 @@ def test_a_missing_file_is_named(tmp_path):
         load_mesh(tmp_path / "nowhere.obj")
     with pytest.raises(MeshError, match="is a folder"):
         load_mesh(tmp_path)
+    with pytest.raises(MeshError, match=r"mesh file is 3; accepted: the path of a file"):
+        load_mesh(3)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "off", "glb"])

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from chsel import SdfGrid
-from chsel.errors import SdfError, SettingError
+from chsel.errors import MeshError, SdfError, SettingError
 from chsel.mesh import load_mesh
 from chsel.sdf import _parts, mesh_sdf
 
@@ -67,6 +68,12 @@ def test_the_sign_changes_nowhere_but_at_the_surface(ycb_directory: Path, name: 
         assert ((here < 0.0) == (there < 0.0))[apart].all()
     volume = (grid.values < 0.0).sum() * grid.resolution**3
     assert volume == pytest.approx(mesh.volume, rel=0.1)
+
+
+@pytest.mark.parametrize("mesh", ["box.obj", None, trimesh.Scene(), trimesh.Trimesh()])
+def test_a_grid_of_no_mesh_is_refused(mesh: Any) -> None:
+    with pytest.raises(MeshError, match=r"mesh is .*; accepted: a Trimesh with faces"):
+        SdfGrid.from_mesh(mesh)
 
 
 def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
