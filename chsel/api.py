@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 
 from chsel.arrays import frozen
-from chsel.errors import MeshError, PointsError
+from chsel.errors import MeshError, PointsError, quoted, require_instance
 from chsel.mesh import clean_mesh
 from chsel.methods import build_method, preset_settings
 from chsel.observer import Observer
@@ -64,6 +65,11 @@ def register(
     Raises ChselError, with what is accepted, for malformed input; at least one point is needed.
     """
     points = _known_points(surface, free, occupied, known, known_sdf)
+    if workspace is not None:
+        require_instance("workspace", workspace, Workspace, "chsel.Workspace(lower, upper)")
+    if previous is not None:
+        what = "the Hypotheses of the registration before, or None"
+        require_instance("previous", previous, Hypotheses, what)
     solver = build_method(method, _settings(method, preset, settings, hypotheses))
     sdf = _grid(target, resolution)
     workspace = workspace or Workspace.around(points.all_points(), sdf.diameter)
@@ -102,7 +108,12 @@ def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGri
     if isinstance(target, SdfGrid):
         return target
     if not isinstance(target, trimesh.Trimesh):
-        raise MeshError(f"target is a {type(target).__name__}; accepted: Trimesh or SdfGrid")
+        path = target if isinstance(target, str | Path) else "mesh.obj"
+        shown = quoted(target) if isinstance(target, str | Path) else f"a {type(target).__name__}"
+        raise MeshError(
+            f"target is {shown}; accepted: a mesh such as chsel.load_mesh({str(path)!r}), "
+            "a Trimesh, or a SdfGrid"
+        )
     mesh = clean_mesh(target.vertices, target.faces, name="target")
     if resolution is None:
         resolution = min(0.01, float(np.min(mesh.extents)) / _VOXELS_PER_EXTENT)
@@ -112,9 +123,10 @@ def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGri
 def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> dict[str, Any]:
     """The preset's settings with changes laid over them, as a mapping."""
     settings = settings_mapping(preset_settings(method, preset))
-    if dataclasses.is_dataclass(changes):
+    if dataclasses.is_dataclass(changes) and not isinstance(changes, type):
         settings = settings_mapping(changes)
     elif changes is not None:
+        require_instance("settings", changes, Mapping, "a mapping, or the settings of the method")
         settings = _merged(settings, changes)
     if hypotheses is not None:
         settings = _merged(settings, {"online": {"hypotheses": hypotheses}})

@@ -29,11 +29,11 @@ def frozen(
     Takes numpy arrays, torch tensors and nested lists. Raises `error` with `name` in the message
     if the value is no array of numbers, has another shape, or holds a value that is not finite.
     """
-    if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
     try:
+        if isinstance(value, torch.Tensor):
+            value = value.detach().cpu().numpy()
         array = np.array(value, dtype=dtype, order="C")
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise error(f"{name} is not an array of numbers; accepted: shape {_show(shape)}") from None
     fits = array.ndim == len(shape)
     fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+_LONGEST_VALUE = 80
+
 
 class ChselError(Exception):
     """Base of all errors with a message meant for the user: what, where, what is accepted."""
@@ -41,11 +43,17 @@ class RecordingError(ChselError):
     """A recording cannot be read or written."""
 
 
+def quoted(value: object) -> str:
+    """A value as an error quotes it: on one line, of bounded length; of large things the type."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _LONGEST_VALUE else f"a {type(value).__name__}"
+
+
 def require_choice(name: str, value: object, accepted: Iterable[str]) -> None:
     """Raise SettingError unless `value` is one of the accepted names."""
     accepted = list(accepted)
-    if value not in accepted:
-        raise SettingError(f"{name} is {value!r}; accepted: {', '.join(accepted)}")
+    if not isinstance(value, str) or value not in accepted:
+        raise SettingError(f"{name} is {quoted(value)}; accepted: {', '.join(accepted)}")
 
 
 def require_at_most(name: str, value: float, most: float) -> None:
@@ -59,4 +67,10 @@ def require_positive(name: str, value: float, *, zero: bool = False) -> None:
     finite = isinstance(value, int | float) and value == value and abs(value) != float("inf")
     if not finite or value < 0 or (value == 0 and not zero):
         bound = "of at least 0" if zero else "above 0"
-        raise SettingError(f"{name} is {value!r}; accepted: a finite number {bound}")
+        raise SettingError(f"{name} is {quoted(value)}; accepted: a finite number {bound}")
+
+
+def require_instance(name: str, value: object, kind: type, accepted: str) -> None:
+    """Raise SettingError unless `value` is of a kind."""
+    if not isinstance(value, kind):
+        raise SettingError(f"{name} is {quoted(value)}; accepted: {accepted}")

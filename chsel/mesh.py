@@ -10,10 +10,15 @@ import numpy as np
 import trimesh
 
 from chsel.arrays import digest, frozen
-from chsel.errors import MeshError, require_positive
+from chsel.complete_file import check_complete
+from chsel.errors import MeshError, quoted, require_positive
+from chsel.special_file import refuse_special_file
 
 SMALLEST = 0.005  # m: the largest extent of anything that a gripper probes is above this
 LARGEST = 10.0  # m: above this, a file is in millimetres rather than metres
+MANY_FACES = 200_000  # above this, a mesh takes its time
+ENOUGH_FACES = 50_000  # of an object that a hand holds: sides of 1 mm
+_SECONDS_PER_FACE = 1.5e-5  # of a core: merging vertices, and a grid of 60 000 nodes
 _NOT_MESHES = {"bz2", "dxf", "stl_ascii", "svg", "tar.bz2", "tar.gz", "xyz", "zip"}
 
 
@@ -23,7 +28,10 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     Scenes are joined to one mesh. `scale` multiplies the file's units into metres. Otherwise, and
     in the errors raised, as `clean_mesh`; MeshError also if the file is not found or not readable.
     """
+    if not isinstance(path, str | Path):
+        raise MeshError(f"mesh file is {quoted(path)}; accepted: the path of a file")
     path = Path(path).expanduser()
+    refuse_special_file(f"mesh file {path}", path, MeshError)
     if not path.is_file():
         kind = "is a folder" if path.is_dir() else "does not exist"
         raise MeshError(f"mesh file {path} {kind}; accepted: {_accepted_files()}")
@@ -38,13 +46,21 @@ def clean_mesh(
 
     vertices (V, 3) in the file's units; faces (F, 3) indices into them. Vertices at one place
     become one. A mesh that is still open is kept with a warning: the winding number decides what
-    is inside it. Raises MeshError if there are no faces, a number is not finite, an index has no
-    vertex, the mesh is flat, or its size in metres is not that of an object.
+    is inside it; so is one of more than MANY_FACES faces, of which the warning says what it costs.
+    Raises MeshError if there are no faces, a number is not finite, an index has no vertex, the mesh
+    is flat, or its size in metres is not that of an object.
     """
     require_positive("mesh scale", scale)
     vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
     faces = frozen(f"{name}: faces", faces, (None, 3), dtype=np.int64, error=MeshError)
     _check_faces(name, len(vertices), faces)
+    if len(faces) > MANY_FACES:
+        seconds = len(faces) * _SECONDS_PER_FACE
+        warnings.warn(
+            f"{name} has {len(faces):,} faces: making its signed distance grid takes "
+            f"{seconds:.0f} s or more; a decimated mesh of {ENOUGH_FACES:,} faces is as good",
+            stacklevel=2,
+        )
     _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale)
 
     # Only positions are taken over, so seams of texture or normals keep no vertices apart.
@@ -76,6 +92,7 @@ def _read(path: Path) -> trimesh.Trimesh:
     if kind not in _mesh_formats():
         raise MeshError(f"mesh file {path} is of no known kind; accepted: {_accepted_files()}")
     try:
+        check_complete(path, kind)
         loaded = trimesh.load(
             str(path), file_type=kind, force="mesh", process=False, skip_materials=True
         )

@@ -14,7 +14,7 @@ import trimesh
 from torch import Tensor
 
 from chsel.arrays import FloatArray, IntArray, digest, frozen
-from chsel.errors import SdfError, require_choice, require_positive
+from chsel.errors import MeshError, SdfError, quoted, require_choice, require_positive
 from chsel.pose import as_tensor
 
 LOOKUPS = ("nearest", "trilinear")
@@ -23,6 +23,8 @@ MAX_NODES = 50_000_000
 FINEST, COARSEST = 1e-6, 1e3  # m: of a grid's nodes, so that no node's place is lost to rounding
 FARTHEST = 1e6  # m: of a grid's first node
 Derived = TypeVar("Derived")
+_PART_NODES = 250_000  # of a grid that are sampled at once, at least
+_PART_FACES = 5  # and one for so many faces: preparing 1.3 million costs as much as 65 000 nodes
 _NORMAL_RANGE = 1e-3  # nearer than this to the surface, the face normal is the better gradient
 
 
@@ -77,10 +79,7 @@ class SdfGrid:
 
     def __post_init__(self) -> None:
         require_positive("SDF resolution", self.resolution)
-        if not FINEST <= self.resolution <= COARSEST:
-            raise SdfError(
-                f"SDF resolution is {self.resolution}; accepted: {FINEST:g} to {COARSEST:g} (m)"
-            )
+        _check_resolution(self.resolution)
         values = frozen("SDF values", self.values, (None, None, None), error=SdfError)
         if min(values.shape) < 2:
             raise SdfError(f"SDF values have shape {values.shape}; accepted: at least 2 per axis")
@@ -99,14 +98,25 @@ class SdfGrid:
 
     @classmethod
     def from_mesh(
-        cls, mesh: trimesh.Trimesh, resolution: float = 0.01, *, padding: float = 0.05
+        cls,
+        mesh: trimesh.Trimesh,
+        resolution: float = 0.01,
+        *,
+        padding: float = 0.05,
+        progress: Callable[[int, int], None] | None = None,
     ) -> SdfGrid:
         """Sample the exact signed distance of a mesh over its padded bounding box.
 
         Values are rounded to 32 bits (nanometres), which halves what a recording holds.
+        progress: called with the number of nodes done and of all, before each part of a large
+        grid; it changes no bit.
         """
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            accepted = "a Trimesh with faces, such as chsel.load_mesh(path)"
+            raise MeshError(f"mesh is {quoted(mesh)}; accepted: {accepted}")
         require_positive("SDF resolution", resolution)
         require_positive("SDF padding", padding)
+        _check_resolution(resolution)
         lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
         origin = lower - padding
         shape = tuple(int(n) + 2 for n in np.floor((upper + padding - origin) / resolution))
@@ -116,7 +126,13 @@ class SdfGrid:
                 f"nodes; accepted: at most {MAX_NODES:.0e}, so a coarser resolution"
             )
         nodes = origin + np.indices(shape).reshape(3, -1).T * resolution
-        values, gradients = (_rounded(part) for part in mesh_sdf(mesh, nodes))
+        parts, done = [], 0
+        for part in _parts(nodes, len(mesh.faces)):
+            if progress is not None:
+                progress(done, len(nodes))
+            parts.append(mesh_sdf(mesh, part))
+            done += len(part)
+        values, gradients = (_rounded(np.concatenate(part)) for part in zip(*parts, strict=True))
         return cls(origin, resolution, values.reshape(shape), gradients.reshape(*shape, 3))
 
     @property
@@ -249,6 +265,17 @@ class SdfGrid:
     def _flat(self, index: Tensor) -> Tensor:
         _, ny, nz = self.shape
         return ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).to(torch.int64)
+
+
+def _parts(nodes: FloatArray, face_count: int) -> list[FloatArray]:
+    """The nodes (N, 3) in parts, each so large that preparing the mesh anew costs little of it."""
+    size = max(_PART_NODES, face_count // _PART_FACES)
+    return [nodes[first : first + size] for first in range(0, len(nodes), size)]
+
+
+def _check_resolution(resolution: float) -> None:
+    if not FINEST <= resolution <= COARSEST:
+        raise SdfError(f"SDF resolution is {resolution}; accepted: {FINEST:g} to {COARSEST:g} (m)")
 
 
 def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:

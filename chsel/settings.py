@@ -9,7 +9,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
-from chsel.errors import SettingError
+from chsel.errors import SettingError, quoted
 
 Settings = TypeVar("Settings")
 
@@ -21,7 +21,7 @@ def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) 
     names that `cls` does not have, for names that are missing, and for values of another type.
     """
     if not isinstance(mapping, Mapping):
-        raise SettingError(f"{where} is {mapping!r}; accepted: a group of settings")
+        raise SettingError(f"{where} is {quoted(mapping)}; accepted: a group of settings")
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for name in mapping:
         if name not in fields:
@@ -71,12 +71,12 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return float(value)
     if hint is Any or (isinstance(value, hint) and not (hint is int and isinstance(value, bool))):
         return value
-    raise SettingError(f"{where} is {value!r}; accepted: {_name(hint)}")
+    raise SettingError(f"{where} is {quoted(value)}; accepted: {_name(hint)}")
 
 
 def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str):
-        raise SettingError(f"{where} is {value!r}; accepted: a list")
+        raise SettingError(f"{where} is {quoted(value)}; accepted: a list")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
         arguments = (arguments[0],) * len(value)
     if len(arguments) != len(value):

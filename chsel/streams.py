@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from chsel.arrays import FloatArray
-from chsel.errors import SettingError
+from chsel.errors import SettingError, quoted
 from chsel.kernels.elementary import logs, sines_cosines
+
+LAST_STEP = 2**32 - 1
+"""The last step of a session that random streams tell apart."""
 
 
 class Purpose(IntEnum):
@@ -42,10 +46,14 @@ class StreamKey:
     step: int
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**64:
-            raise SettingError(f"seed is {self.seed}; accepted: an integer from 0 to 2**64 - 1")
-        if not 0 <= self.step < 2**32:
-            raise SettingError(f"step is {self.step}; accepted: an integer from 0 to 2**32 - 1")
+        for name, bits in (("seed", 64), ("step", 32)):
+            value = getattr(self, name)
+            is_integer = isinstance(value, Integral) and not isinstance(value, bool)
+            if not is_integer or not 0 <= value < 2**bits:
+                raise SettingError(
+                    f"{name} is {quoted(value)}; accepted: an integer from 0 to 2**{bits} - 1"
+                )
+            object.__setattr__(self, name, int(value))
 
     def stream(self, purpose: Purpose, index: int = 0) -> np.random.Generator:
         """The Philox stream of one purpose; `index` tells repetitions within a step apart."""

@@ -12,7 +12,11 @@ from typing import Any
 
 import torch
 
+from chsel.errors import SettingError
 from chsel.kernels.arithmetic import require_ieee_arithmetic
+
+MOST_THREADS = 256
+"""Of one process, or processes of one command: more than these cannot be what is meant."""
 
 _SHARES = 4  # pieces per thread, so that none waits long for another
 _here = threading.local()
@@ -53,9 +57,16 @@ def spread(
         other.result()
 
 
+def require_threads(name: str, count: object) -> None:
+    """Raise SettingError unless a number of threads or processes is one that can be meant."""
+    if type(count) is not int or not 1 <= count <= MOST_THREADS:
+        raise SettingError(f"{name} is {count!r}; accepted: an integer from 1 to {MOST_THREADS}")
+
+
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """As many threads for a while, of torch and of the kernels."""
+    """As many threads for a while, of torch and of the kernels. SettingError for too many."""
+    require_threads("threads", count)
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

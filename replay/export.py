@@ -18,7 +18,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chsel.errors import require_choice
+from chsel.errors import RecordingError, require_choice
+from replay.mcap.reader import Recording
 from replay.new_file import new_file
 from replay.standard_json import standard
 
@@ -37,6 +38,12 @@ class Exported:
     document: Any
     header: tuple[str, ...]
     rows: Iterable[tuple[Any, ...]]
+
+
+def require_any(recording: Recording, name: str, found: object) -> None:
+    """Raise RecordingError if a recording has nothing of what is asked for."""
+    if not found:
+        raise RecordingError(f"recording {recording.path} has no {name}; accepted: one with some")
 
 
 def write_export(exported: Exported, path: Path, file_format: str) -> None:

@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from chsel.pose import inverse
 from chsel.problem import ArchiveSnapshot, Hypotheses
 from replay.events import Measured, Timed
-from replay.export import Exported
+from replay.export import Exported, require_any
 from replay.export_images import exported_images
 from replay.mcap.contents import Contents
 from replay.mcap.foxglove_messages import poses_in_world
@@ -33,6 +33,7 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
     qx to qw are of world_from_object, rounded; m00 to m33 are object_from_world, exact.
     """
     results = [step for step in recording.steps if recording.has_result(step)]
+    require_any(recording, "result", results)
     found = {step: recording.hypotheses(step) for step in chosen_steps(steps, results)}
     arrays: dict[str, Any] = {"steps": np.array(list(found), dtype=np.int64)}
     listed = []
@@ -61,6 +62,7 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
     news = [(probe.step, probe.new_points) for probe in probes]
     first = probes[0].step if probes else 0
     news.insert(0, (first, recording.start.initial_points))
+    require_any(recording, "point", any(new.count for _, new in news))
     existing = list(dict.fromkeys(step for step, _ in news))
     chosen = set(chosen_steps(steps, existing))
     news = [(step, new) for step, new in news if step in chosen]
@@ -86,6 +88,7 @@ def exported_archive(recording: Recording, steps: str | None, *, last: bool = Fa
     """
     taken = {step: _archives(recording, step, last=last) for step in recording.steps}
     taken = {step: archives for step, archives in taken.items() if archives}
+    require_any(recording, "archive", taken)
     taken = {step: taken[step] for step in chosen_steps(steps, list(taken))}
     arrays: dict[str, Any] = {"steps": np.array(list(taken), dtype=np.int64)}
     listed = []
@@ -111,6 +114,7 @@ def exported_metrics(recording: Recording, steps: str | None) -> Exported:
     numbers about the result, in SI units where the name has none; "timed" for seconds.
     """
     rows = list(_metric_rows(recording))
+    require_any(recording, "number about a step", rows)
     chosen = set(chosen_steps(steps, sorted({row[0] for row in rows})))
     rows = [row for row in rows if row[0] in chosen]
     header = ("step", "source", "name", "value")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from replay.events import SensorImage
-from replay.export import Exported
+from replay.export import Exported, require_any
 from replay.mcap.reader import Recording
 from replay.step_ranges import chosen_steps
 
@@ -27,6 +27,7 @@ def exported_images(recording: Recording, steps: str | None) -> Exported:
     the pixels that count, `intrinsics` (4,), fx, fy, cx, cy in pixels, and `world_from_camera`
     (4, 4). csv, json: a row an image, without its pixels; m00 to m33 are world_from_camera.
     """
+    require_any(recording, "image of a sensor", recording.image_steps)
     chosen = chosen_steps(steps, recording.image_steps)
     rows = [_row(number, seen) for number, seen in _numbered(recording, chosen)]
     header = (*_NAMES, *_INTRINSICS, *_ENTRIES)

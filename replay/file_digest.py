@@ -6,12 +6,14 @@ import hashlib
 from pathlib import Path
 
 from chsel.errors import RecordingError
+from chsel.special_file import refuse_special_file
 
 _DIGEST_SIZE = 16  # bytes
 
 
 def file_digest(path: Path) -> str:
     """BLAKE2b (128 bit, hexadecimal) of a file's bytes, as `b2sum -l 128` prints it."""
+    refuse_special_file(str(path), path, RecordingError)
     try:
         with path.open("rb") as file:
             state = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=_DIGEST_SIZE))

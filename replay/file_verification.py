@@ -86,6 +86,11 @@ def _verified_part(path: Path, steps: Sequence[int] | None, part: int, parts: in
         verdict.digest = recording.digest
         wanted = recording.checked_steps(steps)
         first, last = (len(wanted) * part // parts, len(wanted) * (part + 1) // parts)
+        if not any(recording.has_result(step) for step in wanted):
+            raise RecordingError(
+                f"recording {path} has no registration with a result to verify; accepted: a "
+                "recording of at least one"
+            )
         verdict.verdicts = list(verify(recording, wanted[first:last]))
     except (ChselError, OSError, MemoryError) as error:
         verdict.unusable = str(error) or f"recording {path} does not fit into memory"

@@ -14,7 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from chsel.arrays import FloatArray
-from chsel.errors import RecordingError, SettingError, require_positive
+from chsel.errors import RecordingError, SettingError
 from chsel.evaluation.pose_error import pose_errors
 from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
 from chsel.evaluation.true_pose import TruePose, TruePoseSettings, find_true_pose
@@ -22,7 +22,7 @@ from chsel.pose import compose, inverse, roll_pitch_yaw
 from chsel.problem import RegistrationProblem
 from chsel.settings import build_settings, settings_mapping
 from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.threads import require_threads, threads
 from replay.console import Console
 from runners.align_view import save_view
 from runners.alignment_fit import Fit, fit_of
@@ -69,7 +69,7 @@ class AlignConfig:
         if self.pose is not None and self.rotation is not None:
             raise SettingError("rotation is given beside pose; accepted: one of both")
         StreamKey(self.seed, 0)
-        require_positive("threads", self.threads)
+        require_threads("threads", self.threads)
 
     def guess(self) -> FloatArray:
         """world_from_object (4, 4) as a person gave it."""

@@ -19,6 +19,7 @@ from chsel.errors import RecordingError, SettingError, require_choice, require_p
 from chsel.evaluation.true_pose import TruePoseSettings
 from chsel.methods import METHODS
 from chsel.settings import build_settings
+from chsel.threads import require_threads
 from runners.cli import command, plain
 from runners.evaluation.configurations import SENSORS
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label
@@ -80,7 +81,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         if self.workers is not None:
-            require_positive("workers", self.workers)
+            require_threads("workers", self.workers)
         require_choice("objects", self.objects, OBJECTS)
         require_choice("starts", self.starts, (OWN, *METHODS))
         if not self.name or not self.out:

@@ -16,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from chsel.arrays import FloatArray
-from chsel.errors import SettingError, require_positive
+from chsel.errors import SettingError
 from chsel.evaluation.error import EvaluationError
 from chsel.evaluation.plausible_file import load_plausible, save_plausible
 from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
@@ -29,7 +29,7 @@ from chsel.evaluation.true_pose import find_true_pose
 from chsel.problem import RegistrationProblem
 from chsel.settings import build_settings, settings_mapping
 from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.threads import require_threads, threads
 from replay.console import Console, Progress
 from replay.step_ranges import chosen_steps
 from runners.cli import command, plain
@@ -64,7 +64,7 @@ class PlausibleConfig:
         if not self.file:
             raise SettingError("file is missing; pass a recording.mcap or a file of known points")
         StreamKey(self.seed, 0)
-        require_positive("threads", self.threads)
+        require_threads("threads", self.threads)
 
 
 @command("plausible")

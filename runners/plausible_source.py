@@ -21,6 +21,7 @@ from chsel.points import KnownPoints
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.settings import build_settings
+from chsel.special_file import refuse_special_file
 from chsel.streams import StreamKey
 from replay.events import Event, Probe, RigDescribed, SessionStarted
 from replay.file_digest import file_digest
@@ -72,6 +73,7 @@ def open_source(
     session: its settings, for what is no recording; raw logs need those of kind "sensors", with
     which a .yaml is a depth image.
     """
+    refuse_special_file(str(path), path, SettingError)
     is_mcap = path.suffix.lower() == ".mcap"
     if is_mcap and _is_recording(path):
         return _recorded(path)

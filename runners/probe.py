@@ -15,12 +15,13 @@ import trimesh
 import yaml
 from omegaconf import DictConfig
 
-from chsel.errors import RecordingError, require_positive
+from chsel.errors import RecordingError
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.sdf import SdfGrid
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
+from chsel.threads import require_threads
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.recording_info import recording_digest
@@ -72,7 +73,7 @@ class ProbeConfig:
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
-        require_positive("threads", self.threads)
+        require_threads("threads", self.threads)
 
 
 @dataclass
@@ -140,7 +141,10 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
     object_model = load_object(config.object, config.assets.folder)
     session = open_session(kind, settings, object_model, config.seed, watcher)
     sdf = SdfGrid.from_mesh(
-        object_model.mesh, settings.object_resolution, padding=settings.object_padding
+        object_model.mesh,
+        settings.object_resolution,
+        padding=settings.object_padding,
+        progress=lambda done, total: watcher("signed distance grid, nodes", done, total),
     )
     start = (settings.start_contacts, settings.start_probe)
     return Scene(session, object_model.name, object_model.mesh, sdf, start, watcher)

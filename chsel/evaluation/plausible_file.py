@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
-import zlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,23 +15,14 @@ from chsel.errors import ChselError
 from chsel.evaluation.error import EvaluationError
 from chsel.evaluation.plausible_set import PlausibleSet, rotation_seed
 from chsel.evaluation.plausible_settings import PlausibleSettings
+from chsel.npz_file import read_npz
 from chsel.pose import check_rigid
 from chsel.problem import RegistrationProblem
 from chsel.settings import build_settings
 
 FORMAT = 1
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    EOFError,
-    zipfile.BadZipFile,
-    zlib.error,
-    NotImplementedError,
-    MemoryError,
-    OverflowError,
-)
+MOST_BYTES = 4 * 2**30  # of a file, unpacked: 30 million members
+_UNREADABLE = (ChselError, ValueError, TypeError, KeyError, OverflowError)
 
 
 def plausible_path(folder: Path, problem: RegistrationProblem, settings: PlausibleSettings) -> Path:
@@ -114,10 +103,9 @@ def load_plausible(
 def read_plausible(path: Path) -> PlausibleSet:
     """The set in a file, its digest checked. Raises EvaluationError if it is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        arrays = read_npz(path, most_bytes=MOST_BYTES, error=EvaluationError)
         found = _set_of(arrays)
-    except (*_UNREADABLE, ChselError) as error:
+    except _UNREADABLE as error:
         text = " ".join(str(error).split())
         raise EvaluationError(
             f"plausible set {path} is damaged or no plausible set ({text}); accepted: a file that "

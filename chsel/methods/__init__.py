@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from chsel import presets
-from chsel.errors import SettingError, require_choice
+from chsel.errors import SettingError, require_choice, require_instance
 from chsel.methods.anchored import Anchored, preset_anchored
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
@@ -84,6 +84,8 @@ def build_method(name: str, settings: Any = None) -> Method:
         settings = default
     elif isinstance(settings, Mapping):
         settings = build_settings(type(default), settings, "method")
+    kind = type(default)
+    require_instance("settings", settings, kind, f"a mapping, or a {kind.__name__}")
     return make(settings)
 
 

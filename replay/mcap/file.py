@@ -14,6 +14,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
+from chsel.special_file import refuse_special_file
 from replay.mcap.chunk_records import DAMAGE, check_size, chunk_records, plausible_size
 from replay.mcap.damaged import DamagedRecordingError
 from replay.mcap.schemas import PROFILE
@@ -104,6 +105,7 @@ class McapFile:
 
     def messages(self) -> Iterator[StoredMessage]:
         """All messages in the order of writing. Raises RecordingError if the file is no good."""
+        refuse_special_file(f"recording {self.path}", self.path, RecordingError)
         try:
             with self.path.open("rb") as file:
                 size = file.seek(0, 2)

@@ -23,6 +23,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
+from chsel.special_file import refuse_special_file
 from replay.mcap.chunk_records import DAMAGE, check_size, chunk_records, plausible_size
 from replay.mcap.schemas import PROFILE
 
@@ -45,6 +46,7 @@ class McapIndex:
         self._topics: dict[int, str] = {}  # by id of channel
         self._chunks: list[ChunkIndex] = []
         self._read: tuple[int, list[Message]] = (-1, [])  # the last chunk: where, and its messages
+        refuse_special_file(f"recording {path}", path, RecordingError)
         try:
             with path.open("rb") as file:
                 self.size = file.seek(0, 2)

@@ -14,10 +14,10 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn
 from rich.table import Table
 
-from chsel.errors import RecordingError, SettingError
+from chsel.errors import RecordingError
 from chsel.evaluation.plausible_settings import DEFINITIONS
 from chsel.problem import Hypotheses
-from chsel.threads import threads
+from chsel.threads import require_threads, threads
 from replay.comparing.columns import PLAUSIBLE, Column, columns_in_table
 from replay.comparing.comparison import (
     CommonCost,
@@ -71,8 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> int:
     """Print a table of medians, of all steps if wanted; 1 if a registration failed."""
     _check_outputs(given)
-    if given.threads < 1:
-        raise SettingError(f"--threads is {given.threads}; accepted: at least 1")
+    require_threads("--threads", given.threads)
     recording = read_recording(given.file)
     if not recording.steps:
         raise RecordingError(f"recording {given.file} has no registration problem to compare on")

@@ -60,7 +60,9 @@ def run(given: argparse.Namespace) -> int:
 def _format(named: str | None, out: Path | None) -> str:
     """The format that is asked for, by its name or by that of the file."""
     suffix = out.suffix.lower().removeprefix(".") if out is not None else ""
-    of_file = suffix if suffix in FORMATS else None
-    if named is not None and of_file not in (None, named):
+    if out is not None and suffix not in FORMATS:
+        accepted = ", ".join(f".{name}" for name in FORMATS)
+        raise SettingError(f"{out} ends in {out.suffix or 'no suffix'}; accepted: {accepted}")
+    if named is not None and suffix not in ("", named):
         raise SettingError(f"--format is {named} and {out} ends in {suffix}; accepted: one of them")
-    return named or of_file or "npz"
+    return named or suffix or "npz"

@@ -1,6 +1,6 @@
 """Run every registration of recordings again and compare hypotheses, costs and archives.
 
-Status 0 if all bits are equal, 1 if not, 2 if a file cannot be used.
+Status 0 if all bits are equal, 1 if not, 2 if a file cannot be used or holds no result.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from chsel.errors import SettingError
+from chsel.threads import require_threads
 from replay.console import Console, Progress, print_error
 from replay.file_verification import FileVerdict, recordings_in, verified_files
 from replay.verification import NO_RESULT
@@ -25,8 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Print a line for each file, and a report for each step that differs."""
-    if given.jobs < 1:
-        raise SettingError(f"--jobs is {given.jobs}; accepted: at least 1")
+    require_threads("--jobs", given.jobs)
     console = Console(soft_wrap=True)
     paths = recordings_in(given.files)
     begun, status, equal, total = time.perf_counter(), 0, 0, 0

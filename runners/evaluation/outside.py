@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,7 @@ import numpy as np
 
 from chsel.arrays import FloatArray, frozen
 from chsel.errors import ChselError
+from chsel.npz_file import read_npz
 from chsel.pose import inverse
 from chsel.problem import Hypotheses
 from chsel.selection import repeated
@@ -32,7 +31,6 @@ DRAW_FOLDER = "draw_{}"
 SUFFIXES = (".npz", ".json")
 _TOLERANCE = 1e-5  # of the entries of R^T R - 1: transforms may have been written as text
 _KEY = re.compile(r"(step|cost|seconds)_(\d{1,10})")
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 class OutsideError(ChselError):
@@ -143,10 +141,9 @@ def _wanted(plan: Plan, trial: Trial, label: str) -> Path:
 def _values(path: Path) -> Mapping[str, Any]:
     try:
         if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
+            return read_npz(path, error=OutsideError)
         values = json.loads(path.read_text())
-    except _UNREADABLE as error:
+    except (OSError, ValueError, OutsideError) as error:
         reason = " ".join(str(error).split())
         raise OutsideError(f"{path} cannot be read ({reason})") from None
     if not isinstance(values, Mapping):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from chsel.complete_file import check_complete
 from chsel.errors import SettingError
 
 MOST_BYTES = 32 * 2**20  # of the mesh files of one URDF together
@@ -82,6 +83,7 @@ class MeshFiles:
                 f"{where} makes the meshes more than {MOST_BYTES} bytes; accepted: fewer"
             )
         try:
+            check_complete(path, path.suffix.lower().removeprefix("."))
             loaded: Any = trimesh.load(
                 str(path), force="mesh", process=False, skip_materials=True, ignore_broken=True
             )

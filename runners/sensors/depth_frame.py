@@ -14,6 +14,7 @@ from chsel.arrays import BoolArray, FloatArray, frozen
 from chsel.errors import ChselError, SessionError, SettingError
 from chsel.pose import nearest_rigid
 from chsel.sensing.camera import PinholeCamera
+from chsel.special_file import refuse_special_file
 from runners.sensors.image_file import read_image
 
 SUFFIXES = (".yaml", ".yml")
@@ -84,6 +85,7 @@ def _frame(values: Mapping[str, Any], folder: Path) -> DepthFrame:
 def _values(path: Path) -> Mapping[str, Any]:
     if path.suffix.lower() not in SUFFIXES:
         raise SessionError(f"of no known kind; accepted: {', '.join(SUFFIXES)}")
+    refuse_special_file("it", path, SessionError)
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)

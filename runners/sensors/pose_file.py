@@ -13,6 +13,7 @@ import yaml
 from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SessionError
 from chsel.pose import nearest_rigid
+from chsel.special_file import refuse_special_file
 from replay.new_file import new_file
 from runners.whole_file import whole_file
 
@@ -75,6 +76,7 @@ def write_pose(
 
 
 def _values(path: Path) -> dict[str, Any]:
+    refuse_special_file(f"pose file {path}", path, SessionError)
     try:
         with path.open("rb") as file:
             data = file.read(_MOST_BYTES + 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,11 +13,16 @@ import numpy as np
 import trimesh
 
 from chsel.arrays import FloatArray, IntArray, frozen
+from chsel.complete_file import check_complete
 from chsel.errors import ChselError, PointsError, PoseError
+from chsel.npz_file import read_npz
 from chsel.points import KnownPoints
 from chsel.pose import nearest_rigid
+from chsel.special_file import refuse_special_file
+from chsel.streams import LAST_STEP
 
 KINDS = ("surface", "free", "occupied", "known")
+_LONGEST_TEXT = 60  # characters that an error quotes of a file
 _COLUMNS = ("x", "y", "z", "kind", "sdf", "step")
 
 
@@ -79,6 +83,7 @@ def read_points(path: str | Path) -> PointFile:
         raise PointsError(
             f"point file {path} has the suffix {path.suffix!r}; accepted: {', '.join(_READERS)}"
         )
+    refuse_special_file(f"point file {path}", path, PointsError)
     if not path.is_file():
         raise PointsError(f"point file {path} does not exist; accepted: a file")
     try:
@@ -91,15 +96,11 @@ def read_points(path: str | Path) -> PointFile:
 
 
 def _read_npz(path: Path) -> PointFile:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise PointsError(f"not a readable .npz file ({error})") from None
     accepted = [*KINDS, "known_sdf", *(f"{kind}_step" for kind in KINDS), "world_from_object"]
-    for name in arrays:
-        if name not in accepted:
-            raise PointsError(f"array {name} is unknown; accepted: {', '.join(accepted)}")
+    arrays = read_npz(path, accepted=accepted, error=PointsError)
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiu":
+            raise PointsError(f"{name} has type {array.dtype}; accepted: numbers")
     if not any(kind in arrays for kind in KINDS):
         raise PointsError(f"no array of points; accepted: at least one of {', '.join(KINDS)}")
     if ("known" in arrays) != ("known_sdf" in arrays):
@@ -120,9 +121,10 @@ def _npz_class(kind: str, arrays: dict[str, Any]) -> PointClass:
             f"{name} has type {steps.dtype} and shape {steps.shape}; accepted: integers, shape "
             f"({len(points)},)"
         )
-    if (steps < 0).any():
-        row = int(np.argmax(steps < 0))
-        raise PointsError(f"{name}[{row}] is {steps[row]}; accepted: 0 or above")
+    refused = (steps < 0) | (steps > LAST_STEP)
+    if refused.any():
+        row = int(np.argmax(refused))
+        raise PointsError(f"{name}[{row}] is {steps[row]}; accepted: 0 to {LAST_STEP}")
     return PointClass(points, frozen("known_sdf", sdf, (len(points),)), steps.astype(np.int64))
 
 
@@ -152,7 +154,8 @@ def _read_csv(path: Path) -> PointFile:
 def _check_header(header: list[str]) -> None:
     wanted = "x,y,z,kind[,sdf][,step]"
     if not {"x", "y", "z", "kind"} <= set(header) or set(header) - set(_COLUMNS):
-        raise PointsError(f"line 1 is {','.join(header)!r}; accepted: the header {wanted}")
+        shown = repr(",".join(header)[:_LONGEST_TEXT])
+        raise PointsError(f"line 1 is {shown}; accepted: the header {wanted}")
     if len(set(header)) != len(header):
         raise PointsError(f"line 1 names a column twice; accepted: the header {wanted}")
 
@@ -162,7 +165,8 @@ def _csv_row(row: dict[Any, Any], line: int) -> tuple[str, list[float], float, i
         raise PointsError(f"line {line} has another number of fields than the header")
     kind = row["kind"].strip()
     if kind not in KINDS:
-        raise PointsError(f"line {line}: kind is {kind!r}; accepted: {', '.join(KINDS)}")
+        shown = repr(kind[:_LONGEST_TEXT])
+        raise PointsError(f"line {line}: kind is {shown}; accepted: {', '.join(KINDS)}")
     point = [_number(row[axis], axis, line) for axis in "xyz"]
     given = row.get("sdf", "").strip()
     if kind == "known" and not given:
@@ -172,8 +176,11 @@ def _csv_row(row: dict[Any, Any], line: int) -> tuple[str, list[float], float, i
     if kind in ("free", "occupied") and given:
         raise PointsError(f"line {line}: a {kind} point has an sdf; accepted: nothing")
     step = _number(row.get("step", "").strip() or "0", "step", line)
-    if step != int(step) or step < 0:
-        raise PointsError(f"line {line}: step is {row['step']}; accepted: an integer from 0")
+    if step != int(step) or not 0 <= step <= LAST_STEP:
+        raise PointsError(
+            f"line {line}: step is {row['step'][:_LONGEST_TEXT]}; "
+            f"accepted: an integer from 0 to {LAST_STEP}"
+        )
     return kind, point, _number(given or "0", "sdf", line), int(step)
 
 
@@ -183,7 +190,8 @@ def _number(text: str, name: str, line: int) -> float:
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise PointsError(f"line {line}: {name} is {text!r}; accepted: a finite number")
+        shown = repr(text[:_LONGEST_TEXT])
+        raise PointsError(f"line {line}: {name} is {shown}; accepted: a finite number")
     return value
 
 
@@ -197,17 +205,30 @@ def _csv_class(entries: list[tuple[list[float], float, int]]) -> PointClass:
 
 
 def _read_surface(path: Path) -> PointFile:
-    """Every vertex of a mesh or point cloud is a surface point."""
+    """Every vertex of a mesh or point cloud is a surface point, those at one place together one."""
+    kind = path.suffix.lower().removeprefix(".")
     try:
-        loaded = trimesh.load(str(path))
+        check_complete(path, kind)
+        loaded = trimesh.load(str(path), file_type=kind, process=False)
         geometries = list(getattr(loaded, "geometry", {"": loaded}).values())
-        vertices = np.concatenate([np.asarray(g.vertices).reshape(-1, 3) for g in geometries])
+        vertices = np.concatenate([_vertices(geometry) for geometry in geometries])
     except Exception as error:  # readers of foreign formats raise anything
-        raise PointsError(f"not a readable {path.suffix} file ({error})") from None
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise PointsError(f"not a readable .{kind} file ({reason[:200]})") from None
     points = frozen("surface", vertices, (None, 3))
     nothing = {kind: PointClass() for kind in KINDS}
     steps = np.zeros(len(points), dtype=np.int64)
     return PointFile({**nothing, "surface": PointClass(points, np.zeros(len(points)), steps)})
+
+
+def _vertices(geometry: Any) -> FloatArray:
+    """All vertices (V, 3); of those of a mesh's faces, one for each place."""
+    vertices = np.asarray(geometry.vertices, dtype=np.float64).reshape(-1, 3)
+    if not isinstance(geometry, trimesh.Trimesh) or not np.isfinite(vertices).all():
+        return vertices
+    beside = vertices[~geometry.referenced_vertices]
+    geometry.process()
+    return np.concatenate([np.asarray(geometry.vertices).reshape(-1, 3), beside])
 
 
 _READERS: dict[str, Callable[[Path], PointFile]] = {

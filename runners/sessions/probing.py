@@ -191,8 +191,13 @@ class ProbingSession:
             vertices = apply(world_from_object, np.asarray(mesh.vertices))
             points = np.concatenate([points, floor_slab(lattice, vertices)])
         # Some configurations reach out of their workspace; free points within the object would lie.
-        distance, _ = mesh_sdf(mesh, apply(inverse(world_from_object), points))
-        return points[distance > 0.0]
+        in_object = apply(inverse(world_from_object), points)
+        lower, upper = np.asarray(mesh.bounds)
+        beside = ((in_object < lower) | (in_object > upper)).any(axis=1)
+        asked = ~beside if mesh.is_watertight else np.ones(len(points), dtype=bool)
+        inside = np.zeros(len(points), dtype=bool)
+        inside[asked] = mesh_sdf(mesh, in_object[asked])[0] <= 0.0
+        return points[~inside]
 
 
 class _Gripper:

@@ -14,6 +14,7 @@ from chsel.evaluation.pose_error import pose_errors
 from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.methods import preset_settings
 from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.streams import StreamKey
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.4)), np.array([0.3, 0.1, 0.2]))
@@ -97,16 +98,69 @@ def test_points_far_outside_of_the_workspace_cost_their_distance() -> None:
             r"initial_set\[0\] is not a rigid",
         ),
         ({"surface": POINT, "initial_set": np.zeros((0, 4, 4))}, "initial_set is empty"),
+        ({"surface": POINT, "initial_set": np.eye(4)}, r"initial_set has shape \(4, 4\); accepted"),
+        ({"surface": POINT, "initial_set": "best"}, "initial_set is not an array of numbers"),
+        ({"surface": POINT, "previous": np.eye(4)[None]}, "previous is .*; accepted: the Hypoth"),
+        ({"surface": POINT, "previous": np.zeros((9, 4, 4))}, "previous is a ndarray; accepted"),
+        ({"surface": POINT, "seed": 1.5}, r"seed is 1.5; accepted: an integer from 0 to 2\*\*64"),
+        ({"surface": POINT, "seed": "1"}, "seed is '1'; accepted: an integer"),
+        ({"surface": POINT, "seed": None}, "seed is None; accepted: an integer"),
+        ({"surface": POINT, "seed": True}, "seed is True; accepted: an integer"),
+        ({"surface": POINT, "step": -1}, r"step is -1; accepted: an integer from 0 to 2\*\*32"),
+        ({"surface": POINT, "step": 0.0}, "step is 0.0; accepted: an integer"),
+        ({"surface": POINT, "step": [1]}, r"step is \[1\]; accepted: an integer"),
+        ({"surface": POINT, "method": 5}, "method is 5; accepted: chsel"),
+        ({"surface": POINT, "method": ["chsel"]}, r"method is \['chsel'\]; accepted: chsel"),
+        ({"surface": POINT, "method": np.eye(4)}, "method is array.*; accepted: chsel"),
+        ({"surface": POINT, "preset": np.eye(9)}, "preset is a ndarray; accepted: default"),
+        ({"surface": POINT, "hypotheses": 2.5}, "hypotheses is 2.5; accepted: an integer"),
+        ({"surface": POINT, "hypotheses": "30"}, "hypotheses is '30'; accepted: an integer"),
+        ({"surface": POINT, "hypotheses": np.ones(3)}, "hypotheses is array.*; accepted: an int"),
+        (
+            {"surface": POINT, "workspace": [[0, 0, 0], [1, 1, 1]]},
+            r"workspace is \[\[0.*; accepted: chsel\.Workspace\(lower, upper\)",
+        ),
+        ({"surface": POINT, "workspace": np.zeros((2, 3))}, "workspace is array.*; accepted"),
+        ({"surface": POINT, "settings": "fast"}, "settings is 'fast'; accepted: a mapping, or"),
+        ({"surface": POINT, "settings": 3}, "settings is 3; accepted: a mapping"),
+        ({"surface": POINT, "settings": chsel.CostSettings}, "settings is .*; accepted: a map"),
+        ({"surface": POINT, "settings": {"emitter": 3}}, "emitter is 3; accepted: a group of set"),
+        ({"surface": POINT, "settings": {3: 4}}, r"method\.3 does not exist"),
+        ({"surface": POINT, "resolution": 0}, "SDF resolution is 0; accepted: a finite number"),
+        ({"surface": POINT, "resolution": np.nan}, "SDF resolution is nan"),
+        ({"surface": POINT, "resolution": 5e-324}, "SDF resolution is 5e-324; accepted: 1e-06"),
+        ({"surface": POINT, "resolution": "fine"}, "SDF resolution is 'fine'"),
+        ({"surface": POINT, "free_resolution": -0.01}, "free_resolution is -0.01; accepted: a f"),
+        ({"surface": POINT, "free_resolution": np.ones(2)}, "free_resolution is array"),
+        ({"surface": [[10**400, 0, 0]]}, "surface is not an array of numbers"),
+        ({"surface": torch.zeros((1, 3), dtype=torch.bfloat16)}, "surface is not an array of num"),
     ],
 )
 def test_mistakes_say_what_is_accepted(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(chsel.ChselError, match=message):
+    with pytest.raises(chsel.ChselError, match=message) as caught:
         register(**arguments)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
 
 
 def test_a_target_that_is_no_mesh_is_refused() -> None:
-    with pytest.raises(chsel.ChselError, match="target is a str; accepted: Trimesh or SdfGrid"):
+    message = (
+        r"target is 'box\.obj'; accepted: a mesh such as chsel\.load_mesh\('box\.obj'\), a Trim"
+    )
+    with pytest.raises(chsel.ChselError, match=message):
         chsel.register("box.obj", surface=POINT)  # type: ignore[arg-type]
+    with pytest.raises(
+        chsel.ChselError, match=r"target is .*; accepted: .*load_mesh\('box\.obj'\)"
+    ):
+        chsel.register(Path("box.obj"), surface=POINT)  # type: ignore[arg-type]
+    with pytest.raises(chsel.ChselError, match=r"target is a Scene; accepted: .*chsel\.load_mesh"):
+        chsel.register(trimesh.Scene(BOX), surface=POINT)  # type: ignore[arg-type]
+
+
+def test_integers_of_numpy_are_seeds_and_steps_too() -> None:
+    key = StreamKey(np.int64(3), np.uint8(2))  # type: ignore[arg-type]
+    assert key == StreamKey(3, 2)
+    assert type(key.seed) is type(key.step) is int
 
 
 def test_single_settings_and_whole_settings_are_both_taken() -> None:

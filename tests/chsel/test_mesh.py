@@ -90,11 +90,23 @@ def test_an_open_mesh_is_kept_with_a_warning_that_names_it(box, tmp_path):
     assert not mesh.is_watertight
 
 
+def test_a_mesh_of_many_faces_is_kept_with_a_warning_that_names_its_size(box, monkeypatch):
+    monkeypatch.setattr("chsel.mesh.MANY_FACES", 12)
+    clean_mesh(box.vertices, box.faces)
+    finer = box.subdivide().subdivide()
+    message = r"^bowl has 192 faces: .* signed distance grid .*; a decimated mesh of 50,000 faces"
+    with pytest.warns(UserWarning, match=message):
+        mesh = clean_mesh(finer.vertices, finer.faces, name="bowl")
+    assert len(mesh.faces) == 192
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(MeshError, match=r"nowhere\.obj does not exist; accepted: .*\.obj.*\.stl"):
         load_mesh(tmp_path / "nowhere.obj")
     with pytest.raises(MeshError, match="is a folder"):
         load_mesh(tmp_path)
+    with pytest.raises(MeshError, match=r"mesh file is 3; accepted: the path of a file"):
+        load_mesh(3)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "off", "glb"])
@@ -103,6 +115,22 @@ def test_a_damaged_file_of_any_kind_is_named(tmp_path, suffix):
     path.write_bytes(np.random.default_rng(0).bytes(1000))
     with pytest.raises(MeshError, match=rf"noise\.{suffix} (cannot be read|has no faces)"):
         load_mesh(path)
+
+
+@pytest.mark.parametrize("name", ["box.ply", "box.off", "box.stl"])
+def test_a_file_of_text_that_is_cut_is_refused(tmp_path, name):
+    box = trimesh.creation.box(EXTENTS).subdivide()
+    kind = {"ply": "ply", "off": "off", "stl": "stl_ascii"}[name[-3:]]
+    how = {"encoding": "ascii"} if kind == "ply" else {}
+    text = box.export(file_type=kind, **how)
+    text = text.decode() if isinstance(text, bytes) else text
+    lines = text.strip().splitlines(keepends=True)
+    (tmp_path / name).write_text("".join(lines))
+    assert len(load_mesh(tmp_path / name).faces) == 48
+    for count in (len(lines) - 1, len(lines) - 20, len(lines) // 2):
+        (tmp_path / name).write_text("".join(lines[:count]))
+        with pytest.raises(MeshError, match=rf"{name} cannot be read as .*: it (announces|has)"):
+            load_mesh(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "mesh", "cloud.xyz", "parts.zip"])

@@ -1,15 +1,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from chsel import SdfGrid
-from chsel.errors import SdfError, SettingError
+from chsel.errors import MeshError, SdfError, SettingError
 from chsel.mesh import load_mesh
-from chsel.sdf import mesh_sdf
+from chsel.sdf import _parts, mesh_sdf
 
 SIZE = np.array([0.2, 0.12, 0.08])
 
@@ -67,6 +68,32 @@ def test_the_sign_changes_nowhere_but_at_the_surface(ycb_directory: Path, name: 
         assert ((here < 0.0) == (there < 0.0))[apart].all()
     volume = (grid.values < 0.0).sum() * grid.resolution**3
     assert volume == pytest.approx(mesh.volume, rel=0.1)
+
+
+@pytest.mark.parametrize("mesh", ["box.obj", None, trimesh.Scene(), trimesh.Trimesh()])
+def test_a_grid_of_no_mesh_is_refused(mesh: Any) -> None:
+    with pytest.raises(MeshError, match=r"mesh is .*; accepted: a Trimesh with faces"):
+        SdfGrid.from_mesh(mesh)
+
+
+def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
+    box: trimesh.Trimesh, grid: SdfGrid, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[int, int]] = []
+    nodes = grid.values.size
+
+    def remade() -> SdfGrid:
+        told.clear()
+        return SdfGrid.from_mesh(box, 0.01, progress=lambda *counts: told.append(counts))
+
+    assert remade().digest == grid.digest
+    assert told == [(0, nodes)]
+    monkeypatch.setattr("chsel.sdf._PART_NODES", 1000)
+    assert remade().digest == grid.digest
+    assert told == [(done, nodes) for done in range(0, nodes, 1000)]
+    monkeypatch.setattr("chsel.sdf._PART_NODES", 1)
+    parts = _parts(np.zeros((10, 3)), face_count=20)  # of a large mesh, parts are large
+    assert [len(part) for part in parts] == [4, 4, 2]
 
 
 def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid: SdfGrid) -> None:

@@ -14,8 +14,9 @@ import torch
 
 from chsel import KnownPoints, SdfGrid
 from chsel.engine import CompiledCost
-from chsel.errors import EngineError
-from chsel.threads import spread
+from chsel.errors import EngineError, SettingError
+from chsel.threads import require_threads, spread
+from chsel.threads import threads as use_threads
 
 PATIENCE = 20.0  # seconds until what should have ended long ago counts as stuck
 
@@ -37,6 +38,18 @@ def test_pieces_cover_the_range_once(threads: int, count: int) -> None:
     done: list[int] = []
     spread(lambda first, last, _: done.extend(range(first, last)), count, no_scratch)
     assert sorted(done) == list(range(count))
+
+
+@pytest.mark.parametrize("count", [0, -1, 257, 10_000, 1.0, True])
+def test_a_number_of_threads_that_cannot_be_meant_is_refused(count: Any) -> None:
+    before = torch.get_num_threads()
+    with (
+        pytest.raises(SettingError, match=rf"threads is {count}; accepted: .* from 1 to 256"),
+        use_threads(count),
+    ):
+        pass
+    assert torch.get_num_threads() == before
+    require_threads("threads", 256)
 
 
 def test_every_thread_works_in_scratch_of_its_own(threads: int) -> None:

@@ -317,7 +317,7 @@ def test_everything_is_saved(path, tmp_path, capsys):
         (["--save-plot", "out.jpg"], "out.jpg is no name of a picture; accepted: *.png, *.svg"),
         (["--save-plot", "nowhere/out.png"], "nowhere is no folder"),
         (["--save-plot", "out.png", "--save-csv", "out.png"], "out.png is named twice"),
-        (["--threads", "0"], "--threads is 0; accepted: at least 1"),
+        (["--threads", "0"], "--threads is 0; accepted: an integer from 1 to 256"),
         (["--steps", "7"], "there is no step 7; accepted: 0, 1, 2"),
     ],
 )

@@ -185,9 +185,18 @@ def test_metrics_are_all_recorded_numbers(recording, tmp_path):
 
 
 @pytest.mark.parametrize("what", EXPORTS)
-def test_every_recording_can_be_exported(any_events, write, tmp_path, what):
+def test_every_recording_can_be_exported_that_has_something(
+    any_events, write, tmp_path, what, capsys
+):
     recording = read_recording(write(any_events))
     for file_format in ("npz", "csv", "json"):
+        if _is_empty(recording, what):
+            path = tmp_path / f"out.{file_format}"
+            words = ["export", str(recording.path), "--what", what, "-o", str(path)]
+            assert main(words) == 2
+            assert " has no " in capsys.readouterr().err
+            assert not path.exists()
+            continue
         path = exported(recording, tmp_path, what, file_format)
         if file_format == "npz":
             assert all(array.dtype != object for array in arrays(path).values())
@@ -195,6 +204,36 @@ def test_every_recording_can_be_exported(any_events, write, tmp_path, what):
             standard_json(path)
         else:
             table(path)
+
+
+def _is_empty(recording, what: str) -> bool:
+    """Whether a recording has nothing of what an export is asked for."""
+    start, probes = recording.start, recording.probes
+    results = [step for step in recording.steps if recording.has_result(step)]
+    return not {
+        "hypotheses": results,
+        "points": start.initial_points.count + sum(p.new_points.count for p in probes),
+        "archive": [
+            step
+            for step in recording.steps
+            if recording.snapshots(step)
+            or (step in results and recording.hypotheses(step).archive is not None)
+        ],
+        "metrics": probes,
+        "images": recording.image_steps,
+    }[what]
+
+
+@pytest.mark.parametrize("file_format", ["npz", "csv", "json"])
+def test_images_of_a_recording_without_any_are_an_error_and_no_file(
+    recording, tmp_path, capsys, file_format
+):
+    path = tmp_path / f"out.{file_format}"
+    words = ["export", str(recording.path), "--what", "images", "-o", str(path)]
+    assert main(words) == 2
+    message = f"recording {recording.path} has no image of a sensor; accepted: one with some"
+    assert capsys.readouterr().err == f"error: {message}\n"
+    assert [file.suffix for file in tmp_path.iterdir()] == [".mcap"]
 
 
 def test_points_stand_in_the_order_of_the_probes(any_events, write, tmp_path):
@@ -246,6 +285,8 @@ def test_what_does_not_fit_is_named(recording, tmp_path, capsys):
     for more, message in {
         ("points", "--last"): "--last does not go with points; accepted: --what archive",
         ("points", "--format", "csv", "-o", "a.npz"): "--format is csv and a.npz ends in npz",
+        ("points", "-o", "a.xlsx"): "a.xlsx ends in .xlsx; accepted: .npz, .csv, .json",
+        ("points", "--format", "csv", "-o", "a"): "a ends in no suffix; accepted: .npz, .csv",
         ("hypotheses", "--steps", "0"): "there is no step 0; accepted: 1, 2",
         ("archive", "--steps", "x"): "'x' names no steps",
     }.items():

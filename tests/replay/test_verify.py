@@ -13,7 +13,7 @@ import pytest
 
 from chsel.problem import Hypotheses
 from replay.__main__ import main
-from replay.events import Event, HypothesesFound, SessionStarted, Traced
+from replay.events import Event, HypothesesFound, Probe, SessionStarted, Traced
 from replay.file_verification import verified_files
 from replay.mcap.reader import read_recording
 from replay.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verify
@@ -135,6 +135,24 @@ def test_a_registration_that_was_interrupted_has_nothing_to_compare(
     assert "3 of 3 steps equal (gradient_descent)" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_file_without_a_result_cannot_be_verified(
+    write: Write, capsys: pytest.CaptureFixture[str], jobs: str
+) -> None:
+    events = events_of(DESCENT)
+    first = next(i for i, e in enumerate(events) if isinstance(e, HypothesesFound))
+    posed = write(events[:first])
+    assert main(["verify", str(posed), "--jobs", jobs]) == 2
+    shown = capsys.readouterr()
+    message = "has no registration with a result to verify; accepted: a recording of at least one"
+    assert shown.err == f"error: recording {posed} {message}\n"
+    assert shown.out == ""
+    probes = [e for e in events if isinstance(e, SessionStarted | Probe)]
+    path = write(probes)
+    assert main(["verify", str(path), "--jobs", jobs]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_other_settings_than_those_that_gave_the_result_are_found(write: Write) -> None:
     events = events_of(DESCENT)
     start = events[0]
@@ -183,7 +201,7 @@ def test_several_files_and_processes_give_the_same_verdicts(
     [
         (["nowhere.mcap"], "recording nowhere.mcap does not exist"),
         ([str(DESCENT), "--step", "3"], "has no registration problem of step 3; accepted: 8, 9"),
-        ([str(DESCENT), "--jobs", "0"], "--jobs is 0; accepted: at least 1"),
+        ([str(DESCENT), "--jobs", "0"], "--jobs is 0; accepted: an integer from 1 to 256"),
         ([], "the following arguments are required: FILE"),
         ([str(Path(__file__).parent)], "has no recordings; accepted: files *.mcap in it"),
     ],

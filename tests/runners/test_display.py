@@ -1,32 +1,53 @@
-"""The table that an evaluation prints at its end."""
+"""What a run shows on the terminal while it works."""
 
 from __future__ import annotations
 
-import pyarrow as pa
+import io
+from pathlib import Path
+
+import numpy as np
 import pytest
+import trimesh
+from rich.console import Console
 
-from runners.evaluation.display import Display
-from runners.evaluation.table import RESULTS
-from tests.runners.made_up_evaluations import row
+from runners.display import Bar
+from runners.objects.loader import ObjectConfig
+from runners.objects.scans import AssetsConfig
+from runners.probe import PresetName, ProbeConfig, open_scene
+from runners.recording import RecordingConfig
 
 
-def test_the_summary_is_medians_by_object_in_mm2_and_milliseconds(
-    capsys: pytest.CaptureFixture[str],
+def test_a_bar_stands_there_before_the_work_begins() -> None:
+    screen = io.StringIO()
+    bar = Bar(Console(file=screen, force_terminal=True, width=80))
+    bar.show("signed distance grid, nodes", 0, 64_124)
+    shown = screen.getvalue()  # at once: what is done next may keep the thread that draws
+    bar.clear()
+    assert "signed distance grid, nodes" in shown
+    assert "0/64124" in shown
+
+
+def test_the_object_of_a_session_shows_its_size_and_how_far_its_grid_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = [
-        row("can", seed, "icp", 4, diversity=value, root=1.0, seconds=0.001 * value)
-        for seed, value in enumerate((1.0, 2.0, 60.0))
-    ]
-    rows += [row("box", 0, "icp", 4, diversity=1234.0, seconds=0.003)]
-    rows += [row("box", 1, "icp", 4) | {"status": "failed: no reason"}]
-    rows += [row("can", 0, "svgd", 4, diversity=7.0)]
-    table = pa.Table.from_pylist(rows, schema=RESULTS)
-    Display().summary(table, ["icp", "svgd", "cvo"], "wide_sums, by sums")
-    told = capsys.readouterr().out.splitlines()
-    assert "PD in mm²" in told[0]
-    cells = [line.split() for line in told]
-    assert ["method", "can", "box", "ms"] in cells
-    assert ["icp", "2", "1234", "2.5"] in cells  # of 1, 2, 60 and 3 ms
-    assert ["svgd", "7"] in cells
-    assert not any(line.startswith("cvo") for line in told)
-    assert told[-1] == "plausible sets: wide_sums, by sums"
+    monkeypatch.setattr("chsel.mesh.MANY_FACES", 1000)
+    monkeypatch.setattr("chsel.sdf._PART_NODES", 500)
+    trimesh.creation.icosphere(subdivisions=3, radius=0.04).export(tmp_path / "ball.ply")
+    np.savez(tmp_path / "points.npz", surface=np.eye(3) * 0.04)
+    config = ProbeConfig(
+        ObjectConfig("ball", 1.0, 0.001, "ball", kind="file", path=str(tmp_path / "ball.ply")),
+        {"kind": "points", "path": str(tmp_path / "points.npz"), "object_resolution": 0.02},
+        {"name": "chsel"},
+        PresetName("default"),
+        RecordingConfig(),
+        AssetsConfig(str(tmp_path), "https://nowhere.example"),
+        str(tmp_path),
+    )
+    told: list[tuple[str, int, int]] = []
+    message = r"mesh file .*ball\.ply has 1,280 faces: making its signed distance grid takes"
+    with pytest.warns(UserWarning, match=message):
+        scene = open_scene(config, lambda *progress: told.append(progress))
+    nodes = scene.sdf.values.size
+    stage = "signed distance grid, nodes"
+    assert told == [(stage, done, nodes) for done in range(0, nodes, 500)]
+    assert len(told) > 1

@@ -201,6 +201,7 @@ def stamps(folder: Path) -> dict[str, int]:
         (["session.noise=-1"], "noise is -1"),
         (["metrics.method=fast"], "method is 'fast'"),
         (["workers=0"], "workers is 0"),
+        (["workers=10000"], "workers is 10000; accepted: an integer from 1 to 256"),
         (["experiment=smok"], "did you mean smoke?"),
         (["objects=ycb"], "objects is 'ycb'; accepted: models, scans"),
         (["objects=scans", "assets.dir=nowhere"], "mustard_bottle"),

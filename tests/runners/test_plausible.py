@@ -131,8 +131,9 @@ def test_a_points_file_needs_its_object_and_the_true_pose_or_a_guess(folder: Pat
         (["{recording}", "definition.epsilon=-1"], "epsilon is -1.0"),
         (["{recording}", "metrics.quantile=2"], "quantile is 2.0"),
         (["{recording}", "definition.cost.lookup=cubic"], "lookup is 'cubic'"),
+        (["{recording}", "threads=10000"], "threads is 10000; accepted: an integer from 1 to 256"),
     ],
-    ids=["no file", "no name", "no step", "no definition", "epsilon", "quantile", "lookup"],
+    ids=["no file", "no name", "no step", "no definition", "epsilon", "quantile", "lookup", "many"],
 )
 def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
     given = [word.format(recording=folder / "recording.mcap") for word in arguments]

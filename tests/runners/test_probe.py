@@ -249,6 +249,7 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
         ("method.cost.free_scale=many", "method.cost.free_scale is 'many'; accepted: a number"),
         ("seed=-1", "seed is -1; accepted: an integer from 0"),
         ("threads=0", "threads is 0; accepted"),
+        ("threads=10000", "threads is 10000; accepted: an integer from 1 to 256"),
         ("object.path=nothing.obj", "mesh file nothing.obj does not exist"),
         ("session.path=nothing.npz", "point file nothing.npz does not exist"),
         ("logs=/dev/null", "run folder /dev/null/probe"),

@@ -70,6 +70,24 @@ def test_a_stamp_far_off_its_topic_gives_way_to_the_logs_time() -> None:
     assert abs(seconds(correction.time(received("/a", 11, 5000.0)) - BEGIN) - 11.0) < 0.02
 
 
+def test_a_stamp_far_off_its_topic_keeps_the_usual_offset_of_the_topic() -> None:
+    clocks = gathered({"/late": -0.5, "/camera": 90.0, "/b": 0.0})
+    clocks.add(received("/late", 11, 5000.0))
+    clocks.add(received("/camera", 11, 5000.0))
+    correction = clocks.correction()
+    assert (correction.of("/late"), correction.of("/b")) == (0, 0)
+    # On /late every message is half a second old when it is logged; so is the one with the stamp.
+    time = correction.time(received("/late", 11, 5000.0))
+    assert abs(seconds(time - BEGIN) - 10.5) < 0.02
+    regular = correction.time(received("/late", 11, 10.5))
+    assert abs(seconds(time - regular)) < 0.02
+    # The clock of /camera is shifted: its usual offset and its shift cancel, to the typical one.
+    time = correction.time(received("/camera", 11, 5000.0))
+    typical = seconds(correction.medians["/camera"] + correction.of("/camera"))
+    assert abs(typical) < 0.02
+    assert abs(seconds(time - BEGIN) - (11 + typical)) < 1e-6
+
+
 def test_static_transforms_do_not_count() -> None:
     clocks = gathered({"/a": 0.0})
     content = TransformMessage("a", "b", np.eye(4), static=True)

@@ -211,6 +211,18 @@ def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path: Path) 
     np.testing.assert_allclose(found.workspace.bounds, bounds)
 
 
+def test_a_labels_outline_is_left_out_two_pixels_deep_where_no_edge_of_depth_is(
+    tmp_path: Path,
+) -> None:
+    frame = read_depth_frame(written(tmp_path))
+    flat = dataclasses.replace(frame, depth=np.full_like(frame.depth, FRONT))
+    expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    expected[22:38, 32:58] = True
+    for chosen in (rig(), rig(edge=None)):
+        found = depth_frame_points(flat, chosen, free_resolution=0.01, diameter=0.3)
+        np.testing.assert_array_equal(found.surface, expected)
+
+
 def frame_points(frame: DepthFrame, found: module.FramePoints) -> np.ndarray:
     """World points of all surface pixels."""
     return apply(frame.world_from_camera, frame.camera.back_project(frame.depth)[found.surface])

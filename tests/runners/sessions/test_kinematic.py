@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from chsel.points import Lattice
 from chsel.pose import apply, inverse
 from chsel.sdf import mesh_sdf
 from replay.events import Probe
 from runners.objects.models import MODELS
 from runners.sessions import hand
 from runners.sessions.configurations import CONFIGURATIONS
+from runners.sessions.free_space import box_shell
 from runners.sessions.kinematic import KinematicEngine, open_kinematic
 from runners.sessions.probing import START, X_REST, ProbingSession, ProbingSettings
 
@@ -178,6 +180,10 @@ def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_work
     assert apply(session.world_from_object, np.asarray(mesh.vertices))[:, 0].max() > 0.5
     points = apply(inverse(session.world_from_object), session.initial_points.free)
     assert mesh_sdf(mesh, points)[0].min() > 0.0
+    every = box_shell(Lattice(session.workspace.lower, session.free_resolution), session.workspace)
+    distance, _ = mesh_sdf(mesh, apply(inverse(session.world_from_object), every))
+    assert (distance <= 0.0).any()
+    np.testing.assert_array_equal(session.initial_points.free, every[distance > 0.0])
 
 
 def test_a_real_scan_can_be_probed(ycb_directory) -> None:  # type: ignore[no-untyped-def]

@@ -46,12 +46,14 @@ from tests.replay.conftest import same_bits
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import ros2_cloud, ros2_transform, write_ros2
 from tests.runners.sensors.sphere_log import (
+    ASIDE,
     BEGIN,
     CENTRE,
     HAND_FROM_PAD,
     LATENCY,
     MEMBRANE,
     OUTER,
+    PRESSED,
     RADIUS,
     RIG,
     SECOND,
@@ -132,6 +134,21 @@ def test_free_space_is_where_rays_passed_and_the_hand_went(events: list[Any], lo
     assert known.query(within_pad[:3], p=np.inf)[0] <= 0.5 * SPACING + 1e-9
     behind = np.array([0.5 * RADIUS, 0.0, 0.0])
     assert known.query(CENTRE + behind)[0] > 0.01
+
+
+def test_a_pad_frees_what_is_before_its_membrane_and_nothing_behind_it(log: Path) -> None:
+    session = open_log(log, replace(RIG, cameras=(), hand=None))
+    free = np.concatenate([probe.new_points.free for probe in probes(session.probes())])
+    assert len(free) > 100
+    # A voxel is marked up to half its diagonal before the membrane, so no centre is in the sphere,
+    # and none is beyond the furthest place of the membrane's plane.
+    assert heights(free).min() > 0.0
+    beside = np.abs(free[:, 1]) < ASIDE / 2
+    assert free[beside, 0].max() < CENTRE[0] - RADIUS + PRESSED
+    # What is a whole diagonal before the membrane at the end of the push is marked.
+    end = hand_pose(2.0) @ HAND_FROM_PAD
+    before = apply(end, np.array([[0.0, 0.0, MEMBRANE - PRESSED - DIAGONAL - 0.001]]))
+    assert cKDTree(free).query(before, p=np.inf)[0] <= 0.5 * SPACING + 1e-9
 
 
 def test_images_come_ahead_of_their_probe(events: list[Any], log: Path) -> None:
