@@ -22,8 +22,8 @@ DISPLAY_FACES = 6000
 _NO_POSES = np.zeros((0, 4, 4))
 _HIDDEN = np.zeros((1, 4, 4))  # without any pose, the viewer draws the mesh once, at the origin
 _NO_COST = np.full(1, np.nan)
-_BEST_ALPHA = 130
-_ALPHA = (70, 18)  # of the lowest and the highest step
+_BEST_ALPHA = 150
+_ALPHA = (48, 10)  # of the lowest and the highest step
 
 
 class HypothesisMeshes:
@@ -64,7 +64,8 @@ class HypothesisMeshes:
             self._poses(self._level(level), poses[chosen], cost[chosen])
 
     def hide(self) -> None:
-        """Show none."""
+        """Show none, whatever was shown before on any timeline."""
+        self._hidden.clear()
         for entity in (f"{self._root}/best", *map(self._level, range(LEVELS))):
             self._poses(entity, _NO_POSES, np.zeros(0))
 
