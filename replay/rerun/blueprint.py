@@ -10,23 +10,19 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint import encodings
 
-from chsel.arrays import FloatArray
 from chsel.points import Workspace
 from replay.rerun.clock import PROBE, REGISTRATION, TIMELINES
 from replay.rerun.colors import BACKGROUND, GRID
 from replay.rerun.curves import SEARCH_FRAME, SPREADS
+from replay.rerun.eye import Bounds, eye_on
 from replay.rerun.legend import LEGEND_FRAME
 from replay.rerun.plane import Frame
 from replay.rerun.scene import CUMULATIVE
 from replay.rerun.sensors import SensorPicture
 
-Bounds = tuple[FloatArray, FloatArray]
 PlayState = Literal["paused", "following"]
 USUAL_ARCHIVE = Frame(40, 40)
 """Cells of the map that is made room for until the first snapshot is there."""
-_EYE_DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the workspace's middle; probes move along +x
-_EYE_DISTANCE = 1.08  # in diagonals of what is in sight
-_LOOK_DOWN = 0.07  # in heights of what is in sight, whose near corner would be cut off
 _SENSORS_SHARE = 4.6  # of all other views, where a column of pictures has 1
 _IN_A_COLUMN = 4
 _PROBES_PER_SECOND = 4.0  # when the session is played
@@ -98,14 +94,11 @@ def scene_view(
 ) -> rrb.Spatial3DView:
     """The scene under the entity `root`, looked at obliquely from where the probes come from.
 
-    in_sight: lower and upper corner of what fills the view, in the world; by default the workspace.
+    in_sight: what fills the view; by default the workspace.
     more: entities beside it that the view shows too, each with all below it.
     """
     lower, upper = workspace.bounds
     diagonal = float(np.linalg.norm(upper - lower))
-    first, last = (lower, upper) if in_sight is None else in_sight
-    centre = (first + last) / 2
-    away = _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION) * np.linalg.norm(last - first)
     return rrb.Spatial3DView(
         origin=f"/{root}",
         contents=["$origin/**", *(f"/{entity}/**" for entity in more)],
@@ -118,12 +111,7 @@ def scene_view(
             stroke_width=1.0,
             color=GRID,
         ),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=centre + _EYE_DISTANCE * away,
-            look_target=centre - (0.0, 0.0, _LOOK_DOWN * (last[2] - first[2])),
-            eye_up=(0.0, 0.0, 1.0),
-        ),
+        eye_controls=eye_on(in_sight or (lower, upper)),
         overrides={f"/{root}/{path}": _up_to_now() for path in CUMULATIVE},
     )
 

@@ -27,6 +27,7 @@ from replay.rerun.comparison_layout import (
     entity_names,
 )
 from replay.rerun.curves import SHOWN_UNIT
+from replay.rerun.eye import bounds_in_sight
 from replay.rerun.file_stream import new_file_stream
 from replay.rerun.hypotheses import HypothesisMeshes, coarsened, shown_hypotheses
 from replay.rerun.legend import Legend
@@ -36,6 +37,7 @@ from replay.rerun.scene import Scene, bare_mesh
 APPLICATION = "chsel comparison"
 _FACES = 24_000  # of all methods' meshes of one colour together
 _FEWEST_FACES = 1_000
+_ALPHA = (26, 10)  # on one scale for all methods, a good set may be on its lowest step alone
 _NOTE = 15.2  # where the legend tells of the scale, in units of its view
 
 
@@ -96,6 +98,7 @@ class _Comparison:
         self.scene = Scene(stream)
         self._stream = stream
         self._first = first
+        self._laid_out = False
         self._names = entity_names(labels)
         self._start = start
         self._cost: CommonCost = common_cost(recording)
@@ -105,7 +108,6 @@ class _Comparison:
             for label, name in self._names.items()
         }
         stream.send_recording_name(f"{start.object}, seed {start.seed}: {', '.join(labels)}")
-        stream.send_blueprint(comparison_blueprint(start.workspace, self._names, pose_known=known))
         mesh = bare_mesh(start.mesh)
         self.set_probe(min((p.step for p in recording.probes), default=0))
         self.scene.set_up(mesh, start.workspace, start.world_from_object)
@@ -114,7 +116,7 @@ class _Comparison:
         self._legend.set_up(pose_known=known)
         coarse = coarsened(mesh, max(_FACES // len(labels), _FEWEST_FACES))
         for n, (label, meshes) in enumerate(self._meshes.items()):
-            meshes.set_up(coarse)
+            meshes.set_up(coarse, alpha=_ALPHA)
             self._style(label, SERIES[n % len(SERIES)])
 
     def set_probe(self, step: int) -> None:
@@ -136,6 +138,7 @@ class _Comparison:
         with warnings.catch_warnings(action="ignore"):  # whoever registered has been warned
             judge = CompiledCost.of(problem, self._cost.settings)
         judged = {label: ranked(hypotheses, judge) for label, hypotheses in found.items()}
+        self._lay_out(judged)
         shown = [h.cost[shown_hypotheses(h)] for h in judged.values()]
         scale = CostScale.of(np.concatenate(shown))
         self._legend.label(scale, at=_NOTE, note=f"one scale for all:\n{self._cost.name}")
@@ -150,6 +153,19 @@ class _Comparison:
                 self._add_numbers(label, numbers)
                 count = f"{len(shown_hypotheses(hypotheses))} of {len(hypotheses.cost)} drawn"
                 self._summarise(label, *_summary(numbers, count))
+
+    def _lay_out(self, found: Mapping[str, Hypotheses]) -> None:
+        """Make the views once there is something to look at."""
+        if self._laid_out:
+            return
+        self._laid_out = True
+        layout = comparison_blueprint(
+            self._start.workspace,
+            self._names,
+            pose_known=self._start.world_from_object is not None,
+            in_sight=bounds_in_sight(self._start, found.values()),
+        )
+        self._stream.send_blueprint(layout)
 
     def _add_numbers(self, label: str, numbers: Mapping[str, float]) -> None:
         values = dict(numbers)

@@ -17,6 +17,7 @@ from replay.rerun.blueprint import (
     scene_view,
 )
 from replay.rerun.curves import SPREADS
+from replay.rerun.eye import Bounds
 from replay.rerun.plane import Frame
 
 SUMMARY_FRAME = Frame(12.0, 1.2)
@@ -55,20 +56,31 @@ def entity_names(labels: Sequence[str]) -> dict[str, str]:
 
 
 def comparison_blueprint(
-    workspace: Workspace, names: Mapping[str, str], *, pose_known: bool
+    workspace: Workspace,
+    names: Mapping[str, str],
+    *,
+    pose_known: bool,
+    in_sight: Bounds | None = None,
 ) -> rrb.Blueprint:
-    """A view for each method, four in a row at most; names: their entity paths, by label."""
+    """A view for each method, four in a row at most; names: their entity paths, by label.
+
+    in_sight: what fills each view; by default the workspace.
+    """
     columns = len(names) if len(names) <= _IN_A_ROW else math.ceil(math.sqrt(len(names)))
     share = max(_SUMMARIES / math.ceil(len(names) / columns) - 1.0, 1.0)
-    cells = [_method_views(workspace, label, name, share) for label, name in names.items()]
+    cells = [
+        _method_views(workspace, in_sight, label, name, share) for label, name in names.items()
+    ]
     above = rrb.Grid(*cells, grid_columns=columns)
     below = rrb.Horizontal(*_curve_views(pose_known=pose_known))
     return at_first_registration(rrb.Vertical(above, legend_view(), below, row_shares=[57, 7, 36]))
 
 
-def _method_views(workspace: Workspace, label: str, name: str, share: float) -> rrb.Container:
+def _method_views(
+    workspace: Workspace, in_sight: Bounds | None, label: str, name: str, share: float
+) -> rrb.Container:
     """The scene, `share` times as high as the text below it."""
-    scene = scene_view(workspace, name=label, more=[f"hypotheses/{name}"])
+    scene = scene_view(workspace, name=label, in_sight=in_sight, more=[f"hypotheses/{name}"])
     margins = (0.0, 0.0, 0.0, 0.0)
     root = f"summary/{name}"
     summary = plane_view(root, f"{label}: result", SUMMARY_FRAME, margins, titlebar=False)

@@ -6,22 +6,20 @@ import warnings
 from functools import singledispatchmethod
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
-import trimesh
 
 from chsel.errors import RecordingError
-from chsel.pose import apply, inverse
 from chsel.problem import ArchiveSnapshot, Hypotheses
 from replay import events
 from replay.events import Recorder
 from replay.rerun.archive import ArchiveMap, map_frame
-from replay.rerun.blueprint import USUAL_ARCHIVE, Bounds, session_blueprint
+from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
 from replay.rerun.clock import Clock
 from replay.rerun.colors import number
 from replay.rerun.curves import Curves, SearchPlot
+from replay.rerun.eye import Bounds, bounds_in_sight
 from replay.rerun.hand import HandMesh
-from replay.rerun.hypotheses import HypothesisMeshes, shown_hypotheses
+from replay.rerun.hypotheses import HypothesisMeshes
 from replay.rerun.legend import Legend
 from replay.rerun.live import live_sink
 from replay.rerun.plane import Frame
@@ -32,7 +30,6 @@ from replay.rerun.text import session_markdown
 APPLICATION = "chsel"
 _LOG_LEVELS = {"info": rr.TextLogLevel.INFO, "warning": rr.TextLogLevel.WARN}
 _FLUSH_SECONDS = 10.0
-_OUT_OF_SIGHT = 0.05  # of the first hypotheses' corners, at either end of each axis
 
 
 class RerunRecorder(Recorder):
@@ -235,27 +232,10 @@ class RerunRecorder(Recorder):
         if not fitted:
             self._fitted = True
             self._archive_frame = None if archive is None else map_frame(archive)
-        if in_sight is None and hypotheses is not None:
-            self._in_sight = self._bounds_of(hypotheses)
+        if in_sight is None and hypotheses is not None and self._started is not None:
+            self._in_sight = bounds_in_sight(self._started, [hypotheses])
         if not fitted or in_sight is not self._in_sight:
             self._lay_out()
-
-    def _bounds_of(self, hypotheses: Hypotheses) -> Bounds | None:
-        """The room in the workspace that most hypotheses, and the object if its pose is known, take.
-
-        None if there are no hypotheses.
-        """
-        started = self._started
-        if started is None or len(hypotheses.cost) == 0:
-            return None
-        poses = inverse(hypotheses.object_from_world[shown_hypotheses(hypotheses)])
-        if started.world_from_object is not None:
-            poses = np.concatenate([poses, started.world_from_object[None]])
-        corners = trimesh.bounds.corners(started.mesh.bounds)
-        places = np.concatenate([apply(pose, corners) for pose in poses])
-        ends = np.quantile(places, [_OUT_OF_SIGHT, 1.0 - _OUT_OF_SIGHT], axis=0)
-        lower, upper = np.clip(ends, *started.workspace.bounds)
-        return lower, upper
 
     def _lay_out(self) -> None:
         if self._started is not None:
