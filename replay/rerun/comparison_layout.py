@@ -26,8 +26,8 @@ SUMMARY_FRAME = Frame(12.0, 1.2)
 CURVES: Mapping[str, str] = {
     "log10_best_cost": "log₁₀ best cost",
     "best_cost": "best cost",
-    "log10_median_cost": "log₁₀ median cost",
-    "median_cost": "median cost",
+    "log10_median_cost": "log₁₀ median",
+    "median_cost": "median",
     **{f"spread_{kind}": title for kind, title in SPREADS.items()},
     "best_position_error": "Position error of the best [mm]",
     "best_rotation_error": "Rotation error of the best [°]",
