@@ -28,6 +28,7 @@ from replay.rerun.hypotheses import LEVELS
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box
 
 PAUSED = int(PlayState.Paused.value)
+TARGET = "EyeControls3D:look_target"
 DISPLAYED = "ViewBlueprint:display_name"
 Rows = dict[str, list[tuple[int | None, dict[str, Any]]]]
 """By entity: probe, None for what stays, and values by component."""
@@ -196,6 +197,25 @@ def test_it_opens_at_the_first_compared_step_with_all_that_was_known_by_then(
     rows = read(path)
     assert [row["registration"] for _, row in rows["/scene/free/new"]] == [2, 2, 2]
     assert {row["registration"] for _, row in rows["/curves/best_cost/chsel"][1:]} == {2}
+
+
+def test_the_eye_of_every_view_turns_to_the_sets_compared(
+    recording: Recording, results: dict[str, dict[int, Hypotheses]], tmp_path: Path
+) -> None:
+    found = results["chsel"][1]
+    places = np.tile([0.2, 0.2, 0.2], (len(found.cost), 1))
+    near = compose(inverse(found.object_from_world)[:, :3, :3], places)
+    near_one_place = {1: dataclasses.replace(found, object_from_world=inverse(near))}
+    path = tmp_path / "a.rrd"
+    recording.start = dataclasses.replace(recording.start, world_from_object=None)
+    save_comparison(path, recording, {"a": near_one_place, "b": near_one_place})
+    eyes = [row for rows in read(path, blueprint=True).values() for _, row in rows if TARGET in row]
+    assert len(eyes) == 2
+    size = np.linalg.norm(recording.start.mesh.extents)
+    for eye in eyes:
+        (target,), (position,) = eye[TARGET], eye["EyeControls3D:position"]
+        np.testing.assert_allclose(target, (0.2, 0.2, 0.2), atol=size / 2)
+        assert size < np.linalg.norm(np.subtract(position, target)) < 2.0 * size
 
 
 def test_it_ends_at_the_last_compared_step(

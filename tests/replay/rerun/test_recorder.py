@@ -522,6 +522,10 @@ def test_the_viewer_opens_at_the_first_registration(tmp_path: Path) -> None:
     }
     assert moments == {(2, 2), (3, 3)}  # a timeline at rest shows its first moment
     assert {times["probe"] for times, _ in rows["/scene/free"] if "probe" in times} == {0, 1, 2, 3}
+    for entity in ("/archive/cost", "/archive/axes", "/scene/hypotheses/best", "/cost/lowest"):
+        found = [times for times, _ in rows[entity] if times.get("probe", 0) > 1]
+        assert found
+        assert all(times["registration"] == times["probe"] for times in found), entity
 
 
 def test_all_that_is_known_by_the_first_registration_is_in_sight_there(tmp_path: Path) -> None:
