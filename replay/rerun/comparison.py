@@ -179,7 +179,7 @@ class _Comparison:
 
     def _spread(self, hypotheses: Hypotheses) -> dict[str, float]:
         """How far hypotheses are from each other, in metres and radians."""
-        spreads = spread(hypotheses, self._start.mesh.bounds.mean(axis=0))
+        spreads = spread(hypotheses, np.asarray(self._start.mesh.centroid))
         named = {} if spreads is None else spreads._asdict()
         return {f"spread_{kind}": value for kind, value in named.items()}
 

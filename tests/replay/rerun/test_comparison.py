@@ -171,7 +171,9 @@ def test_curves_are_the_numbers_of_the_table(
         numbers = numbers_under(judge, results["chsel"][step], recording.start)
         numbers["log10_best_cost"] = np.log10(numbers["best_cost"])
         numbers["log10_median_cost"] = np.log10(numbers["median_cost"])
-        spreads = spread(ranked(results["chsel"][step], judge), recording.start.mesh.bounds.mean(0))
+        spreads = spread(
+            ranked(results["chsel"][step], judge), np.asarray(recording.start.mesh.centroid)
+        )
         assert spreads is not None
         numbers |= {"spread_position": spreads.position, "spread_rotation": spreads.rotation}
         for curve, title in CURVES.items():

@@ -124,7 +124,7 @@ def hypotheses(count: int = 6, archive: ArchiveSnapshot | None = None) -> Hypoth
     return Hypotheses(poses, cost, duplicate, cell, poses, archive)
 
 
-SPREAD = spread(hypotheses(), MESH.bounds.mean(axis=0)) or Spread(0.0, 0.0)
+SPREAD = spread(hypotheses(), np.asarray(MESH.centroid)) or Spread(0.0, 0.0)
 
 
 def registration(
