@@ -10,7 +10,7 @@ import rerun as rr
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.problem import ArchiveSnapshot, Hypotheses
-from replay.rerun.clock import ITERATION, PROBE
+from replay.rerun.clock import ITERATION, PROBE, REGISTRATION
 from replay.rerun.colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
 from replay.rerun.hypotheses import shown_hypotheses
 from replay.rerun.plane import Frame, Label, color_array, lines, on_screen, texts, ticks
@@ -74,6 +74,7 @@ class ArchiveMap:
             return
         times = [
             rr.TimeColumn(PROBE, sequence=[one.step for one in drawn]),
+            rr.TimeColumn(REGISTRATION, sequence=[one.step for one in drawn]),
             rr.TimeColumn(ITERATION, sequence=[one.moment for one in drawn]),
         ]
         costs = rr.Image.columns(buffer=[one.costs for one in drawn])

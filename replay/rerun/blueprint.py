@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import rerun as rr
@@ -10,21 +11,21 @@ import rerun.blueprint as rrb
 from rerun.blueprint import encodings
 
 from chsel.points import Workspace
-from replay.rerun.clock import ITERATION, PROBE
+from replay.rerun.clock import PROBE, REGISTRATION, TIMELINES
 from replay.rerun.colors import BACKGROUND, GRID
-from replay.rerun.curves import SEARCH_FRAME
+from replay.rerun.curves import SEARCH_FRAME, SPREADS
+from replay.rerun.eye import Bounds, eye_on
 from replay.rerun.legend import LEGEND_FRAME
 from replay.rerun.plane import Frame
 from replay.rerun.scene import CUMULATIVE
 from replay.rerun.sensors import SensorPicture
 
+PlayState = Literal["paused", "following"]
 USUAL_ARCHIVE = Frame(40, 40)
 """Cells of the map that is made room for until the first snapshot is there."""
-_EYE_DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the workspace's middle; probes move along +x
-_EYE_DISTANCE = 1.06  # in diagonals of the workspace
-_LOOK_DOWN = 0.04  # in heights of the workspace, whose near corner would be cut off
 _SENSORS_SHARE = 4.6  # of all other views, where a column of pictures has 1
 _IN_A_COLUMN = 4
+_PROBES_PER_SECOND = 4.0  # when the session is played
 _GRID_LINES = 5  # at least these across the diagonal of the workspace
 
 
@@ -32,21 +33,26 @@ def session_blueprint(
     workspace: Workspace,
     *,
     pose_known: bool,
+    in_sight: Bounds | None = None,
     archive: Frame | None = USUAL_ARCHIVE,
     timed: bool = False,
     sensors: Sequence[SensorPicture] = (),
+    follow: bool = False,
 ) -> rrb.Blueprint:
-    """Scene, archive and text above, curves below; opens at the last probe.
+    """Scene, archive and text above, curves below.
 
-    archive: size of the heat map in cells; None for a method without an archive. timed: whether
-    there are wall-clock times to show. sensors: of a robot session, their pictures beside all.
+    in_sight: see `scene_view`. archive: size of the heat map in cells; None for a method without
+    an archive. timed: whether there are wall-clock times to show. sensors: of a robot session,
+    their pictures beside all. follow: show the last probe, otherwise the first registration, which
+    must be there then.
     """
-    scene = rrb.Vertical(scene_view(workspace), legend_view(), row_shares=[9, 1])
+    view = scene_view(workspace, in_sight=in_sight)
+    scene = rrb.Vertical(view, legend_view(), row_shares=[9, 1])
     upper: list[rrb.View | rrb.Container] = [scene, _text_views()]
-    shares = [9.0, 4.0]
+    shares = [10.0, 4.0]
     if archive is not None:
         upper.insert(1, archive_view(archive))
-        shares = [9.0, 7.0, 4.0]
+        shares = [9.5, 6.5, 4.5]
     above = rrb.Horizontal(*upper, column_shares=shares)
     below = rrb.Horizontal(*_curve_views(pose_known=pose_known, timed=timed))
     views: rrb.Container = rrb.Vertical(above, below, row_shares=[65, 35])
@@ -54,30 +60,45 @@ def session_blueprint(
         columns = 1 if len(sensors) <= _IN_A_COLUMN else 2
         shares = [_SENSORS_SHARE, columns]
         views = rrb.Horizontal(views, _sensor_views(sensors, columns), column_shares=shares)
-    return at_last_probe(views)
+    return at_last_probe(views) if follow else at_first_registration(views)
 
 
 def at_last_probe(views: rrb.Container) -> rrb.Blueprint:
-    """The views alone, all panels collapsed, at the last probe."""
+    """The views alone, all panels collapsed, at the last probe and following what comes."""
+    return _views_alone(views, PROBE, "following")
+
+
+def at_first_registration(views: rrb.Container) -> rrb.Blueprint:
+    """The views alone, all panels collapsed, at the first moment that has hypotheses."""
+    return _views_alone(views, REGISTRATION, "paused")
+
+
+def _views_alone(views: rrb.Container, timeline: str, play_state: PlayState) -> rrb.Blueprint:
     return rrb.Blueprint(
         views,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=PROBE, play_state="following"),
+        rrb.TimePanel(
+            state="collapsed", timeline=timeline, play_state=play_state, fps=_PROBES_PER_SECOND
+        ),
     )
 
 
 def scene_view(
-    workspace: Workspace, root: str = "scene", name: str = "Scene", *, more: Sequence[str] = ()
+    workspace: Workspace,
+    root: str = "scene",
+    name: str = "Scene",
+    *,
+    in_sight: Bounds | None = None,
+    more: Sequence[str] = (),
 ) -> rrb.Spatial3DView:
     """The scene under the entity `root`, looked at obliquely from where the probes come from.
 
+    in_sight: what fills the view; by default the workspace.
     more: entities beside it that the view shows too, each with all below it.
     """
     lower, upper = workspace.bounds
-    centre = (lower + upper) / 2
     diagonal = float(np.linalg.norm(upper - lower))
-    away = _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION) * diagonal
     return rrb.Spatial3DView(
         origin=f"/{root}",
         contents=["$origin/**", *(f"/{entity}/**" for entity in more)],
@@ -90,12 +111,7 @@ def scene_view(
             stroke_width=1.0,
             color=GRID,
         ),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=centre + _EYE_DISTANCE * away,
-            look_target=centre - (0.0, 0.0, _LOOK_DOWN * (upper[2] - lower[2])),
-            eye_up=(0.0, 0.0, 1.0),
-        ),
+        eye_controls=eye_on(in_sight or (lower, upper)),
         overrides={f"/{root}/{path}": _up_to_now() for path in CUMULATIVE},
     )
 
@@ -127,17 +143,22 @@ def _curve_views(*, pose_known: bool, timed: bool) -> list[rrb.View | rrb.Contai
     views: list[rrb.View | rrb.Container] = [
         rrb.Tabs(
             curves_view("cost", "Cost by probe"),
-            curves_view("search", "by iteration"),
+            curves_view("search", "by iteration", whole=False),
         ),
         plane_view("search_plot", "Cost of the search", SEARCH_FRAME, (0.22, 0.1, 0.28, 0.24)),
     ]
     if pose_known:
-        errors = [("position", "Position error [m]"), ("rotation", "Rotation error [rad]")]
+        errors = [("position", "Position error [mm]"), ("rotation", "Rotation error [°]")]
         views.append(rrb.Vertical(*(curves_view(f"error/{kind}", name) for kind, name in errors)))
     if timed:
         views.append(curves_view("seconds", "Seconds by stage"))
+    spreads = [curves_view(f"spread/{kind}", SPREADS[kind], legend=False) for kind in SPREADS]
     views.append(
-        rrb.Tabs(curves_view("distinct", "Distinct hypotheses"), curves_view("measured", "Other"))
+        rrb.Tabs(
+            rrb.Vertical(*spreads, name="Spread"),
+            curves_view("distinct", "Distinct"),
+            curves_view("measured", "Other"),
+        )
     )
     return views
 
@@ -157,18 +178,16 @@ def _text_views() -> rrb.Container:
     )
 
 
-def curves_view(root: str, name: str, *, legend: bool = True) -> rrb.TimeSeriesView:
-    """The curves under the entity `root`, from the first moment to shortly after this one."""
+def curves_view(
+    root: str, name: str, *, legend: bool = True, whole: bool = True
+) -> rrb.TimeSeriesView:
+    """The curves under the entity `root`, whole or from the first moment to shortly after now."""
+    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=4)
     return rrb.TimeSeriesView(
         origin=f"/{root}",
         name=name,
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
-        axis_x=rrb.TimeAxis(
-            view_range=rrb.TimeRange(
-                start=rrb.TimeRangeBoundary.infinite(),
-                end=rrb.TimeRangeBoundary.cursor_relative(seq=4),
-            )
-        ),
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=start if whole else now)),
     )
 
 
@@ -200,8 +219,8 @@ def plane_view(
 
 
 def _up_to_now() -> rrb.VisibleTimeRanges:
-    """All moments from the first one to that of the cursor, on both timelines."""
+    """All moments from the first one to that of the cursor, on every timeline."""
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=0)
     return rrb.VisibleTimeRanges(
-        [rrb.VisibleTimeRange(name, start=start, end=end) for name in (PROBE, ITERATION)]
+        [rrb.VisibleTimeRange(name, start=start, end=end) for name in TIMELINES]
     )

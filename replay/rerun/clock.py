@@ -1,11 +1,16 @@
-"""Where an event stands on the two timelines of a Rerun recording."""
+"""Where an event stands on the timelines of a Rerun recording."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import rerun as rr
 
 PROBE = "probe"
+REGISTRATION = "registration"
 ITERATION = "iteration"
+TIMELINES = (PROBE, REGISTRATION, ITERATION)
 
 
 class Clock:
@@ -14,7 +19,8 @@ class Clock:
     On the timeline `probe` a moment is the step of a probe, and shows what was known and found by
     its end. On `iteration` it is a running count of the iterations of all stages of all
     registrations, one extra per registration, so that scrubbing it plays every snapshot in order,
-    with the scene of its time.
+    with the scene of its time. `registration` has the moments of `probe` from the first
+    registration on: a viewer opens a timeline at its first moment, and has no setting for another.
     """
 
     def __init__(self, stream: rr.RecordingStream) -> None:
@@ -23,6 +29,7 @@ class Clock:
         self._now = 0
         self._step = 0
         self._stages: dict[str, int] = {}
+        self._registering = False
 
     @property
     def iteration(self) -> int:
@@ -34,6 +41,11 @@ class Clock:
         """The present one on the timeline of iterations."""
         return self._now
 
+    @property
+    def registering(self) -> bool:
+        """Whether the first registration has begun, with it the timeline of registrations."""
+        return self._registering
+
     def set_probe(self, step: int) -> None:
         """All that is logged from here on belongs to probe `step`."""
         self._step = step
@@ -43,6 +55,17 @@ class Clock:
         """A moment passes between two registrations, with something of its own to see."""
         self._now += 1
         self._set()
+
+    @contextmanager
+    def beginning_of_registrations(self) -> Iterator[None]:
+        """What is logged in the block is on the timeline of registrations alone, as its first."""
+        self._registering = True
+        self._stream.reset_time()
+        self._stream.set_time(REGISTRATION, sequence=self._step)
+        try:
+            yield
+        finally:
+            self._set()
 
     def start_registration(self) -> None:
         """A registration starts: one moment after all that was before."""
@@ -60,3 +83,5 @@ class Clock:
     def _set(self) -> None:
         self._stream.set_time(PROBE, sequence=self._step)
         self._stream.set_time(ITERATION, sequence=self._now)
+        if self._registering:
+            self._stream.set_time(REGISTRATION, sequence=self._step)

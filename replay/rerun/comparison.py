@@ -13,11 +13,12 @@ import rerun as rr
 
 from chsel.engine import CompiledCost
 from chsel.errors import RecordingError
+from chsel.evaluation.spread import spread
 from chsel.problem import Hypotheses, RegistrationProblem
 from replay.comparing.comparison import CommonCost, common_cost, numbers_under
 from replay.events import Probe, ProblemPosed
 from replay.mcap.reader import Recording
-from replay.rerun.clock import PROBE
+from replay.rerun.clock import PROBE, REGISTRATION
 from replay.rerun.colors import SERIES, CostScale, Rgb, number
 from replay.rerun.comparison_layout import (
     CURVES,
@@ -25,6 +26,8 @@ from replay.rerun.comparison_layout import (
     comparison_blueprint,
     entity_names,
 )
+from replay.rerun.curves import SHOWN_UNIT
+from replay.rerun.eye import bounds_in_sight
 from replay.rerun.file_stream import new_file_stream
 from replay.rerun.hypotheses import HypothesisMeshes, coarsened, shown_hypotheses
 from replay.rerun.legend import Legend
@@ -34,13 +37,14 @@ from replay.rerun.scene import Scene, bare_mesh
 APPLICATION = "chsel comparison"
 _FACES = 24_000  # of all methods' meshes of one colour together
 _FEWEST_FACES = 1_000
+_ALPHA = (26, 10)  # on one scale for all methods, a good set may be on its lowest step alone
 _NOTE = 15.2  # where the legend tells of the scale, in units of its view
 
 
 def save_comparison(
     path: Path, recording: Recording, results: Mapping[str, Mapping[int, Hypotheses]]
 ) -> None:
-    """Write a new .rrd: a 3-D view for each method, curves of all below, at the last of the steps.
+    """Write a new .rrd: a 3-D view for each method, curves of all below, at the first of the steps.
 
     results: hypotheses by the label of a method, then by step; a method may lack steps. Costs,
     and with them the order of a step's hypotheses, are those of `common_cost`.
@@ -53,7 +57,7 @@ def save_comparison(
     recording.checked_steps(sorted(steps))
     stream = new_file_stream(path, APPLICATION)
     try:
-        _draw(stream, recording, results, max(steps))
+        _draw(stream, recording, results, steps)
     except BaseException:
         stream.disconnect()
         path.unlink(missing_ok=True)
@@ -65,21 +69,20 @@ def _draw(
     stream: rr.RecordingStream,
     recording: Recording,
     results: Mapping[str, Mapping[int, Hypotheses]],
-    last: int,
+    steps: set[int],
 ) -> None:
-    drawing = _Comparison(stream, recording, tuple(results))
+    drawing = _Comparison(stream, recording, tuple(results), min(steps))
     drawn: set[int] = set()
     for event in recording.events(images=False):
         if isinstance(event, Probe):
-            if event.step > last:
+            if event.step > max(steps):
                 return
-            stream.set_time(PROBE, sequence=event.step)
-            drawing.scene.add_probe(event)
+            drawing.add_probe(event)
         elif isinstance(event, ProblemPosed) and event.step not in drawn:
             drawn.add(event.step)
             of_step = {name: by[event.step] for name, by in results.items() if event.step in by}
             if of_step:
-                stream.set_time(PROBE, sequence=event.step)
+                drawing.set_probe(event.step)
                 drawing.add_results(event.problem, of_step)
 
 
@@ -87,12 +90,15 @@ class _Comparison:
     """Draws one scene for all, and the results of each method."""
 
     def __init__(
-        self, stream: rr.RecordingStream, recording: Recording, labels: tuple[str, ...]
+        self, stream: rr.RecordingStream, recording: Recording, labels: tuple[str, ...], first: int
     ) -> None:
+        """first: the first step that is compared."""
         start = recording.start
         known = start.world_from_object is not None
         self.scene = Scene(stream)
         self._stream = stream
+        self._first = first
+        self._laid_out = False
         self._names = entity_names(labels)
         self._start = start
         self._cost: CommonCost = common_cost(recording)
@@ -102,22 +108,37 @@ class _Comparison:
             for label, name in self._names.items()
         }
         stream.send_recording_name(f"{start.object}, seed {start.seed}: {', '.join(labels)}")
-        stream.send_blueprint(comparison_blueprint(start.workspace, self._names, pose_known=known))
         mesh = bare_mesh(start.mesh)
-        stream.set_time(PROBE, sequence=min((p.step for p in recording.probes), default=0))
+        self.set_probe(min((p.step for p in recording.probes), default=0))
         self.scene.set_up(mesh, start.workspace, start.world_from_object)
         self.scene.add_points(start.initial_points, new=False)
+        self._legend.add_kinds(start.initial_points)
         self._legend.set_up(pose_known=known)
         coarse = coarsened(mesh, max(_FACES // len(labels), _FEWEST_FACES))
         for n, (label, meshes) in enumerate(self._meshes.items()):
-            meshes.set_up(coarse)
+            meshes.set_up(coarse, alpha=_ALPHA)
             self._style(label, SERIES[n % len(SERIES)])
+
+    def set_probe(self, step: int) -> None:
+        """All that is drawn from here on belongs to probe `step`.
+
+        Of the timeline of registrations, all before the first step that is compared is its start.
+        """
+        self._stream.set_time(PROBE, sequence=step)
+        self._stream.set_time(REGISTRATION, sequence=max(step, self._first))
+
+    def add_probe(self, probe: Probe) -> None:
+        """What a probe adds to the scene."""
+        self.set_probe(probe.step)
+        self.scene.add_probe(probe)
+        self._legend.add_kinds(probe.new_points)
 
     def add_results(self, problem: RegistrationProblem, found: Mapping[str, Hypotheses]) -> None:
         """The hypotheses of methods, by their labels, for one problem."""
         with warnings.catch_warnings(action="ignore"):  # whoever registered has been warned
             judge = CompiledCost.of(problem, self._cost.settings)
         judged = {label: ranked(hypotheses, judge) for label, hypotheses in found.items()}
+        self._lay_out(judged)
         shown = [h.cost[shown_hypotheses(h)] for h in judged.values()]
         scale = CostScale.of(np.concatenate(shown))
         self._legend.label(scale, at=_NOTE, note=f"one scale for all:\n{self._cost.name}")
@@ -128,10 +149,23 @@ class _Comparison:
                 self._summarise(label, "no result")
             else:
                 meshes.draw(hypotheses, scale)
-                numbers = numbers_under(judge, hypotheses, self._start)
+                numbers = numbers_under(judge, hypotheses, self._start) | self._spread(hypotheses)
                 self._add_numbers(label, numbers)
                 count = f"{len(shown_hypotheses(hypotheses))} of {len(hypotheses.cost)} drawn"
                 self._summarise(label, *_summary(numbers, count))
+
+    def _lay_out(self, found: Mapping[str, Hypotheses]) -> None:
+        """Make the views once there is something to look at."""
+        if self._laid_out:
+            return
+        self._laid_out = True
+        layout = comparison_blueprint(
+            self._start.workspace,
+            self._names,
+            pose_known=self._start.world_from_object is not None,
+            in_sight=bounds_in_sight(self._start, found.values()),
+        )
+        self._stream.send_blueprint(layout)
 
     def _add_numbers(self, label: str, numbers: Mapping[str, float]) -> None:
         values = dict(numbers)
@@ -140,7 +174,14 @@ class _Comparison:
                 values[f"log10_{name}"] = log10(numbers[name])
         for name in CURVES.keys() & values.keys():
             if isfinite(values[name]):
-                self._stream.log(self._curve(name, label), rr.Scalars(values[name]))
+                times = next((SHOWN_UNIT[kind] for kind in SHOWN_UNIT if kind in name), 1.0)
+                self._stream.log(self._curve(name, label), rr.Scalars(times * values[name]))
+
+    def _spread(self, hypotheses: Hypotheses) -> dict[str, float]:
+        """How far hypotheses are from each other, in metres and radians."""
+        spreads = spread(hypotheses, np.asarray(self._start.mesh.centroid))
+        named = {} if spreads is None else spreads._asdict()
+        return {f"spread_{kind}": value for kind, value in named.items()}
 
     def _summarise(self, label: str, *rows: str) -> None:
         """Text below the view of a method."""

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import rerun as rr
 
+from chsel.arrays import FloatArray
+from chsel.evaluation.spread import spread
 from chsel.problem import Hypotheses
 from replay.events import Traced
 from replay.rerun.clock import ITERATION
@@ -12,32 +16,48 @@ from replay.rerun.colors import CURVES, SERIES, CostScale, Rgb, number
 from replay.rerun.plane import Frame, Label, lines, texts, ticks
 
 SEARCH_FRAME = Frame(1.5, 1.0)
+SPREADS = {
+    "position": "Spread of positions [mm]",
+    "rotation": "Spread of rotations [°]",
+}
+"""What the curves of a set's spread show."""
 _CURVE_NAMES = ("lowest", "median", "highest")
+SHOWN_UNIT = {"position": 1e3, "rotation": math.degrees(1.0)}
+"""What turns metres and radians into the units shown, millimetres and degrees."""
 _AT_ONCE = 64  # blocks of iterations that are sent together
 
 
 class Curves:
-    """Scalars over probes: costs, pose errors, seconds by stage, and whatever else is measured."""
+    """Scalars over probes: costs, spread, pose errors, seconds by stage, and all else measured.
+
+    Lengths are in millimetres and angles in degrees, as on the console.
+    """
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._named: set[str] = set()
+        self._centre = np.zeros(3)
         self._traced: list[tuple[int, tuple[float, float, float]]] = []
 
-    def set_up(self) -> None:
-        """The curves that every session has."""
+    def set_up(self, centre: FloatArray) -> None:
+        """The curves that every session has. centre: (3,), of the object in its frame, metres."""
+        self._centre = centre
         for name, color in CURVES.items():
             self._style(f"cost/{name}", name, color)
             self._style(f"search/{name}", name, color)
 
     def add_hypotheses(self, hypotheses: Hypotheses) -> None:
-        """Lowest, median and highest cost of the hypotheses, and how many differ."""
+        """Lowest, median and highest cost of the hypotheses, their spread, and how many differ."""
         cost = hypotheses.cost
         if len(cost):
             values = (cost.min(), np.median(cost), cost.max())
             for name, value in zip(_CURVE_NAMES, values, strict=True):
                 self._scalar(f"cost/{name}", name, float(value))
         self._scalar("distinct/hypotheses", "distinct hypotheses", float(hypotheses.distinct))
+        spreads = spread(hypotheses, self._centre)
+        if spreads is not None:
+            for kind, value in spreads._asdict().items():
+                self._scalar(f"spread/{kind}", kind, SHOWN_UNIT[kind] * value)
 
     def add_measured(self, name: str, value: float) -> None:
         """One measured number; its name says where it is shown."""
@@ -46,7 +66,8 @@ class Curves:
         text = name.replace("_", " ")
         for kind in ("position", "rotation"):
             if f"{kind}_error" in name:
-                self._scalar(f"error/{kind}/{name}", text.replace(f" {kind} error", ""), value)
+                label, shown = text.replace(f" {kind} error", ""), SHOWN_UNIT[kind] * value
+                self._scalar(f"error/{kind}/{name}", label, shown)
                 return
         self._scalar(f"measured/{name}", text, value)
 

@@ -13,12 +13,13 @@ from replay.rerun.recorder import RerunRecorder
 def draw_recording(recording: Recording, path: Path, *, last: int | None = None) -> None:
     """Write to `path`, a new file, what the run wrote beside its MCAP file.
 
-    last: the last probe that is drawn; None: all are.
+    last: the last probe that is drawn, where the viewer opens; None: all are, and the viewer opens
+    at the first registration.
     Raises RecordingError if the file exists, cannot be written, or a problem of the recording is
     not the recorded one; nothing is left of the file then.
     """
     check_new(path)
-    recorder = RerunRecorder(path)
+    recorder = RerunRecorder(path, follow=last is not None)
     try:
         try:
             for event in recording.events():

@@ -18,12 +18,13 @@ MOST = 200
 """More hypotheses than these are not drawn: the lowest in cost are."""
 DISPLAY_FACES = 6000
 """Meshes with more faces are coarsened for display."""
+ALPHA = (48, 10)
+"""Opacities of the lowest and the highest step, of 255."""
 
 _NO_POSES = np.zeros((0, 4, 4))
 _HIDDEN = np.zeros((1, 4, 4))  # without any pose, the viewer draws the mesh once, at the origin
 _NO_COST = np.full(1, np.nan)
-_BEST_ALPHA = 130
-_ALPHA = (70, 18)  # of the lowest and the highest step
+_BEST_ALPHA = 150
 
 
 class HypothesisMeshes:
@@ -35,14 +36,23 @@ class HypothesisMeshes:
         self._best_color: tuple[int, int, int, int] | None = None
         self._hidden: set[str] = set()  # entities that show nothing, by what was logged last
 
-    def set_up(self, mesh: trimesh.Trimesh, *, most_faces: int = DISPLAY_FACES) -> None:
-        """Store the object's mesh once for each colour, and show none."""
+    def set_up(
+        self,
+        mesh: trimesh.Trimesh,
+        *,
+        most_faces: int = DISPLAY_FACES,
+        alpha: tuple[int, int] = ALPHA,
+    ) -> None:
+        """Store the object's mesh once for each colour, and show none.
+
+        alpha: opacities of the lowest and the highest step, of 255.
+        """
         coarse = coarsened(mesh, most_faces)
         self._stream.log(f"{self._root}/best", display_mesh(coarse), static=True)
         for level in range(LEVELS):
             fraction = level / (LEVELS - 1)
-            alpha = round(_ALPHA[0] + fraction * (_ALPHA[1] - _ALPHA[0]))
-            drawn = display_mesh(coarse, (*_rgb((level + 0.5) / LEVELS), alpha))
+            opacity = round(alpha[0] + fraction * (alpha[1] - alpha[0]))
+            drawn = display_mesh(coarse, (*_rgb((level + 0.5) / LEVELS), opacity))
             self._stream.log(self._level(level), drawn, static=True)
         self.hide()
 
@@ -64,7 +74,8 @@ class HypothesisMeshes:
             self._poses(self._level(level), poses[chosen], cost[chosen])
 
     def hide(self) -> None:
-        """Show none."""
+        """Show none, whatever was shown before on any timeline."""
+        self._hidden.clear()
         for entity in (f"{self._root}/best", *map(self._level, range(LEVELS))):
             self._poses(entity, _NO_POSES, np.zeros(0))
 

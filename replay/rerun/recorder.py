@@ -6,6 +6,7 @@ import warnings
 from functools import singledispatchmethod
 from pathlib import Path
 
+import numpy as np
 import rerun as rr
 
 from chsel.errors import RecordingError
@@ -18,6 +19,7 @@ from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
 from replay.rerun.clock import Clock
 from replay.rerun.colors import number
 from replay.rerun.curves import Curves, SearchPlot
+from replay.rerun.eye import Bounds, bounds_in_sight
 from replay.rerun.hand import HandMesh
 from replay.rerun.hypotheses import HypothesisMeshes
 from replay.rerun.legend import Legend
@@ -36,11 +38,12 @@ class RerunRecorder(Recorder):
     """A recorder whose file, live viewer or both show a session as it happens.
 
     path: where the recording goes; None for a live viewer alone. live: also show it in a viewer on
-    this machine; without one, a warning. Timelines are those of `Clock`; no wall clock is written.
-    Raises RecordingError if the file cannot be written.
+    this machine; without one, a warning. follow: the viewer opens at the last probe, as a live one
+    does, and not at the first registration. Timelines are those of `Clock`; no wall clock is
+    written. Raises RecordingError if the file cannot be written.
     """
 
-    def __init__(self, path: Path | None, *, live: bool = False) -> None:
+    def __init__(self, path: Path | None, *, live: bool = False, follow: bool = False) -> None:
         self._stream = rr.RecordingStream(APPLICATION, send_properties=False)
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
@@ -57,8 +60,11 @@ class RerunRecorder(Recorder):
         self._curves = Curves(self._stream)
         self._search = SearchPlot(self._stream)
         self._started: events.SessionStarted | None = None
+        self._early: list[events.Probe | events.Logged] = []  # before the first registration
+        self._follow = live or follow
         self._archive_frame: Frame | None = USUAL_ARCHIVE
         self._fitted = False
+        self._in_sight: Bounds | None = None
         self._timed = False
         self._lagging = False
 
@@ -68,6 +74,8 @@ class RerunRecorder(Recorder):
             max(getattr(event, "step", 0), 0)
         )  # what precedes all is of the first
         self._draw(event)
+        if isinstance(event, events.Probe | events.Logged) and not self._clock.registering:
+            self._early.append(event)
 
     def flush(self) -> None:
         """Hand all events so far to the operating system, and to the viewer if there is one."""
@@ -136,7 +144,8 @@ class RerunRecorder(Recorder):
         self._scene.set_up(mesh, event.workspace, event.world_from_object)
         self._meshes.set_up(mesh)
         self._legend.set_up(pose_known=known)
-        self._curves.set_up()
+        self._legend.add_kinds(event.initial_points)
+        self._curves.set_up(np.asarray(mesh.centroid))
         self._scene.add_points(event.initial_points, new=False)
 
     @_draw.register
@@ -153,11 +162,13 @@ class RerunRecorder(Recorder):
     @_draw.register
     def _(self, event: events.Probe) -> None:
         self._sensors.end_step()
-        self._hand.draw(event)
-        self._scene.add_probe(event)
+        self._legend.add_kinds(event.new_points)
+        self._draw_probe(event)
 
     @_draw.register
     def _(self, event: events.ProblemPosed) -> None:
+        if not self._clock.registering:
+            self._begin_registrations()
         self._clock.start_registration()
         self._archive.start()
         self._search.start()
@@ -179,7 +190,7 @@ class RerunRecorder(Recorder):
         self._meshes.draw(event.hypotheses)
         self._legend.draw(event.hypotheses)
         self._archive.mark(event.step, self._clock.moment, event.hypotheses)
-        self._fit_layout(event.hypotheses.archive)
+        self._fit_layout(event.hypotheses.archive, event.hypotheses)
         self._curves.add_hypotheses(event.hypotheses)
         self._search.draw(event.step)
         self._log_result(event.hypotheses)
@@ -206,26 +217,52 @@ class RerunRecorder(Recorder):
     def _(self, event: events.SessionEnded) -> None:
         """Nothing to draw: runners also log the outcome as text."""
 
+    def _draw_probe(self, probe: events.Probe) -> None:
+        self._hand.draw(probe)
+        self._scene.add_probe(probe)
+
+    def _begin_registrations(self) -> None:
+        """Draw all that there is to see by now as the first moment of the registrations."""
+        with self._clock.beginning_of_registrations():
+            self._meshes.hide()
+            self._sensors.draw_again()
+            if self._started is not None:
+                self._scene.add_points(self._started.initial_points, new=False)
+            for event in self._early:
+                if isinstance(event, events.Probe):
+                    self._draw_probe(event)
+                else:
+                    self._draw(event)
+        self._early.clear()
+
     def _log_result(self, hypotheses: Hypotheses) -> None:
         """A line of text about the result."""
         best = f"best cost {number(hypotheses.cost[0])}, " if len(hypotheses.cost) else ""
         text = f"{best}{hypotheses.distinct} distinct hypotheses"
         self._stream.log("log", rr.TextLog(text, level=rr.TextLogLevel.INFO))
 
-    def _fit_layout(self, archive: ArchiveSnapshot | None) -> None:
-        """Lay the views out anew once the first registration shows what archive there is."""
-        if not self._fitted:
+    def _fit_layout(
+        self, archive: ArchiveSnapshot | None, hypotheses: Hypotheses | None = None
+    ) -> None:
+        """Lay the views out anew once the first registration shows archive and hypotheses."""
+        fitted, in_sight = self._fitted, self._in_sight
+        if not fitted:
             self._fitted = True
             self._archive_frame = None if archive is None else map_frame(archive)
+        if in_sight is None and hypotheses is not None and self._started is not None:
+            self._in_sight = bounds_in_sight(self._started, [hypotheses])
+        if not fitted or in_sight is not self._in_sight:
             self._lay_out()
 
     def _lay_out(self) -> None:
         if self._started is not None:
             layout = session_blueprint(
                 self._started.workspace,
+                in_sight=self._in_sight,
                 pose_known=self._started.world_from_object is not None,
                 archive=self._archive_frame,
                 timed=self._timed,
                 sensors=[*self._sensors.pictures.values()],
+                follow=self._follow or not self._clock.registering,
             )
             self._stream.send_blueprint(layout)

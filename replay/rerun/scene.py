@@ -65,7 +65,7 @@ class Scene:
         self._points("free", points.free, FREE_FAINT, size=0.9)
         self._points("occupied", points.occupied, OCCUPIED, size=2.5)
         self._points("known", points.known[~exact], KNOWN, size=3.0)
-        self._points("contacts", points.known[exact], CONTACT, size=4.0)
+        self._points("contacts", points.known[exact], CONTACT, size=5.0)
         if new:
             self._points("free/new", points.free, FREE, size=1.4)
 
@@ -77,7 +77,7 @@ class Scene:
         self._log("gripper/path", _path(path, GRIPPER, 1.6))
         self._points("gripper/end", probe.gripper_path[-1:, :3, 3], GRIPPER, size=4.0)
         self._normals(probe)
-        self._points("contacts/new", probe.contacts, CONTACT, size=6.5)
+        self._points("contacts/new", probe.contacts, CONTACT, size=7.0)
 
     def _normals(self, probe: Probe) -> None:
         known = np.abs(probe.contact_normals).sum(axis=1) > 0.0
@@ -87,7 +87,7 @@ class Scene:
             origins=probe.contacts[known].astype(np.float32),
             vectors=(self._normal_length * probe.contact_normals[known]).astype(np.float32),
             colors=color_array(CONTACT),
-            radii=on_screen(1.2),
+            radii=on_screen(1.4),
         )
         self._log("contacts/normals", arrows)
 

@@ -68,6 +68,7 @@ class SensorImages:
         self._ranges: dict[str, tuple[float, float]] = {}
         self._of_step: dict[str, SensorImage] = {}  # what a probe shows of each sensor
         self._shown: dict[str, SensorImage] = {}
+        self._left: dict[str, SensorImage] = {}  # what the last probe that ended left to see
 
     def add(self, image: SensorImage) -> bool:
         """Draw an image at the present moment; whether it is the first of its sensor.
@@ -93,9 +94,17 @@ class SensorImages:
             if best is None and picture.kind == DEFORMATION:
                 for name in ("values", "pixels", "caption"):
                     self._stream.log(f"{self._root}/{sensor}/{name}", rr.Clear(recursive=False))
+                self._left.pop(sensor, None)
             elif best is not None and self._shown.get(sensor) is not best:
                 self._draw(best, display_size(best))
+        self._left |= self._of_step
         self._of_step.clear()
+        self._shown.clear()
+
+    def draw_again(self) -> None:
+        """Draw what the last probe left to see once more, at the present moment."""
+        for image in self._left.values():
+            self._draw(image, display_size(image))
         self._shown.clear()
 
     def _set_up(self, image: SensorImage) -> None:

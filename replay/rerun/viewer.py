@@ -38,9 +38,9 @@ def has_screen() -> bool:
 
 @contextmanager
 def window(rrd: Path, *, step: int | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    """The viewer in a window, at probe `step` (None: the last); it ends with the block at latest.
+    """The viewer in a window, at probe `step`; it ends with the block at latest.
 
-    Raises RecordingError if it cannot be started.
+    step: None is where the viewer opens. Raises RecordingError if it cannot be started.
     """
     port = free_port()
     options = ["--port", str(port), "--hide-welcome-screen", str(rrd.resolve())]

@@ -14,7 +14,10 @@ from replay.mcap.reader import Recording, read_recording
 from replay.rerun.drawing import check_new, draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
 
-_STEP_HELP = "probe to show, by default the last; in a saved file and in a browser none follows it"
+_STEP_HELP = (
+    "probe to show, by default the first with a registration; in a saved file and in a browser "
+    "none follows it"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

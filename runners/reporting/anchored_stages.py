@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from PIL import Image
 
 from chsel.anchors import anchored_poses, bounds_of, in_telling_order
 from chsel.arrays import FloatArray
@@ -28,10 +26,10 @@ from replay.console import print_error
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.panels import drawn, new_figure
 from runners.reporting.silhouette import VIEWS, Frame, Silhouettes
+from runners.reporting.small_picture import small_png
 
 _OUTLINES = 30  # of each stage, evenly from the lowest energy to the highest
 _COLOR = "#0072b2"
-_COLORS = 160  # of the file
 _CONTACTS: Any = {
     "color": "#e69f00",
     "marker": "o",
@@ -95,15 +93,7 @@ def picture_of_stages(
     stages = stages_of(recording.problem(step), settings)
     probes = [probe.contacts for probe in recording.probes if probe.step <= step]
     contacts = np.concatenate([np.zeros((0, 3)), *probes])
-    return _small(drawn(lambda: _figure(recording, stages, contacts, VIEWS[view])))
-
-
-def _small(png: bytes) -> bytes:
-    """The same picture in few colours, which makes a small file."""
-    stream = io.BytesIO()
-    few = Image.open(io.BytesIO(png)).convert("RGB").quantize(_COLORS, dither=Image.Dither.NONE)
-    few.save(stream, format="png", optimize=True)
-    return stream.getvalue()
+    return small_png(drawn(lambda: _figure(recording, stages, contacts, VIEWS[view])))
 
 
 def _figure(

@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute
 import pytest
 import trimesh
+from rerun.blueprint.components import PlayState
 from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
@@ -29,6 +30,7 @@ from replay.rerun import viewer as rerun_viewer
 from replay.rerun.drawing import draw_recording
 from replay.rerun.recorder import RerunRecorder
 from replay.rerun.viewer import web_server
+from tests.replay.rerun.test_recorder import opens_at
 
 QUICK = ("recording=both", "recording.snapshot_interval=5")
 KINEMATIC = (
@@ -203,6 +205,14 @@ def test_nothing_after_the_step_asked_for_is_saved(
         for step in chunk.to_record_batch().column("probe").to_pylist()
     }
     assert max(probes) == 1
+    assert opens_at(saved) == ("probe", PlayState.Following)  # at that probe, the last
+
+
+def test_it_opens_at_the_first_registration(
+    events: list[Event], tmp_path: Path, write: Write
+) -> None:
+    draw_recording(read_recording(write(events)), tmp_path / "a.rrd")
+    assert opens_at(tmp_path / "a.rrd") == ("registration", PlayState.Paused)
 
 
 def test_what_is_whole_of_an_unfinished_file_is_drawn_with_a_warning(

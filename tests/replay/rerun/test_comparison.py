@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rerun.blueprint.components import PlayState
 from rerun.chunk import RrdReader
 
 from chsel.engine import CompiledCost
 from chsel.errors import RecordingError
+from chsel.evaluation.spread import spread
 from chsel.pose import compose, inverse
 from chsel.problem import Hypotheses
 from replay.comparing.comparison import common_cost, numbers_under
@@ -20,11 +22,13 @@ from replay.events import Event
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.colors import cost_colors, number
 from replay.rerun.comparison import ranked, save_comparison
-from replay.rerun.comparison_layout import entity_names
+from replay.rerun.comparison_layout import CURVES, entity_names
 from replay.rerun.hypotheses import LEVELS
 
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box
 
+PAUSED = int(PlayState.Paused.value)
+TARGET = "EyeControls3D:look_target"
 DISPLAYED = "ViewBlueprint:display_name"
 Rows = dict[str, list[tuple[int | None, dict[str, Any]]]]
 """By entity: probe, None for what stays, and values by component."""
@@ -167,11 +171,53 @@ def test_curves_are_the_numbers_of_the_table(
         numbers = numbers_under(judge, results["chsel"][step], recording.start)
         numbers["log10_best_cost"] = np.log10(numbers["best_cost"])
         numbers["log10_median_cost"] = np.log10(numbers["median_cost"])
-        numbers.pop("hypotheses")
-        for curve, value in numbers.items():
+        spreads = spread(
+            ranked(results["chsel"][step], judge), np.asarray(recording.start.mesh.centroid)
+        )
+        assert spreads is not None
+        numbers |= {"spread_position": spreads.position, "spread_rotation": spreads.rotation}
+        for curve, title in CURVES.items():
             shown = at_probe(rows[f"/curves/{curve}/{name}"], step)
-            assert shown["Scalars:scalars"] == [pytest.approx(value, rel=1e-12)]
+            unit = 1e3 if "[mm]" in title else 180.0 / np.pi if "[°]" in title else 1.0
+            assert shown["Scalars:scalars"] == [pytest.approx(unit * numbers[curve], rel=1e-9)]
             assert shown["SeriesLines:names"] == ["chsel"]
+        units = {name: title[-4:] for name, title in CURVES.items() if title.endswith("]")}
+        assert {name for name in units if "position" in name} == {
+            name for name, unit in units.items() if unit == "[mm]"
+        }
+        assert len(units) == 6
+
+
+def test_it_opens_at_the_first_compared_step_with_all_that_was_known_by_then(
+    recording: Recording, results: dict[str, dict[int, Hypotheses]], tmp_path: Path
+) -> None:
+    path = tmp_path / "late.rrd"
+    save_comparison(path, recording, {"chsel": {2: results["chsel"][2]}})
+    panel = {k: v for _, row in read(path, blueprint=True)["/time_panel"] for k, v in row.items()}
+    assert panel["TimePanelBlueprint:timeline"] == ["registration"]
+    assert panel["TimePanelBlueprint:play_state"] == [PAUSED]
+    rows = read(path)
+    assert [row["registration"] for _, row in rows["/scene/free/new"]] == [2, 2, 2]
+    assert {row["registration"] for _, row in rows["/curves/best_cost/chsel"][1:]} == {2}
+
+
+def test_the_eye_of_every_view_turns_to_the_sets_compared(
+    recording: Recording, results: dict[str, dict[int, Hypotheses]], tmp_path: Path
+) -> None:
+    found = results["chsel"][1]
+    places = np.tile([0.2, 0.2, 0.2], (len(found.cost), 1))
+    near = compose(inverse(found.object_from_world)[:, :3, :3], places)
+    near_one_place = {1: dataclasses.replace(found, object_from_world=inverse(near))}
+    path = tmp_path / "a.rrd"
+    recording.start = dataclasses.replace(recording.start, world_from_object=None)
+    save_comparison(path, recording, {"a": near_one_place, "b": near_one_place})
+    eyes = [row for rows in read(path, blueprint=True).values() for _, row in rows if TARGET in row]
+    assert len(eyes) == 2
+    size = np.linalg.norm(recording.start.mesh.extents)
+    for eye in eyes:
+        (target,), (position,) = eye[TARGET], eye["EyeControls3D:position"]
+        np.testing.assert_allclose(target, (0.2, 0.2, 0.2), atol=size / 2)
+        assert size < np.linalg.norm(np.subtract(position, target)) < 2.0 * size
 
 
 def test_it_ends_at_the_last_compared_step(
@@ -204,7 +250,7 @@ def test_each_method_has_a_view_of_the_scene_and_of_its_hypotheses(
     names = entity_names(labels)
     assert views == {label: ["$origin/**", f"/hypotheses/{names[label]}/**"] for label in labels}
     titles = {row[DISPLAYED][0] for row in values.values() if DISPLAYED in row}
-    assert ("Rotation error of the best [rad]" in titles) is pose_known
+    assert ("Rotation error of the best [°]" in titles) is pose_known
     assert "log₁₀ best cost" in titles
     grid = [row for row in values.values() if row.get("ContainerBlueprint:grid_columns")]
     assert [row["ContainerBlueprint:grid_columns"] for row in grid] == [[columns]]

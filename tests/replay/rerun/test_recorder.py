@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from rerun.blueprint.components import PlayState
 from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
+from chsel.evaluation.spread import Spread, spread
 from chsel.points import KnownPoints, Workspace
 from chsel.pose import compose, inverse, random_rotations
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
@@ -122,6 +124,9 @@ def hypotheses(count: int = 6, archive: ArchiveSnapshot | None = None) -> Hypoth
     return Hypotheses(poses, cost, duplicate, cell, poses, archive)
 
 
+SPREAD = spread(hypotheses(), np.asarray(MESH.centroid)) or Spread(0.0, 0.0)
+
+
 def registration(
     step: int, *, shape: tuple[int, ...] | None = (4, 3), count: int = 6
 ) -> Iterator[Event]:
@@ -139,7 +144,11 @@ def registration(
         yield SnapshotTaken(step, last)
         yield Traced(step, "quality_diversity", iteration, "0", (0.5, 1.0, 2.0))
     yield HypothesesFound(step, hypotheses(count, last))
-    yield Measured(step, {"best_position_error": 0.01 * (step + 1), "coverage_mm2": 4.0})
+    errors = {
+        "best_position_error": 0.01 * (step + 1),
+        "best_rotation_error": 0.5 * (step + 1),
+    }
+    yield Measured(step, {**errors, "coverage_mm2": 4.0})
     yield Timed(step, {"gradient_descent": 0.25})
     yield Logged(step, "warning", f"line {step}")
 
@@ -202,7 +211,7 @@ def test_the_file_holds_one_recording_of_the_application_and_a_blueprint(recordi
 
 def test_only_our_timelines_exist(rows: dict[str, list[Row]]) -> None:
     timelines = {name for entity in rows.values() for times, _ in entity for name in times}
-    assert timelines == {"probe", "iteration"}
+    assert timelines == {"probe", "registration", "iteration"}
 
 
 def test_contacts_and_points_are_those_of_the_probe(rows: dict[str, list[Row]]) -> None:
@@ -362,7 +371,10 @@ def test_costs_of_the_search_are_on_the_timeline_of_iterations_alone(
         ("/cost/median", [18.75] * 3),
         ("/cost/highest", [54.0] * 3),
         ("/distinct/hypotheses", [5.0] * 3),
-        ("/error/position/best_position_error", [0.01, 0.02, 0.03]),
+        ("/error/position/best_position_error", [10.0, 20.0, 30.0]),
+        ("/error/rotation/best_rotation_error", [0.5 * n * 180.0 / np.pi for n in (1, 2, 3)]),
+        ("/spread/position", [1000.0 * SPREAD.position] * 3),
+        ("/spread/rotation", [SPREAD.rotation * 180.0 / np.pi] * 3),
         ("/measured/coverage_mm2", [4.0] * 3),
         ("/seconds/gradient_descent", [0.25] * 3),
     ],
@@ -375,7 +387,7 @@ def test_numbers_of_a_step_stand_at_its_probe(
         for times, values in rows[entity]
         if "Scalars:scalars" in values
     }
-    assert series == {step: [value] for step, value in enumerate(expected)}
+    assert series == {step: [pytest.approx(value)] for step, value in enumerate(expected)}
 
 
 def test_the_text_tells_the_session_and_its_whole_configuration(rows: dict[str, list[Row]]) -> None:
@@ -461,21 +473,125 @@ def test_costs_of_zero_are_drawn_as_the_lowest(tmp_path: Path) -> None:
     assert first["cost"] == [0.0, 0.0]
 
 
-def views_of_the_last_layout(path: Path) -> set[str]:
-    """Their titles."""
+def last_layout(path: Path) -> list[dict[str, Any]]:
+    """The rows of the blueprint that counts."""
     reader, layouts = RrdReader(path), []
     for store in reader.blueprints():
         batches = [chunk.to_record_batch() for chunk in reader.stream(store=store).to_chunks()]
         rows = [row for batch in batches for row in batch.to_pylist()]
-        titles = {name for row in rows for name in row.get("ViewBlueprint:display_name") or ()}
-        layouts.append((min(row["rerun.controls.RowId"] for row in rows), titles))
-    return max(layouts)[1]
+        layouts.append((min(row["rerun.controls.RowId"] for row in rows), rows))
+    return max(layouts, key=lambda layout: layout[0])[1]
+
+
+def views_of_the_last_layout(path: Path) -> set[str]:
+    """Their titles."""
+    rows = last_layout(path)
+    return {name for row in rows for name in row.get("ViewBlueprint:display_name") or ()}
+
+
+def in_layout(path: Path, name: str) -> Any:
+    """The one value of a component that the last layout has once."""
+    ((value,),) = [row[name] for row in last_layout(path) if row.get(name)]
+    return value
+
+
+def opens_at(path: Path) -> tuple[str, PlayState]:
+    """The timeline that the viewer shows first, and whether it rests at its first moment."""
+    timeline = in_layout(path, "TimePanelBlueprint:timeline")
+    return timeline, PlayState(in_layout(path, "TimePanelBlueprint:play_state"))
+
+
+def late_session() -> list[Event]:
+    """Registrations follow the last two of four probes."""
+    events: list[Event] = [started()]
+    for step in range(4):
+        events.append(probe(step))
+        events += registration(step) if step > 1 else [Logged(step, "info", f"early {step}")]
+    return events
+
+
+def test_the_viewer_opens_at_the_first_registration(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.rrd", late_session())
+    assert opens_at(path) == ("registration", PlayState.Paused)
+    rows = read(path)
+    moments = {
+        (times["registration"], times.get("probe", times["registration"]))
+        for entity in rows.values()
+        for times, _ in entity
+        if "registration" in times
+    }
+    assert moments == {(2, 2), (3, 3)}  # a timeline at rest shows its first moment
+    assert {times["probe"] for times, _ in rows["/scene/free"] if "probe" in times} == {0, 1, 2, 3}
+    for entity in ("/archive/cost", "/archive/axes", "/scene/hypotheses/best", "/cost/lowest"):
+        found = [times for times, _ in rows[entity] if times.get("probe", 0) > 1]
+        assert found
+        assert all(times["registration"] == times["probe"] for times in found), entity
+
+
+def test_all_that_is_known_by_the_first_registration_is_in_sight_there(tmp_path: Path) -> None:
+    rows = read(write(tmp_path / "a.rrd", late_session()))
+
+    def first(entity: str) -> list[dict[str, Any]]:
+        return [values for times, values in rows[entity] if times.get("registration") == 2]
+
+    for name, points in (
+        ("free", [INITIAL.free, *(probe(step).new_points.free for step in range(3))]),
+        ("contacts", [probe(step).new_points.contacts for step in range(3)]),
+    ):
+        shown = [row["Points3D:positions"] for row in first(f"/scene/{name}")]
+        expected = np.concatenate(points).astype(np.float32)
+        np.testing.assert_array_equal(
+            np.concatenate([np.reshape(part, (-1, 3)) for part in shown]), expected
+        )
+    paths = [row["LineStrips3D:strips"] for row in first("/scene/gripper/path")]
+    np.testing.assert_allclose(paths[-1], probe(2).gripper_path[None, :, :3, 3], rtol=1e-6)
+    assert [row["TextLog:text"] for row in first("/log")][:2] == [["early 0"], ["early 1"]]
+    for entity in MESH_ENTITIES:  # without a pose there, the viewer draws the mesh at the origin
+        assert "InstancePoses3D:mat3x3" in first(entity)[0]
+
+
+@pytest.mark.parametrize("registered", [True, False])
+def test_a_live_view_and_one_without_a_registration_follow_the_probes(
+    tmp_path: Path, registered: bool
+) -> None:
+    events = late_session() if registered else [started(), probe(0), probe(1)]
+    recorder = RerunRecorder(tmp_path / "a.rrd", follow=registered)
+    for event in events:
+        recorder.record(event)
+    recorder.close()
+    assert opens_at(tmp_path / "a.rrd") == ("probe", PlayState.Following)
+
+
+def test_the_eye_turns_to_the_first_hypotheses_and_the_object(tmp_path: Path) -> None:
+    set_of_two = hypotheses(2)
+    poses = inverse(compose(np.tile(np.eye(3), (2, 1, 1)), np.array([[0.1, 0, 0], [0.3, 0.2, 0]])))
+    found = dataclasses.replace(set_of_two, object_from_world=poses)
+    before = write(tmp_path / "a.rrd", [started(), probe(0)])
+    after = write(tmp_path / "b.rrd", [started(), probe(0), HypothesesFound(0, found)])
+    targets = [np.array(in_layout(path, "EyeControls3D:look_target")) for path in (before, after)]
+    eyes = [np.array(in_layout(path, "EyeControls3D:position")) for path in (before, after)]
+    np.testing.assert_allclose(targets[0][:2], 0.0, atol=1e-6)  # of the workspace
+    np.testing.assert_allclose(targets[1][:2], [0.2, 0.1], atol=1e-6)
+    distances = [np.linalg.norm(eye - target) for eye, target in zip(eyes, targets, strict=True)]
+    extent = np.array([0.3, 0.4, 0.3])  # of both and of the true pose
+    expected = float(distances[0]) * np.linalg.norm(extent) / np.sqrt(3.0)
+    assert distances[1] == pytest.approx(expected, rel=0.02)
+
+
+def test_the_legend_names_what_is_there(tmp_path: Path, rows: dict[str, list[Row]]) -> None:
+    free = Probe(0, "free", KnownPoints(free=np.zeros((1, 3))))
+    few = read(write(tmp_path / "a.rrd", [started(), free]))
+    named = few["/legend/kinds"][-1][1]["Points2D:labels"]
+    assert named == ["contact", "free", "gripper", "true pose"]
+    named = rows["/legend/kinds"][-1][1]["Points2D:labels"]
+    assert named == ["contact", "free", "occupied", "known", "gripper", "true pose"]
 
 
 def test_times_have_a_view_once_there_are_any(tmp_path: Path) -> None:
     untimed = [event for event in session(1) if not isinstance(event, Timed)]
     layout = views_of_the_last_layout(write(tmp_path / "a.rrd", untimed))
-    assert "Distinct hypotheses" in layout
+    assert {"Position error [mm]", "Rotation error [°]"} < layout
+    assert {"Spread of positions [mm]", "Spread of rotations [°]"} < layout
     assert "Seconds by stage" not in layout
     late = [*untimed[:2], Timed(0, {"probe": 0.5}), *untimed[2:]]
     timed = views_of_the_last_layout(write(tmp_path / "b.rrd", late))

@@ -143,6 +143,24 @@ def test_a_pad_that_tells_nothing_of_a_probe_shows_nothing(rows: dict[str, list[
         assert [values for values in last if "Clear:is_recursive" in values]
 
 
+def test_the_first_registration_shows_the_images_of_its_probe(tmp_path: Path) -> None:
+    events: list[Event] = [started(), RigDescribed(-1, "cabinet", "0a1b", HAND)]
+    events += [touch(0, 9), depth(0), probe(0), depth(1), touch(1, 7), touch(1, 4), probe(1)]
+    rows = read(write(tmp_path / "a.rrd", [*events, *registration(1)]))
+
+    def first(entity: str) -> dict[str, Any]:
+        return [values for times, values in rows[entity] if times.get("registration") == 1][-1]
+
+    felt = pixels(first("/sensors/pad_1/pixels"), "SegmentationImage", np.uint8, (3, 5))
+    assert (felt == 0).sum() == 7
+    seen = first("/scene/cameras/camera/depth")
+    np.testing.assert_array_equal(pixels(seen, "DepthImage", np.uint16, (4, 6)), depth(1).values)
+    assert first("/sensors/camera/caption")["Points2D:labels"][0].startswith("probe 1: ")
+    hand = np.array(first("/scene/hand")["InstancePoses3D:translations"], np.float32)
+    path = probe(1).gripper_path
+    np.testing.assert_array_equal(hand, path[deepest(path), :3, 3].astype(np.float32)[None])
+
+
 def test_sensors_have_views_beside_all_others(recording: Path, tmp_path: Path) -> None:
     bare = [e for e in robot_session() if not isinstance(e, RigDescribed | SensorImage)]
     others = views_of_the_last_layout(write(tmp_path / "a.rrd", bare))
