@@ -62,8 +62,8 @@ def main(config: DictConfig) -> None:
     mesh = load_object(chosen, checked.assets.folder).mesh
     console = Console(highlight=False)
     console.print(
-        f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, {count} probes, seed "
-        f"{checked.seed}",
+        f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, probes 0 to "
+        f"{count - 1}, seed {checked.seed}",
         style="bold",
         soft_wrap=True,
     )
@@ -73,7 +73,7 @@ def main(config: DictConfig) -> None:
 
             def told(push: Push) -> None:
                 bar.advance(task)
-                bar.console.print(_line(push, count), soft_wrap=True)
+                bar.console.print(_line(push), markup=False)
 
             simulated = simulate_log(log, configuration, mesh, checked.seed, settings, told)
         with whole_file(truth) as beside:
@@ -112,11 +112,11 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _line(push: Push, count: int) -> str:
+def _line(push: Push) -> str:
     stops = {"pads": "felt by the pads", "hand": "stopped by the hand", "end": "nothing touched"}
     pads = ", ".join(f"{pad} {pixels} px" for pad, pixels in push.pressed.items() if pixels)
     return (
-        f"probe {push.step + 1:>3}/{count}  y {push.y:+.3f} z {push.z:.3f} m  pushed "
+        f"probe {push.step:>3}  y {push.y:+.3f} z {push.z:.3f} m  pushed "
         f"{push.reach:.3f} m  {stops[push.stopped]}{f' ({pads})' if pads else ''}"
     )
 

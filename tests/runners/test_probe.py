@@ -90,7 +90,7 @@ def test_a_run_leaves_recordings_config_and_summary(
     assert config["method"]["descent"]["iterations"] == 20
     assert done.stdout.count("\nprobe ") == 3
     assert "errors to the true pose: best hypothesis, closest one" in done.stdout
-    assert f"{folder / 'recording.mcap'}" in done.stdout
+    assert f"{folder}/\n" in done.stdout
     assert done.stderr == ""
 
 
