@@ -26,6 +26,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from chsel.errors import ChselError
+from runners.path_values import literal_paths
 from runners.presets import store_presets
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -45,6 +46,7 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
         def program() -> None:
             show_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1" or TRACEBACK in sys.argv
             sys.argv = [argument for argument in sys.argv if argument != TRACEBACK]
+            sys.argv[1:] = literal_paths(sys.argv[1:])
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
             warnings.showwarning = _print_warning
             store_presets()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from dataclasses import dataclass
@@ -36,11 +35,11 @@ from replay.step_ranges import chosen_steps
 from runners.cli import command, plain
 from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig
+from runners.path_values import is_setting, quoted
 from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import beside, read_pose
 
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
-_OVERRIDE = re.compile(r"[~+]{0,2}[\w.@/:]+=")
 Row = dict[str, Any]
 
 
@@ -244,17 +243,12 @@ def named_arguments(arguments: list[str]) -> list[str]:
         elif argument in _TAKES_VALUE or argument.startswith("--config-"):
             kept.append(argument)
             kept += [] if "=" in argument else [value for value in [next(rest, None)] if value]
-        elif argument.startswith("-") or _OVERRIDE.match(argument):
+        elif argument.startswith("-") or is_setting(argument):
             kept.append(argument)
         else:
             (steps if files else files).append(argument)
-    kept += [f"file={_quoted(path)}" for path in files]
-    return [*kept, f"steps={_quoted(','.join(steps))}"] if steps else kept
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
-    return f"'{escaped}'"
+    kept += [f"file={quoted(path)}" for path in files]
+    return [*kept, f"steps={quoted(','.join(steps))}"] if steps else kept
 
 
 def store_definitions() -> None:
