@@ -152,7 +152,8 @@ def test_a_sweep_keeps_commas_of_paths_and_quoted_files_are_several(
 
 
 def test_a_missing_file_of_a_strange_name_is_named(home: Path) -> None:
-    done = run(probe.main, "object=mesh", "object.path=~/ä,=[.obj", "session=points", *SHORT)
+    points = ("session=points", "session.path=~/Prüf körper,1.npz")
+    done = run(probe.main, "object=mesh", "object.path=~/ä,=[.obj", *points, *SHORT)
     assert done.returncode == 2
     assert f"{home}/ä,=[.obj" in done.stderr
     assert done.stderr.count("\n") == 1
