@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
-import torch
-
 from chsel.kernels.arithmetic import require_ieee_arithmetic
 
 _SHARES = 4  # pieces per thread, so that none waits long for another
@@ -30,6 +28,8 @@ def spread(
     scratch: makes what one thread works in. The pieces must not depend on each other. least: how
     many at least are worth another thread.
     """
+    import torch
+
     most = min(torch.get_num_threads(), count // least)
     if most <= 1 or hasattr(_here, "works"):  # a worker must not wait for workers
         if count:
@@ -56,6 +56,8 @@ def spread(
 @contextmanager
 def threads(count: int) -> Iterator[None]:
     """As many threads for a while, of torch and of the kernels."""
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

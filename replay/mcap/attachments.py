@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from chsel.errors import RecordingError
 from chsel.sdf import SdfGrid
 from replay.mcap.encoding import decode, encode
+
+if TYPE_CHECKING:
+    import trimesh
 
 MESH = "mesh.ply"
 SDF_GRID = "sdf_grid"
@@ -46,6 +49,8 @@ def mesh_to_ply(mesh: trimesh.Trimesh) -> bytes:
 
 def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
     """The mesh that `mesh_to_ply` wrote; RecordingError for any other file."""
+    import trimesh
+
     header = re.match(_HEADER_PATTERN.encode(), data[:_LONGEST_HEADER])
     if header is None:
         raise RecordingError(f"attachment {MESH} has no header as written by this project")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray, IntArray, frozen
 from chsel.errors import ChselError, PointsError, PoseError
@@ -189,6 +188,8 @@ def _csv_class(entries: list[tuple[list[float], float, int]]) -> PointClass:
 
 def _read_surface(path: Path) -> PointFile:
     """Every vertex of a mesh or point cloud is a surface point."""
+    import trimesh
+
     try:
         loaded = trimesh.load(str(path))
         geometries = list(getattr(loaded, "geometry", {"": loaded}).values())
