@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -22,13 +21,11 @@ from chsel.evaluation.error import EvaluationError
 from chsel.evaluation.plausible_file import load_plausible, save_plausible
 from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
 from chsel.evaluation.plausible_settings import (
-    DEFINITIONS,
     PlausibleSettings,
-    plausible_settings,
 )
 from chsel.evaluation.true_pose import find_true_pose
 from chsel.problem import RegistrationProblem
-from chsel.settings import build_settings, settings_mapping
+from chsel.settings import build_settings
 from chsel.streams import StreamKey
 from chsel.threads import threads
 from replay.step_ranges import chosen_steps
@@ -251,18 +248,8 @@ def named_arguments(arguments: list[str]) -> list[str]:
     return [*kept, f"steps={quoted(','.join(steps))}"] if steps else kept
 
 
-def store_definitions() -> None:
-    """Offer every definition as definition/NAME."""
-    store = ConfigStore.instance()
-    for name in DEFINITIONS:
-        values = settings_mapping(plausible_settings(name, 1.0))
-        # None: that of the object.
-        store.store(group="definition", name=name, node={"name": name, **values, "epsilon": None})
-
-
 def program() -> None:
     """The command, from the arguments of this process."""
-    store_definitions()
     sys.argv[1:] = named_arguments(sys.argv[1:])
     main()
 

@@ -8,10 +8,8 @@ from collections.abc import Mapping
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-import trimesh
 import yaml
 from omegaconf import DictConfig
 
@@ -23,6 +21,7 @@ from chsel.settings import build_settings
 from chsel.streams import StreamKey
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
+from replay.startup import importing
 from runners.cli import command, plain
 from runners.compiling import Compiling
 from runners.display import Display, reading_bar
@@ -37,6 +36,9 @@ from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
+
+if TYPE_CHECKING:
+    import trimesh
 
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
@@ -102,11 +104,15 @@ def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
     checked = build_settings(ProbeConfig, values, "probe")
+    display = Display(f"{_title(checked)}, preset {checked.preset.name}, seed {checked.seed}")
+    with importing():  # what takes long, after there is something to read
+        import igl  # noqa: F401
+        import torch
+        import trimesh  # noqa: F401
     torch.set_num_threads(checked.threads)
     method_config = dict(checked.method)
     method_name = str(method_config.pop("name", None))
     method = build_method(method_name, method_config)
-    display = Display(f"{_title(checked)}, preset {checked.preset.name}, seed {checked.seed}")
     with ExitStack() as stack:
         with Compiling() as kernels:
             with reading_bar() as bar:
