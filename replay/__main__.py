@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from chsel.errors import ChselError
+from replay.startup import ready
 from replay.verbs import VERBS
 
 TRACEBACK = "--traceback"
@@ -33,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = _print_warning
     try:
         given = _parser(words[0] if words else "").parse_args(words)
+        ready()
         status: int = importlib.import_module(f"replay.verbs.{given.verb}").run(given)
         sys.stdout.flush()
     except KeyboardInterrupt:

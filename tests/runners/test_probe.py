@@ -155,6 +155,7 @@ def test_a_recorded_session_repeats_the_probes_with_another_method(
     assert again.hypotheses(2).archive is None
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
     points: tuple[str, ...], tmp_path: Path
 ) -> None:
