@@ -79,12 +79,12 @@ def main(config: DictConfig) -> None:
     with threads(checked.threads):
         truth = _truth(checked, source, settings, console)
         rows, failures = _rows(checked, source, steps, settings, truth, folder)
-    console.print(_title(checked, source, settings, truth), style="bold", soft_wrap=True)
+    console.print(_title(checked, source, settings, truth), style="bold")
     if rows:
         console.print(_table(rows))
     for failure in failures:
         console.print(failure, soft_wrap=True, markup=False)
-    console.print(f"{folder}  {len(rows)} sets", soft_wrap=True, markup=False)
+    console.print(f"{len(rows)} sets in\n{folder}", soft_wrap=True, markup=False)
     if failures:
         sys.exit(1)
 

@@ -65,7 +65,6 @@ def main(config: DictConfig) -> None:
         f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, probes 0 to "
         f"{count - 1}, seed {checked.seed}",
         style="bold",
-        soft_wrap=True,
     )
     try:
         with _bar(console) as bar:
@@ -85,8 +84,8 @@ def main(config: DictConfig) -> None:
             "an out=FILE.mcap that can be written"
         ) from error
     console.print(
-        f"{log}  {decimal(log.stat().st_size)}, {simulated.messages} messages of "
-        f"{simulated.seconds:.1f} simulated seconds\n{truth}  the true pose",
+        f"{log}\n  {decimal(log.stat().st_size)}, {simulated.messages} messages of "
+        f"{simulated.seconds:.1f} simulated seconds\n{truth}\n  the true pose",
         soft_wrap=True,
         markup=False,
     )
