@@ -1,9 +1,14 @@
 # make probe: set up and run a session. make test: set up and run all checks.
 # make PYTHON=python3.12 probe: with another Python, 3.11 or newer.
+# make PIP_ARGS="--extra-index-url URL" probe: with options for pip install.
+# make VENV_ARGS=--system-site-packages probe: with the packages that PYTHON has already.
 
 PYTHON ?= python3
+PIP_ARGS ?=
+VENV_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
+INSTALL = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint $(VENV)/constraints.txt
 
 .PHONY: probe test clean
 
@@ -23,15 +28,20 @@ test: $(VENV)/.installed-test
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "$(PYTHON) is older than Python 3.11; pass PYTHON=python3.11 or newer"; exit 2; }
-	@$(PYTHON) -m venv $(VENV) || \
+	@$(PYTHON) -m venv $(VENV_ARGS) $(VENV) || \
 		{ rm -rf $(VENV); echo "no virtual environment: on Debian, apt install python3-venv"; exit 2; }
 
-$(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+# A torch that is there stays, whatever its version: it is the largest part by far.
+$(VENV)/constraints.txt: constraints.txt | $(VENV)/bin/python
+	@if $(BIN)/python -c "import importlib.metadata as m; m.version('torch')" 2>/dev/null; \
+		then sed '/^torch==/d' constraints.txt; else cat constraints.txt; fi > $@
+
+$(VENV)/.installed: pyproject.toml $(VENV)/constraints.txt
+	$(INSTALL) --editable .
 	@touch $@
 
 $(VENV)/.installed-test: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test]"
+	$(INSTALL) --editable ".[test]"
 	@touch $@
 
 clean:

@@ -4,8 +4,16 @@ Zhong, Fazeli and Berenson, "CHSEL: Producing Diverse Plausible Pose Estimates f
 Free Space Data", Robotics: Science and Systems, 2023.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+if os.path.exists(os.path.join(os.path.dirname(__file__), "wrapper.py")):  # a file of theirs
+    raise ImportError(
+        "package chsel of PyPI is installed beside this one, chsel-replay, and files of both are "
+        "mixed, as both are imported as chsel; to mend it: pip uninstall -y chsel chsel-replay, "
+        "and install chsel-replay again (each needs an environment of its own)"
+    )
 
 if TYPE_CHECKING:
     from chsel.api import register

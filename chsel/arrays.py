@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from chsel.errors import ChselError, PointsError
@@ -29,8 +29,9 @@ def frozen(
     Takes numpy arrays, torch tensors and nested lists. Raises `error` with `name` in the message
     if the value is no array of numbers, has another shape, or holds a value that is not finite.
     """
+    torch = sys.modules.get("torch")  # who has a tensor has imported it; it takes seconds
     try:
-        if isinstance(value, torch.Tensor):
+        if torch is not None and isinstance(value, torch.Tensor):
             value = value.detach().cpu().numpy()
         array = np.array(value, dtype=dtype, order="C")
     except (TypeError, ValueError, OverflowError):

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import digest, frozen
 from chsel.complete_file import check_complete
 from chsel.errors import MeshError, quoted, require_positive
 from chsel.special_file import refuse_special_file
+
+if TYPE_CHECKING:
+    import trimesh
 
 SMALLEST = 0.005  # m: the largest extent of anything that a gripper probes is above this
 LARGEST = 10.0  # m: above this, a file is in millimetres rather than metres
@@ -50,6 +52,8 @@ def clean_mesh(
     Raises MeshError if there are no faces, a number is not finite, an index has no vertex, the mesh
     is flat, or its size in metres is not that of an object.
     """
+    import trimesh
+
     require_positive("mesh scale", scale)
     vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
     faces = frozen(f"{name}: faces", faces, (None, 3), dtype=np.int64, error=MeshError)
@@ -88,6 +92,8 @@ def mesh_digest(mesh: trimesh.Trimesh) -> str:
 
 def _read(path: Path) -> trimesh.Trimesh:
     """The file as one mesh, as it stands in the file."""
+    import trimesh
+
     kind = path.suffix.lower().removeprefix(".")
     if kind not in _mesh_formats():
         raise MeshError(f"mesh file {path} is of no known kind; accepted: {_accepted_files()}")
@@ -136,6 +142,8 @@ def _check_size(name: str, extents: np.ndarray) -> None:
 
 def _turn_outward(mesh: trimesh.Trimesh) -> None:
     """Make neighbouring faces agree, and the volume of a closed mesh positive."""
+    import trimesh
+
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0.0:
@@ -143,6 +151,8 @@ def _turn_outward(mesh: trimesh.Trimesh) -> None:
 
 
 def _mesh_formats() -> set[str]:
+    import trimesh
+
     return set(trimesh.available_formats()) - _NOT_MESHES
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from chsel.arrays import FloatArray
 from chsel.errors import PoseError
 from chsel.kernels.elementary import arctangents, sines_cosines
 from chsel.streams import normals
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 RIGID_TOLERANCE = 1e-6
 
@@ -145,6 +147,8 @@ def encode_9d(object_from_world: FloatArray) -> FloatArray:
 
 def decode_6d(rows: Tensor) -> Tensor:
     """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
+    import torch
+
     first, second = rows[:, 0:3], rows[:, 3:6]
     b1 = first / _length(first)
     b2 = second - _dot(b1, second) * b1
@@ -162,7 +166,8 @@ def decode_6d(rows: Tensor) -> Tensor:
 
 def _length(vectors: Tensor) -> Tensor:
     # Kept away from 0, so that a degenerate 6-D vector decodes to finite numbers.
-    return torch.sqrt(_dot(vectors, vectors)).clamp_min(1e-12)
+
+    return _dot(vectors, vectors).sqrt().clamp_min(1e-12)
 
 
 def _dot(left: Tensor, right: Tensor) -> Tensor:
@@ -182,4 +187,6 @@ def moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
 
 def as_tensor(value: Any, device: torch.device | str = "cpu") -> Tensor:
     """A float64 tensor that shares no memory with a read-only array."""
+    import torch
+
     return torch.tensor(np.asarray(value), dtype=torch.float64).to(device)

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-import igl
 import numpy as np
-import torch
-import trimesh
-from torch import Tensor
 
 from chsel.arrays import FloatArray, IntArray, digest, frozen
 from chsel.errors import MeshError, SdfError, quoted, require_choice, require_positive
 from chsel.pose import as_tensor
+
+if TYPE_CHECKING:
+    import torch
+    import trimesh
+    from torch import Tensor
 
 LOOKUPS = ("nearest", "trilinear")
 OUTSIDE = ("surface_point", "bounding_box")
@@ -35,6 +36,8 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     for scans with folds, where pseudonormals fail. Within 1 mm of the surface the gradient is the
     normal of the closest face (CHSEL, Sec. IV-B; there by ray casting, which is not reproducible).
     """
+    import igl
+
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
     queries = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
@@ -176,6 +179,8 @@ class SdfGrid:
 
     def active_cells(self, level: float, lookup: str) -> Tensor:
         """Flags of the cells, as `cells` counts them, that read any value below `level`."""
+        import torch
+
         below = self.values < level
         if lookup == "trilinear":
             padded = np.pad(below, ((0, 1), (0, 1), (0, 1)))
@@ -192,16 +197,16 @@ class SdfGrid:
         The nearest node for lookup "nearest", the lowest of eight nodes for "trilinear".
         """
         cell = (points - self._on(points.device).first) * (1.0 / self.resolution)
-        return self._flat(torch.round(cell) if lookup == "nearest" else self._base(cell))
+        return self._flat(cell.round() if lookup == "nearest" else self._base(cell))
 
     def clamped(self, points: Tensor) -> Tensor:
         """The points of the grid's box (P, 3) nearest to points (P, 3); no nan stays one."""
         grid = self._on(points.device)
-        return torch.fmin(torch.fmax(points, grid.first), grid.last)
+        return points.fmax(grid.first).fmin(grid.last)
 
     def _base(self, cell: Tensor) -> Tensor:
         """The lowest of the eight nodes around grid coordinates (P, 3)."""
-        return torch.minimum(torch.floor(cell), self._on(cell.device).top)
+        return cell.floor().minimum(self._on(cell.device).top)
 
     def _on(self, device: torch.device) -> _Tensors:
         """The grid on a device, where it stays."""
@@ -222,6 +227,8 @@ class SdfGrid:
         distance to the surface point closest to the nearest point of the grid, an upper bound;
         "bounding_box" returns the distance to the grid's box.
         """
+        import torch
+
         require_choice("lookup", lookup, LOOKUPS)
         require_choice("outside", outside, OUTSIDE)
         points = torch.as_tensor(points, dtype=torch.float64)
@@ -243,7 +250,7 @@ class SdfGrid:
 
     def _nearest(self, cell: Tensor) -> tuple[Tensor, Tensor]:
         """Value and gradient at grid coordinates (P, 3) by the nearest node."""
-        index = self._flat(torch.round(cell))
+        index = self._flat(cell.round())
         grid = self._on(cell.device)
         return grid.values[index], grid.gradients[index]
 
@@ -254,7 +261,7 @@ class SdfGrid:
         sides = (1.0 - fraction, fraction)
         first = self._flat(base)
         grid, (_, ny, nz) = self._on(cell.device), self.shape
-        value, gradient = torch.zeros_like(cell[:, 0]), torch.zeros_like(cell)
+        value, gradient = cell.new_zeros(len(cell)), cell.new_zeros(cell.shape)
         for i, j, k in np.ndindex(2, 2, 2):
             weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
             index = first + (i * ny + j) * nz + k
@@ -264,7 +271,7 @@ class SdfGrid:
 
     def _flat(self, index: Tensor) -> Tensor:
         _, ny, nz = self.shape
-        return ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).to(torch.int64)
+        return ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).long()
 
 
 def _parts(nodes: FloatArray, face_count: int) -> list[FloatArray]:
@@ -301,4 +308,4 @@ def squared_length(vectors: Tensor) -> Tensor:
 
 
 def _length(vectors: Tensor) -> Tensor:
-    return torch.sqrt(squared_length(vectors)).clamp_min(1e-12)
+    return squared_length(vectors).sqrt().clamp_min(1e-12)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from chsel.arrays import FloatArray, frozen
 from chsel.errors import SettingError
@@ -16,6 +14,9 @@ from chsel.kernels.pose import Space, decode_all, matrix_of
 from chsel.kernels.region import triple
 from chsel.pose import as_tensor, compose, decode_6d, encode_9d, product, rotated, rotation_vector
 from chsel.sdf import SdfGrid
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class SearchSpace(Protocol):
@@ -127,6 +128,8 @@ class SE2Space:
 
     def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Rodrigues' formula about the axis, and a point of the plane."""
+        import torch
+
         device = vectors.device
         hat, hat_squared, rest = (
             part.to(device) for part in (self._hat, self._hat_squared, self._rest)

@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
-import torch
-
 from chsel.errors import SettingError
 from chsel.kernels.arithmetic import require_ieee_arithmetic
 
@@ -34,6 +32,8 @@ def spread(
     scratch: makes what one thread works in. The pieces must not depend on each other. least: how
     many at least are worth another thread.
     """
+    import torch
+
     most = min(torch.get_num_threads(), count // least)
     if most <= 1 or hasattr(_here, "works"):  # a worker must not wait for workers
         if count:
@@ -67,6 +67,8 @@ def require_threads(name: str, count: object) -> None:
 def threads(count: int) -> Iterator[None]:
     """As many threads for a while, of torch and of the kernels. SettingError for too many."""
     require_threads("threads", count)
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -12,6 +12,7 @@ from typing import NoReturn
 
 from chsel.errors import ChselError
 from replay.console import print_error, print_warning
+from replay.startup import ready
 from replay.verbs import VERBS
 
 TRACEBACK = "--traceback"
@@ -34,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = print_warning
     try:
         given = _parser(words[0] if words else "").parse_args(words)
+        ready()
         status: int = importlib.import_module(f"replay.verbs.{given.verb}").run(given)
         sys.stdout.flush()
     except KeyboardInterrupt:

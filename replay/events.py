@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.points import KnownPoints, Workspace
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -27,11 +28,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from chsel.errors import ChselError
 from replay.console import print_error, print_warning
+from replay.startup import ready
+from runners.command_help import asked_for, help_text
+from runners.path_values import literal_paths
 from runners.presets import store_presets
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 TRACEBACK = "--traceback"
 _NESTED_GROUPS = ("session/rig",)  # choices of their own, not options of the group around them
+_OPEN_GROUPS = {"evaluate": ("settings.", "outside.")}  # of a command, groups that have any key
 _USER_ERRORS = (ChselError, HydraException, OmegaConfBaseException, OSError)
 
 
@@ -44,12 +49,16 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
 
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         def program() -> None:
+            ready()
             show_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1" or TRACEBACK in sys.argv
-            sys.argv = [argument for argument in sys.argv if argument != TRACEBACK]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
             warnings.showwarning = print_warning
-            store_presets()
-            _register_resolvers()
+            sys.argv[1:] = prepared(config_name, sys.argv[1:])
+            if asked_for(sys.argv[1:]):
+                words = sys.argv[1:]
+                show_help = partial(_print_help, config_name, words)
+                _exit_on_error(show_help, config_name, show_traceback)
+                return
 
             job = _Job(_importable(main), config_name, show_traceback)
             run = hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
@@ -59,6 +68,20 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
         return program
 
     return decorate
+
+
+def prepared(config_name: str, words: list[str]) -> list[str]:
+    """The arguments of a command as Hydra takes them, which has all presets to choose from."""
+    store_presets()
+    _register_resolvers()
+    words = [word for word in words if word != TRACEBACK]
+    open_groups = _OPEN_GROUPS.get(config_name, ())
+    words = [f"++{word}" if word.startswith(open_groups) else word for word in words]
+    return literal_paths(words)
+
+
+def _print_help(config_name: str, words: list[str]) -> None:
+    print(help_text(config_name, words))
 
 
 @dataclass(frozen=True)

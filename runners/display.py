@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -62,25 +63,28 @@ def reading_bar() -> Iterator[Bar]:
 class Display:
     """One line a probe, a bar within a registration, a table at the end."""
 
-    def __init__(self, title: str, count: int) -> None:
+    def __init__(self, title: str) -> None:
         self._console = Console()
-        self._count = count
         self._bar = Bar(self._console)
-        self._console.print(title, style="bold", soft_wrap=True)
+        self._console.print(title, style="bold")
+
+    def probes(self, count: int) -> None:
+        """How many there will be; their numbers are the steps of the recording."""
+        numbers = f"probes 0 to {count - 1}" if count > 1 else "probe 0"
+        self._console.print(f"{numbers}, numbered as the steps of the recording")
 
     def working(self, stage: str, iteration: int, total: int) -> None:
         """A stage of the registration, or of reading, stands at `iteration` of `total`."""
         self._bar.show(stage, iteration, total)
 
-    def probe(self, index: int, row: Mapping[str, Any]) -> None:
+    def probe(self, row: Mapping[str, Any]) -> None:
         """A probe, and the registration after it if there was one, are done."""
         self._bar.clear()
-        text = f"probe {index + 1:>3}/{self._count}  {row['outcome']:<8}"
-        text += f" contacts {row['contacts']:>3}  free points {row['free_points']:>6}"
+        text = f"probe {row['step']:>3}  {row['outcome']:<7}  {row['contacts']:>3} contacts"
+        text += f"  {row['free_points']:>6} free"
         if "best_cost" in row:
-            text += f"  best cost {row['best_cost']:.4g}  distinct {row['distinct']:>2}"
-        text += f"  {row['seconds']:.2f} s"
-        self._console.print(text, soft_wrap=True)
+            text += f"  cost {row['best_cost']:.3g}  {row['distinct']:>2} distinct"
+        self._console.print(f"{text}  {row['seconds']:.2f} s")
 
     def say(self, text: str) -> None:
         """A line of its own."""
@@ -118,15 +122,18 @@ class Display:
             self._console.print(_sensor_table(report))
         for level, text in report.lines:
             line = f"warning: {text}" if level == "warning" else text
-            self._console.print(line, soft_wrap=True)
+            self._console.print(line)
 
     def written(self, folder: Path, files: Mapping[str, int]) -> None:
-        """What lies in the run's folder, and how to look at it."""
+        """What lies in the run's folder, and how to look at it; paths on lines of their own."""
+        self._console.print(f"{folder}/", soft_wrap=True)
         for name, size in files.items():
-            self._console.print(f"{folder / name}  {decimal(size)}", soft_wrap=True)
+            self._console.print(f"  {name:<15} {decimal(size):>9}")
         if "recording.rrd" in files:
             viewer = f"{_viewer()} --bind 127.0.0.1"
-            self._console.print(f"look at it: {viewer} {folder / 'recording.rrd'}", soft_wrap=True)
+            path = shlex.quote(str(folder / "recording.rrd"))
+            self._console.print("look at it:")
+            self._console.print(f"{viewer} {path}", soft_wrap=True)
 
     def close(self) -> None:
         """Give the terminal back."""

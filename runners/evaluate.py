@@ -35,11 +35,9 @@ from runners.evaluation.selection import chosen_configurations, chosen_seeds
 from runners.evaluation.sensor_logs import check_log, is_missing
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
-from runners.plausible import store_definitions
 from runners.probe import PresetName
 
 _GATHER = 300.0  # s between tables of what is finished so far
-_OPEN_GROUPS = ("settings.", "outside.")
 _OF_TRIAL = ("configuration", "logs")
 
 
@@ -213,9 +211,6 @@ def _cores() -> int:
 
 def program() -> None:
     """The command, from the arguments of this process."""
-    store_definitions()
-    # Names of methods and of outside sets are no keys that the configuration could have already.
-    sys.argv[1:] = [f"++{word}" if word.startswith(_OPEN_GROUPS) else word for word in sys.argv[1:]]
     main()
 
 

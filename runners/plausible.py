@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -21,13 +19,11 @@ from chsel.evaluation.error import EvaluationError
 from chsel.evaluation.plausible_file import load_plausible, save_plausible
 from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
 from chsel.evaluation.plausible_settings import (
-    DEFINITIONS,
     PlausibleSettings,
-    plausible_settings,
 )
 from chsel.evaluation.true_pose import find_true_pose
 from chsel.problem import RegistrationProblem
-from chsel.settings import build_settings, settings_mapping
+from chsel.settings import build_settings
 from chsel.streams import StreamKey
 from chsel.threads import require_threads, threads
 from replay.console import Console, Progress
@@ -36,11 +32,11 @@ from runners.cli import command, plain
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig
+from runners.path_values import is_setting, quoted
 from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import beside, read_pose
 
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
-_OVERRIDE = re.compile(r"[~+]{0,2}[\w.@/:]+=")
 Row = dict[str, Any]
 
 
@@ -83,12 +79,13 @@ def main(config: DictConfig) -> None:
     with threads(checked.threads):
         truth = _truth(checked, source, settings, console)
         rows, failures = _rows(checked, source, steps, settings, truth, folder)
-    console.print(_title(checked, source, settings, truth), style="bold", soft_wrap=True)
+    console.print(_title(checked, source, settings, truth), style="bold")
     if rows:
         console.print(_table(rows))
     for failure in failures:
         console.print(failure, soft_wrap=True)
-    console.print(f"{folder}  {len(rows)} sets", soft_wrap=True)
+    console.print(f"{len(rows)} sets in")
+    console.print(str(folder), soft_wrap=True)
     if failures:
         sys.exit(1)
 
@@ -239,31 +236,16 @@ def named_arguments(arguments: list[str]) -> list[str]:
         elif argument in _TAKES_VALUE or argument.startswith("--config-"):
             kept.append(argument)
             kept += [] if "=" in argument else [value for value in [next(rest, None)] if value]
-        elif argument.startswith("-") or _OVERRIDE.match(argument):
+        elif argument.startswith("-") or is_setting(argument):
             kept.append(argument)
         else:
             (steps if files else files).append(argument)
-    kept += [f"file={_quoted(path)}" for path in files]
-    return [*kept, f"steps={_quoted(','.join(steps))}"] if steps else kept
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
-    return f"'{escaped}'"
-
-
-def store_definitions() -> None:
-    """Offer every definition as definition/NAME."""
-    store = ConfigStore.instance()
-    for name in DEFINITIONS:
-        values = settings_mapping(plausible_settings(name, 1.0))
-        # None: that of the object.
-        store.store(group="definition", name=name, node={"name": name, **values, "epsilon": None})
+    kept += [f"file={quoted(path)}" for path in files]
+    return [*kept, f"steps={quoted(','.join(steps))}"] if steps else kept
 
 
 def program() -> None:
     """The command, from the arguments of this process."""
-    store_definitions()
     sys.argv[1:] = named_arguments(sys.argv[1:])
     main()
 

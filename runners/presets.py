@@ -8,6 +8,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 
 from chsel.errors import SettingError
+from chsel.evaluation.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.methods import METHODS, OURS, preset_settings
 from chsel.presets import PRESETS
 from chsel.settings import settings_mapping
@@ -19,6 +20,7 @@ def store_presets() -> None:
     """Offer every preset as method/presets/METHOD/PRESET and session/presets/probing/PRESET.
 
     session/presets/rig/default has all keys of a rig, so that each can be changed by its name.
+    definition/NAME is a definition of plausible sets.
 
     A method of an installed package is a choice of its own, as those of conf/method/ are.
     """
@@ -38,6 +40,10 @@ def store_presets() -> None:
     rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out
     del rig["name"], rig["world"]
     store.store(group="session/presets/rig", name="default", node=rig)
+    for name in DEFINITIONS:
+        values = settings_mapping(plausible_settings(name, 1.0))
+        # None: that of the object.
+        store.store(group="definition", name=name, node={"name": name, **values, "epsilon": None})
 
 
 def _store_presets_of(store: ConfigStore, method: str) -> None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-import trimesh
 import yaml
 from omegaconf import DictConfig
 
@@ -26,7 +24,9 @@ from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.recording_info import recording_digest
 from replay.registration import symmetry_for_errors
+from replay.startup import importing
 from runners.cli import command, plain
+from runners.compiling import Compiling
 from runners.display import Display, reading_bar
 from runners.interrupt import Interrupt
 from runners.objects.loader import ObjectConfig, load_object
@@ -45,6 +45,9 @@ from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
 from runners.whole_file import WritingError
+
+if TYPE_CHECKING:
+    import trimesh
 
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
@@ -110,22 +113,35 @@ def main(config: DictConfig) -> None:
     """Run one session."""
     values = plain(config)
     checked = build_settings(ProbeConfig, values, "probe")
+    display = Display(f"{_title(checked)}, preset {checked.preset.name}, seed {checked.seed}")
+    with importing():  # what takes long, after there is something to read
+        import igl  # noqa: F401
+        import torch
+        import trimesh  # noqa: F401
     torch.set_num_threads(checked.threads)
     method_config = dict(checked.method)
     method_name = str(method_config.pop("name", None))
     method = build_method(method_name, method_config)
-    with reading_bar() as bar:
-        scene = open_scene(checked, bar.show)
-    try:
+    with ExitStack() as stack:
+        with Compiling() as kernels:
+            with reading_bar() as bar:
+                scene = open_scene(checked, bar.show)
+            stack.callback(scene.session.close)
+            kernels.rehearse(method, sensing=checked.session["kind"] == "sensors")
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name, scene)
         with Interrupt() as interrupt:
-            interrupted = run(folder, checked, method, scene, started, interrupt)
-    finally:
-        scene.session.close()
+            interrupted = run(folder, checked, method, scene, started, interrupt, display)
     if interrupted:
         sys.exit(130)
+
+
+def _title(config: ProbeConfig) -> str:
+    """What is run; the object of a recorded session is known once it is read."""
+    kind = str(config.session.get("kind"))
+    session = f"{kind} session, {config.method.get('name')}"
+    return session if kind == "recorded" else f"{config.object.name}, {session}"
 
 
 def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
@@ -179,12 +195,10 @@ def run(
     scene: Scene,
     started: SessionStarted,
     interrupt: Interrupt,
+    display: Display,
 ) -> bool:
     """Run the session to its end or to Ctrl-C; whether it was interrupted."""
-    title = f"{started.object}, {started.session} session, {started.method}, "
-    display = Display(
-        title + f"preset {config.preset.name}, seed {config.seed}", scene.session.count
-    )
+    display.probes(scene.session.count)
 
     def show(stage: str, iteration: int, total: int) -> None:
         interrupt.check()
@@ -207,9 +221,9 @@ def run(
     try:
         recorder.record(started)
         recorder.flush()
-        for index, (_, row) in enumerate(session_run.steps()):
+        for _, row in session_run.steps():
             rows.append(row)
-            display.probe(index, row)
+            display.probe(row)
             interrupt.check()
         outcome = "finished"
     except KeyboardInterrupt:

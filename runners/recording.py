@@ -46,7 +46,7 @@ def make_run_folder(logs: Path, *names: str) -> Path:
     """
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     parts = [stamp, *(re.sub(r"[^\w.-]", "-", name)[:60] for name in names), os.urandom(2).hex()]
-    folder = logs / "_".join(parts)
+    folder = logs.expanduser() / "_".join(parts)
     try:
         folder.mkdir(parents=True)
     except OSError as error:

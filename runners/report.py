@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from chsel.errors import SettingError
 from chsel.settings import build_settings, settings_mapping
 from replay.console import Console, print_error
 from runners.cli import command, plain
+from runners.path_values import is_setting, quoted
 from runners.reporting.against_baseline import section_against
 from runners.reporting.completeness import planned_methods
 from runners.reporting.console_table import print_table
@@ -27,7 +27,6 @@ from runners.whole_file import whole_file
 
 HTML, MARKDOWN = "report.html", "report.md"
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
-_OVERRIDE = re.compile(r"[~+]{0,2}[\w.@/:]+=")
 
 
 @dataclass(frozen=True)
@@ -83,18 +82,13 @@ def named_arguments(arguments: Sequence[str]) -> list[str]:
         if argument in _TAKES_VALUE or argument.startswith("--config-"):
             kept.append(argument)
             kept += [] if "=" in argument else [value for value in [next(rest, None)] if value]
-        elif argument.startswith("-") or _OVERRIDE.match(argument):
+        elif argument.startswith("-") or is_setting(argument):
             kept.append(argument)
         else:
             folders.append(argument)
     if len(folders) > 1:
         raise SettingError(f"{folders[1]!r} is one folder too many; accepted: DIR KEY=VALUE ...")
-    return [*kept, *(f"dir={_quoted(path)}" for path in folders)]
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("'", "\\'") if "'" in text else text
-    return f"'{escaped}'"
+    return [*kept, *(f"dir={quoted(path)}" for path in folders)]
 
 
 def _write(out: Path, page: Page) -> None:

@@ -62,10 +62,9 @@ def main(config: DictConfig) -> None:
     mesh = load_object(chosen, checked.assets.folder).mesh
     console = Console()
     console.print(
-        f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, {count} probes, seed "
-        f"{checked.seed}",
+        f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, probes 0 to "
+        f"{count - 1}, seed {checked.seed}",
         style="bold",
-        soft_wrap=True,
     )
     try:
         with _bar(console) as bar:
@@ -73,7 +72,7 @@ def main(config: DictConfig) -> None:
 
             def told(push: Push) -> None:
                 bar.advance(task)
-                bar.console.print(_line(push, count), soft_wrap=True)
+                bar.console.print(_line(push))
 
             simulated = simulate_log(log, configuration, mesh, checked.seed, settings, told)
         with whole_file(truth) as beside:
@@ -84,12 +83,11 @@ def main(config: DictConfig) -> None:
             f"{log} cannot be written ({getattr(reason, 'strerror', None) or reason}); accepted: "
             "an out=FILE.mcap that can be written"
         ) from error
-    console.print(
-        f"{log}  {decimal(log.stat().st_size)}, {simulated.messages} messages of "
-        f"{simulated.seconds:.1f} simulated seconds",
-        soft_wrap=True,
-    )
-    console.print(f"{truth}  the true pose", soft_wrap=True)
+    written = f"{decimal(log.stat().st_size)}, {simulated.messages} messages of"
+    console.print(str(log), soft_wrap=True)
+    console.print(f"  {written} {simulated.seconds:.1f} simulated seconds")
+    console.print(str(truth), soft_wrap=True)
+    console.print("  the true pose")
 
 
 def _object(values: dict[str, Any], configuration: CabinetConfiguration) -> ObjectConfig:
@@ -112,11 +110,11 @@ def _bar(console: Console) -> Progress:
     )
 
 
-def _line(push: Push, count: int) -> str:
+def _line(push: Push) -> str:
     stops = {"pads": "felt by the pads", "hand": "stopped by the hand", "end": "nothing touched"}
     pads = ", ".join(f"{pad} {pixels} px" for pad, pixels in push.pressed.items() if pixels)
     return (
-        f"probe {push.step + 1:>3}/{count}  y {push.y:+.3f} z {push.z:.3f} m  pushed "
+        f"probe {push.step:>3}  y {push.y:+.3f} z {push.z:.3f} m  pushed "
         f"{push.reach:.3f} m  {stops[push.stopped]}{f' ({pads})' if pads else ''}"
     )
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,14 @@ def _optional_data(part: str) -> Path:
     if not directory.is_dir():
         pytest.skip(f"optional data directory is missing: no folder {part}/ (set CHSEL_DATA)")
     return directory
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Child processes can be sent SIGINT, also where a shell has started the tests ignoring it."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
 
 
 @pytest.fixture(scope="session")

@@ -9,11 +9,9 @@ surface; one-directional, s the distance to the mesh (CHSEL, Sec. V).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import igl
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.engine import poses_of
@@ -28,6 +26,9 @@ from chsel.kernels.surface_distance import (
 from chsel.sdf import SdfGrid
 from chsel.streams import Purpose, StreamKey, uniforms
 from chsel.threads import spread
+
+if TYPE_CHECKING:
+    import trimesh
 
 METHODS = ("nearest", "exact", "grid")
 SQUARE_MILLIMETRES = 1e6  # in a square metre
@@ -65,6 +66,8 @@ class SurfaceDistance:
         settings: DistanceSettings | None = None,
     ) -> None:
         """points (Q, 3): on the surface, in the object's frame, see surface_points."""
+        import igl
+
         self.settings = settings = settings or DistanceSettings()
         if mesh is None and settings.method != "grid":
             raise SettingError(f"method {settings.method} needs a mesh; accepted without: grid")

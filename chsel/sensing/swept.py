@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray, frozen
 from chsel.errors import PoseError, SettingError, require_positive
@@ -13,6 +13,9 @@ from chsel.pose import check_rigid, product, rotation_angle
 from chsel.sdf import mesh_sdf
 from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.slerp import interpolated
+
+if TYPE_CHECKING:
+    import trimesh
 
 MOST_NODES = 2_000_000
 MOST_POSES = 1_000_000
@@ -30,6 +33,8 @@ def interior_lattice(
     have nodes, too. No voxel inside a solid is missed if `spacing` is at most its side / sqrt(3).
     Raises SettingError for a spacing that makes too many nodes.
     """
+    import trimesh
+
     require_positive("spacing", spacing)
     solids = [meshes] if isinstance(meshes, trimesh.Trimesh) else meshes
     return np.concatenate([np.zeros((0, 3)), *(_inside(solid, spacing) for solid in solids)])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from chsel.errors import RecordingError
 from chsel.sdf import SdfGrid
 from replay.mcap.encoding import decode, encode
 from replay.mcap.schemas import MESH, SDF_GRID
+
+if TYPE_CHECKING:
+    import trimesh
 
 MEDIA_TYPES = {MESH: "model/ply", SDF_GRID: "application/protobuf; message=chsel.SdfGrid"}
 
@@ -45,6 +48,8 @@ def mesh_to_ply(mesh: trimesh.Trimesh) -> bytes:
 
 def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
     """The mesh that `mesh_to_ply` wrote; RecordingError for any other file."""
+    import trimesh
+
     header = re.match(_HEADER_PATTERN.encode(), data[:_LONGEST_HEADER])
     if header is None:
         raise RecordingError(f"attachment {MESH} has no header as written by this project")

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 import zstandard
 
 from chsel.errors import RecordingError
@@ -51,6 +50,8 @@ def rig_values(event: RigDescribed) -> dict[str, Any]:
 
 def rig(values: Mapping[str, Any]) -> RigDescribed:
     """The rig of a message `Rig`. Raises RecordingError if its hand is no mesh."""
+    import trimesh
+
     vertices, faces = values["hand_vertices"], values["hand_faces"]
     if (vertices is None) is not (faces is None):
         raise RecordingError("the hand lacks its vertices or its faces; accepted: both or none")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import rerun as rr
-import trimesh
 
 from chsel.arrays import FloatArray
 from replay.events import Probe
 from replay.rerun.colors import HAND
 from replay.rerun.hypotheses import DISPLAY_FACES, coarsened
 from replay.rerun.scene import bare_mesh, display_mesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 _ALPHA = 80
 _HIDDEN = np.zeros((1, 4, 4))  # without any pose, the viewer draws the mesh once, at the origin

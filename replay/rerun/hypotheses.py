@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import rerun as rr
-import trimesh
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.pose import inverse
 from chsel.problem import Hypotheses
 from replay.rerun.colors import CostScale, cost_colors
 from replay.rerun.scene import display_mesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 LEVELS = 8
 """Steps of the cost scale; a mesh entity has one colour, so each step is an entity."""
@@ -120,6 +124,8 @@ def coarsened(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
 
     The cell is doubled in number of faces it swallows until few enough are left.
     """
+    import trimesh
+
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
     cell = float(np.sqrt(mesh.area / max(most_faces, 1)))
     coarse = mesh

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import rerun as rr
-import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.points import KnownPoints, Workspace
@@ -22,6 +23,9 @@ from replay.rerun.colors import (
     Rgb,
 )
 from replay.rerun.plane import color_array, on_screen
+
+if TYPE_CHECKING:
+    import trimesh
 
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
@@ -111,6 +115,8 @@ class Scene:
 
 def bare_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Vertices and faces alone, as an MCAP file keeps them; normals follow from these."""
+    import trimesh
+
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn
@@ -32,6 +31,7 @@ from replay.comparing.csv_file import write_csv
 from replay.comparing.plausible import PlausibleSets
 from replay.console import Console, Progress, TextColumn
 from replay.mcap.reader import Recording, read_recording
+from replay.path_argument import path_argument
 from replay.step_ranges import STEPS_HELP, chosen_steps
 
 _FEW_STEPS = 3
@@ -39,7 +39,7 @@ _FEW_STEPS = 3
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The file, its steps, the methods with their settings, and what to save."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
+    parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording")
     parser.add_argument(
         "--methods",
         nargs="+",
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--each", action="store_true", help="show every step, not medians alone")
     parser.add_argument(
         "--plausible",
-        type=Path,
+        type=path_argument,
         metavar="FOLDER",
         help="plausible sets of `runners.plausible`; by default those beside the recording",
     )
@@ -63,9 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"which of them: {', '.join(DEFINITIONS)}",
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads, 1 by default")
-    parser.add_argument("--save-csv", type=Path, metavar="OUT", help="all numbers")
-    parser.add_argument("--save-plot", type=Path, metavar="OUT", help="a png, svg or pdf")
-    parser.add_argument("--save-rerun", type=Path, metavar="OUT", help="a Rerun recording")
+    parser.add_argument("--save-csv", type=path_argument, metavar="OUT", help="all numbers")
+    parser.add_argument("--save-plot", type=path_argument, metavar="OUT", help="a png, svg or pdf")
+    parser.add_argument("--save-rerun", type=path_argument, metavar="OUT", help="a Rerun recording")
 
 
 def run(given: argparse.Namespace) -> int:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -15,6 +14,7 @@ from rich.table import Table
 from replay.comparing.message_content import printable
 from replay.comparing.recording_diff import Ignored, RecordingDiff, TopicDiff, recording_diff
 from replay.console import Console
+from replay.path_argument import path_argument
 
 _SHOWN = 20
 _MANY_ULPS = 10**6
@@ -22,8 +22,8 @@ _MANY_ULPS = 10**6
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Two files, and what to leave out."""
-    parser.add_argument("first", type=Path, metavar="A", help="a recording")
-    parser.add_argument("second", type=Path, metavar="B", help="another one")
+    parser.add_argument("first", type=path_argument, metavar="A", help="a recording")
+    parser.add_argument("second", type=path_argument, metavar="B", help="another one")
     parser.add_argument("--all", action="store_true", help="list every difference")
     parser.add_argument(
         "--ignore",

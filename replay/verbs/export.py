@@ -13,6 +13,7 @@ from replay.console import Console
 from replay.export import FORMATS, write_export
 from replay.export_content import EXPORTS, exported_archive
 from replay.mcap.reader import read_recording
+from replay.path_argument import path_argument
 from replay.step_ranges import STEPS_HELP
 
 
@@ -24,7 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--what", required=True, choices=EXPORTS, help="what to write")
     parser.add_argument("--format", choices=FORMATS, help="npz, or as the name of OUT ends")
     parser.add_argument(
-        "-o", "--out", type=Path, help="a new file; else RECORDING_WHAT.FORMAT in this folder"
+        "-o",
+        "--out",
+        type=path_argument,
+        help="a new file; else RECORDING_WHAT.FORMAT in this folder",
     )
     parser.add_argument("--steps", metavar="A..B", help=STEPS_HELP)
     parser.add_argument(

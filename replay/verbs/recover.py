@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from replay.console import Console
 from replay.mcap.recovery import Recovered, recover
+from replay.path_argument import path_argument
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The damaged file and the new one."""
-    parser.add_argument("file", metavar="FILE", type=Path, help="a recording.mcap")
+    parser.add_argument("file", metavar="FILE", type=path_argument, help="a recording.mcap")
     parser.add_argument(
-        "-o", "--out", metavar="OUT", type=Path, required=True, help="a new file; never overwrites"
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=path_argument,
+        required=True,
+        help="a new file; never overwrites",
     )
 
 

@@ -20,6 +20,7 @@ from chsel.methods import METHODS
 from replay.comparing.comparison import common_cost, numbers_under
 from replay.console import Console
 from replay.mcap.reader import Recording, read_recording
+from replay.path_argument import path_argument
 from replay.registration import other_method
 from replay.rerun.drawing import check_new, draw_recording
 from replay.step_again import StepAgain, register_step_again
@@ -27,7 +28,7 @@ from replay.step_again import StepAgain, register_step_again
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The file, its step, the method with its settings, and what to write."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="a recording")
+    parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording")
     parser.add_argument("--step", type=int, required=True, metavar="K", help="a recorded problem")
     parser.add_argument(
         "--method",
@@ -38,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "cost.free_scale=40, or preset=NAME",
     )
     parser.add_argument(
-        "-o", "--out", type=Path, help="a new file; else RECORDING_stepK_METHOD.mcap in this folder"
+        "-o",
+        "--out",
+        type=path_argument,
+        help="a new file; else RECORDING_stepK_METHOD.mcap in this folder",
     )
     parser.add_argument(
         "--snapshot-interval",
@@ -46,7 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="iterations between snapshots of the archive, 0 for first and last; else as recorded",
     )
-    parser.add_argument("--save-rerun", type=Path, metavar="RRD", help="also draw it: a new file")
+    parser.add_argument(
+        "--save-rerun", type=path_argument, metavar="RRD", help="also draw it: a new file"
+    )
 
 
 def run(given: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from pathlib import Path
 from chsel.errors import RecordingError
 from replay.console import Console
 from replay.mcap.reader import Recording, read_recording
+from replay.path_argument import path_argument
 from replay.rerun.drawing import check_new, draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
 
@@ -22,9 +23,11 @@ _STEP_HELP = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to look at, and where."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="a recording.mcap")
+    parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording.mcap")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--save", type=Path, metavar="RRD", help="write a new file, open nothing")
+    where.add_argument(
+        "--save", type=path_argument, metavar="RRD", help="write a new file, open nothing"
+    )
     where.add_argument("--web", action="store_true", help="in a browser on this machine")
     parser.add_argument("--step", type=int, metavar="K", help=_STEP_HELP)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-
-import trimesh
+from typing import TYPE_CHECKING
 
 from chsel.errors import SettingError, require_choice, require_positive
 from chsel.mesh import clean_mesh, load_mesh
 from runners.objects.scans import scan_file
+
+if TYPE_CHECKING:
+    import trimesh
 
 KINDS = ("model", "scan", "file")
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from chsel.complete_file import check_complete
 from chsel.errors import SettingError
+
+if TYPE_CHECKING:
+    import trimesh
 
 MOST_BYTES = 32 * 2**20  # of the mesh files of one URDF together
 _MOST_LISTED = 5
@@ -74,6 +76,8 @@ class MeshFiles:
         ]
 
     def _loaded(self, path: Path, where: str) -> trimesh.Trimesh:
+        import trimesh
+
         where = f"{where}: mesh {path}"
         if path.suffix.lower() not in _SUFFIXES:
             raise SettingError(f"{where} is of no known kind; accepted: {', '.join(_SUFFIXES)}")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from chsel.errors import SettingError
 from runners.sensors.collision_mesh import MeshFiles
+
+if TYPE_CHECKING:
+    import trimesh
 
 _CYLINDER_SIDES = 32  # the prism lies within the cylinder, so it claims no free space too much
 
@@ -28,6 +30,8 @@ def collision_solid(collision: Any, files: MeshFiles, where: str) -> trimesh.Tri
 
 
 def _solid(geometry: Any, files: MeshFiles, where: str) -> trimesh.Trimesh:
+    import trimesh
+
     if geometry.box is not None:
         return trimesh.creation.box(_sizes("box", geometry.box.size, 3, where))
     if geometry.sphere is not None:

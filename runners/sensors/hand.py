@@ -5,15 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import trimesh
+from typing import TYPE_CHECKING, Any
 
 from chsel.arrays import frozen
 from chsel.errors import SettingError
 from chsel.pose import compose, roll_pitch_yaw
 from runners.sensors.rig import BoxRig, HandRig
 from runners.sensors.urdf import Linkage
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 class HandModel:
@@ -40,6 +41,8 @@ class HandModel:
 
     def solids(self, joints: Mapping[str, float] | None = None) -> trimesh.Trimesh | None:
         """All parts as one mesh of several closed bodies; None if the rig describes none."""
+        import trimesh
+
         parts = self.parts(joints)
         joined: Any = trimesh.util.concatenate(parts) if parts else None
         return joined
@@ -61,6 +64,8 @@ def hand_solids(hand: HandRig, joints: Mapping[str, float] | None = None) -> tri
 
 
 def _solid(box: BoxRig, where: str) -> trimesh.Trimesh:
+    import trimesh
+
     values = {
         name: frozen(f"{where}.{name}", getattr(box, name), (3,), error=SettingError)
         for name in ("size", "position", "rotation")

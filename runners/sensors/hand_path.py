@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.points import Lattice
@@ -18,6 +18,9 @@ from runners.sensors.push_end import PushEnd
 from runners.sensors.rig import HandRig
 from runners.sensors.tally import Tally
 from runners.sensors.windows import ProbeWindow
+
+if TYPE_CHECKING:
+    import trimesh
 
 MOST_POSES = 200  # of a probe's path, as it is shown
 _BATCH = 50_000  # poses looked up at once

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.errors import SettingError
@@ -15,6 +14,9 @@ from chsel.pose import axis_angle, compose
 from runners.sensors.collision_mesh import MeshFiles
 from runners.sensors.collision_shape import collision_solid
 from runners.sensors.urdf_file import read_robot
+
+if TYPE_CHECKING:
+    import trimesh
 
 MOST_FACES = 1_000_000  # of all shapes of a hand
 _MOST_MIMICS = 100  # joints in a chain of mimicry

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.pose import compose
+
+if TYPE_CHECKING:
+    import trimesh
 
 # World axes of the hand's axes: the fingers (hand z) point along world x, and the wide side of
 # the hand (hand y) lies along world y.
@@ -60,6 +63,8 @@ def solids() -> tuple[trimesh.Trimesh, ...]:
 @cache
 def surface_points(spacing: float) -> FloatArray:
     """Points (S, 3) that cover the surface about `spacing` apart, all corners among them."""
+    import trimesh
+
     points = []
     for solid, other in zip(solids(), reversed(solids()), strict=True):
         fine, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, spacing)
@@ -81,6 +86,8 @@ def interior_points(spacing: float, depth: float) -> FloatArray:
 
 
 def _solid(rings: tuple[tuple[float, float, float], ...]) -> trimesh.Trimesh:
+    import trimesh
+
     vertices = np.concatenate([_ring(*ring) for ring in rings]) @ ROTATION.T
     return trimesh.convex.convex_hull(vertices)
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray, IntArray, frozen
 from chsel.complete_file import check_complete
@@ -206,6 +205,8 @@ def _csv_class(entries: list[tuple[list[float], float, int]]) -> PointClass:
 
 def _read_surface(path: Path) -> PointFile:
     """Every vertex of a mesh or point cloud is a surface point, those at one place together one."""
+    import trimesh
+
     kind = path.suffix.lower().removeprefix(".")
     try:
         check_complete(path, kind)
@@ -223,6 +224,8 @@ def _read_surface(path: Path) -> PointFile:
 
 def _vertices(geometry: Any) -> FloatArray:
     """All vertices (V, 3); of those of a mesh's faces, one for each place."""
+    import trimesh
+
     vertices = np.asarray(geometry.vertices, dtype=np.float64).reshape(-1, 3)
     if not isinstance(geometry, trimesh.Trimesh) or not np.isfinite(vertices).all():
         return vertices

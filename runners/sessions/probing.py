@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.errors import require_choice, require_positive
@@ -19,6 +18,9 @@ from replay.events import Probe
 from runners.sessions import hand
 from runners.sessions.configurations import WORKSPACE, Configuration
 from runners.sessions.free_space import box_shell, floor_slab, swept_voxels
+
+if TYPE_CHECKING:
+    import trimesh
 
 BOUNDARIES = ("floor_slab", "box_shell", "both")
 SWEEPS = ("mini_steps", "control_steps")

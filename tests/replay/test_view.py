@@ -274,6 +274,7 @@ def test_a_viewer_that_does_not_start_says_why(
     assert "the Rerun viewer does not start: no graphics today" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
 @pytest.mark.parametrize(("ending", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_the_web_viewer_is_served_here_alone_and_ends_with_the_command(

@@ -237,6 +237,7 @@ def test_jobs_of_a_sweep_share_a_folder(tmp_path: Path) -> None:
     assert told["configurations"] == ["box", "can"]
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_path: Path) -> None:
     slow = ("settings.chsel.emitter.iterations=1000000", "methods=chsel", "workers=1")
     command = [sys.executable, "-m", "runners.evaluate", *SMALL, f"out={tmp_path}", *slow]

@@ -52,7 +52,7 @@ def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
         "scale": 1.0,
         "seed": 4,
     }
-    assert "probe   1/1" in done.stdout
+    assert "probe   0  y" in done.stdout
     assert "nothing touched" in done.stdout
 
     before = log.read_bytes()

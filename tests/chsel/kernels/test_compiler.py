@@ -17,7 +17,9 @@ print(np.stack(sines_cosines(np.linspace(-9.0, 9.0, 50))).tobytes().hex())
 """
 
 
-def start(code: str, tmp_path: Path, **changes: str | None) -> subprocess.Popen[str]:
+def start(
+    code: str, tmp_path: Path, umask: int = -1, **changes: str | None
+) -> subprocess.Popen[str]:
     """A process with a home folder of its own; None takes a variable out of the environment."""
     home = tmp_path / "home"
     environment: dict[str, str | None] = {**os.environ, "HOME": str(home), "TMPDIR": str(tmp_path)}
@@ -31,6 +33,7 @@ def start(code: str, tmp_path: Path, **changes: str | None) -> subprocess.Popen[
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        umask=umask,
     )
 
 
@@ -92,6 +95,50 @@ def test_a_named_folder_that_cannot_be_written_is_named_and_passed_over(tmp_path
     )
     assert (tmp_path / "chsel" / "kernels").is_dir()
     assert file.read_text() == "no folder"
+
+
+def test_a_named_folder_that_others_can_write_to_is_named_and_passed_over(tmp_path: Path) -> None:
+    open_to_all = tmp_path / "open"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    names = {"CHSEL_CACHE_DIR": str(open_to_all), "XDG_CACHE_HOME": str(tmp_path / "xdg")}
+    _, said = result_of(start(COMPUTE, tmp_path, **names))
+    assert said.splitlines()[0] == (
+        f"CHSEL_CACHE_DIR is {open_to_all}, which others can write to, and compiled kernels are "
+        "executed; accepted: a folder of your own that only you can write to (chmod go-w). They go "
+        "where they go without it"
+    )
+    assert not kernels_in(open_to_all)
+    assert kernels_in(tmp_path / "xdg")
+
+
+def test_folders_are_private_whatever_the_umask_and_used_again(tmp_path: Path) -> None:
+    """Those that an earlier version left open to a group, too."""
+    xdg, temporary = tmp_path / "xdg", tmp_path / "temporary"
+    temporary.mkdir()
+    names = {"XDG_CACHE_HOME": str(xdg), "TMPDIR": str(temporary)}
+    first, _ = result_of(start(COMPUTE, tmp_path, umask=0o002, **names))
+    place = xdg / "chsel" / "kernels"
+    kept = kernels_in(place)
+    assert kept
+    folders = [xdg, xdg / "chsel", place, *place.iterdir()]
+    assert {folder.stat().st_mode & 0o777 for folder in folders} == {0o700}
+    place.chmod(0o775)
+    assert result_of(start(COMPUTE, tmp_path, umask=0o002, **names)) == (first, "")
+    assert place.stat().st_mode & 0o022 == 0
+    assert kernels_in(place) == kept
+    assert not list(temporary.glob("chsel*"))
+
+
+def test_once_is_said_once_and_not_of_kernels_that_come_later(tmp_path: Path) -> None:
+    names = {"CHSEL_CACHE_DIR": str(tmp_path / "kept")}
+    _, said = result_of(start(COMPUTE, tmp_path, **names))
+    assert said.count("CPU, once:") == 1
+    later = "from chsel.kernels.elementary import logs; logs(np.ones(2))"
+    both = f"{COMPUTE}\n{later}\nfrom chsel.kernels.elementary import arctangents\n"
+    both += "arctangents(np.ones(2), np.ones(2))"
+    _, said = result_of(start(both, tmp_path, **names))
+    assert said == f"compiling the kernels that are still missing (kept in {tmp_path / 'kept'})\n"
 
 
 NAMELESS = """

@@ -641,7 +641,7 @@ def test_the_report_is_a_table_of_what_was_used(
 ) -> None:
     session = open_log(log)
     list(session.probes())
-    display = Display("title", 2)
+    display = Display("title")
     display.sensed(session.report)
     shown = capsys.readouterr().out
     rows = {tuple(line.split()[:3]) for line in shown.splitlines()}

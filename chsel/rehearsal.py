@@ -1,0 +1,91 @@
+"""Registrations of next to nothing, so that all kernels are there before the first real one."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from typing import Any
+
+import numpy as np
+
+from chsel.evaluation.result_numbers import result_numbers
+from chsel.methods.method import Method
+from chsel.online import pose_problem
+from chsel.points import KnownPoints, Workspace
+from chsel.problem import Hypotheses
+from chsel.sdf import SdfGrid
+from chsel.sensing.camera import PinholeCamera
+from chsel.sensing.depth import occlusion_edges
+from chsel.sensing.free_space import FreeGrid
+from chsel.streams import StreamKey
+
+_RADIUS = 0.025
+_SPACING = 0.01
+_MOST = 30  # iterations, hypotheses and so on: one compiles as much as a thousand do
+_WORKSPACE = Workspace((-0.06, -0.06, -0.06), (0.06, 0.06, 0.06))
+
+
+def warm_up(method: Method) -> None:
+    """Compile every kernel that a session with `method` needs, or load it if it was compiled.
+
+    Registers a small ball twice, first from contacts and free points, then from points of every
+    class and with the first result as the previous one. Takes a tenth of a second if all is
+    compiled. It changes no bit of any registration, as these depend on their problems alone.
+    """
+    try:
+        method = type(method)(_brief(method.settings))  # type: ignore[call-arg]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about a ball that nobody has asked for
+            _register_twice(method)
+    except Exception:
+        return  # settings that fit no such ball; kernels are compiled when they are needed
+
+
+def warm_up_sensing() -> None:
+    """Compile the kernels that turn depth images and swept solids into known points, or load them.
+
+    See `warm_up`.
+    """
+    grid, camera = FreeGrid(_WORKSPACE, 0.02), PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5)
+    depth, mask = np.full((3, 4), 0.05), np.ones((3, 4), dtype=bool)
+    occlusion_edges(depth, mask, 0.1)
+    grid.from_depth(depth, camera, np.eye(4), mask)
+    grid.scaled_images(depth, camera, np.eye(4), mask)
+    grid.along_rays(np.zeros(3), np.ones((1, 3)))
+    grid.at(np.zeros((1, 3)))
+
+
+def _register_twice(method: Method) -> None:
+    ball = _ball()
+    surface = _RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
+    free = 0.02 * np.argwhere(np.ones((6, 6, 6))) - 0.05
+    free = free[(free**2).sum(axis=1) > 0.035**2]
+    touched = KnownPoints(free, known=surface[:3])
+    known = np.concatenate([surface, 1.2 * surface])
+    known_sdf = np.concatenate([np.zeros(6), np.full(6, 0.2 * _RADIUS)])
+    every = KnownPoints(free, np.zeros((1, 3)), known, known_sdf)
+    previous: Hypotheses | None = None
+    for step, points in enumerate((touched, every)):
+        key = StreamKey(0, step)
+        problem = pose_problem(ball, points, _WORKSPACE, 0.02, key, method.online, previous)
+        previous = method.register(problem)
+        result_numbers(previous, problem, np.eye(4), None)
+
+
+def _ball() -> SdfGrid:
+    nodes = np.indices((9, 9, 9)) * _SPACING - 0.04
+    radius = np.sqrt((nodes**2).sum(axis=0))
+    gradients = np.moveaxis(nodes / np.maximum(radius, 1e-9), 0, -1)
+    return SdfGrid(np.full(3, -0.04), _SPACING, radius - _RADIUS, gradients)
+
+
+def _brief(settings: Any) -> Any:
+    """The settings with every count at most _MOST."""
+    changes: dict[str, Any] = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            changes[field.name] = _brief(value)
+        elif isinstance(value, int) and not isinstance(value, bool):
+            changes[field.name] = min(value, _MOST)
+    return dataclasses.replace(settings, **changes)

@@ -1,0 +1,63 @@
+"""The first moments of a command: its imports, which take seconds, end quietly on Ctrl-C.
+
+And a check that `chsel` is this project's package: the authors' published one has the same name.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+THEIRS = "wrapper.py"  # a file of the published package that ours does not have
+OURS = "problem.py"
+WRONG_PACKAGE = (
+    "package chsel of PyPI is installed beside this one, chsel-replay, and files of both are "
+    "mixed, as both are imported as chsel; to mend it: pip uninstall -y chsel chsel-replay, "
+    "and install chsel-replay again (each needs an environment of its own)"
+)
+
+
+def begin() -> None:
+    """For a command, before its imports: Ctrl-C ends it at once, and `chsel` must be ours."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if not chsel_is_ours():
+        print(f"error: {WRONG_PACKAGE}", file=sys.stderr)
+        sys.exit(2)
+
+
+def ready() -> None:
+    """Imports are done: Ctrl-C raises KeyboardInterrupt again, unless it is ignored."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Imports within a command, during which Ctrl-C ends it at once, too."""
+    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not raises or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        ready()
+
+
+def chsel_is_ours() -> bool:
+    """Whether the package that `import chsel` finds is this project's, and whole."""
+    spec = find_spec("chsel")  # finds it, and imports nothing
+    folders = spec.submodule_search_locations if spec else None
+    places = [Path(folder) for folder in folders or ()]
+    return any(_is_file(places, OURS)) and not any(_is_file(places, THEIRS))
+
+
+def _is_file(places: list[Path], name: str) -> Iterator[bool]:
+    return ((place / name).is_file() for place in places)

@@ -1,0 +1,168 @@
+"""All kernels are there before the first probe, and a line says so."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.kernels.compiler import watched
+from chsel.methods import build_method
+from chsel.methods.method import Method
+from chsel.pose import apply, axis_angle, compose
+from runners import compiling, probe
+from runners.compiling import Compiling
+from tests.runners.in_process import run
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
+SESSION = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from runners import probe
+from runners.compiling import Compiling
+
+def specialised():
+    kernels = [module for name, module in sys.modules.items() if name.startswith("chsel.kernels")]
+    return {
+        (kernel.__name__, str(signature))
+        for module in kernels
+        for kernel in vars(module).values()
+        if isinstance(kernel, Dispatcher) and type(kernel._cache).__name__ != "NullCache"
+        for signature in kernel.nopython_signatures
+    }
+
+def noting(self, *given, **named):
+    rehearse(self, *given, **named)
+    rehearsed.update(specialised())
+
+rehearsed, rehearse, Compiling.rehearse = set(), Compiling.rehearse, noting
+probe.main()
+print("rehearsed", len(rehearsed), "more", sorted(specialised() - rehearsed))
+"""
+QUICK = (
+    "method.descent.restarts=1",
+    "method.descent.iterations=5",
+    "method.emitter.iterations=2",
+    "recording.snapshot_interval=0",
+)
+
+
+@pytest.fixture(scope="module")
+def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """A session of three steps on a box, with points of every class."""
+    folder = tmp_path_factory.mktemp("points")
+    box = trimesh.creation.box((0.1, 0.06, 0.2))
+    box.export(folder / "box.ply")
+    surface = apply(POSE, trimesh.sample.sample_surface(box, 15, seed=0)[0])
+    free = np.random.default_rng(0).uniform(0.3, 0.6, (40, 3))
+    np.savez(
+        folder / "box.npz",
+        surface=surface,
+        surface_step=np.arange(15) // 5,
+        free=free,
+        free_step=np.arange(40) % 3,
+        occupied=POSE[None, :3, 3],
+        occupied_step=[1],
+        known=apply(POSE, np.array([[0.0, 0.0, 0.11]])),
+        known_sdf=[0.01],
+        known_step=[2],
+        world_from_object=POSE,
+    )
+    box_file = f"object.path={folder / 'box.ply'}"
+    return "session=points", f"session.path={folder / 'box.npz'}", "object=mesh", box_file
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [
+        ("method=chsel", *QUICK),
+        ("method=icp",),
+        ("method=cvo", "preset=reference"),
+        ("method=medial_constraint", "preset=reference"),
+        ("method=anchored",),
+    ],
+    ids=lambda choice: " ".join(choice[:2]),
+)
+def test_a_session_needs_no_kernel_that_the_rehearsal_did_not(
+    choice: tuple[str, ...], points: tuple[str, ...], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-c", SESSION, *points, *choice, f"logs={tmp_path}"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    rehearsed, more = re.findall(r"rehearsed (\d+) more (.*)", done.stdout)[0]
+    assert int(rehearsed) > 5
+    assert more == "[]"
+
+
+@pytest.fixture
+def two_kernels(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Compiles two kernels that nobody has, whenever a method is rehearsed."""
+
+    def compile_two(_: Method | None = None) -> None:
+        for _ in range(2):
+
+            def kernel(x: float) -> float:
+                return x + 1.0
+
+            kernel.__module__ = "chsel.kernels.made_up"
+            numba.njit(kernel)(1.0)
+
+    monkeypatch.setattr(compiling, "warm_up", compile_two)
+    return compile_two
+
+
+@pytest.mark.parametrize(("kept", "text"), [(False, "kernels for this CPU, once"), (True, "")])
+def test_the_line_counts_and_stays_and_says_once_the_first_time_alone(
+    kept: bool,
+    text: str,
+    two_kernels: Callable[[], None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(compiling, "has_kernels", lambda: kept)
+    with Compiling() as kernels:
+        two_kernels()  # while the session is opened
+        assert capsys.readouterr().out == ""
+        kernels.rehearse(build_method("icp"), sensing=False)
+    said = capsys.readouterr()
+    which = text or "further kernels for this CPU"
+    assert re.fullmatch(rf"compiling {which}: 4 compiled, 0:00:0\d *\n", said.out)
+    assert said.err == ""
+
+
+def test_nothing_is_said_where_nothing_is_compiled(capsys: pytest.CaptureFixture[str]) -> None:
+    counts: list[int] = []
+    with watched(counts.append):
+        Compiling().rehearse(build_method("icp"), sensing=True)
+    counts.clear()
+    with Compiling() as kernels:
+        kernels.rehearse(build_method("icp"), sensing=True)
+    assert counts == []
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_console_numbers_probes_as_the_recording_on_eighty_columns(
+    points: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = run(probe.main, *points, *QUICK, f"logs={tmp_path}", columns=80)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert lines[1] == "probes 0 to 2, numbered as the steps of the recording"
+    shown = [line.split() for line in lines if line.startswith("probe ")]
+    assert [words[1] for words in shown] == ["0", "1", "2"]
+    rows = [line.split() for line in lines if re.match(r" +\d+ +\d+ +\d", line)]
+    assert [row[0] for row in rows] == ["0", "1", "2"]
+    paths = [line for line in lines if str(tmp_path) in line]
+    assert len(paths) == 2
+    assert all(len(line) <= 80 for line in lines if line not in paths)
+    assert all(line.startswith(("/", "rerun", ".venv")) for line in paths)

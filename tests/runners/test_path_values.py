@@ -1,0 +1,159 @@
+"""Files whose names Hydra would read as its own grammar, as they are typed in a shell."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from replay.__main__ import main as replay
+from runners import plausible, probe, report
+from runners.path_values import is_setting, literal_paths, quoted
+from tests.runners.in_process import run
+
+NAMES = (
+    "a,b=[c]'d",
+    'it\'s "so"',
+    "two words",
+    "Prüfkörper",
+    "物体",
+    "{x: 1}",
+    "(a)",
+    "a\\",
+    "a\\'b",
+    "${seed}",
+    "\\${seed}",
+    "a$b#c%d&e",
+    "null and void",
+    "12",
+    "true",
+    "glob(*)",
+    "~+x",
+    "[/bold]",
+)
+SHORT = (
+    "recording=mcap",
+    "recording.snapshot_interval=0",
+    "method.descent.restarts=1",
+    "method.descent.iterations=5",
+    "method.emitter.iterations=2",
+)
+COARSE = (
+    "definition.epsilon=0.01",
+    "definition.grid.rotations=200",
+    "definition.grid.upright=4",
+    "definition.grid.offsets.x=[[-0.01,0.01,3]]",
+    "definition.grid.offsets.y=[[0,0,1]]",
+    "definition.grid.offsets.z=[[0,0,1]]",
+)
+
+
+def value_of(word: str) -> object:
+    """What a setting becomes in Hydra's configuration."""
+    override = OverridesParser.create().parse_override(word)
+    assert not override.is_sweep_override()
+    config = OmegaConf.create({"seed": 7, "path": override.value()})
+    return OmegaConf.to_container(config, resolve=True)["path"]  # type: ignore[index,call-overload]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("key", ["object.path", "++session.path", "+outside.x", "logs", "out"])
+def test_a_path_reaches_the_configuration_as_typed(key: str, name: str) -> None:
+    (word,) = literal_paths([f"{key}={name}"])
+    assert word.startswith(f"{key}=")
+    assert value_of(word) == name
+    assert value_of(f"x={quoted(name)}") == name
+
+
+def test_the_home_folder_is_put_in_and_what_is_quoted_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("HOME", "/home/somebody")
+    words = ["object.path=~/x.obj", "assets.dir=~", "session.rig.hand.urdf=~/a b.urdf"]
+    assert [value_of(word) for word in literal_paths(words)] == [
+        "/home/somebody/x.obj",
+        "/home/somebody",
+        "/home/somebody/a b.urdf",
+    ]
+    unchanged = ['session.path="a,b"', "session.path='a,b'", "out=null", "out=", "object=drill"]
+    unchanged += ['session.path="a","b"', "name=~/x", "seed=1,2", "~object.path", "-m"]
+    assert literal_paths(unchanged) == unchanged
+
+
+def test_a_word_that_is_a_file_is_no_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert is_setting("seed=1")
+    Path("seed=1").touch()
+    assert not is_setting("seed=1")
+    assert plausible.named_arguments(["seed=1"]) == ["file='seed=1'"]
+    assert report.named_arguments(["seed=1"]) == ["dir='seed=1'"]
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home folder with a mesh and points of strange names."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    box = trimesh.creation.box((0.1, 0.06, 0.2))
+    box.export(tmp_path / "mesh.obj")
+    shutil.copy(tmp_path / "mesh.obj", tmp_path / "a,b=[c]'d.obj")
+    points = trimesh.sample.sample_surface(box, 6, seed=0)[0]
+    free = np.array([[0.4, 0.0, 0.0], [0.0, 0.4, 0.0]])
+    np.savez(tmp_path / "Prüf körper,1.npz", surface=points, free=free, world_from_object=np.eye(4))
+    return tmp_path
+
+
+def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(home)
+    done = run(
+        probe.main,
+        "session=points",
+        "session.path=~/Prüf körper,1.npz",
+        "object=mesh",
+        "object.path=a,b=[c]'d.obj",
+        "logs=~/läufe [1],x=${seed}",
+        *SHORT,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    (folder,) = (home / "läufe [1],x=${seed}" / "probe").iterdir()
+    assert json.loads((folder / "summary.json").read_text())["outcome"] == "finished"
+    drawn = home / "drawn.rrd"
+    assert replay(["view", str(folder / "recording.mcap"), "--save=~/drawn.rrd"]) == 0
+    assert drawn.stat().st_size > 10_000
+
+    recording = shutil.copy(folder / "recording.mcap", home / "x=1,[2].mcap")
+    done = run(plausible.program, Path(recording).name, *COARSE, "out=~/s,1")
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    assert list((home / "s,1").iterdir())
+
+
+def test_a_sweep_keeps_commas_of_paths_and_quoted_files_are_several(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(home)
+    shutil.copy(home / "Prüf körper,1.npz", "b.npz")
+    given = ["session=points", "object=mesh", "object.path=~/a,b=[c]'d.obj", *SHORT]
+    files = 'session.path="Prüf körper,1.npz","b.npz"'
+    done = run(probe.main, "-m", "seed=0,1", *given, files, "logs=l,1")
+    assert (done.returncode, done.stderr) == (0, "")
+    finished = [
+        json.loads(path.read_text()) for path in (home / "l,1" / "probe").glob("*/summary.json")
+    ]
+    assert sorted(one["seed"] for one in finished) == [0, 0, 1, 1]
+
+
+def test_a_missing_file_of_a_strange_name_is_named(home: Path) -> None:
+    points = ("session=points", "session.path=~/Prüf körper,1.npz")
+    done = run(probe.main, "object=mesh", "object.path=~/ä,=[.obj", *points, *SHORT)
+    assert done.returncode == 2
+    assert f"{home}/ä,=[.obj" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,124 @@
+"""The first moments of a command."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from replay.startup import WRONG_PACKAGE
+from replay.verbs import VERBS
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+COMMANDS = ("align", "benchmark", "evaluate", "fetch", "plausible", "probe", "published")
+COMMANDS += ("report", "simulate_rig")
+HEAVY = ("torch", "trimesh", "igl", "matplotlib", "pybullet", "networkx")
+LISTED = f"""
+import atexit, sys
+atexit.register(lambda: print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr))
+"""
+INTERRUPTED = """
+import importlib.abc, os, signal, sys, time
+
+class Interrupts(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)  # a KeyboardInterrupt would come here
+
+sys.meta_path.insert(0, Interrupts())
+"""
+
+
+def ran(
+    words: list[str], folder: Path, code: str, **changes: str
+) -> subprocess.CompletedProcess[str]:
+    """`python -m words`, with code that Python runs before anything else."""
+    (folder / "sitecustomize.py").write_text(code)
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{REPOSITORY}", **changes}
+    command = [sys.executable, "-m", *words]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_a_command_waits_for_no_heavy_import(command: str, tmp_path: Path) -> None:
+    done = ran([f"runners.{command}", "--help"], tmp_path, LISTED)
+    assert (done.returncode, done.stderr) == (0, "[]\n")
+    assert "== Settings" in done.stdout
+    assert len(done.stdout.splitlines()) > 8
+
+
+def test_help_shows_the_choices_made_and_leaves_mistakes_to_the_command(tmp_path: Path) -> None:
+    words = ["runners.probe", "object=mustard", "method=icp", "seed=3", "-h"]
+    done = ran(words, tmp_path, LISTED)
+    assert "name: icp" in done.stdout
+    assert "name: mustard" in done.stdout
+    assert "seed: 3" in done.stdout
+    assert done.stderr == "[]\n"
+    mistaken = ran(["runners.report", "colour=red", "--help"], tmp_path, "")
+    assert mistaken.returncode == 2
+    assert "report has no key 'colour'" in mistaken.stderr
+
+
+@pytest.mark.parametrize("verb", ["", *VERBS])
+def test_help_of_replay_waits_for_no_heavy_import(verb: str, tmp_path: Path) -> None:
+    done = ran(["replay", *([verb] if verb else []), "--help"], tmp_path, LISTED)
+    assert (done.returncode, done.stderr) == (0, "[]\n")
+    assert "usage: replay" in done.stdout
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize(
+    ("words", "module"),
+    [
+        (["runners.probe"], "hydra"),
+        (["runners.probe"], "numba"),
+        (["runners.probe", "logs=l"], "torch"),
+        (["runners.report", "x"], "pyarrow"),
+        (["replay", "verify", "x.mcap"], "numba"),
+    ],
+    ids=str,
+)
+def test_ctrl_c_during_imports_ends_a_command_quietly(
+    words: list[str], module: str, tmp_path: Path
+) -> None:
+    done = ran(words, tmp_path, INTERRUPTED.format(module=module))
+    assert done.returncode == -signal.SIGINT  # which a shell shows as 130
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
+def test_ctrl_c_stays_ignored_where_it_was(tmp_path: Path) -> None:
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+    code += INTERRUPTED.format(module="numba")
+    done = ran(["replay", "verify", "x.mcap"], tmp_path, code)
+    assert done.returncode == 2
+    assert "x.mcap does not exist" in done.stderr
+
+
+def test_the_published_package_in_our_place_is_named(tmp_path: Path) -> None:
+    """As pip leaves it, or as it shadows an editable installation."""
+    theirs = tmp_path / "chsel"
+    theirs.mkdir()
+    (theirs / "__init__.py").write_text("from chsel.wrapper import CHSEL")
+    (theirs / "wrapper.py").write_text("import pytorch_kinematics")
+    for words in (["runners.probe"], ["runners.report", "--help"], ["replay", "info", "x"]):
+        done = ran(words, tmp_path, "")
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr == f"error: {WRONG_PACKAGE}\n"
+
+
+def test_files_of_the_published_package_among_ours_are_named(tmp_path: Path) -> None:
+    shutil.copytree(REPOSITORY / "chsel", tmp_path / "chsel")
+    (tmp_path / "chsel" / "wrapper.py").touch()
+    done = ran(["replay", "info", "x.mcap"], tmp_path, "")
+    assert (done.returncode, done.stderr) == (2, f"error: {WRONG_PACKAGE}\n")
+    code = "try:\n    import chsel\nexcept ImportError as error:\n    print(error)"
+    (tmp_path / "library.py").write_text(code)
+    assert ran(["library"], tmp_path, "").stdout == f"{WRONG_PACKAGE}\n"

@@ -1,0 +1,50 @@
+"""What make would do, without doing it, and which versions it asks pip for."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+MAKE = shutil.which("make")
+pytestmark = pytest.mark.skipif(MAKE is None, reason="make is not installed")
+
+
+def made(folder: Path, *words: str) -> str:
+    for name in ("Makefile", "constraints.txt", "pyproject.toml"):
+        shutil.copy(REPOSITORY / name, folder)
+    command = ["make", f"PYTHON={sys.executable}", *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("goal", ["probe", "test"])
+def test_make_passes_options_on_to_pip_and_venv(goal: str, tmp_path: Path) -> None:
+    words = ("PIP_ARGS=--index-url=URL --no-deps", "VENV_ARGS=--system-site-packages")
+    steps = made(tmp_path, "-n", goal, *words)
+    installs = [line for line in steps.splitlines() if "pip install" in line]
+    assert len(installs) == {"probe": 1, "test": 2}[goal]
+    assert all(" --index-url=URL --no-deps --constraint " in line for line in installs)
+    assert " -m venv --system-site-packages .venv" in steps
+
+
+@pytest.mark.parametrize("version", [None, "2.9.1+cpu"])
+def test_a_torch_that_is_there_stays(version: str | None, tmp_path: Path) -> None:
+    venv.create(tmp_path / ".venv", with_pip=False)
+    if version is not None:
+        (packages,) = (tmp_path / ".venv").glob("lib/python*/site-packages")
+        metadata = packages / f"torch-{version}.dist-info" / "METADATA"
+        metadata.parent.mkdir()
+        metadata.write_text(f"Metadata-Version: 2.1\nName: torch\nVersion: {version}\n")
+    made(tmp_path, ".venv/constraints.txt")
+    asked = (tmp_path / ".venv" / "constraints.txt").read_text().splitlines()
+    pinned = (REPOSITORY / "constraints.txt").read_text().splitlines()
+    torch = [line for line in pinned if line.startswith("torch==")]
+    assert len(torch) == 1
+    assert asked == [line for line in pinned if version is None or line not in torch]
