@@ -10,7 +10,8 @@ import numpy as np
 import trimesh
 
 from chsel.arrays import digest, frozen
-from chsel.errors import MeshError, require_positive
+from chsel.errors import MeshError, MeshWarning, require_positive
+from chsel.mesh_bodies import check_bodies
 
 SMALLEST = 0.005  # m: the largest extent of anything that a gripper probes is above this
 LARGEST = 10.0  # m: above this, a file is in millimetres rather than metres
@@ -37,9 +38,10 @@ def clean_mesh(
     """A checked mesh in metres: vertices merged, faces turned outward, float64.
 
     vertices (V, 3) in the file's units; faces (F, 3) indices into them. Vertices at one place
-    become one. A mesh that is still open is kept with a warning: the winding number decides what
-    is inside it. Raises MeshError if there are no faces, a number is not finite, an index has no
-    vertex, the mesh is flat, or its size in metres is not that of an object.
+    become one. A mesh that is still open is kept with a MeshWarning: the winding number decides
+    what is inside it. So is one of bodies that are far apart. Raises MeshError if there are no
+    faces, a number is not finite, an index has no vertex, the mesh is flat, or its size in metres
+    is not that of an object.
     """
     require_positive("mesh scale", scale)
     vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
@@ -57,11 +59,13 @@ def clean_mesh(
         raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
     _turn_outward(mesh)
     if not mesh.is_watertight:
-        warnings.warn(
+        text = (
             f"{name} is open even after merging its vertices; the winding number decides what is "
-            "inside, which is inexact near the holes",
-            stacklevel=2,
+            "inside, which is inexact near the holes"
         )
+        warnings.warn(MeshWarning("open_mesh", text), stacklevel=2)
+    for warning in check_bodies(mesh, name):
+        warnings.warn(warning, stacklevel=2)
     return mesh
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,9 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from chsel.errors import InputWarning
 from runners.sensors.tally import Report, Tally
+from runners.session_run import FROM_SESSION, StepWarning
 
 
 class Bar:
@@ -65,6 +67,7 @@ class Display:
     def __init__(self, title: str, count: int) -> None:
         self._console = Console(highlight=False)
         self._count = count
+        self._warned = {FROM_SESSION}  # codes; what the session itself remarks is in its report
         self._bar = Bar(self._console)
         self._console.print(title, style="bold", soft_wrap=True)
 
@@ -81,6 +84,13 @@ class Display:
             text += f"  best cost {row['best_cost']:.4g}  distinct {row['distinct']:>2}"
         text += f"  {row['seconds']:.2f} s"
         self._console.print(text, soft_wrap=True)
+
+    def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
+        """Warnings that were not shown before, each kind once."""
+        for warning in warnings:
+            if warning.code not in self._warned:
+                self._warned.add(warning.code)
+                self._line("warning", warning.text)
 
     def say(self, text: str) -> None:
         """A line of its own."""
@@ -114,8 +124,7 @@ class Display:
         if report.tallies:
             self._console.print(_sensor_table(report))
         for level, text in report.lines:
-            line = f"warning: {text}" if level == "warning" else text
-            self._console.print(line, markup=False, soft_wrap=True)
+            self._line(level, text)
 
     def written(self, folder: Path, files: Mapping[str, int]) -> None:
         """What lies in the run's folder, and how to look at it."""
@@ -128,6 +137,10 @@ class Display:
     def close(self) -> None:
         """Give the terminal back."""
         self._bar.clear()
+
+    def _line(self, level: str, text: str) -> None:
+        line = f"warning: {text}" if level == "warning" else text
+        self._console.print(line, markup=False, soft_wrap=True)
 
 
 def _viewer() -> str:

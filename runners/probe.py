@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import trimesh
 import yaml
 from omegaconf import DictConfig
 
-from chsel.errors import RecordingError, require_positive
+from chsel.errors import InputWarning, RecordingError, require_positive
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.sdf import SdfGrid
@@ -26,17 +27,19 @@ from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from runners.cli import command, plain
 from runners.display import Display, reading_bar
 from runners.interrupt import Interrupt
-from runners.objects.loader import ObjectConfig, load_object
+from runners.objects.loader import ObjectConfig, ObjectModel, load_object
 from runners.objects.scans import AssetsConfig
+from runners.objects.size_check import check_size
 from runners.recording import RecordingConfig, make_run_folder, open_recorder
 from runners.sensors.tally import Report
-from runners.session_run import Row, SessionRun
+from runners.session_run import Row, SessionRun, StepWarning
 from runners.sessions import open_session, session_settings
 from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
 
+_OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
 
@@ -80,7 +83,10 @@ class Watcher:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The session and the object that it hides. watcher: is told of what the session reads."""
+    """The session and the object that it hides. watcher: is told of what the session reads.
+
+    warnings: about the object.
+    """
 
     session: Session
     object_name: str
@@ -88,6 +94,7 @@ class Scene:
     sdf: SdfGrid
     start: tuple[int, int]
     watcher: Watcher = field(default_factory=Watcher)
+    warnings: tuple[InputWarning, ...] = ()
 
     @property
     def report(self) -> Report | None:
@@ -129,13 +136,30 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
         recorded = RecordedSession(settings)
         of = recorded.recorded
         return Scene(recorded, of.object, of.mesh, of.sdf, recorded.start)
-    object_model = load_object(config.object, config.assets.folder)
+    object_model, found = _load_object(config)
     session = open_session(kind, settings, object_model, config.seed, watcher)
     sdf = SdfGrid.from_mesh(
         object_model.mesh, settings.object_resolution, padding=settings.object_padding
     )
     start = (settings.start_contacts, settings.start_probe)
-    return Scene(session, object_model.name, object_model.mesh, sdf, start, watcher)
+    if kind in _OF_REAL_OBJECTS:
+        found += check_size(object_model, session.workspace)
+    name, mesh = object_model.name, object_model.mesh
+    return Scene(session, name, mesh, sdf, start, watcher, tuple(found))
+
+
+def _load_object(config: ProbeConfig) -> tuple[ObjectModel, list[InputWarning]]:
+    """The object, and warnings about its mesh, which belong into the recording."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        object_model = load_object(config.object, config.assets.folder)
+    found = []
+    for each in caught:
+        if isinstance(each.message, InputWarning):
+            found.append(each.message)
+        else:
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return object_model, found
 
 
 def session_started(
@@ -189,7 +213,9 @@ def run(
         start=scene.start,
         recording=config.recording,
         show=show,
+        opening=scene.warnings,
     )
+    display.warn(scene.warnings)
     rows: list[Row] = []
     try:
         recorder.record(started)
@@ -197,20 +223,22 @@ def run(
         for index, (_, row) in enumerate(session_run.steps()):
             rows.append(row)
             display.probe(index, row)
+            display.warn(session_run.warnings)
             interrupt.check()
+        display.warn(session_run.warnings)
         outcome = "finished"
     except KeyboardInterrupt:
         outcome = "interrupted"
     except SystemExit:  # whoever read the output has had enough of it
-        _finish(folder, recorder, session_run.step, started, rows, "interrupted")
+        _finish(folder, recorder, session_run, started, rows, "interrupted")
         raise
     except Exception as error:
         with suppress(OSError):  # the first error is the one to tell
-            _finish(folder, recorder, session_run.step, started, rows, f"failed: {error}")
+            _finish(folder, recorder, session_run, started, rows, f"failed: {error}")
         raise
     finally:
         display.close()
-    _finish(folder, recorder, session_run.step, started, rows, outcome)
+    _finish(folder, recorder, session_run, started, rows, outcome)
     if scene.report is not None:
         display.sensed(scene.report)
     display.table(rows)
@@ -223,7 +251,7 @@ def run(
 def _finish(
     folder: Path,
     recorder: Recorder,
-    step: int,
+    session_run: SessionRun,
     started: SessionStarted,
     rows: list[Row],
     outcome: str,
@@ -232,12 +260,12 @@ def _finish(
     finished = outcome == "finished"
     try:
         with nullcontext() if finished else suppress(RecordingError):
-            _end(recorder, step, "info" if finished else "warning", outcome)
+            _end(recorder, session_run.step, "info" if finished else "warning", outcome)
     except RecordingError as error:
         with suppress(OSError):  # the first error is the one to tell
-            _summarise(folder, started, rows, f"failed: {error}")
+            _summarise(folder, started, rows, session_run.warnings, f"failed: {error}")
         raise
-    _summarise(folder, started, rows, outcome)
+    _summarise(folder, started, rows, session_run.warnings, outcome)
 
 
 def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:
@@ -248,8 +276,14 @@ def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:
         recorder.close()
 
 
-def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: str) -> None:
-    """Write summary.json: the outcome and the numbers of every step, wall-clock times included."""
+def _summarise(
+    folder: Path,
+    started: SessionStarted,
+    rows: list[Row],
+    found: Sequence[StepWarning],
+    outcome: str,
+) -> None:
+    """Write summary.json: the outcome, warnings, and the numbers of every step, times included."""
     summary = {
         "runner": started.runner,
         "object": started.object,
@@ -257,6 +291,7 @@ def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: 
         "method": started.method,
         "seed": started.seed,
         "outcome": outcome,
+        "warnings": [asdict(warning) for warning in found],
         "steps": rows,
         "bytes": _sizes(folder),
         "environment": dict(started.environment),

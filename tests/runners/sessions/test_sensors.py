@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from runners.cli import CONF
 from runners.display import Display
-from runners.objects.loader import ObjectConfig, ObjectModel, load_object
+from runners.objects.loader import ObjectConfig, load_object
 from runners.recording import RecordingConfig
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import (
@@ -41,7 +40,7 @@ from runners.sensors.rig import (
 )
 from runners.session_run import SessionRun
 from runners.sessions import session_settings
-from runners.sessions.sensors import SensorsSession, SensorsSettings, open_sensors
+from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.replay.conftest import same_bits
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import ros2_cloud, ros2_transform, write_ros2
@@ -491,16 +490,6 @@ def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) 
         session_settings("sensors", values)
     with pytest.raises(SettingError, match=r"path is missing; pass session.path=LOG"):
         build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")
-
-
-def test_an_object_that_is_not_of_real_size_is_a_warning(log: Path) -> None:
-    settings = SensorsSettings(RIG, str(log))
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.02)
-    with pytest.warns(UserWarning, match=r"0.04 m long at scale 2.5, .* have object.scale=1"):
-        open_sensors(settings, ObjectModel("ball", ball, 2.5, 0.001, "drill"), 0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        open_sensors(settings, ObjectModel("ball", ball, 0.001, 0.001, "drill"), 0)
 
 
 def test_progress_is_told_in_megabytes(log: Path) -> None:
