@@ -70,6 +70,7 @@ def test_points_added_later_start_from_the_previous_result() -> None:
     ],
 )
 @pytest.mark.parametrize("preset", ["default", "paper", "reference"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_odd_points_have_a_defined_result(points: dict[str, Any], preset: str) -> None:
     found = register(**points, preset=preset, hypotheses=5)
     assert found.object_from_world.shape == (5, 4, 4)
@@ -85,6 +86,7 @@ def test_odd_points_have_a_defined_result(points: dict[str, Any], preset: str) -
     ],
 )
 @pytest.mark.parametrize("preset", ["default", "paper", "reference"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_points_that_are_refused_have_a_defined_result_for_a_method(
     points: chsel.KnownPoints, preset: str
 ) -> None:
