@@ -327,19 +327,27 @@ def joined(path: Path, *parts: Path) -> Path:
     return path
 
 
-def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
-    SphereLog().write(tmp_path / "a.mcap")
-    origin = np.array([0.72, 0.1, 0.55])
-    points = np.array([[0.2, 0.0, 0.0], [0.2, 0.0, 0.001], [np.nan, 0.0, 0.0], [9.0, 0.0, 0.0]])
-    fixed = {"transforms": [ros2_transform("world", "lidar", origin, BEGIN)]}
+LIDAR = np.array([0.72, 0.1, 0.55])  # m: its place in the world
+
+
+def log_with_clouds(folder: Path, points: np.ndarray) -> Path:
+    """The sphere's log with points (N, 3) in the lidar's frame on /lidar and /skin, twice each."""
+    SphereLog().write(folder / "a.mcap")
+    fixed = {"transforms": [ros2_transform("world", "lidar", LIDAR, BEGIN)]}
     sent = [("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)]
     for seconds in (0.5, 2.0):
         stamp = BEGIN + round(seconds * SECOND)
         for topic in ("/lidar", "/skin"):
             cloud = ros2_cloud(points, stamp)
             sent.append((topic, "sensor_msgs/PointCloud2", cloud, stamp + LATENCY))
-    write_ros2(tmp_path / "b.mcap", sent)
-    log = joined(tmp_path / "log.mcap", tmp_path / "a.mcap", tmp_path / "b.mcap")
+    write_ros2(folder / "b.mcap", sent)
+    return joined(folder / "log.mcap", folder / "a.mcap", folder / "b.mcap")
+
+
+def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
+    origin = LIDAR
+    points = np.array([[0.2, 0.0, 0.0], [0.2, 0.0, 0.001], [np.nan, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    log = log_with_clouds(tmp_path, points)
     with_clouds = replace(
         RIG,
         cameras=(),
@@ -359,6 +367,23 @@ def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
     surface = replace(with_clouds, clouds=(CloudRig("/skin", "surface"),))
     first = probes(open_log(log, surface).probes())[0]
     assert (len(first.contacts), len(first.new_points.known)) == (50, 51)
+    assert "/skin" not in lines(events)
+    assert "/lidar" not in lines(events)
+
+
+@pytest.mark.parametrize("role", ["surface", "contacts", "rays"])
+def test_a_topic_whose_points_are_all_out_of_reach_is_a_warning(tmp_path: Path, role: str) -> None:
+    """Here, as they are in millimetres."""
+    points = np.array([[200.0, 0.0, 0.0], [200.0, 0.0, 1.0], [np.nan, 0.0, 0.0]])
+    log = log_with_clouds(tmp_path, points)
+    session = open_log(log, replace(RIG, cameras=(), clouds=(CloudRig("/skin", role),)))
+    count = 2 if role == "contacts" else 4  # of which the second message is between probes
+    reach = "over 100 m away" if role == "rays" else "out of the workspace"
+    text = (
+        f"/skin: all {count} points are {reach}, in the first message around [200.7, 0.1, 1.05] m"
+    )
+    assert text in lines(session.probes())
+    assert ("warning", text) in [(level, line[: len(text)]) for level, line in session.report.lines]
 
 
 @pytest.mark.parametrize(
