@@ -18,7 +18,7 @@ from rich.table import Table
 
 from chsel.errors import InputWarning
 from runners.sensors.tally import Report, Tally
-from runners.session_run import FROM_SESSION, StepWarning
+from runners.step_warning import FROM_SESSION, StepWarning
 
 
 class Bar:

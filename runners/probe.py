@@ -32,12 +32,13 @@ from runners.objects.scans import AssetsConfig
 from runners.objects.size_check import check_size
 from runners.recording import RecordingConfig, make_run_folder, open_recorder
 from runners.sensors.tally import Report
-from runners.session_run import Row, SessionRun, StepWarning
+from runners.session_run import Row, SessionRun
 from runners.sessions import open_session, session_settings
 from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
+from runners.step_warning import StepWarning
 
 _OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 from chsel.errors import InputWarning
@@ -26,19 +25,9 @@ from replay.events import (
 from replay.registration import register_recorded
 from runners.recording import RecordingConfig
 from runners.sessions.session import Session
+from runners.step_warning import FROM_SESSION, StepWarning
 
 Row = dict[str, Any]
-FROM_SESSION = "session"
-"""The code of warnings that the session itself gives."""
-
-
-@dataclass(frozen=True)
-class StepWarning:
-    """What a person should know about the input. step: the probe at which it first holds."""
-
-    step: int
-    code: str
-    text: str
 
 
 class SessionRun:

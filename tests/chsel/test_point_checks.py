@@ -142,5 +142,5 @@ def test_free_points_alone_say_nothing_about_where_the_object_is() -> None:
 
 def test_fine_voxels_over_a_large_space_take_no_memory() -> None:
     """Too many voxels to number them are not looked at."""
-    points = KnownPoints(free=[[1.0, 0.0, 0.0]], known=[[0.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
+    points = KnownPoints(free=[[1.0, 0.0, 0.0]], known=[[0.0, 0.0, 0.0], [4.0, 4.0, 4.0]])
     assert check_points(points, 10.0, 1e-6) == []

@@ -11,10 +11,12 @@ import pytest
 import trimesh
 
 from chsel.arrays import FloatArray
+from chsel.points import KnownPoints, Workspace
 from chsel.pose import apply, axis_angle, compose, inverse
-from chsel.sdf import mesh_sdf
-from replay.events import Logged
+from chsel.sdf import SdfGrid, mesh_sdf
+from replay.events import Logged, Probe, SessionEnded, SessionStarted
 from replay.mcap.reader import read_recording
+from replay.mcap.writer import McapRecorder
 from runners.probe import main
 from tests.runners.in_process import Done, run
 
@@ -148,6 +150,35 @@ def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path: Path) -> 
     (summary,) = again.rglob("summary.json")
     assert json.loads(summary.read_text())["warnings"] == told
     assert said(done) == [each["text"] for each in told]
+
+
+def test_a_recording_of_points_in_millimetres_is_refused_as_well(tmp_path: Path) -> None:
+    box = BOX.copy().apply_scale(2.0)
+    path = tmp_path / "recording.mcap"
+    recorder = McapRecorder(path)
+    recorder.record(
+        SessionStarted(
+            runner="probe",
+            object="box",
+            session="points",
+            method="chsel",
+            seed=0,
+            config={},
+            mesh=box,
+            sdf=SdfGrid.from_mesh(box, 0.02),
+            workspace=Workspace.around(1000.0 * SURFACE, 0.5),
+            free_resolution=0.01,
+            initial_points=KnownPoints(),
+        )
+    )
+    recorder.record(Probe(0, "points", KnownPoints(known=1000.0 * SURFACE)))
+    recorder.record(SessionEnded(0, "finished"))
+    recorder.close()
+    logs = tmp_path / "logs"
+    done = run(main, "session=recorded", f"session.path={path}", f"logs={logs}")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: recording {path}: points on the object span ")
+    assert not logs.exists()
 
 
 def test_a_simulated_session_gives_no_warning(tmp_path: Path) -> None:
