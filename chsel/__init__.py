@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from chsel.cost import RelaxedCost
     from chsel.cost_settings import CostSettings
     from chsel.engine import CompiledCost
-    from chsel.errors import ChselError
+    from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
     from chsel.mesh import load_mesh
     from chsel.points import KnownPoints, Workspace
     from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
@@ -32,7 +32,10 @@ __all__ = [
     "CompiledCost",
     "CostSettings",
     "Hypotheses",
+    "InputWarning",
     "KnownPoints",
+    "MeshWarning",
+    "PointsWarning",
     "RegistrationProblem",
     "RelaxedCost",
     "SdfGrid",
@@ -47,7 +50,10 @@ _PLACES = {
     "CompiledCost": "engine",
     "CostSettings": "cost_settings",
     "Hypotheses": "problem",
+    "InputWarning": "errors",
     "KnownPoints": "points",
+    "MeshWarning": "errors",
+    "PointsWarning": "errors",
     "RegistrationProblem": "problem",
     "RelaxedCost": "cost",
     "SdfGrid": "sdf",

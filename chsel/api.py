@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +13,13 @@ import numpy as np
 import trimesh
 
 from chsel.arrays import frozen
-from chsel.errors import MeshError, PointsError, quoted, require_instance
+from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
+from chsel.fit_check import check_fit
 from chsel.mesh import clean_mesh
-from chsel.methods import build_method, preset_settings
+from chsel.methods import build_method, noise_of, preset_settings
 from chsel.observer import Observer
 from chsel.online import pose_problem
+from chsel.point_checks import check_contacts, check_points
 from chsel.points import KnownPoints, Workspace
 from chsel.problem import Hypotheses
 from chsel.sdf import SdfGrid
@@ -63,6 +66,8 @@ def register(
 
     Returns hypotheses with costs, best first, repeated poses flagged.
     Raises ChselError, with what is accepted, for malformed input; at least one point is needed.
+    Warns with PointsWarning about points that are hardly meant, see chsel.point_checks, and where
+    no hypothesis explains them, see chsel.fit_check.
     """
     points = _known_points(surface, free, occupied, known, known_sdf)
     if workspace is not None:
@@ -72,12 +77,21 @@ def register(
         require_instance("previous", previous, Hypotheses, what)
     solver = build_method(method, _settings(method, preset, settings, hypotheses))
     sdf = _grid(target, resolution)
+    _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
     workspace = workspace or Workspace.around(points.all_points(), sdf.diameter)
     key = StreamKey(seed, step)
     problem = pose_problem(sdf, points, workspace, free_resolution, key, solver.online, previous)
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
-    return solver.register(problem, observer)
+    result = solver.register(problem, observer)
+    _warn(check_fit(problem, result, noise_of(solver)))
+    return result
+
+
+def _warn(found: list[PointsWarning]) -> None:
+    """Warn at the line that calls `register`."""
+    for warning in found:
+        warnings.warn(warning, stacklevel=3)
 
 
 def _known_points(surface: Any, free: Any, occupied: Any, known: Any, sdf: Any) -> KnownPoints:

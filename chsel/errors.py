@@ -43,6 +43,29 @@ class RecordingError(ChselError):
     """A recording cannot be read or written."""
 
 
+class InputWarning(UserWarning):
+    """What was given can be registered, and is hardly meant.
+
+    code: names the kind of warning, for programs. text: one line, with numbers and what to do.
+    """
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(code, text)
+        self.code = code
+        self.text = text
+
+    def __str__(self) -> str:
+        return self.text
+
+
+class PointsWarning(InputWarning):
+    """Known points are hardly those of the object, or no hypothesis explains them."""
+
+
+class MeshWarning(InputWarning):
+    """A mesh, or the size of an object, is hardly meant."""
+
+
 def quoted(value: object) -> str:
     """A value as an error quotes it: on one line, of bounded length; of large things the type."""
     text = " ".join(repr(value).split())

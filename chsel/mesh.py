@@ -10,7 +10,8 @@ import numpy as np
 
 from chsel.arrays import digest, frozen
 from chsel.complete_file import check_complete
-from chsel.errors import MeshError, quoted, require_positive
+from chsel.errors import MeshError, MeshWarning, quoted, require_positive
+from chsel.mesh_bodies import check_bodies
 from chsel.special_file import refuse_special_file
 
 if TYPE_CHECKING:
@@ -47,10 +48,11 @@ def clean_mesh(
     """A checked mesh in metres: vertices merged, faces turned outward, float64.
 
     vertices (V, 3) in the file's units; faces (F, 3) indices into them. Vertices at one place
-    become one. A mesh that is still open is kept with a warning: the winding number decides what
-    is inside it; so is one of more than MANY_FACES faces, of which the warning says what it costs.
-    Raises MeshError if there are no faces, a number is not finite, an index has no vertex, the mesh
-    is flat, or its size in metres is not that of an object.
+    become one. A mesh that is still open is kept with a MeshWarning: the winding number decides
+    what is inside it. So is one of bodies that are far apart, and one of more than MANY_FACES
+    faces, of which the warning says what it costs. Raises MeshError if there are no faces, a number
+    is not finite, an index has no vertex, the mesh is flat, or its size in metres is not that of an
+    object.
     """
     import trimesh
 
@@ -77,11 +79,13 @@ def clean_mesh(
         raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
     _turn_outward(mesh)
     if not mesh.is_watertight:
-        warnings.warn(
+        text = (
             f"{name} is open even after merging its vertices; the winding number decides what is "
-            "inside, which is inexact near the holes",
-            stacklevel=2,
+            "inside, which is inexact near the holes"
         )
+        warnings.warn(MeshWarning("open_mesh", text), stacklevel=2)
+    for warning in check_bodies(mesh, name):
+        warnings.warn(warning, stacklevel=2)
     return mesh
 
 

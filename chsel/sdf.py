@@ -150,7 +150,7 @@ class SdfGrid:
         span = (np.array(self.shape) - 1) * self.resolution
         return np.stack([self.origin, self.origin + span])
 
-    @property
+    @cached_property
     def diameter(self) -> float:
         """Diagonal in metres of the box around the object."""
         inside = np.argwhere(self.values < self.resolution) * self.resolution

@@ -6,7 +6,7 @@ import math
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,10 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, TimeElapsedColumn
 from rich.table import Table
 
+from chsel.errors import InputWarning
 from replay.console import Console, Progress, TextColumn
 from runners.sensors.tally import Report, Tally
+from runners.step_warning import FROM_SESSION, StepWarning
 
 
 class Bar:
@@ -65,6 +67,7 @@ class Display:
 
     def __init__(self, title: str) -> None:
         self._console = Console()
+        self._warned = {FROM_SESSION}  # codes; what the session itself remarks is in its report
         self._bar = Bar(self._console)
         self._console.print(title, style="bold")
 
@@ -85,6 +88,13 @@ class Display:
         if "best_cost" in row:
             text += f"  cost {row['best_cost']:.3g}  {row['distinct']:>2} distinct"
         self._console.print(f"{text}  {row['seconds']:.2f} s")
+
+    def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
+        """Warnings that were not shown before, each kind once."""
+        for warning in warnings:
+            if warning.code not in self._warned:
+                self._warned.add(warning.code)
+                self._line("warning", warning.text)
 
     def say(self, text: str) -> None:
         """A line of its own."""
@@ -121,8 +131,7 @@ class Display:
         if report.tallies:
             self._console.print(_sensor_table(report))
         for level, text in report.lines:
-            line = f"warning: {text}" if level == "warning" else text
-            self._console.print(line)
+            self._line(level, text)
 
     def written(self, folder: Path, files: Mapping[str, int]) -> None:
         """What lies in the run's folder, and how to look at it; paths on lines of their own."""
@@ -138,6 +147,10 @@ class Display:
     def close(self) -> None:
         """Give the terminal back."""
         self._bar.clear()
+
+    def _line(self, level: str, text: str) -> None:
+        line = f"warning: {text}" if level == "warning" else text
+        self._console.print(line)
 
 
 def _viewer() -> str:

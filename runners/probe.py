@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 from omegaconf import DictConfig
 
-from chsel.errors import RecordingError
+from chsel.errors import InputWarning, RecordingError
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.sdf import SdfGrid
@@ -29,8 +30,9 @@ from runners.cli import command, plain
 from runners.compiling import Compiling
 from runners.display import Display, reading_bar
 from runners.interrupt import Interrupt
-from runners.objects.loader import ObjectConfig, load_object
+from runners.objects.loader import ObjectConfig, ObjectModel, load_object
 from runners.objects.scans import AssetsConfig
+from runners.objects.size_check import check_size
 from runners.recording import (
     RecordingConfig,
     make_run_folder,
@@ -44,11 +46,13 @@ from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
+from runners.step_warning import StepWarning
 from runners.whole_file import WritingError
 
 if TYPE_CHECKING:
     import trimesh
 
+_OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
 
@@ -92,7 +96,10 @@ class Watcher:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The session and the object that it hides. watcher: is told of what the session reads."""
+    """The session and the object that it hides. watcher: is told of what the session reads.
+
+    warnings: about the object.
+    """
 
     session: Session
     object_name: str
@@ -100,6 +107,7 @@ class Scene:
     sdf: SdfGrid
     start: tuple[int, int]
     watcher: Watcher = field(default_factory=Watcher)
+    warnings: tuple[InputWarning, ...] = ()
 
     @property
     def report(self) -> Report | None:
@@ -154,7 +162,7 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
         recorded = RecordedSession(settings)
         of = recorded.recorded
         return Scene(recorded, of.object, of.mesh, of.sdf, recorded.start)
-    object_model = load_object(config.object, config.assets.folder)
+    object_model, found = _load_object(config)
     session = open_session(kind, settings, object_model, config.seed, watcher)
     sdf = SdfGrid.from_mesh(
         object_model.mesh,
@@ -163,7 +171,24 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
         progress=lambda done, total: watcher("signed distance grid, nodes", done, total),
     )
     start = (settings.start_contacts, settings.start_probe)
-    return Scene(session, object_model.name, object_model.mesh, sdf, start, watcher)
+    if kind in _OF_REAL_OBJECTS:
+        found += check_size(object_model, session.workspace)
+    name, mesh = object_model.name, object_model.mesh
+    return Scene(session, name, mesh, sdf, start, watcher, tuple(found))
+
+
+def _load_object(config: ProbeConfig) -> tuple[ObjectModel, list[InputWarning]]:
+    """The object, and warnings about its mesh, which belong into the recording."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        object_model = load_object(config.object, config.assets.folder)
+    found = []
+    for each in caught:
+        if isinstance(each.message, InputWarning):
+            found.append(each.message)
+        else:
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return object_model, found
 
 
 def session_started(
@@ -216,7 +241,9 @@ def run(
         start=scene.start,
         recording=config.recording,
         show=show,
+        opening=scene.warnings,
     )
+    display.warn(scene.warnings)
     rows: list[Row] = []
     try:
         recorder.record(started)
@@ -224,20 +251,22 @@ def run(
         for _, row in session_run.steps():
             rows.append(row)
             display.probe(row)
+            display.warn(session_run.warnings)
             interrupt.check()
+        display.warn(session_run.warnings)
         outcome = "finished"
     except KeyboardInterrupt:
         outcome = "interrupted"
     except SystemExit:  # whoever read the output has had enough of it
-        _finish(folder, recorder, session_run.step, started, rows, "interrupted")
+        _finish(folder, recorder, session_run, started, rows, "interrupted")
         raise
     except Exception as error:
         with suppress(OSError, WritingError):  # the first error is the one to tell
-            _finish(folder, recorder, session_run.step, started, rows, f"failed: {error}")
+            _finish(folder, recorder, session_run, started, rows, f"failed: {error}")
         raise
     finally:
         display.close()
-    _finish(folder, recorder, session_run.step, started, rows, outcome)
+    _finish(folder, recorder, session_run, started, rows, outcome)
     if scene.report is not None:
         display.sensed(scene.report)
     display.table(rows)
@@ -250,7 +279,7 @@ def run(
 def _finish(
     folder: Path,
     recorder: Recorder,
-    step: int,
+    session_run: SessionRun,
     started: SessionStarted,
     rows: list[Row],
     outcome: str,
@@ -259,12 +288,12 @@ def _finish(
     finished = outcome == "finished"
     try:
         with nullcontext() if finished else suppress(RecordingError):
-            _end(recorder, step, "info" if finished else "warning", outcome)
+            _end(recorder, session_run.step, "info" if finished else "warning", outcome)
     except RecordingError as error:
         with suppress(OSError, WritingError):  # the first error is the one to tell
-            _summarise(folder, started, rows, f"failed: {error}")
+            _summarise(folder, started, rows, session_run.warnings, f"failed: {error}")
         raise
-    _summarise(folder, started, rows, outcome)
+    _summarise(folder, started, rows, session_run.warnings, outcome)
 
 
 def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:
@@ -275,8 +304,14 @@ def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:
         recorder.close()
 
 
-def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: str) -> None:
-    """Write summary.json: the outcome and the numbers of every step, wall-clock times included."""
+def _summarise(
+    folder: Path,
+    started: SessionStarted,
+    rows: list[Row],
+    found: Sequence[StepWarning],
+    outcome: str,
+) -> None:
+    """Write summary.json: the outcome, warnings, and the numbers of every step, times included."""
     summary = {
         "runner": started.runner,
         "object": started.object,
@@ -285,6 +320,7 @@ def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: 
         "seed": started.seed,
         "outcome": outcome,
         "recording_digest": recording_digest(folder / "recording.mcap"),
+        "warnings": [asdict(warning) for warning in found],
         "steps": rows,
         "bytes": _sizes(folder),
         "environment": dict(started.environment),

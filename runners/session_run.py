@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+from chsel.errors import InputWarning
 from chsel.evaluation.symmetry import ObjectSymmetry
+from chsel.fit_check import check_fit
+from chsel.methods import noise_of
 from chsel.methods.method import Method
 from chsel.online import pose_problem
+from chsel.point_checks import check_contacts, check_points
 from chsel.points import GrowingPoints
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
@@ -23,6 +27,7 @@ from replay.events import (
 from replay.registration import register_recorded
 from runners.recording import RecordingConfig
 from runners.sessions.session import Session
+from runners.step_warning import FROM_SESSION, StepWarning
 
 Row = dict[str, Any]
 
@@ -42,10 +47,12 @@ class SessionRun:
         start: tuple[int, int],
         recording: RecordingConfig,
         show: Callable[[str, int, int], None],
+        opening: Iterable[InputWarning] = (),
     ) -> None:
         """symmetry: of the object, for errors to the true pose; None where that is not known.
 
-        start: a registration needs so many contacts, and this probe index.
+        start: a registration needs so many contacts, and this probe index. opening: warnings about
+        what was opened, which are recorded with the first probe.
         """
         self._session, self._method, self._sdf, self._recorder = session, method, sdf, recorder
         self._symmetry, self._seed = symmetry, seed
@@ -56,16 +63,21 @@ class SessionRun:
         self._points = GrowingPoints(session.initial_points)
         self.previous: Hypotheses | None = None
         self.step = 0
+        self.warnings: list[StepWarning] = []
+        self._opening = tuple(opening)
 
     def steps(self) -> Iterator[tuple[Probe, Row]]:
         """Each probe with the row of numbers that is shown and summarised about it."""
         begun = time.perf_counter()
         for event in self._session.probes():
             self._recorder.record(event)
+            if isinstance(event, Logged) and event.level == "warning":
+                self.warnings.append(StepWarning(event.step, FROM_SESSION, event.text))
             if not isinstance(event, Probe):
                 continue
             probe = event
             self.step = probe.step
+            self._warn(self._opening)
             seconds = {"probe": time.perf_counter() - begun}
             self._points.add(probe.new_points)
             row: Row = {
@@ -83,6 +95,9 @@ class SessionRun:
             row |= {"seconds": sum(seconds.values()), "seconds_by_stage": seconds}
             yield probe, row
             begun = time.perf_counter()
+        self._check_points()
+        self._warn(check_contacts(self._points.all()))
+        self._recorder.flush()
 
     def _enough(self, probe: Probe) -> bool:
         contacts, index = self._start
@@ -90,7 +105,8 @@ class SessionRun:
         return known.contacts >= contacts and probe.step >= index and known.count > 0
 
     def _register(self, step: int, seconds: dict[str, float]) -> Row:
-        """Pose the problem, register, and record both; numbers about the result."""
+        """Check the points, pose the problem, register, and record; numbers about the result."""
+        self._check_points()
         problem = self._pose(step, self.previous)
         registered = register_recorded(
             ProblemPosed(step, problem),
@@ -103,8 +119,21 @@ class SessionRun:
         )
         seconds |= registered.seconds
         found = self.previous = registered.hypotheses
+        self._warn(check_fit(problem, found, noise_of(self._method)))
         row = {"best_cost": float(found.cost[0]), "distinct": found.distinct}
         return row | {"digest": found.digest} | dict(registered.numbers)
+
+    def _check_points(self) -> None:
+        """Warn about points known so far; PointsError if they cannot be the object's."""
+        workspace, resolution = self._session.workspace, self._session.free_resolution
+        self._warn(check_points(self._points.all(), self._sdf.diameter, resolution, workspace))
+
+    def _warn(self, found: Iterable[InputWarning]) -> None:
+        """Record warnings, each kind once a session."""
+        for warning in found:
+            if warning.code not in {earlier.code for earlier in self.warnings}:
+                self.warnings.append(StepWarning(self.step, warning.code, warning.text))
+                self._recorder.record(Logged(self.step, "warning", warning.text))
 
     def _pose(self, step: int, previous: Hypotheses | None) -> RegistrationProblem:
         """What is to be registered at a step, after the result of the one before."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from chsel import presets
 from chsel.errors import SettingError, require_choice, require_instance
-from chsel.methods.anchored import Anchored, preset_anchored
+from chsel.methods.anchored import Anchored, AnchoredSettings, preset_anchored
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
@@ -87,6 +87,11 @@ def build_method(name: str, settings: Any = None) -> Method:
     kind = type(default)
     require_instance("settings", settings, kind, f"a mapping, or a {kind.__name__}")
     return make(settings)
+
+
+def noise_of(method: Method) -> float | None:
+    """The noise of known points by a method's settings, metres; None if it has no such setting."""
+    return method.settings.noise if isinstance(method.settings, AnchoredSettings) else None
 
 
 def _entry(name: str) -> tuple[Callable[[Any], Method], Callable[[str], Any]]:

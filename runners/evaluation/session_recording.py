@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -14,6 +15,7 @@ from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.sensor_logs import ensure_log
 from runners.evaluation.trial_truth import find_truth, known_at_the_end
 from runners.objects.loader import load_object
+from runners.objects.size_check import check_size
 from runners.sessions import open_session
 
 METHOD = "none"
@@ -36,6 +38,9 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
         "configuration": trial.configuration,
     }
     session = open_session(plan.kind, settings, model, trial.seed)
+    if plan.kind == SENSORS:
+        for warning in check_size(model, session.workspace):
+            warnings.warn(warning, stacklevel=2)
     try:
         sdf = SdfGrid.from_mesh(
             model.mesh, settings.object_resolution, padding=settings.object_padding

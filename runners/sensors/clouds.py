@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.arrays import BoolArray, FloatArray
 from chsel.points import Lattice
 from chsel.pose import apply
 from runners.sensors.cell import Cell
 from runners.sensors.messages import CloudMessage
 from runners.sensors.rig import CloudRig
 from runners.sensors.tally import Tally
+
+FARTHEST = 100.0  # m: no robot that probes an object measures rays of this length
 
 
 class Clouds:
@@ -22,6 +24,7 @@ class Clouds:
         self._lattice = Lattice(cell.free.workspace.lower, resolution)
         self._seen: set[tuple[int, int, int]] = set()
         self._new: list[FloatArray] = []
+        self._place: FloatArray | None = None
 
     @property
     def touches(self) -> bool:
@@ -42,18 +45,39 @@ class Clouds:
         tally.pixels += len(message.points)
         tally.invalid += len(message.points) - len(points)
         tally.used += 1
-        points = apply(pose, points)
+        points, origin = apply(pose, points), pose[:3, 3]
+        within_reach = self._within_reach(points, origin)
+        tally.outside += int((~within_reach).sum())
+        if self._place is None and len(points):
+            self._place = np.median(points, axis=0)
         if self._rig.role == "rays":
-            origin = pose[:3, 3]
             with self._cell.free.by(tally) as grid:
                 grid.along_rays(origin, origin + self._rig.fraction * (points - origin))
         else:
-            self._new.append(self._unseen(points[self._cell.free.within(points)]))
+            self._new.append(self._unseen(points[within_reach]))
+
+    def check(self, total: Tally) -> str | None:
+        """What is suspicious about the tally of a whole log: that no point was within reach."""
+        if self._place is None or total.outside < total.pixels - total.invalid:
+            return None
+        place = ", ".join(f"{value:.4g}" for value in self._place)
+        reach = f"over {FARTHEST:g} m away" if self._rig.role == "rays" else "out of the workspace"
+        return (
+            f"{self._rig.topic}: all {total.outside} points are {reach}, in the first message "
+            f"around [{place}] m in the world; check its unit and frame, and the workspace"
+        )
 
     def surface(self) -> FloatArray:
         """Points (N, 3) on the surface that came since the last call."""
         new, self._new = self._new, []
         return np.concatenate([np.zeros((0, 3)), *new])
+
+    def _within_reach(self, points: FloatArray, origin: FloatArray) -> BoolArray:
+        """Which of points (N, 3) can be used, or end a ray from origin (3,)."""
+        if self._rig.role != "rays":
+            return self._cell.free.within(points)
+        within: BoolArray = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
+        return within
 
     def _unseen(self, points: FloatArray) -> FloatArray:
         """The first point of every voxel that had none."""

@@ -73,6 +73,14 @@ class LogReading:
                 message = next(messages, None)
             yield from self._finish(window)
 
+    def check(self) -> None:
+        """Remark on topics whose points were all out of reach, once the log is read."""
+        total = self._report.total()
+        for topic, cloud in self._clouds.items():
+            suspicious = cloud.check(total[topic]) if topic in total else None
+            if suspicious:
+                self._cell.remarks.warn(suspicious)
+
     def _pad(self, sensor: BubbleRig, survey: Survey) -> Pad:
         """A pad; where the reference's sweep is chosen, that alone tells of free space by it."""
         return Pad(

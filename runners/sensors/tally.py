@@ -13,7 +13,8 @@ class Tally:
     rate, or as nothing had moved. lost: without a transform. unusable: of another size than the
     camera's, or without a single pixel that counts. pixels: of the images that were looked at;
     invalid, edges: of these without a depth within range, and beside an occluding edge. touching:
-    pixels in contact. contacts: points. free: voxels that it was the first to tell of.
+    pixels in contact. outside: points of a cloud that are out of reach. contacts: points. free:
+    voxels that it was the first to tell of.
     """
 
     images: int = 0
@@ -25,6 +26,7 @@ class Tally:
     invalid: int = 0
     edges: int = 0
     touching: int = 0
+    outside: int = 0
     contacts: int = 0
     free: int = 0
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from chsel.point_checks import check_points
 from chsel.points import KnownPoints
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from replay.file_digest import file_digest
@@ -43,6 +44,7 @@ class DepthFrameSession:
         )
         self.workspace = self._points.workspace
         self.world_from_object = self._frame.world_from_object
+        check_points(self._points.points, diameter, free_resolution, self.workspace)
 
     def probes(self) -> Iterator[SessionEvent]:
         """The image, and what follows from it."""

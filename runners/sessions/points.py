@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
-from chsel.errors import SettingError, require_positive
+from chsel.errors import PointsError, SettingError, require_positive
+from chsel.point_checks import check_points
 from chsel.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from replay.events import Probe
 from runners.objects.loader import ObjectModel
@@ -43,7 +45,10 @@ class PointsSettings:
 
 
 class PointsSession:
-    """Replays the steps of a file; a probe's index is the file's step."""
+    """Replays the steps of a file; a probe's index is the file's step.
+
+    Raises PointsError for points that cannot be those of the object.
+    """
 
     def __init__(self, settings: PointsSettings, object_model: ObjectModel) -> None:
         assert settings.path is not None
@@ -55,14 +60,22 @@ class PointsSession:
         self.world_from_object = self._file.world_from_object
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
+        self._check(settings.path, _diameter(object_model))
+
+    def _check(self, path: str, diameter: float) -> None:
+        """Before any work; warnings are given when the points become known."""
+        every = reduce(KnownPoints.merged, map(self._file.at, self._steps))
+        try:
+            check_points(every, diameter, self.free_resolution, self.workspace)
+        except PointsError as error:
+            raise PointsError(f"point file {path}: {error}") from None
 
     def _workspace(self, settings: PointsSettings, object_model: ObjectModel) -> Workspace:
         if settings.workspace is not None:
             (x0, x1), (y0, y1), (z0, z1) = settings.workspace
             return Workspace((x0, y0, z0), (x1, y1, z1))
         points = np.concatenate([group.points for group in self._file.classes.values()])
-        diameter = float(np.sqrt((np.asarray(object_model.mesh.extents) ** 2).sum()))
-        return Workspace.around(points, diameter)
+        return Workspace.around(points, _diameter(object_model))
 
     def probes(self) -> Iterator[Probe]:
         """One probe per step of the file."""
@@ -78,3 +91,8 @@ class PointsSession:
 
     def close(self) -> None:
         """Nothing is held open."""
+
+
+def _diameter(object_model: ObjectModel) -> float:
+    """Diagonal in metres of the box around the object."""
+    return float(np.sqrt((np.asarray(object_model.mesh.extents) ** 2).sum()))

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 
-from chsel.errors import SettingError
+from chsel.errors import PointsError, SettingError
+from chsel.point_checks import check_points
+from chsel.points import KnownPoints
 from replay.events import Probe
 from replay.mcap.reader import read_recording
 
@@ -28,7 +31,11 @@ class RecordedSettings:
 
 
 class RecordedSession:
-    """Gives the probes of a recording, with every point as it was."""
+    """Gives the probes of a recording, with every point as it was.
+
+    Raises RecordingError for a file that is not one, PointsError for points that cannot be those of
+    its object.
+    """
 
     def __init__(self, settings: RecordedSettings) -> None:
         assert settings.path is not None
@@ -40,10 +47,21 @@ class RecordedSession:
         self.initial_points = self.recorded.initial_points
         self._probes = recording.probes
         self.count = len(self._probes)
+        self._check(settings.path)
         self.start = (
             self._rule("start_contacts", settings.start_contacts),
             self._rule("start_probe", settings.start_probe),
         )
+
+    def _check(self, path: str) -> None:
+        """Before any work; warnings are given when the points become known."""
+        new = (probe.new_points for probe in self._probes)
+        every = reduce(KnownPoints.merged, new, self.initial_points)
+        diameter = self.recorded.sdf.diameter
+        try:
+            check_points(every, diameter, self.free_resolution, self.workspace)
+        except PointsError as error:
+            raise PointsError(f"recording {path}: {error}") from None
 
     def probes(self) -> Iterator[Probe]:
         """The recorded probes in their order."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from chsel.arrays import FloatArray
 from chsel.errors import SettingError, require_positive
@@ -79,16 +76,7 @@ def open_sensors(
             free_resolution=settings.free_resolution,
             images=settings.images,
         )
-    session = SensorsSession(settings, seed, progress)
-    longest = float(object_model.mesh.extents.max())
-    side = float(np.ptp(session.workspace.bounds, 0).max())
-    if object_model.scale > 1.0 or longest > side:
-        warnings.warn(
-            f"the object is {longest:.3g} m long at scale {object_model.scale:g}, the workspace "
-            f"{side:.3g} m; objects of real size have object.scale=1",
-            stacklevel=2,
-        )
-    return session
+    return SensorsSession(settings, seed, progress)
 
 
 class SensorsSession:
@@ -133,6 +121,7 @@ class SensorsSession:
         yield RigDescribed(-1, rig.name, self.source, hand)
         messages = self._log.messages(survey.bulky, progress=self._shown("reading images"))
         yield from reading.events(in_time_order(messages, survey.clocks.time))
+        reading.check()
         for text, count in self._log.faults.items():
             remarks.warn(text, count)
         for name, tally in self.report.total().items():

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import trimesh
 import chsel
 from chsel.evaluation.pose_error import pose_errors
 from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.methods import preset_settings
+from chsel.methods import build_method, preset_settings
+from chsel.online import pose_problem
 from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.settings import settings_mapping
 from chsel.streams import StreamKey
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
@@ -63,11 +66,12 @@ def test_points_added_later_start_from_the_previous_result() -> None:
         {"occupied": POINT},
         {"known": POINT, "known_sdf": [0.02]},
         {"surface": np.zeros((30, 3)), "free": np.zeros((50, 3))},
-        {"surface": [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]},
-        {"free": np.full((1, 3), 1e6), "surface": POINT},
+        {"surface": [[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]},
+        {"free": np.full((1, 3), 50.0), "surface": POINT},
     ],
 )
 @pytest.mark.parametrize("preset", ["default", "paper", "reference"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_odd_points_have_a_defined_result(points: dict[str, Any], preset: str) -> None:
     found = register(**points, preset=preset, hypotheses=5)
     assert found.object_from_world.shape == (5, 4, 4)
@@ -75,10 +79,98 @@ def test_odd_points_have_a_defined_result(points: dict[str, Any], preset: str) -
     assert np.isfinite(found.cost).all()
 
 
+@pytest.mark.parametrize(
+    "points",
+    [
+        chsel.KnownPoints(known=[[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]),
+        chsel.KnownPoints(free=np.full((1, 3), 1e6), known=POINT),
+    ],
+)
+@pytest.mark.parametrize("preset", ["default", "paper", "reference"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_points_that_are_refused_have_a_defined_result_for_a_method(
+    points: chsel.KnownPoints, preset: str
+) -> None:
+    found = unchecked(points, chsel.Workspace((0, 0, 0), (1, 1, 1)), preset)
+    assert np.isfinite(found.object_from_world).all()
+    assert np.isfinite(found.cost).all()
+
+
 def test_points_far_outside_of_the_workspace_cost_their_distance() -> None:
     workspace = chsel.Workspace((0, 0, 0), (1, 1, 1))
-    found = register(surface=[[1e6, 0, 0]], workspace=workspace)
+    found = unchecked(chsel.KnownPoints(known=[[1e6, 0, 0]]), workspace)
     assert found.cost[0] == pytest.approx(1e6, rel=1e-4)
+
+
+def unchecked(
+    points: chsel.KnownPoints, workspace: chsel.Workspace, preset: str = "default"
+) -> chsel.Hypotheses:
+    """A registration of points that nobody has checked."""
+    settings = settings_mapping(preset_settings("chsel", preset))
+    settings["descent"] |= QUICK["descent"]
+    settings["emitter"] |= QUICK["emitter"]
+    solver = build_method("chsel", settings)
+    grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
+    key = StreamKey(0, 0)
+    return solver.register(pose_problem(grid, points, workspace, 0.01, key, solver.online, None))
+
+
+def warned(**arguments: Any) -> list[chsel.InputWarning]:
+    """The warnings of a registration, each of this file's line that asked for it."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        chsel.register(BOX, **{"settings": QUICK, **arguments})
+    mine = [each for each in caught if issubclass(each.category, chsel.InputWarning)]
+    assert {Path(each.filename).name for each in mine} <= {"test_api.py"}
+    return [each.message for each in mine if isinstance(each.message, chsel.InputWarning)]
+
+
+FREE = np.random.default_rng(0).uniform(-0.3, 0.3, (4000, 3)) + POSE[:3, 3]
+FREE = FREE[
+    chsel.SdfGrid.from_mesh(BOX, 0.005, padding=0.5).query(apply(inverse(POSE), FREE))[0].numpy()
+    > 0.005
+]
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"), [("chsel", QUICK), ("anchored", {"size": "small"})]
+)
+def test_good_points_give_no_warning(method: str, settings: dict[str, Any]) -> None:
+    room = chsel.Workspace.around(SURFACE, 0.1)
+    assert (
+        warned(surface=SURFACE, free=FREE, workspace=room, method=method, settings=settings) == []
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        ({"free": FREE}, "no_contact"),
+        ({"surface": SURFACE, "free": np.concatenate([FREE, SURFACE])}, "contacts_in_free_space"),
+        (
+            {"surface": SURFACE, "workspace": chsel.Workspace((0.38, 0, 0), (0.6, 0.3, 0.3))},
+            "contacts_outside",
+        ),
+        ({"surface": np.concatenate([SURFACE, [[3.0, 0, 0]]])}, "contacts_apart"),
+        ({"surface": SURFACE, "free": FREE + 5.0}, "contacts_far_from_free"),
+        ({"surface": 3.0 * SURFACE}, "no_fit"),
+    ],
+)
+def test_points_that_are_hardly_meant_give_a_warning(arguments: Any, code: str) -> None:
+    assert code in [warning.code for warning in warned(**arguments)]
+
+
+def test_points_13_noise_levels_from_all_poses_give_a_warning() -> None:
+    noise = np.random.default_rng(0).normal(0.0, 0.004, SURFACE.shape)
+    settings = {"size": "small", "noise": 0.0001}
+    found = warned(surface=SURFACE + noise, method="anchored", settings=settings)
+    assert [warning.code for warning in found] == ["above_noise"]
+
+
+@pytest.mark.parametrize("points", [1000.0 * SURFACE, [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]])
+def test_points_in_millimetres_are_an_error(points: Any) -> None:
+    with pytest.raises(chsel.ChselError, match=r"the object is 0\.1.* m: are they in mill"):
+        register(surface=points)
 
 
 @pytest.mark.parametrize(

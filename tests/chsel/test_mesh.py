@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import MeshError, SettingError
+from chsel.errors import MeshError, MeshWarning, SettingError
 from chsel.mesh import clean_mesh, load_mesh, mesh_digest
+from chsel.mesh_bodies import check_bodies
 
 EXTENTS = (0.1, 0.2, 0.3)
 
@@ -43,12 +44,38 @@ def test_a_box_comes_back_closed_with_eight_vertices_whatever_the_format(box, tm
 def test_a_scene_becomes_one_mesh_with_its_parts_in_place(box, tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(box)
-    scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([1, 0, 0]))
+    scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([0.25, 0, 0]))
     scene.export(tmp_path / "scene.glb")
     mesh = load_mesh(tmp_path / "scene.glb")
     assert mesh.is_watertight
-    assert mesh.extents == pytest.approx([1.1, 0.2, 0.3], rel=1e-6)
+    assert mesh.extents == pytest.approx([0.35, 0.2, 0.3], rel=1e-6)
     assert mesh.volume == pytest.approx(0.012, rel=1e-6)
+
+
+def moved(mesh: trimesh.Trimesh, *offset: float) -> trimesh.Trimesh:
+    return mesh.copy().apply_translation(offset)
+
+
+def test_bodies_far_apart_are_kept_with_a_warning_that_counts_them(box):
+    two = trimesh.util.concatenate([box, moved(box, 0.05, 0.0, 0.0), moved(box, 0.0, 1.0, 0.0)])
+    with pytest.warns(MeshWarning, match=r"shelf has 2 bodies at least 0\.8 m apart, .* 0\.374 m"):
+        mesh = clean_mesh(two.vertices, two.faces, name="shelf")
+    assert len(mesh.faces) == 36
+    assert mesh.extents == pytest.approx([0.15, 1.2, 0.3])
+
+
+def test_parts_near_one_another_are_one_object_however_many(box):
+    """A row of parts is longer than what is far apart, and no two neighbours are."""
+    row = [moved(box, 0.25 * k, 0.0, 0.0) for k in range(8)]
+    crumb = moved(trimesh.creation.box((0.001, 0.001, 0.001)), 0.0, 0.25, 0.0)
+    parts = trimesh.util.concatenate([*row, crumb])
+    assert len(clean_mesh(parts.vertices, parts.faces).faces) == 9 * 12
+
+
+def test_real_scans_have_their_parts_together(ycb_directory):
+    for file in ycb_directory.glob("*/google_16k/nontextured.ply"):
+        mesh = trimesh.load(file, process=True)
+        assert check_bodies(mesh, file.parent.name) == []
 
 
 def test_texture_seams_keep_no_vertices_apart(tmp_path):

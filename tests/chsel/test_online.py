@@ -82,9 +82,13 @@ def test_upright_starts_turn_about_the_vertical_alone() -> None:
     assert np.ptp(np.arctan2(world[:, 1, 0], world[:, 0, 0])) > 6.0
 
 
-def test_centroid_starts_lie_around_the_mean_contact() -> None:
+def test_centroid_starts_lie_around_the_mean_contact_whatever_else_is_known() -> None:
     settings = OnlineSettings(hypotheses=500, initial="contact_centroid")
-    points = KnownPoints(known=[[0.1, 0.2, 0.3], [0.3, 0.2, 0.3]])
+    points = KnownPoints(
+        free=np.full((9, 3), 2.0),
+        known=[[0.1, 0.2, 0.3], [0.3, 0.2, 0.3], [1.5, 1.5, 1.5]],
+        known_sdf=[0.0, 0.0, 0.4],
+    )
     world = inverse(first_initial_set(WORKSPACE, points, KEY, settings))
     assert np.abs(world[:, :3, 3] - [0.2, 0.2, 0.3]).max() <= 0.05 + 1e-12
 

@@ -4,24 +4,28 @@ import dataclasses
 import json
 import struct
 import zlib
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from PIL import Image
 
 import chsel
-from chsel.errors import SessionError, SettingError
+from chsel.errors import PointsError, SessionError, SettingError
 from chsel.mesh import load_mesh
 from chsel.pose import apply, inverse
 from chsel.sdf import mesh_sdf
 from chsel.settings import build_settings
+from runners.objects.loader import ObjectModel
 from runners.sensors import depth_frame_points as module
 from runners.sensors.depth_frame import DepthFrame, read_depth_frame
 from runners.sensors.depth_frame_points import depth_frame_points, one_per_voxel
 from runners.sensors.rig import Rig
+from runners.sessions.depth_frame import DepthFrameSession
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 WIDTH, HEIGHT = 80, 60
@@ -285,6 +289,16 @@ def test_frames_and_rigs_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         depth_frame_points(
             dataclasses.replace(frame, label=dots), rig(), free_resolution=0.01, diameter=0.3
         )
+
+
+def test_a_workspace_away_from_all_surface_points_is_refused(tmp_path: Path) -> None:
+    path, box = written(tmp_path), trimesh.creation.box((0.15, 0.1, 0.05))
+    model = ObjectModel("box", box, 1.0, 0.001, "box")
+    for lower, fits in ((0.3, True), (5.0, False)):
+        bounds = ((-0.3, 0.3), (-0.3, 0.3), (lower, lower + 0.5))
+        own = dataclasses.replace(rig(), workspace=bounds)
+        with nullcontext() if fits else pytest.raises(PointsError, match="outside of the works"):
+            DepthFrameSession(path, own, model, free_resolution=0.01, images=False)
 
 
 def test_the_real_frame_registers_near_its_published_pose(real_directory: Path) -> None:

@@ -71,6 +71,34 @@ def test_csv_holds_every_kind(tmp_path: Path) -> None:
     np.testing.assert_array_equal(content.at(0).free, [[1, 0, 0]])
 
 
+def test_csv_points_without_a_step_are_known_from_the_first(tmp_path: Path) -> None:
+    content = read_points(text(tmp_path, "x,y,z,kind\n0,0,0,surface\n"))
+    assert content.steps == [0]
+    rows = "x,y,z,kind,step\n0,0,0,surface,\n1,0,0,free,1\n2,0,0,free, \n"
+    content = read_points(text(tmp_path, rows))
+    assert content.steps == [0, 1]
+    np.testing.assert_array_equal(content.at(0).known, [[0, 0, 0]])
+    np.testing.assert_array_equal(content.at(0).free, [[2, 0, 0]])
+    np.testing.assert_array_equal(content.at(1).free, [[1, 0, 0]])
+
+
+@pytest.mark.parametrize("name", ["points.npz", "points.csv", "points.ply", "points.xyz"])
+def test_points_in_millimetres_are_refused_whatever_the_file(tmp_path: Path, name: str) -> None:
+    surface, path = 1000.0 * SURFACE, tmp_path / name
+    if name.endswith("npz"):
+        np.savez(path, surface=surface, surface_step=np.arange(3))
+    elif name.endswith("csv"):
+        rows = [f"{x},{y},{z},surface" for x, y, z in surface]
+        path.write_text("\n".join(["x,y,z,kind", *rows]))
+    elif name.endswith("ply"):
+        trimesh.Trimesh(surface, [[0, 1, 2]]).export(path)
+    else:
+        np.savetxt(path, surface)
+    message = rf"{name}: points on the object span 223.6 m, and the object is 0.13 m: are they in"
+    with pytest.raises(PointsError, match=message):
+        PointsSession(PointsSettings(str(path)), BOX)
+
+
 @pytest.mark.parametrize("suffix", ["ply", "off", "stl", "xyz"])
 def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"points.{suffix}"

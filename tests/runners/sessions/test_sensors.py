@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from runners.cli import CONF
 from runners.display import Display
-from runners.objects.loader import ObjectConfig, ObjectModel, load_object
+from runners.objects.loader import ObjectConfig, load_object
 from runners.recording import RecordingConfig
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import (
@@ -41,7 +40,7 @@ from runners.sensors.rig import (
 )
 from runners.session_run import SessionRun
 from runners.sessions import session_settings
-from runners.sessions.sensors import SensorsSession, SensorsSettings, open_sensors
+from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.replay.conftest import same_bits
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
 from tests.runners.sensors.small_logs import ros2_cloud, ros2_transform, write_ros2
@@ -345,19 +344,27 @@ def joined(path: Path, *parts: Path) -> Path:
     return path
 
 
-def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
-    SphereLog().write(tmp_path / "a.mcap")
-    origin = np.array([0.72, 0.1, 0.55])
-    points = np.array([[0.2, 0.0, 0.0], [0.2, 0.0, 0.001], [np.nan, 0.0, 0.0], [9.0, 0.0, 0.0]])
-    fixed = {"transforms": [ros2_transform("world", "lidar", origin, BEGIN)]}
+LIDAR = np.array([0.72, 0.1, 0.55])  # m: its place in the world
+
+
+def log_with_clouds(folder: Path, points: np.ndarray) -> Path:
+    """The sphere's log with points (N, 3) in the lidar's frame on /lidar and /skin, twice each."""
+    SphereLog().write(folder / "a.mcap")
+    fixed = {"transforms": [ros2_transform("world", "lidar", LIDAR, BEGIN)]}
     sent = [("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)]
     for seconds in (0.5, 2.0):
         stamp = BEGIN + round(seconds * SECOND)
         for topic in ("/lidar", "/skin"):
             cloud = ros2_cloud(points, stamp)
             sent.append((topic, "sensor_msgs/PointCloud2", cloud, stamp + LATENCY))
-    write_ros2(tmp_path / "b.mcap", sent)
-    log = joined(tmp_path / "log.mcap", tmp_path / "a.mcap", tmp_path / "b.mcap")
+    write_ros2(folder / "b.mcap", sent)
+    return joined(folder / "log.mcap", folder / "a.mcap", folder / "b.mcap")
+
+
+def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
+    origin = LIDAR
+    points = np.array([[0.2, 0.0, 0.0], [0.2, 0.0, 0.001], [np.nan, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    log = log_with_clouds(tmp_path, points)
     with_clouds = replace(
         RIG,
         cameras=(),
@@ -377,6 +384,23 @@ def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
     surface = replace(with_clouds, clouds=(CloudRig("/skin", "surface"),))
     first = probes(open_log(log, surface).probes())[0]
     assert (len(first.contacts), len(first.new_points.known)) == (50, 51)
+    assert "/skin" not in lines(events)
+    assert "/lidar" not in lines(events)
+
+
+@pytest.mark.parametrize("role", ["surface", "contacts", "rays"])
+def test_a_topic_whose_points_are_all_out_of_reach_is_a_warning(tmp_path: Path, role: str) -> None:
+    """Here, as they are in millimetres."""
+    points = np.array([[200.0, 0.0, 0.0], [200.0, 0.0, 1.0], [np.nan, 0.0, 0.0]])
+    log = log_with_clouds(tmp_path, points)
+    session = open_log(log, replace(RIG, cameras=(), clouds=(CloudRig("/skin", role),)))
+    count = 2 if role == "contacts" else 4  # of which the second message is between probes
+    reach = "over 100 m away" if role == "rays" else "out of the workspace"
+    text = (
+        f"/skin: all {count} points are {reach}, in the first message around [200.7, 0.1, 1.05] m"
+    )
+    assert text in lines(session.probes())
+    assert ("warning", text) in [(level, line[: len(text)]) for level, line in session.report.lines]
 
 
 @pytest.mark.parametrize(
@@ -508,16 +532,6 @@ def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) 
         session_settings("sensors", values)
     with pytest.raises(SettingError, match=r"path is missing; pass session.path=LOG"):
         build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")
-
-
-def test_an_object_that_is_not_of_real_size_is_a_warning(log: Path) -> None:
-    settings = SensorsSettings(RIG, str(log))
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.02)
-    with pytest.warns(UserWarning, match=r"0.04 m long at scale 2.5, .* have object.scale=1"):
-        open_sensors(settings, ObjectModel("ball", ball, 2.5, 0.001, "drill"), 0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        open_sensors(settings, ObjectModel("ball", ball, 0.001, 0.001, "drill"), 0)
 
 
 def test_progress_is_told_in_megabytes(log: Path) -> None:

@@ -1,0 +1,200 @@
+"""Input that is hardly meant: said on the terminal, in the log, and in the summary."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.arrays import FloatArray
+from chsel.points import KnownPoints, Workspace
+from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.sdf import SdfGrid, mesh_sdf
+from replay.events import Logged, Probe, SessionEnded, SessionStarted
+from replay.mcap.reader import read_recording
+from replay.mcap.writer import McapRecorder
+from runners.probe import main
+from tests.runners.in_process import Done, run
+
+BOX = trimesh.creation.box((0.1, 0.06, 0.2))
+POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
+SURFACE = apply(POSE, trimesh.sample.sample_surface(BOX, 30, seed=0)[0])
+STEPS = np.arange(30) // 10
+FREE = np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3)) + POSE[:3, 3]
+FREE = FREE[mesh_sdf(BOX, apply(inverse(POSE), FREE))[0] > 0.0]
+QUICK = (
+    "method.descent.restarts=2",
+    "method.descent.iterations=50",
+    "method.emitter.iterations=10",
+    "recording=mcap",
+)
+Found = tuple[Done, list[dict[str, Any]], list[tuple[int, str]]]
+
+
+def probe(folder: Path, *overrides: str, points: dict[str, Any], mesh: Any = BOX) -> Found:
+    """A session of points: the command, its summary's warnings, and those of its recording."""
+    np.savez(folder / "points.npz", **points)
+    mesh.export(folder / "box.ply")
+    chosen = ["session=points", f"session.path={folder / 'points.npz'}", f"logs={folder / 'logs'}"]
+    if not any(override.startswith("object=") for override in overrides):
+        chosen += ["object=mesh", f"object.path={folder / 'box.ply'}"]
+    quick = [] if any(override.startswith("method=") for override in overrides) else QUICK[:3]
+    done = run(main, *chosen, *quick, QUICK[3], *overrides)
+    if done.returncode:
+        return done, [], []
+    (made,) = (folder / "logs" / "probe").iterdir()
+    told = json.loads((made / "summary.json").read_text())["warnings"]
+    events = read_recording(made / "recording.mcap").events(images=False)
+    logged = [e for e in events if isinstance(e, Logged) and e.level == "warning"]
+    return done, told, [(event.step, event.text) for event in logged]
+
+
+def said(done: Done) -> list[str]:
+    """The warnings on the terminal."""
+    lines = (done.stdout + done.stderr).splitlines()
+    return [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
+
+
+def sequence(surface: FloatArray = SURFACE, free: FloatArray = FREE) -> dict[str, Any]:
+    return {"surface": surface, "surface_step": STEPS, "free": free}
+
+
+@pytest.mark.parametrize("method", ["chsel", "anchored"])
+def test_good_points_give_no_warning(tmp_path: Path, method: str) -> None:
+    choice = [] if method == "chsel" else ["method=anchored", "method.size=small"]
+    done, told, logged = probe(tmp_path, *choice, points=sequence())
+    assert (said(done), told, logged) == ([], [], [])
+
+
+def test_a_warning_is_given_once_with_the_step_at_which_it_first_holds(tmp_path: Path) -> None:
+    surface = SURFACE.copy()
+    surface[[15, 25]] = [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]  # of the second and third probe
+    done, told, logged = probe(tmp_path, points=sequence(surface))
+    assert [(each["step"], each["code"]) for each in told] == [
+        (1, "contacts_apart"),
+        (1, "contacts_far_from_free"),
+        (1, "no_fit"),
+    ]
+    texts = [each["text"] for each in told]
+    assert said(done) == texts
+    assert logged == [(1, text) for text in texts]
+    probes = [line for line in done.stdout.splitlines() if line.startswith(("probe  ", "warning"))]
+    assert [line.split()[0] for line in probes[:5]] == ["probe", "probe", *["warning:"] * 3]
+
+
+def test_free_points_alone_are_a_warning_at_the_end(tmp_path: Path) -> None:
+    steps = np.arange(len(FREE)) % 3
+    done, told, logged = probe(tmp_path, points={"free": FREE, "free_step": steps})
+    assert [(each["step"], each["code"]) for each in told] == [(2, "no_contact")]
+    assert "all known points are free" in said(done)[0]
+    assert logged == [(2, told[0]["text"])]
+
+
+def test_contacts_that_come_late_are_no_warning(tmp_path: Path) -> None:
+    late = {"surface": SURFACE, "surface_step": STEPS + 2, "free": FREE}
+    _, told, _ = probe(tmp_path, points=late)
+    assert told == []
+
+
+def test_points_outside_of_a_given_workspace_are_a_warning_even_unregistered(
+    tmp_path: Path,
+) -> None:
+    workspace = "session.workspace=[[0.13,0.5],[0,0.5],[0,0.5]]"
+    never = "session.start_contacts=100"
+    done, told, _ = probe(tmp_path, workspace, never, points=sequence())
+    assert [(each["step"], each["code"]) for each in told] == [(2, "contacts_outside")]
+    assert "outside of the workspace [[0.13, 0.5], [0, 0.5], [0, 0.5]]" in said(done)[0]
+
+
+def test_points_in_millimetres_are_an_error_before_anything_is_written(tmp_path: Path) -> None:
+    done, _, _ = probe(tmp_path, points=sequence(1000.0 * SURFACE, 1000.0 * FREE))
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: point file {tmp_path / 'points.npz'}: points on the obj")
+    assert "are they in millimetres? accepted: points in metres" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "logs").exists()
+
+
+def test_warnings_about_the_object_come_first_and_are_recorded_too(tmp_path: Path) -> None:
+    two = trimesh.util.concatenate([BOX, BOX.copy().apply_translation((0.0, 1.0, 0.0))])
+    points = sequence(SURFACE, FREE[:0])
+    done, told, logged = probe(tmp_path, "object.scale=1.5", points=points, mesh=two)
+    assert [(each["step"], each["code"]) for each in told[:2]] == [
+        (0, "bodies_apart"),
+        (0, "object_size"),
+    ]
+    assert [text for _, text in logged] == said(done) == [each["text"] for each in told]
+    assert done.stdout.index("warning: ") < done.stdout.index("probe   1/3")
+
+
+def test_a_model_larger_than_life_with_points_of_ones_own_is_a_warning(tmp_path: Path) -> None:
+    done, told, _ = probe(tmp_path, "object=mustard", points=sequence())
+    assert told[0]["code"] == "object_size"
+    assert "at scale 2.5, the workspace" in said(done)[0]
+    assert said(done)[0].endswith("objects of real size have object.scale=1")
+
+
+def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path: Path) -> None:
+    surface = SURFACE.copy()
+    surface[15] = [5.0, 0.0, 0.0]
+    _, told, _ = probe(tmp_path, points=sequence(surface))
+    (recording,) = (tmp_path / "logs").rglob("recording.mcap")
+    again = tmp_path / "again"
+    source = ["session=recorded", f"session.path={recording}", f"logs={again}"]
+    done = run(main, *source, *QUICK)
+    assert done.returncode == 0, done.stderr
+    (summary,) = again.rglob("summary.json")
+    assert json.loads(summary.read_text())["warnings"] == told
+    assert said(done) == [each["text"] for each in told]
+
+
+def test_a_recording_of_points_in_millimetres_is_refused_as_well(tmp_path: Path) -> None:
+    box = BOX.copy().apply_scale(2.0)
+    path = tmp_path / "recording.mcap"
+    recorder = McapRecorder(path)
+    recorder.record(
+        SessionStarted(
+            runner="probe",
+            object="box",
+            session="points",
+            method="chsel",
+            seed=0,
+            config={},
+            mesh=box,
+            sdf=SdfGrid.from_mesh(box, 0.02),
+            workspace=Workspace.around(1000.0 * SURFACE, 0.5),
+            free_resolution=0.01,
+            initial_points=KnownPoints(),
+        )
+    )
+    recorder.record(Probe(0, "points", KnownPoints(known=1000.0 * SURFACE)))
+    recorder.record(SessionEnded(0, "finished"))
+    recorder.close()
+    logs = tmp_path / "logs"
+    done = run(main, "session=recorded", f"session.path={path}", f"logs={logs}")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: recording {path}: points on the object span ")
+    assert not logs.exists()
+
+
+def test_a_simulated_session_gives_no_warning(tmp_path: Path) -> None:
+    """Its object is larger than life on purpose."""
+    chosen = ["session=kinematic", "object=spam_can", "session.start_probe=11"]
+    done = run(main, *chosen, *QUICK[3:], f"logs={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    assert said(done) == []
+    (summary,) = tmp_path.rglob("summary.json")
+    assert json.loads(summary.read_text())["warnings"] == []
+
+
+@pytest.mark.parametrize("name", ["icub_lego", "icub_cylinder", "ycbv_foam_brick"])
+def test_real_points_give_no_warning(real_directory: Path, tmp_path: Path, name: str) -> None:
+    points = ["session=points", f"session.path={real_directory / name}.npz", "object=mesh"]
+    mesh = f"object.path={real_directory / name}.obj"
+    done = run(main, *points, mesh, "recording=none", f"logs={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    assert said(done) == []
