@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -66,14 +67,69 @@ class KnownPoints:
 
     def merged(self, new: KnownPoints) -> KnownPoints:
         """These points followed by new ones, class by class."""
-        joined: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), getattr(new, name)]) for name in _CLASSES
+        return KnownPoints.joined([self, new])
+
+    @classmethod
+    def joined(cls, parts: Sequence[KnownPoints]) -> KnownPoints:
+        """The points of several parts, at least one, in their order, class by class."""
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in _CLASSES
         }
-        return KnownPoints(**joined)
+        return cls(**arrays)
 
     def all_points(self) -> FloatArray:
         """Every point of every class (N + K + M, 3)."""
         return np.concatenate([self.free, self.occupied, self.known])
+
+
+class GrowingPoints:
+    """The known points of a session so far: copied only when all are asked for.
+
+    free, occupied, known, contacts: how many there are, without a copy.
+    """
+
+    def __init__(self, initial: KnownPoints) -> None:
+        self._parts = [initial]
+        self._counts = _counts(initial)
+
+    def add(self, new: KnownPoints) -> None:
+        """New points follow those so far."""
+        self._parts.append(new)
+        self._counts = self._counts + _counts(new)
+
+    def all(self) -> KnownPoints:
+        """All points so far; the same value until more are added."""
+        if len(self._parts) > 1:
+            self._parts = [KnownPoints.joined(self._parts)]
+        return self._parts[0]
+
+    @property
+    def free(self) -> int:
+        return int(self._counts[0])
+
+    @property
+    def occupied(self) -> int:
+        return int(self._counts[1])
+
+    @property
+    def known(self) -> int:
+        return int(self._counts[2])
+
+    @property
+    def contacts(self) -> int:
+        return int(self._counts[3])
+
+    @property
+    def count(self) -> int:
+        """How many points there are in all classes."""
+        return self.free + self.occupied + self.known
+
+
+def _counts(points: KnownPoints) -> np.ndarray:
+    """Numbers of points (4,): free, occupied, known, contacts."""
+    return np.array(
+        [len(points.free), len(points.occupied), len(points.known), len(points.contacts)]
+    )
 
 
 @dataclass(frozen=True)

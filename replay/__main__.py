@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from chsel.errors import ChselError
+from replay.console import print_error, print_warning
 from replay.verbs import VERBS
 
 TRACEBACK = "--traceback"
@@ -21,7 +22,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print it and exit with status 2."""
-        print(f"error: {self.prog}: {message} (--help shows what is accepted)", file=sys.stderr)
+        print_error(f"{self.prog}: {message} (--help shows what is accepted)")
         sys.exit(2)
 
 
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     show_traceback = TRACEBACK in words
     words = [word for word in words if word != TRACEBACK]
-    warnings.showwarning = _print_warning
+    warnings.showwarning = print_warning
     try:
         given = _parser(words[0] if words else "").parse_args(words)
         status: int = importlib.import_module(f"replay.verbs.{given.verb}").run(given)
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ChselError, OSError, MemoryError) as error:
         if show_traceback:
             raise
-        print(f"error: {_message(error)}", file=sys.stderr)
+        print_error(_message(error))
         return 2
     return status
 
@@ -75,10 +76,6 @@ def _message(error: Exception) -> str:
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror or error}"
     return " ".join(str(error).split("\n"))
-
-
-def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"warning: {message}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chsel.errors import RecordingError, require_choice
+from chsel.errors import require_choice
 from replay.new_file import new_file
 from replay.standard_json import standard
 
@@ -43,11 +43,8 @@ def write_export(exported: Exported, path: Path, file_format: str) -> None:
     """Write a new file. RecordingError if it exists or cannot be written."""
     require_choice("format", file_format, FORMATS)
     write = {"npz": _write_npz, "csv": _write_csv, "json": _write_json}[file_format]
-    try:
-        with new_file(path) as beside, beside.open("xb") as file:
-            write(exported, file)
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from error
+    with new_file(path) as beside, beside.open("xb") as file:
+        write(exported, file)
 
 
 def _write_npz(exported: Exported, file: IO[bytes]) -> None:

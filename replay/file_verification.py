@@ -20,12 +20,14 @@ from replay.verification import DIFFERS, EQUAL, Verdict, verify
 class FileVerdict:
     """What verifying one file showed; `unusable` says why it could not be done.
 
+    digest: of the recording, "" before format version 3.
     seconds: from reading the file to its last verdict, summed over processes.
     """
 
     path: Path
     verdicts: list[Verdict] = field(default_factory=list)
     unusable: str = ""
+    digest: str = ""
     seconds: float = 0.0
 
     @property
@@ -81,6 +83,7 @@ def _verified_part(path: Path, steps: Sequence[int] | None, part: int, parts: in
     begun, verdict = time.perf_counter(), FileVerdict(path)
     try:
         recording = read_recording(path)
+        verdict.digest = recording.digest
         wanted = recording.checked_steps(steps)
         first, last = (len(wanted) * part // parts, len(wanted) * (part + 1) // parts)
         verdict.verdicts = list(verify(recording, wanted[first:last]))
@@ -93,4 +96,5 @@ def _verified_part(path: Path, steps: Sequence[int] | None, part: int, parts: in
 def _joined(parts: Sequence[FileVerdict]) -> FileVerdict:
     verdicts = [verdict for part in parts for verdict in part.verdicts]
     unusable = next((part.unusable for part in parts if part.unusable), "")
-    return FileVerdict(parts[0].path, verdicts, unusable, sum(part.seconds for part in parts))
+    seconds = sum(part.seconds for part in parts)
+    return FileVerdict(parts[0].path, verdicts, unusable, parts[0].digest, seconds)

@@ -8,19 +8,28 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from chsel.errors import RecordingError
+from replay.disk import disk_error, sync_file, sync_folder
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """A path beside `path` to write to; it becomes `path` if all went well, else it is removed.
 
-    Raises RecordingError if there is such a file already, before or after, and if none can be made.
+    It is on the disk then, for good. Raises RecordingError if there is such a file already, before
+    or after, and if it cannot be written.
     """
     _check_free(path)
     beside = path.with_name(f".{path.name[:100]}.{os.urandom(4).hex()}")
     try:
         yield beside
+        sync_file(beside)
         _rename(beside, path)
+        sync_folder(path.parent)
+    except (OSError, RecordingError) as error:
+        reason = disk_error(error, beside)
+        if reason is None:
+            raise
+        raise RecordingError(f"{path} cannot be written: {reason.strerror or reason}") from error
     finally:
         with suppress(OSError):
             beside.unlink(missing_ok=True)

@@ -110,7 +110,9 @@ class UnusableRecording(pytest.Item):
 
     def runtest(self) -> None:
         """Fail with the reason."""
-        pytest.fail(self._reason, pytrace=False)
+        from replay.console import printable
+
+        pytest.fail(printable(self._reason), pytrace=False)
 
     def reportinfo(self) -> tuple[Path, None, str]:
         """Where it is."""
@@ -128,11 +130,12 @@ class ReplayedStep(pytest.Item):
 
     def runtest(self) -> None:
         """Fail with the report unless every bit is equal."""
+        from replay.console import printable
         from replay.verification import EQUAL
 
         verdict = self.parent.verdict(self.step)
         if verdict.outcome != EQUAL:
-            pytest.fail(f"{self.path}: {verdict.report()}", pytrace=False)
+            pytest.fail(f"{printable(str(self.path))}: {verdict.report()}", pytrace=False)
 
     def reportinfo(self) -> tuple[Path, None, str]:
         """Where it is."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chsel.errors import RecordingError
+from replay.mcap.damaged import recover_hint
 from replay.mcap.encoding import decode
 from replay.mcap.file import StoredMessage
 from replay.mcap.index import McapIndex
@@ -32,7 +33,8 @@ class RecordingInfo:
     steps: a mapping for each probe, named as the columns of the message `Contents`; points are
     all known with the probe. outcome: how the session ended, None if that is not told.
     attachments: bytes by name. messages, message_bytes: by topic; bytes are known where everything
-    was read. checked: whether it was. damage: what is wrong, None if nothing is.
+    was read. checked: whether it was. damage: what is wrong, None if nothing is. digest: of the
+    whole recording, "" if it is of a format before version 3 or has no end.
     """
 
     path: Path
@@ -46,6 +48,7 @@ class RecordingInfo:
     checked: bool = False
     damage: str | None = None
     rig: Mapping[str, str] | None = None
+    digest: str = ""
 
     @property
     def registrations(self) -> int:
@@ -56,9 +59,10 @@ class RecordingInfo:
     def integrity(self) -> str:
         """A line about what holds of the file."""
         if self.damage is not None:
-            return f"{self.damage}; what is whole was read, and `recover` may save it"
+            return f"{self.damage}; what is whole was read, and {recover_hint(self.path)}"
         if self.checked:
-            return "finished; everything was read, all checksums and digests are right"
+            seals = "" if self.digest else "; a format before 3 has no seals"
+            return f"finished; everything was read, all checksums and digests are right{seals}"
         return "finished; checksums of what was read are right (--check reads everything)"
 
     def plain(self) -> dict[str, Any]:
@@ -76,6 +80,7 @@ class RecordingInfo:
             "outcome": self.outcome,
             "registrations": self.registrations,
             "integrity": integrity,
+            "digest": self.digest,
             "steps": standard([*self.steps]),
             "attachments": dict(self.attachments),
             "messages": dict(self.messages),
@@ -99,47 +104,58 @@ def recording_info(path: str | Path, *, check: bool = False) -> RecordingInfo:
     try:
         checked = _from_everything(path)
     except RecordingError as error:
-        return replace(indexed, checked=True, damage=str(error).removeprefix(f"recording {path}: "))
+        damage = str(error).removeprefix(f"recording {path}: ").partition("; `python -m")[0]
+        return replace(indexed, checked=True, damage=damage)
     return replace(checked, damage=checked.damage or _contradiction(indexed, checked))
 
 
+def recording_digest(path: Path) -> str | None:
+    """The digest of a finished recording, from its end; None if there is none."""
+    try:
+        contents = McapIndex(path).message("/contents")
+    except RecordingError:
+        return None
+    return None if contents is None else decode("Contents", contents)["digest"] or None
+
+
 def _from_index(index: McapIndex) -> RecordingInfo:
-    session, contents = index.message("/session"), index.message("/contents")
-    if session is None or contents is None:
+    session, last = index.message("/session"), index.message("/contents")
+    if session is None or last is None:
         raise RecordingError(f"recording {index.path} has no session or no contents")
+    contents = decode("Contents", last)
     ended, rig = index.message("/session_ended"), index.message("/rig")
     return RecordingInfo(
         index.path,
         index.size,
         _session(index.path, session),
-        _rows(decode("Contents", contents)),
+        _rows(contents),
         None if ended is None else decode("SessionEnded", ended)["outcome"],
         index.attachments,
         index.messages,
         rig=None if rig is None else _rig(index.path, decode("Rig", rig)),
+        digest=contents["digest"],
     )
 
 
 def _from_everything(path: Path) -> RecordingInfo:
-    from replay.mcap.attachments import MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
     from replay.mcap.reader import read_recording
 
     tally = _Tally()
     recording = read_recording(path, partial=True, watch=tally.take)
     steps, damage = _checked_steps(recording)
-    start = recording.start
     return RecordingInfo(
         path,
         path.stat().st_size,
         _session(path, tally.session),
         steps,
         None if recording.ended is None else recording.ended.outcome,
-        {MESH: len(mesh_to_ply(start.mesh)), SDF_GRID: len(sdf_to_bytes(start.sdf))},
+        recording.attachments,
         tally.messages,
         tally.bytes,
         checked=True,
         damage=recording.damage or damage,
         rig=None if recording.rig is None else _rig(path, vars(recording.rig)),
+        digest=recording.digest if recording.damage is None else "",
     )
 
 
@@ -186,6 +202,7 @@ def _session(path: Path, data: bytes) -> dict[str, Any]:
         "format_version": values["format_version"],
         "workspace": standard(values["workspace"].tolist()),
         "true_pose": values["world_from_object"] is not None,
+        "lost": list(values["lost"]),
         "sdf_digest": values["sdf_digest"],
         "mesh_digest": values["mesh_digest"],
         "environment": {item["name"]: item["value"] for item in values["environment"]},
@@ -202,7 +219,7 @@ def _rig(path: Path, values: Mapping[str, Any]) -> dict[str, str]:
 
 def _rows(columns: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     """A mapping for each row of the columns of `Contents`."""
-    names = tuple(MESSAGES["Contents"])
+    names = tuple(name for name in MESSAGES["Contents"] if name not in ("session", "digest"))
     rows = zip(*(columns[name].tolist() for name in names), strict=True)
     return tuple(dict(zip(names, row, strict=True)) for row in rows)
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from chsel.errors import RecordingError
+from replay.console import print_error
 from replay.rerun.headless import headless_viewer
 
 
@@ -25,19 +27,19 @@ def save_screenshot(
     png.write_bytes(picture)
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """`python -m replay.screenshot FILE.rrd OUT.png`."""
     parser = argparse.ArgumentParser(prog="replay.screenshot", description=__doc__)
     parser.add_argument("rrd", type=Path)
     parser.add_argument("png", type=Path)
     parser.add_argument("--step", type=int, help="probe to show; by default where the viewer opens")
     parser.add_argument("--size", type=int, nargs=2, default=(1600, 900))
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
     width, height = given.size
     try:
         save_screenshot(given.rrd, given.png, step=given.step, width=width, height=height)
     except RecordingError as error:
-        print(error, file=sys.stderr)
+        print_error(str(error))
         return 2
     return 0
 

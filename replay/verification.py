@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from chsel.errors import ChselError
+from chsel.errors import ChselError, RecordingError
 from chsel.online import pose_problem
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.differences import apart, difference
@@ -17,13 +17,17 @@ from replay.environment import environment
 from replay.events import (
     Event,
     HypothesesFound,
+    Measured,
     ProblemPosed,
     SessionStarted,
     SnapshotTaken,
     Traced,
 )
+from replay.lost_attachment import LostAttachment
 from replay.mcap.reader import Recording
 from replay.mcap.recovery import tells_loss
+from replay.mcap.schemas import SEALED_SINCE
+from replay.measured import measured_differences
 from replay.recorder import ListRecorder
 from replay.registration import NamedMethod, recorded_method, register_recorded
 
@@ -71,10 +75,13 @@ class Verdict:
 def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator[Verdict]:
     """Verdicts on steps of a recording (None: on all that pose a problem), in their order.
 
-    Raises RecordingError if the recording does not tell its method, or lacks a step.
+    Raises RecordingError if the recording does not tell its method, lacks a step, or has lost its
+    SDF grid.
     """
     method = recorded_method(recording)
-    wanted = recording.checked_steps(steps)
+    wanted = set(recording.checked_steps(steps))
+    if isinstance(recording.start.sdf, LostAttachment):
+        raise RecordingError(f"recording {recording.path}: {recording.start.sdf.error()}")
     differing = environment_differences(recording.start)
     events = recording.events(images=False)
     before, posed = _until_next_problem(events)
@@ -82,7 +89,10 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
     while posed is not None:
         of_step, following = _until_next_problem(events)
         if posed.step in wanted:
-            yield _verified(recording.start, posed, of_step, method, previous, differing)
+            measured = recording.version >= SEALED_SINCE
+            yield _verified(
+                recording.start, posed, of_step, method, previous, differing, measured=measured
+            )
         previous = _previous(of_step, previous)
         posed = following
 
@@ -140,8 +150,13 @@ def _verified(
     method: NamedMethod,
     previous: Previous,
     environment: tuple[str, ...],
+    *,
+    measured: bool,
 ) -> Verdict:
-    """Run the registration of a step again, and compare."""
+    """Run the registration of a step again, and compare; measured: also numbers about the result.
+
+    Before format version 3 those may be others than the ones computed today.
+    """
     step = posed.step
     recorded, whole = _events_of(step, events)
     expected = _result(recorded)
@@ -170,6 +185,11 @@ def _verified(
     else:
         comparison.stage_is("the end of the registration", equal=False)
         comparison.differences.append(f"today's registration does not end: {failure}")
+    numbers = [event for event in recorded if isinstance(event, Measured)]
+    if measured and (numbers or not any(map(tells_loss, events))):
+        lines = measured_differences(start, posed.problem, expected, numbers)
+        comparison.stage_is("the measured values", equal=not lines)
+        comparison.differences += lines
     return comparison.verdict(step, method.name, environment, seconds)
 
 

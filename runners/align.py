@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from chsel.arrays import FloatArray
@@ -23,6 +22,7 @@ from chsel.problem import RegistrationProblem
 from chsel.settings import build_settings, settings_mapping
 from chsel.streams import StreamKey
 from chsel.threads import threads
+from replay.console import Console
 from runners.align_view import save_view
 from runners.alignment_fit import Fit, fit_of
 from runners.cli import command, plain
@@ -96,7 +96,7 @@ def main(config: DictConfig) -> None:
     problem = source.problems.problem(source.steps[-1])
     if len(problem.points.known) == 0:
         raise SettingError(f"{path} has no contact; accepted: a session that touched the object")
-    console, waiting = Console(highlight=False), Console(stderr=True)
+    console, waiting = Console(), Console(stderr=True)
     with threads(checked.threads):
         if waiting.is_terminal:
             with waiting.status("searching"):
@@ -115,14 +115,14 @@ def main(config: DictConfig) -> None:
         apart = _apart(*_between(found.world_from_object, source.world_from_object))
         console.print(f"from the true pose that the recording has: {apart}")
     for warning in _warnings(found, guess, fits["found"], checked.search):
-        console.print(f"warning: {warning}", soft_wrap=True, markup=False)
+        console.print(f"warning: {warning}", soft_wrap=True)
     pose_path.parent.mkdir(parents=True, exist_ok=True)
     about = _about(checked, source, found, guess, fits["found"])
     view_path.unlink(missing_ok=True)
     save_view(view_path, source.mesh, problem, guess, found.world_from_object)
     write_pose(pose_path, found.world_from_object, about, overwrite=checked.overwrite)
     for written in (pose_path, view_path):
-        console.print(str(written), soft_wrap=True, markup=False)
+        console.print(str(written), soft_wrap=True)
 
 
 def _check_new(*paths: Path, overwrite: bool) -> None:

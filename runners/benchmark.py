@@ -11,12 +11,12 @@ from typing import Any
 import torch
 import yaml
 from omegaconf import DictConfig
-from rich.console import Console
 
 from chsel.device import device_named, gpus
 from chsel.errors import require_choice, require_positive
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
+from replay.console import Console
 from runners.benchmarks import report
 from runners.benchmarks.alone import MEASURES
 from runners.benchmarks.comparison import WHAT, compare
@@ -27,7 +27,7 @@ from runners.benchmarks.problems import PROBLEMS
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
 from runners.benchmarks.scope import Scope
 from runners.cli import command, plain
-from runners.recording import make_run_folder
+from runners.recording import make_run_folder, write_in_run_folder
 
 
 @dataclass(frozen=True)
@@ -92,15 +92,16 @@ def main(config: DictConfig) -> None:
     if checked.quick:
         checked = checked.shortened()
     torch.set_num_threads(1)
-    console = Console(highlight=False)
+    console = Console()
     say = partial(console.print, soft_wrap=True)
     with ExitStack() as stack:
         python = None if checked.package.skip else interpreter(checked.package, say)
         package = None if python is None else stack.enter_context(PublishedPackage(python))
         folder = make_run_folder(Path(checked.logs) / "benchmark", "drill")
-        (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+        write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         found = _run(checked, package, folder, console)
     report.show(console, found)
+    report.write_markdown(folder / "speed.md", found)
     draw(found, folder / "benchmark.png")
     say(f"written: {folder}")
 

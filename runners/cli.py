@@ -26,6 +26,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from chsel.errors import ChselError
+from replay.console import print_error, print_warning
 from runners.presets import store_presets
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -46,7 +47,7 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
             show_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1" or TRACEBACK in sys.argv
             sys.argv = [argument for argument in sys.argv if argument != TRACEBACK]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
-            warnings.showwarning = _print_warning
+            warnings.showwarning = print_warning
             store_presets()
             _register_resolvers()
 
@@ -116,7 +117,7 @@ def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bo
     except _USER_ERRORS as error:
         if show_traceback:
             raise
-        print(f"error: {_message(error, config_name)}", file=sys.stderr)
+        print_error(_message(error, config_name))
         sys.exit(2)
 
 
@@ -187,7 +188,3 @@ def _register_resolvers() -> None:
         return "\n".join(f"  {group}={'|'.join(choices(group))}" for group in groups)
 
     OmegaConf.register_new_resolver("options", options, replace=True)
-
-
-def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"warning: {message}", file=sys.stderr)

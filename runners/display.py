@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.filesize import decimal
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TimeElapsedColumn
 from rich.table import Table
 
+from replay.console import Console, Progress, TextColumn
 from runners.sensors.tally import Report, Tally
 
 
@@ -52,7 +52,7 @@ class Bar:
 @contextmanager
 def reading_bar() -> Iterator[Bar]:
     """A bar of its own, as long as a session is opened."""
-    bar = Bar(Console(highlight=False))
+    bar = Bar(Console())
     try:
         yield bar
     finally:
@@ -63,7 +63,7 @@ class Display:
     """One line a probe, a bar within a registration, a table at the end."""
 
     def __init__(self, title: str, count: int) -> None:
-        self._console = Console(highlight=False)
+        self._console = Console()
         self._count = count
         self._bar = Bar(self._console)
         self._console.print(title, style="bold", soft_wrap=True)
@@ -115,7 +115,7 @@ class Display:
             self._console.print(_sensor_table(report))
         for level, text in report.lines:
             line = f"warning: {text}" if level == "warning" else text
-            self._console.print(line, markup=False, soft_wrap=True)
+            self._console.print(line, soft_wrap=True)
 
     def written(self, folder: Path, files: Mapping[str, int]) -> None:
         """What lies in the run's folder, and how to look at it."""

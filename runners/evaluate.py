@@ -22,6 +22,7 @@ from chsel.settings import build_settings
 from runners.cli import command, plain
 from runners.evaluation.configurations import SENSORS
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label
+from runners.evaluation.definition import definition_text
 from runners.evaluation.display import Display
 from runners.evaluation.experiment import join_experiment, read_experiment
 from runners.evaluation.gathering import gather
@@ -131,7 +132,7 @@ def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
         results = gather(plan.folder)
         if sys.exc_info()[0] is KeyboardInterrupt:
             display.say("interrupted: what is finished stays, and the same command goes on")
-    display.summary(results, _labels(plan.folder))
+    display.summary(results, _labels(plan.folder), definition_text(plan.definition))
     display.true_poses(true_poses(plan.folder, read_experiment(plan.folder)))
     display.written(plan.folder, results)
     return any(text.startswith("failed") for text in results["status"].to_pylist())

@@ -10,18 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     DownloadColumn,
-    TextColumn,
     TimeRemainingColumn,
     TransferSpeedColumn,
 )
-from rich.progress import Progress as ProgressBar
 
 from chsel.errors import ChselError, MeshError, SettingError
 from chsel.settings import build_settings
+from replay.console import Console, TextColumn
+from replay.console import Progress as ProgressBar
 from runners.cli import command, plain
 from runners.download import DownloadError, Progress, download
 from runners.objects.loader import ObjectConfig
@@ -36,13 +35,14 @@ def main(config: DictConfig) -> None:
     assets = build_settings(AssetsConfig, settings["assets"], "assets")
     scan = _chosen_scan(settings["object"])
     folder = scan_folder(assets.folder, scan)
+    console = Console(soft_wrap=True)
     if folder.exists():
-        print(f"{folder} is there already: {_check_present(folder, scan)}")
+        console.print(f"{folder} is there already: {_check_present(folder, scan)}")
         return
     with progress_bar(scan) as progress:
         found = fetch_scan(scan, assets, progress)
-    print(f"{folder}: {found}")
-    print("This scan is of the YCB Object and Model Set (Calli et al.), licence CC BY 4.0.")
+    console.print(f"{folder}: {found}")
+    console.print("This scan is of the YCB Object and Model Set (Calli et al.), licence CC BY 4.0.")
 
 
 def fetch_scan(scan: str, assets: AssetsConfig, progress: Progress) -> str:
@@ -73,9 +73,9 @@ def fetch_scan(scan: str, assets: AssetsConfig, progress: Progress) -> str:
 @contextmanager
 def progress_bar(title: str) -> Iterator[Progress]:
     """A bar on the terminal that follows the calls of what is yielded."""
-    columns = (DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with ProgressBar(TextColumn(title), BarColumn(), *columns, console=console) as bar:
+    text, bar_column = TextColumn("{task.description}"), BarColumn()
+    columns = (text, bar_column, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    with ProgressBar(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 

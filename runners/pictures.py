@@ -77,10 +77,14 @@ class CheckedPictures(Recorder):
         self.flush()
         if self._broken:
             return
-        self._recorder.close()
+        synced = True
+        try:
+            self._recorder.close()
+        except RecordingError:
+            synced = False
         if _size(self._path) is None:
             self._tell("is not there any more")
-        elif _END not in _last_bytes(self._path):
+        elif not synced or _END not in _last_bytes(self._path):
             self._tell("cannot be written to its end: the disk may be full")
 
     def _tell(self, what: str) -> None:

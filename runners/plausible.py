@@ -13,8 +13,6 @@ import numpy as np
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from chsel.arrays import FloatArray
@@ -32,8 +30,10 @@ from chsel.problem import RegistrationProblem
 from chsel.settings import build_settings, settings_mapping
 from chsel.streams import StreamKey
 from chsel.threads import threads
+from replay.console import Console, Progress
 from replay.step_ranges import chosen_steps
 from runners.cli import command, plain
+from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig
 from runners.plausible_source import Source, open_source
@@ -79,7 +79,7 @@ def main(config: DictConfig) -> None:
     steps = chosen_steps(checked.steps, source.steps)
     settings = _settings(checked.definition, source)
     folder = Path(checked.out).expanduser() if checked.out else path.parent / "plausible"
-    console = Console(highlight=False)
+    console = Console()
     with threads(checked.threads):
         truth = _truth(checked, source, settings, console)
         rows, failures = _rows(checked, source, steps, settings, truth, folder)
@@ -87,23 +87,19 @@ def main(config: DictConfig) -> None:
     if rows:
         console.print(_table(rows))
     for failure in failures:
-        console.print(failure, soft_wrap=True, markup=False)
-    console.print(f"{folder}  {len(rows)} sets", soft_wrap=True, markup=False)
+        console.print(failure, soft_wrap=True)
+    console.print(f"{folder}  {len(rows)} sets", soft_wrap=True)
     if failures:
         sys.exit(1)
 
 
 def _settings(definition: Any, source: Source) -> PlausibleSettings:
-    values = dict(definition)
-    values.pop("name", None)
-    if values.get("epsilon") is None:
-        if source.epsilon is None:
-            raise SettingError(
-                "definition.epsilon is missing, as the recording names none of its object; "
-                "accepted: metres above 0, such as 0.001"
-            )
-        values["epsilon"] = source.epsilon
-    return build_settings(PlausibleSettings, values, "definition")
+    if definition.get("epsilon") is None and source.epsilon is None:
+        raise SettingError(
+            "definition.epsilon is missing, as the recording names none of its object; "
+            "accepted: metres above 0, such as 0.001"
+        )
+    return definition_settings(definition, source.epsilon)
 
 
 def _truth(
@@ -120,10 +116,10 @@ def _truth(
     found = find_true_pose(problem, np.array(config.guess))
     console.print(
         f"true pose found near the guess, which costs {found.guess_cost:.4g}: it costs "
-        f"{found.cost:.4g}\n{found.world_from_object.tolist()}",
+        f"{found.cost:.4g}",
         soft_wrap=True,
-        markup=False,
     )
+    console.print(str(found.world_from_object.tolist()), soft_wrap=True)
     return found.world_from_object
 
 
@@ -136,7 +132,7 @@ def _aligned(path: Path, console: Console) -> FloatArray:
             f"that `python -m runners.align {path} position=[x,y,z] rotation=[roll,pitch,yaw]` "
             "finds, guess=[[...],[...],[...],[0,0,0,1]] near it, or a file with world_from_object"
         )
-    console.print(f"true pose: that of {there}", soft_wrap=True, markup=False)
+    console.print(f"true pose: that of {there}", soft_wrap=True)
     return read_pose(there)
 
 
@@ -190,10 +186,9 @@ def _title(
     config: PlausibleConfig, source: Source, settings: PlausibleSettings, truth: FloatArray
 ) -> str:
     position = ", ".join(f"{value:.3f}" for value in truth[:3, 3])
-    name = config.definition.get("name", "own")
     return (
-        f"{source.object}, plausible sets by definition {name}, epsilon "
-        f"{1000.0 * settings.epsilon:g} mm, around ({position}) m"
+        f"{source.object}, plausible sets by definition {definition_label(config.definition)}, "
+        f"epsilon {1000.0 * settings.epsilon:g} mm, around ({position}) m"
     )
 
 

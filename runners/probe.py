@@ -23,12 +23,18 @@ from chsel.settings import build_settings
 from chsel.streams import StreamKey
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
+from replay.recording_info import recording_digest
 from runners.cli import command, plain
 from runners.display import Display, reading_bar
 from runners.interrupt import Interrupt
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
-from runners.recording import RecordingConfig, make_run_folder, open_recorder
+from runners.recording import (
+    RecordingConfig,
+    make_run_folder,
+    open_recorder,
+    write_in_run_folder,
+)
 from runners.sensors.tally import Report
 from runners.session_run import Row, SessionRun
 from runners.sessions import open_session, session_settings
@@ -36,6 +42,7 @@ from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
+from runners.whole_file import WritingError
 
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
@@ -109,7 +116,7 @@ def main(config: DictConfig) -> None:
         scene = open_scene(checked, bar.show)
     try:
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
-        (folder / "config.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+        write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name, scene)
         with Interrupt() as interrupt:
             interrupted = run(folder, checked, method, scene, started, interrupt)
@@ -205,7 +212,7 @@ def run(
         _finish(folder, recorder, session_run.step, started, rows, "interrupted")
         raise
     except Exception as error:
-        with suppress(OSError):  # the first error is the one to tell
+        with suppress(OSError, WritingError):  # the first error is the one to tell
             _finish(folder, recorder, session_run.step, started, rows, f"failed: {error}")
         raise
     finally:
@@ -234,7 +241,7 @@ def _finish(
         with nullcontext() if finished else suppress(RecordingError):
             _end(recorder, step, "info" if finished else "warning", outcome)
     except RecordingError as error:
-        with suppress(OSError):  # the first error is the one to tell
+        with suppress(OSError, WritingError):  # the first error is the one to tell
             _summarise(folder, started, rows, f"failed: {error}")
         raise
     _summarise(folder, started, rows, outcome)
@@ -257,11 +264,12 @@ def _summarise(folder: Path, started: SessionStarted, rows: list[Row], outcome: 
         "method": started.method,
         "seed": started.seed,
         "outcome": outcome,
+        "recording_digest": recording_digest(folder / "recording.mcap"),
         "steps": rows,
         "bytes": _sizes(folder),
         "environment": dict(started.environment),
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    write_in_run_folder(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
 
 
 def _sizes(folder: Path) -> dict[str, int]:

@@ -14,6 +14,10 @@ from replay.events import Recorder
 from replay.mcap.writer import McapRecorder
 from replay.recorder import TeeRecorder
 from runners.pictures import open_pictures
+from runners.whole_file import WritingError, whole_file
+
+IN_RUN_FOLDER = "a logs=DIR that can be written"
+"""What is accepted where a file of a run cannot be written."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,14 @@ def make_run_folder(logs: Path, *names: str) -> Path:
             f"run folder {folder} cannot be made ({error.strerror}); accepted: a writable logs=DIR"
         ) from None
     return folder
+
+
+def write_in_run_folder(path: Path, text: str) -> None:
+    """Write a file of a run. Raises WritingError, which names it, if that cannot be done."""
+    if not path.parent.is_dir():  # it was removed during the run, and is not made again
+        raise WritingError(f"{path} cannot be written: its folder was removed")
+    with whole_file(path, IN_RUN_FOLDER) as beside:
+        beside.write_text(text)
 
 
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
-from rich.console import Console
 
 from chsel.errors import SettingError
 from chsel.settings import build_settings, settings_mapping
+from replay.console import Console, print_error
 from runners.cli import command, plain
 from runners.reporting.against_baseline import section_against
 from runners.reporting.completeness import planned_methods
@@ -51,7 +51,7 @@ def main(config: DictConfig) -> None:
     folder = Path(checked.dir or "").expanduser()
     out = Path(checked.out).expanduser() if checked.out else folder / "report"
     evaluation = open_evaluation(folder)
-    console, waiting = Console(highlight=False), Console(stderr=True)
+    console, waiting = Console(), Console(stderr=True)
     if checked.baseline is not None:
         styles = method_styles(planned_methods(evaluation))
         for table in section_against(evaluation, styles, checked.baseline).tables:
@@ -66,9 +66,9 @@ def main(config: DictConfig) -> None:
     for section in sections:
         if section.missing:
             line = f"no picture of {section.title}: {section.missing}"
-            console.print(line, soft_wrap=True, markup=False)
+            console.print(line, soft_wrap=True)
     for name in (HTML, MARKDOWN):
-        console.print(str(out / name), soft_wrap=True, markup=False)
+        console.print(str(out / name), soft_wrap=True)
 
 
 def named_arguments(arguments: Sequence[str]) -> list[str]:
@@ -128,7 +128,7 @@ def program() -> None:
     try:
         sys.argv[1:] = named_arguments(sys.argv[1:])
     except SettingError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print_error(str(error))
         sys.exit(2)
     main()
 

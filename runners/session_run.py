@@ -8,6 +8,7 @@ from typing import Any
 
 from chsel.methods.method import Method
 from chsel.online import pose_problem
+from chsel.points import GrowingPoints
 from chsel.problem import Hypotheses, RegistrationProblem
 from chsel.sdf import SdfGrid
 from chsel.streams import StreamKey
@@ -47,8 +48,7 @@ class SessionRun:
         self._snapshot_interval = recording.snapshot_interval
         self._timings = recording.timings
         self._show = show
-        self.points = session.initial_points
-        self.contact_count = len(session.initial_points.contacts)
+        self._points = GrowingPoints(session.initial_points)
         self.previous: Hypotheses | None = None
         self.step = 0
 
@@ -62,12 +62,12 @@ class SessionRun:
             probe = event
             self.step = probe.step
             seconds = {"probe": time.perf_counter() - begun}
-            self._take(probe)
+            self._points.add(probe.new_points)
             row: Row = {
                 "step": probe.step,
                 "outcome": probe.outcome,
-                "contacts": self.contact_count,
-                "free_points": len(self.points.free),
+                "contacts": self._points.contacts,
+                "free_points": self._points.free,
             }
             if self._enough(probe):
                 row |= self._register(probe.step, seconds)
@@ -79,13 +79,10 @@ class SessionRun:
             yield probe, row
             begun = time.perf_counter()
 
-    def _take(self, probe: Probe) -> None:
-        self.points = self.points.merged(probe.new_points)
-        self.contact_count = len(self.points.contacts)
-
     def _enough(self, probe: Probe) -> bool:
         contacts, index = self._start
-        return self.contact_count >= contacts and probe.step >= index and self.points.count > 0
+        known = self._points
+        return known.contacts >= contacts and probe.step >= index and known.count > 0
 
     def _register(self, step: int, seconds: dict[str, float]) -> Row:
         """Pose the problem, register, and record both; numbers about the result."""
@@ -107,7 +104,7 @@ class SessionRun:
         """What is to be registered at a step, after the result of the one before."""
         return pose_problem(
             self._sdf,
-            self.points,
+            self._points.all(),
             self._session.workspace,
             self._session.free_resolution,
             StreamKey(self._seed, step),

@@ -9,13 +9,13 @@ from typing import Any
 
 import yaml
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.filesize import decimal
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TimeElapsedColumn
 
 from chsel.errors import SettingError
 from chsel.settings import build_settings
 from chsel.streams import StreamKey
+from replay.console import Console, Progress, TextColumn
 from runners.cli import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
@@ -60,7 +60,7 @@ def main(config: DictConfig) -> None:
         if os.path.lexists(path) and not checked.overwrite:
             raise SettingError(f"{path} exists; accepted: another out=FILE.mcap, or overwrite=true")
     mesh = load_object(chosen, checked.assets.folder).mesh
-    console = Console(highlight=False)
+    console = Console()
     console.print(
         f"{chosen.name} at scale {chosen.scale:g} in {configuration.name}, {count} probes, seed "
         f"{checked.seed}",
@@ -86,10 +86,10 @@ def main(config: DictConfig) -> None:
         ) from error
     console.print(
         f"{log}  {decimal(log.stat().st_size)}, {simulated.messages} messages of "
-        f"{simulated.seconds:.1f} simulated seconds\n{truth}  the true pose",
+        f"{simulated.seconds:.1f} simulated seconds",
         soft_wrap=True,
-        markup=False,
     )
+    console.print(f"{truth}  the true pose", soft_wrap=True)
 
 
 def _object(values: dict[str, Any], configuration: CabinetConfiguration) -> ObjectConfig:

@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
+from replay.disk import sync_file, sync_folder
 
 
 class WritingError(ChselError):
@@ -15,25 +16,24 @@ class WritingError(ChselError):
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A path beside `path` to write to, which replaces `path` once all went well.
+def whole_file(path: Path, accepted: str = "an out=DIR that can be written") -> Iterator[Path]:
+    """A path beside `path` to write to, which replaces `path` once all is on the disk.
 
-    Raises WritingError, with the reason, if either cannot be written.
+    accepted: what to do about it if either cannot be written: the end of the WritingError.
     """
     beside = path.with_name(f".{path.name}.{os.urandom(4).hex()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield beside
-        with beside.open("rb") as written:
-            os.fsync(written.fileno())  # else a power cut may leave the name without the content
+        sync_file(beside)  # else a power cut may leave the name without the content
         beside.replace(path)
+        sync_folder(path.parent)
     except (OSError, RecordingError) as error:
         reason = error if isinstance(error, OSError) else error.__context__
         if not isinstance(reason, OSError):  # what was to be recorded is no good
             raise
         raise WritingError(
-            f"{path} cannot be written ({reason.strerror or reason}); accepted: an out=DIR that "
-            "can be written"
+            f"{path} cannot be written ({reason.strerror or reason}); accepted: {accepted}"
         ) from error
     finally:
         with suppress(OSError):

@@ -13,16 +13,22 @@ from replay.new_file import new_file
 
 
 def write_csv(
-    path: Path, outcomes: Sequence[Outcome], methods: Sequence[Contender], cost: CommonCost
+    path: Path,
+    outcomes: Sequence[Outcome],
+    methods: Sequence[Contender],
+    cost: CommonCost,
+    definition: str,
 ) -> None:
     """Write a new file: a row for each step and method; names of columns end in their unit.
 
     step, label, method, changes (to the settings, with "; " between), cost (by which all are
-    judged), then the numbers with all digits, empty where there are none, then bits_as_recorded
-    (yes, no, or empty where the method is not the recorded one) and failure.
+    judged), definition (of the plausible sets, empty where a row has no PD), then the numbers with
+    all digits, empty where there are none, then bits_as_recorded (yes, no, or empty where the
+    method is not the recorded one) and failure.
     """
     by_label = {method.label: method for method in methods}
-    names = ["step", "label", "method", "changes", "cost", *(c.csv_name for c in COLUMNS)]
+    names = ["step", "label", "method", "changes", "cost", "definition"]
+    names += [column.csv_name for column in COLUMNS]
     with new_file(path) as beside, beside.open("x", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([*names, "bits_as_recorded", "failure"])
@@ -33,6 +39,7 @@ def write_csv(
                     outcome.label,
                     *_method(outcome, by_label),
                     cost.name,
+                    definition if "diversity" in outcome.numbers else "",
                     *(_exact(outcome, column.name) for column in COLUMNS),
                     {True: "yes", False: "no", None: ""}[outcome.as_recorded],
                     outcome.failure,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 
 from chsel.errors import RecordingError, require_choice
@@ -30,9 +31,13 @@ class PlausibleSets:
             raise RecordingError(f"{folder} is no folder; accepted: one with plausible sets")
         self._folder = folder or recording.path.parent / "plausible"
         self._definition = definition
-        start = recording.start
+        self._start = recording.start
+
+    @cached_property
+    def _distance(self) -> SurfaceDistance:
+        start = self._start
         points = surface_points(start.mesh, DistanceSettings().points, StreamKey(start.seed, 0))
-        self._distance = SurfaceDistance(start.sdf, start.mesh, points)
+        return SurfaceDistance(start.sdf, start.mesh, points)
 
     def numbers(self, problem: RegistrationProblem, hypotheses: Hypotheses) -> dict[str, float]:
         """Coverage, plausibility and PD in mm^2 (CHSEL, Sec. V); none without a set of the problem.

@@ -24,8 +24,9 @@ from replay.differences import apart, difference
 from replay.mcap.attachments import MESH, SDF_GRID
 from replay.mcap.encoding import decode
 from replay.mcap.file import McapFile, StoredMessage
-from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.foxglove_messages import FOXGLOVE, SCENE
 from replay.mcap.schemas import MESSAGES, RECORDS, message_class
+from replay.mcap.seal import CONTENTS, SEAL
 
 BOTH, FIRST, SECOND = "both", "first", "second"
 _LONGEST_TEXT = 60
@@ -149,6 +150,8 @@ def recording_diff(
 ) -> RecordingDiff:
     """Compare two recordings, each read twice and never held as a whole.
 
+    What is drawn for viewers alone (`SCENE`) is left out: it follows from the rest.
+
     keep: how many differences to keep beside those of the session's start; None: all. Raises
     RecordingError if a file cannot be read, or one of its checksums is wrong.
     """
@@ -175,13 +178,18 @@ class _Survey:
         self.counts = Counter(key.kind for key, _ in self.messages())
 
     def messages(self) -> Iterator[tuple[Key, StoredMessage]]:
-        """All messages that are not left out, in their order, as the file has them."""
+        """All messages that are not left out, in their order, as the file has them.
+
+        Seals follow from the messages that they close, and what viewers draw from the rest.
+        """
         schemas = {topic: message_class(name).DESCRIPTOR for topic, name in RECORDS.items()}
         schemas |= {topic: kind.DESCRIPTOR for topic, kind in FOXGLOVE.items()}
-        file = McapFile(self.path, {topic: kind.full_name for topic, kind in schemas.items()})
+        names = {topic: kind.full_name for topic, kind in schemas.items()}
+        file = McapFile(self.path, names, check_seals=False)  # to see what was changed
         numbers: Counter[tuple[str, int, str]] = Counter()
         for message in file.messages():
-            if not self._ignored.topic(message.topic):
+            derived = message.topic == SEAL or message.topic in SCENE
+            if not derived and not self._ignored.topic(message.topic):
                 kind = (message.topic, step_of(message), _about(message))
                 yield Key(*kind, numbers[kind]), message
                 numbers[kind] += 1
@@ -274,8 +282,12 @@ def _compared_messages(pair: _Pair, ignored: Ignored) -> list[Difference]:
     found = order if moved else []
     if first.data == second.data and key.topic in RECORDS:
         return found
-    contents = _read(message_content, first), _read(message_content, second)
-    return found + _compared(key, *contents, ignored)
+    one, other = (dict(_read(message_content, message)) for message in (first, second))
+    if key.topic == CONTENTS:
+        for name in ("session", "digest"):  # these follow from the seals
+            one.pop(name, None)
+            other.pop(name, None)
+    return found + _compared(key, one, other, ignored)
 
 
 def _compared_attachments(

@@ -10,9 +10,8 @@ import trimesh
 from chsel.errors import RecordingError
 from chsel.sdf import SdfGrid
 from replay.mcap.encoding import decode, encode
+from replay.mcap.schemas import MESH, SDF_GRID
 
-MESH = "mesh.ply"
-SDF_GRID = "sdf_grid"
 MEDIA_TYPES = {MESH: "model/ply", SDF_GRID: "application/protobuf; message=chsel.SdfGrid"}
 
 _VERTEX = np.dtype(("<f8", 3))

@@ -15,8 +15,7 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
-
-BEFORE_ALL_STEPS = -1
+from replay.mcap.schemas import BEFORE_ALL_STEPS
 
 
 class EventOrder:

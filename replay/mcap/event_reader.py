@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import trimesh
 from google.protobuf.message import DecodeError
 
 from chsel.arrays import FloatArray
@@ -28,25 +30,27 @@ from replay.events import (
     Timed,
     Traced,
 )
+from replay.lost_attachment import LostAttachment
 from replay.mcap.attachments import MESH, SDF_GRID, mesh_from_ply, sdf_from_bytes
 from replay.mcap.contents import Contents
 from replay.mcap.encoding import decode
 from replay.mcap.event_checks import check_event, check_free_resolution, check_poses
 from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
 from replay.mcap.file import StoredMessage
-from replay.mcap.foxglove_messages import cloud_points, log_level_and_text
+from replay.mcap.foxglove_messages import VIEWS, cloud_points, log_level_and_text
 from replay.mcap.plain_config import config_from_json
 from replay.mcap.schemas import (
     FORMAT_VERSION,
     RECORDS,
+    SEALED_SINCE,
     SINCE_VERSION,
     STEP_TIME,
     message_class,
 )
+from replay.mcap.seal import CONTENTS, SEAL
 from replay.mcap.sensor_messages import ImagePlace, check_image, plausible_pixels, rig
 from replay.mcap.wire import check_wire
 
-_VIEWS = ("/object_pose", "/gripper_path", "/hypothesis_poses")  # they repeat what records say
 _CLOUDS = {"/points/free": 3, "/points/occupied": 3, "/points/known": 4}  # columns
 
 
@@ -86,6 +90,7 @@ Entry = Event | RecordedProblem | ImagePlace
 class EventReader:
     """Joins messages to events. `within` is the topic of an event whose points are yet to come.
 
+    version: of the file's format, once its session has started.
     size: of the file, bytes, by which it is judged how many pixels it can plausibly hold.
     """
 
@@ -95,7 +100,7 @@ class EventReader:
         self.contents = Contents()
         self.closed = False  # whether the contents, which come last, were there
         self._pixels = plausible_pixels(size)  # that are left
-        self._version = FORMAT_VERSION
+        self.version = FORMAT_VERSION
         self._order = EventOrder()
         self._sdf_digest = ""
         self._points_digest = ""  # of all points known so far, as recorded
@@ -109,8 +114,10 @@ class EventReader:
     def take(self, message: StoredMessage) -> None:
         """Read one message. Raises RecordingError if it is malformed or out of place."""
         topic, data = message.topic, message.data
-        if topic in _VIEWS:
+        if topic in VIEWS:
             return
+        if topic == SEAL and self.version >= SEALED_SINCE and not self.closed:
+            return  # compared by whoever reads the file
         if not self._fits(topic):
             raise RecordingError(f"a message on {topic} is out of place")
         step = message.log_time // STEP_TIME - 1
@@ -120,11 +127,11 @@ class EventReader:
             self._clouds[topic] = cloud_points(data, _CLOUDS[topic])
         elif topic == "/log":
             self._append(Logged(step, *log_level_and_text(data)))
-        elif topic == "/contents":
+        elif topic == CONTENTS:
             self._compare_contents(data)
         else:
             if topic == "/session":
-                self._version = _checked_version(data)
+                self.version = _checked_version(data)
             values = decode(RECORDS[topic], data)
             if values.get("step", step) != step:
                 raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
@@ -141,7 +148,7 @@ class EventReader:
             return topic == "/known_points" or (topic in _CLOUDS and topic not in self._clouds)
         if not self.entries:
             return topic == "/session"
-        if SINCE_VERSION.get(topic, 0) > self._version:
+        if SINCE_VERSION.get(topic, 0) > self.version:
             return False
         return topic not in (*_CLOUDS, "/known_points", "/session")
 
@@ -160,7 +167,7 @@ class EventReader:
     def _compare_contents(self, data: bytes) -> None:
         """The last message says again what came before it."""
         self.closed = True
-        recorded = decode(RECORDS["/contents"], data)
+        recorded = decode(RECORDS[CONTENTS], data)
         for name, column in self.contents.values().items():
             if recorded[name].tobytes() != column.tobytes():
                 raise RecordingError(f"its contents, as read, have another {name} than recorded")
@@ -211,8 +218,16 @@ class EventReader:
         topic, self.within = self.within, None
         if topic == "/session":
             self._sdf_digest = self._opening["sdf_digest"]
-            return _session(self._opening, points, self._attachments)
+            mesh = self._attached(MESH, self._opening["mesh_digest"])
+            sdf = self._attached(SDF_GRID, self._sdf_digest)
+            return _session(self._opening, points, mesh, sdf)
         return Probe(**self._opening, new_points=points)
+
+    def _attached(self, name: str, digest: str) -> Any:
+        """The mesh or the grid; RecordingError unless it is there as recorded, or known as lost."""
+        if name not in self._attachments and name in self._opening["lost"]:
+            return LostAttachment(name, digest)
+        return attached(self._attachments, name, digest)
 
     def _image(self, values: dict[str, Any]) -> ImagePlace | SensorImage:
         """The place of an image: all of them would fill the memory."""
@@ -238,11 +253,12 @@ class EventReader:
             raise RecordingError(f"the initial set of step {step} is empty; accepted: some poses")
         check_poses(f"the initial set of step {step}", values["initial_set"])
         check_free_resolution(values["free_resolution"])
-        _check_digest(
-            f"all points before the problem of step {step}",
-            self._points_digest,
-            values["points_digest"],
-        )
+        if self.version < SEALED_SINCE:
+            _check_digest(
+                f"all points before the problem of step {step}",
+                self._points_digest,
+                values["points_digest"],
+            )
         _check_digest(
             f"the SDF grid of the problem of step {step}", self._sdf_digest, values["sdf_digest"]
         )
@@ -270,15 +286,20 @@ class EventReader:
         return HypothesesFound(values["step"], found)
 
 
-def _session(
-    values: dict[str, Any], points: KnownPoints, attachments: dict[str, bytes]
-) -> SessionStarted:
-    missing = [name for name in (MESH, SDF_GRID) if name not in attachments]
-    if missing:
-        raise RecordingError(f"it lacks the attachment {missing[0]}")
-    mesh, sdf = mesh_from_ply(attachments[MESH]), sdf_from_bytes(attachments[SDF_GRID])
-    _check_digest(f"attachment {MESH}", mesh_digest(mesh), values["mesh_digest"])
-    _check_digest(f"attachment {SDF_GRID}", sdf.digest, values["sdf_digest"])
+def attached(attachments: Mapping[str, bytes], name: str, digest: str) -> trimesh.Trimesh | SdfGrid:
+    """The mesh or the grid among attachments; RecordingError unless it has the digest."""
+    if name not in attachments:
+        raise RecordingError(f"it lacks the attachment {name}")
+    if name == MESH:
+        mesh = mesh_from_ply(attachments[name])
+        _check_digest(f"attachment {name}", mesh_digest(mesh), digest)
+        return mesh
+    sdf = sdf_from_bytes(attachments[name])
+    _check_digest(f"attachment {name}", sdf.digest, digest)
+    return sdf
+
+
+def _session(values: dict[str, Any], points: KnownPoints, mesh: Any, sdf: Any) -> SessionStarted:
     config = config_from_json(values["config"])
     named = ("runner", "object", "session", "method", "seed", "free_resolution", "source")
     return SessionStarted(

@@ -15,7 +15,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
 from replay.mcap.chunk_records import DAMAGE, check_size, chunk_records, plausible_size
+from replay.mcap.damaged import DamagedRecordingError
 from replay.mcap.schemas import PROFILE
+from replay.mcap.seal import Chain
 from replay.mcap.texts import one_line
 
 UNFINISHED = "unfinished"
@@ -41,29 +43,32 @@ class Topics:
 
     def __init__(self, schemas: Mapping[str, str]) -> None:
         self._schemas = schemas
-        self._names: dict[int, str] = {}  # of schemas, by id
-        self._topics: dict[int, str] = {}  # by id of channel
+        self._described: dict[int, Schema] = {}  # by id
+        self._channels: dict[int, Channel] = {}  # by id
 
     def describe(self, part: Schema | Channel) -> None:
         """Take note of a schema or channel; ValueError if it is not as this project writes it."""
         if isinstance(part, Schema):
-            if self._names.setdefault(part.id, part.name) != part.name:
+            if self._described.setdefault(part.id, part) != part:
                 raise ValueError(f"schema {part.id} is described twice, and not the same")
             return
-        name = self._names.get(part.schema_id)
+        schema = self._described.get(part.schema_id)
+        name = None if schema is None else schema.name
         if self._schemas.get(part.topic, name) != name:
             raise ValueError(f"topic {part.topic} carries {name}")
-        if self._topics.setdefault(part.id, part.topic) != part.topic:
+        if self._channels.setdefault(part.id, part) != part:
             raise ValueError(f"channel {part.id} is described twice, and not the same")
 
-    def stored(self, message: Message) -> StoredMessage | None:
-        """The message with its topic; None if that does not matter, ValueError if unknown."""
-        topic = self._topics.get(message.channel_id)
-        if topic is None:
+    def stored(self, message: Message) -> StoredMessage:
+        """The message with its topic; ValueError if that is unknown."""
+        channel = self._channels.get(message.channel_id)
+        if channel is None:
             raise ValueError(f"channel {message.channel_id} does not exist")
-        if topic not in self._schemas:
-            return None
-        return StoredMessage(topic, message.log_time, message.data)
+        return StoredMessage(channel.topic, message.log_time, message.data)
+
+    def matters(self, message: StoredMessage) -> bool:
+        """Whether the topic of a message is one of those named."""
+        return message.topic in self._schemas
 
 
 class McapFile:
@@ -71,15 +76,27 @@ class McapFile:
 
     schemas: the full name of the message on every topic that matters; others are skipped.
     partial: take what is whole from an unfinished or damaged file, up to the first damage.
-    attachments: by name, those met so far. damage: what ended a partial reading, or None.
+    check_seals: whether what was changed since it was written counts as damage.
+    attachments: by name, those met so far. chain: follows the seals of the file.
+    damage: what ended a partial reading, or None.
     """
 
-    def __init__(self, path: Path, schemas: Mapping[str, str], *, partial: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        schemas: Mapping[str, str],
+        *,
+        partial: bool = False,
+        check_seals: bool = True,
+    ) -> None:
         self.path = path
         self.attachments: dict[str, bytes] = {}
+        self.chain = Chain()
         self.damage: str | None = None
         self._topics = Topics(schemas)
         self._partial = partial
+        self._check_seals = check_seals
+        self._repeated: list[Schema | Channel] = []
         self._count = 0  # messages met so far
         self._most_messages = _PLAUSIBLE_MESSAGES
         self._data_ended = False
@@ -144,6 +161,10 @@ class McapFile:
                 raise ValueError(f"the attachment {record.name!r} stands in it twice")
             case Attachment():
                 self.attachments[record.name] = record.data
+                if self._check_seals:
+                    self.chain.attach(record)
+            case Schema() | Channel():  # of the summary, where they stand once more
+                self._repeated.append(record)
             case Message():
                 raise ValueError("a message stands outside of a chunk")
             case Chunk():
@@ -163,17 +184,22 @@ class McapFile:
         match part:
             case Schema() | Channel():
                 self._topics.describe(part)
+                if self._check_seals:
+                    self.chain.describe(part)
             case Message():
                 if part.sequence != self._count:
                     raise ValueError(f"message {self._count} is missing, {part.sequence} follows")
                 self._count += 1
                 if self._count > self._most_messages:
                     raise ValueError(f"it holds more than {self._most_messages} messages")
-                return self._topics.stored(part)
+                stored = self._topics.stored(part)
+                if self._check_seals:
+                    self.chain.read(stored.topic, part)
+                return stored if self._topics.matters(stored) else None
         return None
 
     def _check_end(self, file: IO[bytes], size: int) -> None:
-        """The summary's checksum, which reading in order passes by, and what stands in it."""
+        """The summary's checksum, which reading in order passes by, and what no seal closes."""
         if file.tell() != size:
             return self._stop_at(f"damaged: it ends at byte {file.tell()} of {size}")
         crc_size = 4
@@ -184,14 +210,19 @@ class McapFile:
         summary = file.read(length)
         if zlib.crc32(summary) != self._footer.summary_crc:
             return self._stop_at("damaged: the checksum of its summary is wrong")
+        try:
+            for part in self._repeated:
+                self._topics.describe(part)
+        except ValueError as error:
+            return self._stop_at(f"damaged: in its summary, {error}")
+        if self.chain.session and self.chain.is_open:
+            return self._stop_at("damaged: records follow its last seal")
         return None
 
     def _stop_at(self, damage: str) -> None:
         """Keep the damage in mind, or raise it if all is wanted."""
         if not self._partial:
-            hint = "; accepted: a closed recording, or partial reading"
-            hint = hint if damage == UNFINISHED else ""
-            raise RecordingError(f"recording {self.path} is {one_line(damage)}{hint}")
+            raise DamagedRecordingError(self.path, f"is {one_line(damage)}")
         self.damage = self.damage or damage
 
 

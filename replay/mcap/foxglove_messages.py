@@ -11,21 +11,39 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import DecodeError, Message
 
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
 from chsel.quaternions import quaternions
+from replay.mcap.cumulative_points import LEVELS
 from replay.mcap.wire import check_wire
+
+POINT_CLASSES = ("free", "occupied", "known")
+SCENE: Mapping[str, type[Message]] = {
+    "/object_mesh": SceneUpdate,
+    "/object_surface": PointCloud,
+    "/hypothesis_meshes": SceneUpdate,
+    "/hypothesis_surfaces": PointCloud,
+    **{f"/all_points/{kind}/{n}": PointCloud for kind in POINT_CLASSES for n in range(LEVELS)},
+}
+"""Topics of `scene_messages`, which recordings of older programs do not have."""
+
+VIEWS: Mapping[str, type[Message]] = {
+    "/object_pose": FrameTransform,
+    "/gripper_path": PosesInFrame,
+    "/hypothesis_poses": PosesInFrame,
+    **SCENE,
+}
+"""Topics for viewers alone: they repeat what other messages say, and our reader ignores them."""
 
 FOXGLOVE: Mapping[str, type[Message]] = {
     "/points/free": PointCloud,
     "/points/occupied": PointCloud,
     "/points/known": PointCloud,
-    "/object_pose": FrameTransform,
-    "/gripper_path": PosesInFrame,
-    "/hypothesis_poses": PosesInFrame,
     "/log": Log,
+    **VIEWS,
 }
 """Topics that carry Foxglove's messages. Points and log are the only copy of what they say."""
 
@@ -67,7 +85,7 @@ def poses_in_world(world_from_body: FloatArray, time: int) -> bytes:
     message = PosesInFrame(frame_id=WORLD)
     turned = quaternions(world_from_body[:, :3, :3]).tolist()
     for position, quaternion in zip(world_from_body[:, :3, 3].tolist(), turned, strict=True):
-        _set_pose(message.poses.add(), position, quaternion)
+        set_pose(message.poses.add(), position, quaternion)
     return _stamped(message, time)
 
 
@@ -104,9 +122,14 @@ def _fields(columns: int) -> list[PackedElementField]:
 
 
 def _stamped(message: Any, time: int) -> bytes:
-    message.timestamp.seconds, message.timestamp.nanos = divmod(time, 10**9)
+    set_stamp(message.timestamp, time)
     data: bytes = message.SerializeToString(deterministic=True)
     return data
+
+
+def set_stamp(stamp: Any, time: int) -> None:
+    """Set a protobuf timestamp to nanoseconds."""
+    stamp.seconds, stamp.nanos = divmod(time, 10**9)
 
 
 def _parsed(kind: Any, data: bytes) -> Any:
@@ -117,7 +140,8 @@ def _parsed(kind: Any, data: bytes) -> Any:
         raise RecordingError(f"a message is no valid {kind.DESCRIPTOR.full_name}") from None
 
 
-def _set_pose(message: Any, position: list[float], quaternion: list[float]) -> None:
+def set_pose(message: Any, position: list[float], quaternion: list[float]) -> None:
+    """Set position and orientation (x y z w) of a pose."""
     message.position.x, message.position.y, message.position.z = position
     _set_quaternion(message.orientation, quaternion)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import reduce
+from functools import cached_property
 from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
-from chsel.points import KnownPoints
+from chsel.points import GrowingPoints
 from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.events import (
     Event,
@@ -22,11 +22,12 @@ from replay.events import (
     SnapshotTaken,
     Timed,
 )
+from replay.mcap.damaged import DamagedRecordingError
 from replay.mcap.encoding import decode
 from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
 from replay.mcap.file import McapFile, StoredMessage
 from replay.mcap.foxglove_messages import FOXGLOVE
-from replay.mcap.schemas import RECORDS, STEP_TIME, message_class
+from replay.mcap.schemas import RECORDS, SEALED_SINCE, STEP_TIME, message_class
 from replay.mcap.sensor_messages import ImagePlace, image
 from replay.mcap.texts import one_line
 
@@ -37,14 +38,28 @@ class Recording:
     path: of the file. damage: what cut reading short, None if the file is whole. start: how the
     session began. ended: how it ended, None if it did not. probes: in their order. steps: those
     with a registration problem. rig: of a recorded robot session, else None. image_steps: those
-    with images of sensors.
+    with images of sensors. version: of its format. digest: of its last seal, "" before version 3.
+    attachments: bytes of each, by name.
     """
 
-    def __init__(self, path: Path, entries: list[Entry], damage: str | None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        entries: list[Entry],
+        damage: str | None,
+        *,
+        version: int,
+        digest: str,
+        attachments: Mapping[str, int],
+    ) -> None:
         if not entries or not isinstance(entries[0], SessionStarted):
-            raise RecordingError(f"recording {path} has no session in it")
+            why = "" if damage is None else f": it is {damage}"
+            raise RecordingError(f"recording {path} has no session in it{why}")
         self.path = path
         self.damage = damage
+        self.version = version
+        self.digest = digest
+        self.attachments = attachments
         self.start = entries[0]
         self.ended = next((entry for entry in entries if isinstance(entry, SessionEnded)), None)
         self.probes = [entry for entry in entries if isinstance(entry, Probe)]
@@ -59,11 +74,11 @@ class Recording:
 
         Images are read from the file once more, one at a time, or left out.
         """
-        points = self.start.initial_points
+        points = GrowingPoints(self.start.initial_points)
         seen = self._images()
         for entry in self._entries:
             if isinstance(entry, Probe):
-                points = points.merged(entry.new_points)
+                points.add(entry.new_points)
             if isinstance(entry, RecordedProblem):
                 yield ProblemPosed(entry.step, self._completed(entry, points))
             elif not isinstance(entry, ImagePlace):
@@ -80,47 +95,64 @@ class Recording:
     def problem(self, step: int) -> RegistrationProblem:
         """The registration problem of a step, from the file alone; its digest is checked."""
         self._check_step(step, self.steps, "registration problem")
-        news: list[KnownPoints] = []
+        points = GrowingPoints(self.start.initial_points)
         for entry in self._entries:
             if isinstance(entry, Probe):
-                news.append(entry.new_points)
+                points.add(entry.new_points)
             if isinstance(entry, RecordedProblem) and entry.step == step:
                 break
         assert isinstance(entry, RecordedProblem)
-        points = reduce(KnownPoints.merged, news, self.start.initial_points)
         return self._completed(entry, points)
 
     def checked_steps(self, steps: Sequence[int] | None) -> tuple[int, ...]:
         """Steps with a registration problem, in order; None means all. RecordingError if not."""
-        for step in steps or ():
+        if steps is None:
+            return self.steps
+        wanted, known = set(steps), set(self.steps)
+        for step in sorted(wanted - known):
             self._check_step(step, self.steps, "registration problem")
-        return self.steps if steps is None else tuple(s for s in self.steps if s in set(steps))
+        return tuple(step for step in self.steps if step in wanted)
 
     def hypotheses(self, step: int) -> Hypotheses:
         """What the registration of a step found."""
-        found = {e.step: e.hypotheses for e in self._entries if isinstance(e, HypothesesFound)}
-        self._check_step(step, tuple(found), "result")
-        return found[step]
+        if step not in self._results:
+            self._check_step(step, tuple(self._results), "result")
+        return self._results[step]
 
     def has_result(self, step: int) -> bool:
         """Whether the registration of a step ended with hypotheses."""
-        return any(isinstance(e, HypothesesFound) and e.step == step for e in self._entries)
+        return step in self._results
 
-    @property
+    @cached_property
     def has_timings(self) -> bool:
         """Whether wall-clock times were recorded."""
         return any(isinstance(entry, Timed) for entry in self._entries)
 
     def snapshots(self, step: int) -> list[ArchiveSnapshot]:
         """The archive over the registration of a step; empty if the method keeps none."""
-        taken = [e for e in self._entries if isinstance(e, SnapshotTaken)]
-        return [event.archive for event in taken if event.step == step]
+        return list(self._snapshots.get(step, []))
+
+    @cached_property
+    def _results(self) -> dict[int, Hypotheses]:
+        """Hypotheses by step."""
+        return {e.step: e.hypotheses for e in self._entries if isinstance(e, HypothesesFound)}
+
+    @cached_property
+    def _snapshots(self) -> dict[int, list[ArchiveSnapshot]]:
+        """Archives by step."""
+        taken: dict[int, list[ArchiveSnapshot]] = {}
+        for entry in self._entries:
+            if isinstance(entry, SnapshotTaken):
+                taken.setdefault(entry.step, []).append(entry.archive)
+        return taken
 
     def _images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
         """The images in the file; others are passed by."""
         topic = "/sensor_image"
         schemas = {topic: message_class(RECORDS[topic]).DESCRIPTOR.full_name}
-        for message in McapFile(self.path, schemas, partial=self.damage is not None).messages():
+        partial = self.damage is not None
+        file = McapFile(self.path, schemas, partial=partial, check_seals=False)  # they were
+        for message in file.messages():
             if steps is None or message.log_time // STEP_TIME - 1 in steps:
                 with _blaming(self.path):
                     found = image(decode(RECORDS[topic], message.data))
@@ -133,9 +165,9 @@ class Recording:
             raise RecordingError(f"recording {self.path} has changed while it was read")
         return found
 
-    def _completed(self, entry: RecordedProblem, points: KnownPoints) -> RegistrationProblem:
+    def _completed(self, entry: RecordedProblem, points: GrowingPoints) -> RegistrationProblem:
         with _blaming(self.path):
-            return entry.completed(self.start.sdf, points)
+            return entry.completed(self.start.sdf, points.all())
 
     def _check_step(self, step: int, accepted: tuple[int, ...], what: str) -> None:
         if step not in accepted:
@@ -169,10 +201,21 @@ def read_recording(
         with _blaming(path):
             events.take(message)
     if events.within is not None and file.damage is None:
-        raise RecordingError(f"recording {path} ends within an event on {events.within}")
+        raise DamagedRecordingError(path, f"ends within an event on {events.within}")
     if not events.closed and events.entries and file.damage is None:
-        raise RecordingError(f"recording {path} ends without its contents")
-    return Recording(path, events.entries, file.damage)
+        raise DamagedRecordingError(path, "ends without its contents")
+    sealed = bool(file.chain.session) or not events.entries
+    if events.version >= SEALED_SINCE and not sealed and file.damage is None:
+        raise DamagedRecordingError(path, "has no seals; accepted: those of its format")
+    sizes = {name: len(data) for name, data in file.attachments.items()}
+    return Recording(
+        path,
+        events.entries,
+        file.damage,
+        version=events.version,
+        digest=file.chain.last,
+        attachments=sizes,
+    )
 
 
 @contextmanager

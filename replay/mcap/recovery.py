@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from chsel.errors import ChselError, RecordingError
+from chsel.points import GrowingPoints
+from chsel.sdf import SdfGrid
 from replay.events import (
     Event,
     HypothesesFound,
@@ -21,13 +24,16 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
+from replay.lost_attachment import LostAttachment
+from replay.mcap.attachments import MESH, SDF_GRID
 from replay.mcap.contents import Row, rows
 from replay.mcap.encoding import decode
 from replay.mcap.event_checks import RECOVERED, check_event
 from replay.mcap.event_order import EventOrder
-from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
+from replay.mcap.event_reader import Entry, EventReader, RecordedProblem, attached
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.plain_config import config_from_json
 from replay.mcap.reader import read_recording
 from replay.mcap.salvage import Gap, Salvage
 from replay.mcap.schemas import RECORDS, STEP_TIME, message_class
@@ -52,7 +58,7 @@ class Recovered:
     missing bytes. complete: whether the recording's own list of contents was there, so that all
     losses are known. lost_probes: first and last of steps in a row; without the list, those that
     may be lost. lost_problems, lost_results: steps of registrations; without the list, those known
-    to be lost.
+    to be lost. attachments: names of those lost. remade: of those that were made again, to the bit.
     ended: outcome, where the recording told it.
     """
 
@@ -68,19 +74,23 @@ class Recovered:
     lost_probes: list[tuple[int, int]] = field(default_factory=list)
     lost_problems: list[int] = field(default_factory=list)
     lost_results: list[int] = field(default_factory=list)
+    attachments: list[str] = field(default_factory=list)
+    remade: list[str] = field(default_factory=list)
     ended: str | None = None
 
     @property
     def nothing_lost(self) -> bool:
         """Whether all that the recording ever held is kept."""
-        return self.complete and not (self.messages or self.events or self.lost_probes)
+        lost = self.messages or self.events or self.lost_probes or self.attachments
+        return self.complete and not lost
 
 
 def recover(path: Path, out: Path) -> Recovered:
     """Write a finished recording of all that is whole in another one.
 
-    Raises RecordingError if the session's start is not whole, with which nothing makes sense; if
-    `path` is no recording; or if `out` exists or cannot be written.
+    A lost SDF grid is made again from the mesh if that gives its digest. Without the mesh, or the
+    grid, all else is kept. Raises RecordingError if the session's start is not whole, without which
+    nothing makes sense; if `path` is no recording; or if `out` exists or cannot be written.
     """
     with new_file(out) as beside:
         recovery = _Recovery(path)
@@ -122,7 +132,9 @@ class _Recovery:
         except RecordingError as error:
             if not self._path.is_file():
                 raise
-            self.found.damage = str(error)
+            named = f"recording {self._path}: "
+            content = f"cannot be read: {str(error).removeprefix(named)}"
+            self.found.damage = getattr(error, "damage", content)
             yield from self._counted(self._salvaged())
         else:
             self.found.complete = True
@@ -183,6 +195,8 @@ class _Recovery:
                 yield from self._lost(f"{message.topic} of step {step}: {one_line(str(error))}")
             # else its probe was lost with the messages before it
         for entry in entries:
+            if isinstance(entry, SessionStarted):
+                self._note_attachments(entry, reader)
             yield from self._kept(reader, entry)
 
     def _kept(self, reader: _GapReader, entry: Entry) -> Iterator[Event]:
@@ -247,6 +261,12 @@ class _Recovery:
             self._order.take(warning)
             yield warning
 
+    def _note_attachments(self, start: SessionStarted, reader: _GapReader) -> None:
+        for part in (start.mesh, start.sdf):
+            if isinstance(part, LostAttachment):
+                self.found.attachments.append(part.name)
+        self.found.remade = reader.remade
+
     def _check_started(self, reader: _GapReader) -> None:
         """Raise RecordingError if the session's start is not there by now."""
         if reader.start is None:
@@ -262,15 +282,16 @@ class _Recovery:
 class _GapReader(EventReader):
     """Joins messages to events where some messages may be missing.
 
-    start: how the session began. wanting: whether messages were lost by now. rows: of the
-    contents, once they were there.
+    start: how the session began. remade: attachments that were lost and are there again. wanting:
+    whether messages were lost by now. rows: of the contents, once they were there.
     """
 
     def __init__(self, attachments: dict[str, bytes], size: int) -> None:
         super().__init__(attachments, size)
         self.start: SessionStarted | None = None
         self.rows: list[Row] = []
-        self._points: Any = None
+        self.remade: list[str] = []
+        self._points: GrowingPoints | None = None
         self.wanting = False
 
     def gap(self) -> None:
@@ -287,15 +308,16 @@ class _GapReader(EventReader):
         del self.entries[1:]
         for entry in news:
             if isinstance(entry, SessionStarted):
-                self.start, self._points = entry, entry.initial_points
-            elif isinstance(entry, Probe):
-                self._points = self._points.merged(entry.new_points)
+                self.start, self._points = entry, GrowingPoints(entry.initial_points)
+            elif isinstance(entry, Probe) and self._points is not None:
+                self._points.add(entry.new_points)
         return news
 
     def completed(self, entry: RecordedProblem) -> ProblemPosed:
         """The whole problem; RecordingError if points or elites of lost messages are missing."""
         assert self.start is not None
-        return ProblemPosed(entry.step, entry.completed(self.start.sdf, self._points))
+        assert self._points is not None
+        return ProblemPosed(entry.step, entry.completed(self.start.sdf, self._points.all()))
 
     def _append(self, entry: Entry) -> None:
         if not isinstance(entry, RecordedProblem | ImagePlace):
@@ -310,6 +332,28 @@ class _GapReader(EventReader):
         if self.wanting:  # points that are lost were counted; the new ones must all be there
             self._counts = {name: values[name] - values[f"new_{name}"] for name in self._counts}
         return super()._close(values)
+
+    def _attached(self, name: str, digest: str) -> Any:
+        """The mesh or the grid, made again if that is possible, or what stands for a lost one."""
+        with suppress(*_WRONG):
+            return attached(self._attachments, name, digest)
+        if name == SDF_GRID:
+            with suppress(*_WRONG):
+                grid = self._grid_again()
+                if grid.digest == digest:
+                    self.remade.append(name)
+                    return grid
+        return LostAttachment(name, digest)
+
+    def _grid_again(self) -> SdfGrid:
+        """The grid of the mesh, as the session's configuration says; any of _WRONG if it cannot."""
+        mesh: Any = attached(self._attachments, MESH, self._opening["mesh_digest"])
+        session = config_from_json(self._opening["config"]).get("session")
+        if not isinstance(session, dict):
+            raise RecordingError("the configuration does not say how the grid was made")
+        named = (session.get("object_resolution"), session.get("object_padding"))
+        resolution, padding = (float(x) if isinstance(x, int | float) else 0.0 for x in named)
+        return SdfGrid.from_mesh(mesh, resolution, padding=padding)
 
     def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
         try:

@@ -11,6 +11,7 @@ from mcap.records import Attachment, Channel, Message, Schema
 
 from chsel.errors import RecordingError
 from replay.mcap.file import StoredMessage, Topics
+from replay.mcap.seal import MIXED, Chain
 from replay.mcap.texts import one_line
 from replay.mcap.whole_records import Damage, WholeRecord, WholeRecords
 
@@ -23,7 +24,7 @@ class Gap:
 
 
 class Salvage:
-    """Reads all messages of one file that are in whole chunks.
+    """Reads all messages of one file that are in whole chunks, and that its seals tie together.
 
     schemas: the full name of the message on every topic that matters; others are skipped.
     attachments: by name, those met so far. Raises RecordingError if the file cannot be read.
@@ -35,6 +36,7 @@ class Salvage:
         self._damages: list[Damage] = []
         self._records: WholeRecords | None = None
         self._topics = Topics(schemas)
+        self._chain = Chain(forgiving=True)
         self._count = 0  # messages met or missed so far
         self._whole_until = 0  # the end of the last chunk with messages
 
@@ -74,12 +76,15 @@ class Salvage:
     def _take(self, record: WholeRecord) -> list[StoredMessage | Gap]:
         if isinstance(record.content, Attachment):
             self.attachments[record.content.name] = record.content.data
+            self._chain.attach(record.content)
             return []
         try:
             messages = self._messages(record.content)
         except ValueError as error:
             self._damages.append(Damage(record.start, record.end, one_line(str(error))))
             return []
+        for name in self._chain.lost:
+            self.attachments.pop(name, None)
         self._whole_until = record.end
         return messages
 
@@ -91,15 +96,29 @@ class Salvage:
             raise ValueError("the messages of a chunk are not in order")
         if first < self._count:
             raise ValueError("the messages of a chunk were there before")
+        stored = self._sealed(parts, after_gap=first > self._count)
+        gap = [Gap(first - self._count)] if first > self._count else []
+        self._count = first + len(sequences)
+        return [*gap, *(message for message in stored if self._topics.matters(message))]
+
+    def _sealed(self, parts: list[Any], *, after_gap: bool) -> list[StoredMessage]:
+        """The messages of a chunk; ValueError if they are not those of the session.
+
+        Every chunk ends with a seal, but in files of older formats, which have none.
+        """
+        if after_gap:
+            self._chain.skip()
         stored = []
         for part in parts:
             if isinstance(part, Schema | Channel):
                 self._topics.describe(part)
+                self._chain.describe(part)
             elif isinstance(part, Message):
                 stored.append(self._topics.stored(part))
-        gap = [Gap(first - self._count)] if first > self._count else []
-        self._count = first + len(sequences)
-        return [*gap, *(message for message in stored if message is not None)]
+                self._chain.read(stored[-1].topic, part)
+        if self._chain.session and self._chain.is_open:
+            raise ValueError(f"the chunk has no seal of this recording: {MIXED}")
+        return stored
 
 
 def _sequences(parts: list[Any]) -> list[int]:

@@ -12,17 +12,26 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
-FORMAT_VERSION = 2
-"""The newest. A reader refuses newer ones, so any change of meaning needs a new number.
+FORMAT_VERSION = 3
+"""That of new recordings. A reader refuses newer ones, so any change of meaning needs a new number.
 
-A recording has the lowest number that fits: 1, or 2 with a rig and images of its sensors.
+Version 2 added a rig and images of its sensors, version 3 seals.
 """
+
+SEALED_SINCE = 3
+"""From this version on, seals cover every record, and measured values are those of the results."""
 
 PROFILE = "chsel"
 """How the file's header names this use of MCAP."""
 
 STEP_TIME = 10**9
 """Nanoseconds of log time from one step to the next; step k begins at k + 1 times this."""
+
+BEFORE_ALL_STEPS = -1
+"""The step of a session's start."""
+
+MESH, SDF_GRID = "mesh.ply", "sdf_grid"
+"""Names of attachments."""
 
 # A field is a protobuf scalar, a message of this table, or an array with its type and shape. In a
 # shape, a letter is a length that is the same wherever it stands in the message. "?" after a field
@@ -48,6 +57,7 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
         "mesh_digest": "string",
         "sdf_digest": "string",
         "source": "string",
+        "lost": "string*",  # attachments that a damaged file no longer held when it was recovered
     },
     "Probe": {
         "step": "sint32",
@@ -66,7 +76,7 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
         "free": "uint64",
         "occupied": "uint64",
         "known": "uint64",
-        "digest": "string",
+        "digest": "string",  # of all points so far; empty since version 3
     },
     "Problem": {
         "step": "sint32",
@@ -149,6 +159,16 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
         "hypotheses": "i8[S]",  # -1 where there is no result
         "distinct": "i8[S]",
         "best_cost": "f8[S]",  # NaN where there is no result
+        "session": "string",  # as in the seals; empty before version 3
+        "digest": "string",  # of the last seal
+    },
+    # Ends the session's start, every step and every chunk; see seal.py.
+    "Seal": {
+        "step": "sint32",
+        "session": "string",  # digest of all before the first seal
+        "previous": "string",  # digest of the seal before, empty for the first
+        "parts": "Text*",  # of each topic with messages since then, and the digest of these
+        "digest": "string",  # of the above, and of number and time of this message
     },
     # No topic: this is the attachment "sdf_grid".
     "SdfGrid": {
@@ -173,10 +193,11 @@ RECORDS: Mapping[str, str] = {
     "/contents": "Contents",
     "/rig": "Rig",
     "/sensor_image": "SensorImage",
+    "/seal": "Seal",
 }
 """Topics that carry messages of the table."""
 
-SINCE_VERSION: Mapping[str, int] = {"/rig": 2, "/sensor_image": 2}
+SINCE_VERSION: Mapping[str, int] = {"/rig": 2, "/sensor_image": 2, "/seal": SEALED_SINCE}
 """Topics that a recording of a lower version does not have."""
 
 PACKAGE = "chsel"

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.records import Attachment, Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
 from chsel.mesh import mesh_digest
-from chsel.points import KnownPoints
+from chsel.points import GrowingPoints, KnownPoints
 from chsel.pose import inverse
 from chsel.problem import ArchiveSnapshot
+from replay.disk import sync_folder
 from replay.events import (
     Event,
     HypothesesFound,
@@ -33,31 +35,43 @@ from replay.events import (
     Timed,
     Traced,
 )
+from replay.lost_attachment import LostAttachment, is_lost
 from replay.mcap.attachments import MEDIA_TYPES, MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
 from replay.mcap.contents import Contents
+from replay.mcap.cumulative_points import CumulativePoints
 from replay.mcap.encoding import encode
 from replay.mcap.event_checks import check_event
 from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
 from replay.mcap.foxglove_messages import (
     FOXGLOVE,
+    POINT_CLASSES,
     log_line,
     object_in_world,
     point_cloud,
     poses_in_world,
 )
 from replay.mcap.plain_config import config_to_json
+from replay.mcap.scene_messages import (
+    POINT_COLORS,
+    STARTING_EMPTY,
+    SceneMessages,
+    colored_cloud,
+    empty_cloud,
+)
 from replay.mcap.schemas import (
+    FORMAT_VERSION,
     PROFILE,
     RECORDS,
-    SINCE_VERSION,
     STEP_TIME,
     descriptor_set,
     message_class,
 )
+from replay.mcap.seal import CONTENTS, SEAL, Chain
 from replay.mcap.sensor_messages import image_values, rig_values
+from replay.mcap.simple_mesh import simple_mesh
 
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
-_FIRST_VERSION = 1
+_NEVER = 2**62  # the size at which the library would end a chunk by itself, without a seal
 _LIBRARY = "chsel-replay"  # without versions of packages, which stand in the session's environment
 
 
@@ -75,10 +89,24 @@ class McapRecorder(Recorder):
         self._closed = False
         self._contents = Contents()
         self._order = EventOrder()
-        self._before_steps: list[Event] = []  # as long as a rig may follow
+        self._chain = Chain()
+        self._count = 0  # messages written so far
+        self._step = BEFORE_ALL_STEPS  # of the last message
+        self._unflushed = 0  # bytes of messages in the chunk in progress
+        self._channels: dict[str, int] = {}
+        self._points: GrowingPoints | None = None  # all that is known, once a session has started
+        self._cumulative = {name: CumulativePoints() for name in POINT_CLASSES}
+        self._sdf_digest = ""
+        self._last_snapshot = b""
+        self._last_elites: FloatArray | None = None
         with self._writing():
             self._file = self._path.open("xb")
-            self._begin(_FIRST_VERSION)
+            self._begin()
+
+    @property
+    def digest(self) -> str:
+        """The digest of all that is sealed so far: of the recording, once it is closed."""
+        return self._chain.last
 
     def record(self, event: Event) -> None:
         """Write one event."""
@@ -89,81 +117,63 @@ class McapRecorder(Recorder):
         with self._writing():
             self._order.take(event)
             check_event(event)
-            if isinstance(event, RigDescribed):
-                self._begin_again(max(SINCE_VERSION.values()))
+            if not isinstance(event, SessionStarted) and event.step > self._step:
+                self._seal()
             self._write(event)
         self._contents.take(event)
-        if self._order.has_rig or self._order.step != BEFORE_ALL_STEPS:
-            self._before_steps.clear()
-        else:
-            self._before_steps.append(event)
 
     def flush(self) -> None:
         """End the chunk in progress and hand it to the operating system."""
         if not self._closed:
             with self._writing():
-                self._writer.flush()
+                self._end_chunk()
                 self._check_in_place()
 
     def close(self) -> None:
-        """Write contents and checksums. Until then, and after a failure, the file is unfinished."""
+        """Write contents and checksums, and wait until all is on the disk.
+
+        Until then, and after a failure, the file is unfinished.
+        """
         if not self._closed:
             with self._writing():
                 if self._points is not None:
-                    self._record("/contents", self._order.step, self._contents.values())
+                    self._seal()
+                    ends = {"session": self._chain.session, "digest": self._chain.last}
+                    self._record(CONTENTS, self._step, self._contents.values() | ends)
                 self._writer.finish()
                 self._file.flush()
                 self._check_in_place()
+                os.fsync(self._file.fileno())
                 self._file.close()
             self._closed = True
+            sync_folder(self._path.parent)
 
-    def _begin(self, version: int) -> None:
-        """Start a file, of a version that has all topics that its events will need."""
-        self._version = version
-        self._count = 0  # messages written so far
-        self._channels: dict[str, int] = {}
-        self._points: KnownPoints | None = None  # all that is known, once a session has started
-        self._sdf_digest = ""
-        self._last_snapshot = b""
-        self._last_elites: FloatArray | None = None
+    def _begin(self) -> None:
+        """Start the file, with a description of every topic, used or not."""
         self._writer = Writer(
             self._file,
-            chunk_size=_CHUNK_SIZE,
+            chunk_size=_NEVER,
             compression=CompressionType.ZSTD,
             enable_crcs=True,
             enable_data_crcs=True,
         )
         self._writer.start(profile=PROFILE, library=_LIBRARY)
-        self._register_channels()
-
-    def _begin_again(self, version: int) -> None:
-        """Write all events so far once more, in a file of a higher version.
-
-        Only what comes after a session's start tells whether that is needed. A reader of a lower
-        version would pass unknown topics by and take the rest for the whole.
-        """
-        self._file.seek(0)
-        self._file.truncate()
-        self._begin(version)
-        for event in self._before_steps:
-            self._write(event)
-
-    def _register_channels(self) -> None:
-        """Describe every topic of the version, used or not, ahead of the first message."""
-        topics: dict[str, Any] = {
-            topic: message_class(name)
-            for topic, name in RECORDS.items()
-            if SINCE_VERSION.get(topic, 0) <= self._version
-        }
+        topics: dict[str, Any] = {topic: message_class(name) for topic, name in RECORDS.items()}
         schemas: dict[str, int] = {}
         for topic, kind in {**topics, **FOXGLOVE}.items():
             name = kind.DESCRIPTOR.full_name
             if name not in schemas:
-                described = descriptor_set(kind)
-                schemas[name] = self._writer.register_schema(name, "protobuf", described)
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schemas[name])
-        grid = message_class("SdfGrid")  # so that the file describes its attachment too
-        self._writer.register_schema(grid.DESCRIPTOR.full_name, "protobuf", descriptor_set(grid))
+                schemas[name] = self._register_schema(kind)
+            number = self._writer.register_channel(topic, "protobuf", schemas[name])
+            self._channels[topic] = number
+            self._chain.describe(Channel(number, topic, "protobuf", {}, schemas[name]))
+        self._register_schema(message_class("SdfGrid"))  # the file describes its attachment too
+
+    def _register_schema(self, kind: Any) -> int:
+        name, described = kind.DESCRIPTOR.full_name, descriptor_set(kind)
+        number: int = self._writer.register_schema(name, "protobuf", described)
+        self._chain.describe(Schema(id=number, data=described, encoding="protobuf", name=name))
+        return number
 
     def _write(self, event: Event) -> None:
         match event:
@@ -171,7 +181,7 @@ class McapRecorder(Recorder):
                 self._write_session(event)
             case RigDescribed():
                 self._record("/rig", event.step, rig_values(event))
-                self._writer.flush()  # so that it is read, or lost, apart from what follows
+                self._end_chunk()  # so that it is read, or lost, apart from what follows
             case SensorImage():
                 self._record("/sensor_image", event.step, image_values(event))
             case Probe():
@@ -199,54 +209,82 @@ class McapRecorder(Recorder):
                 raise RecordingError(f"{type(event).__name__} is no event of a session")
 
     def _write_session(self, event: SessionStarted) -> None:
-        for name, data in ((MESH, mesh_to_ply(event.mesh)), (SDF_GRID, sdf_to_bytes(event.sdf))):
-            self._writer.add_attachment(0, 0, name, MEDIA_TYPES[name], data)
+        if not is_lost(event.mesh):
+            self._attach(MESH, mesh_to_ply(event.mesh))
+        if not is_lost(event.sdf):
+            self._attach(SDF_GRID, sdf_to_bytes(event.sdf))
         self._sdf_digest = event.sdf.digest
+        self._scene = None if is_lost(event.mesh) else SceneMessages(simple_mesh(event.mesh))
         named = ("runner", "object", "session", "method", "seed", "free_resolution")
         values = {name: getattr(event, name) for name in (*named, "world_from_object")}
-        values["format_version"] = self._version
+        values["format_version"] = FORMAT_VERSION
         values["config"] = config_to_json(event.config)
         values["workspace"] = event.workspace.bounds
         values["environment"] = [{"name": k, "value": v} for k, v in event.environment.items()]
-        values["mesh_digest"] = mesh_digest(event.mesh)
+        mesh: Any = event.mesh
+        values["mesh_digest"] = mesh.digest if is_lost(mesh) else mesh_digest(mesh)
         values["sdf_digest"] = event.sdf.digest
         values["source"] = event.source
+        lost = [part for part in (event.mesh, event.sdf) if isinstance(part, LostAttachment)]
+        values["lost"] = [part.name for part in lost]
         self._record("/session", BEFORE_ALL_STEPS, values)
-        self._write_points(BEFORE_ALL_STEPS, KnownPoints(), event.initial_points)
+        for topic in STARTING_EMPTY:
+            time = self._time(BEFORE_ALL_STEPS)
+            self._add(topic, time, empty_cloud(time))
+        self._points = GrowingPoints(KnownPoints())
+        self._write_points(BEFORE_ALL_STEPS, event.initial_points)
         if event.world_from_object is not None:
             time = self._time(BEFORE_ALL_STEPS)
             self._add("/object_pose", time, object_in_world(event.world_from_object, time))
-        self._writer.flush()
+            for name in ("object_mesh", "object_surface") if self._scene else ():
+                time = self._time(BEFORE_ALL_STEPS)
+                self._add(f"/{name}", time, getattr(self._scene, name)(time))
+        self._end_chunk()
+
+    def _attach(self, name: str, data: bytes) -> None:
+        self._writer.add_attachment(0, 0, name, MEDIA_TYPES[name], data)
+        self._chain.attach(Attachment(0, 0, name, MEDIA_TYPES[name], data))
 
     def _write_probe(self, event: Probe) -> None:
-        assert self._points is not None
         named = ("outcome", "gripper_path", "contacts", "contact_normals")
         self._record("/probe", event.step, {name: getattr(event, name) for name in named})
-        self._write_points(event.step, self._points, event.new_points)
+        self._write_points(event.step, event.new_points)
         if len(event.gripper_path) > 0:
             time = self._time(event.step)
             self._add("/gripper_path", time, poses_in_world(event.gripper_path, time))
 
-    def _write_points(self, step: int, old: KnownPoints, new: KnownPoints) -> None:
+    def _write_points(self, step: int, new: KnownPoints) -> None:
         """New points, class by class, and then what is known with them."""
+        assert self._points is not None
         known = np.column_stack([new.known, new.sdf])
         clouds = {"/points/free": new.free, "/points/occupied": new.occupied}
         for topic, points in {**clouds, "/points/known": known}.items():
             if len(points) > 0:
                 time = self._time(step)
                 self._add(topic, time, point_cloud(points, time))
-        self._points = old.merged(new)
+        self._points.add(new)
         values: dict[str, Any] = {}
         for name in ("free", "occupied", "known"):
             values[f"new_{name}"] = len(getattr(new, name))
-            values[name] = len(getattr(self._points, name))
-        values |= {"new_digest": new.digest, "digest": self._points.digest}
+            values[name] = getattr(self._points, name)
+        values |= {"new_digest": new.digest, "digest": ""}
         self._record("/known_points", step, values)
+        self._write_all_points(step, new)
+
+    def _write_all_points(self, step: int, new: KnownPoints) -> None:
+        """For viewers: the clouds of all points so far that change with new ones."""
+        for name, cumulative in self._cumulative.items():
+            points = getattr(new, name)
+            for level, cloud in cumulative.add(points).items() if len(points) else ():
+                time = self._time(step)
+                topic = f"/all_points/{name}/{level}"
+                self._add(topic, time, colored_cloud(cloud, POINT_COLORS[name], time))
 
     def _write_problem(self, event: ProblemPosed) -> None:
         problem = event.problem
         assert self._points is not None
-        if problem.points.digest != self._points.digest or problem.sdf.digest != self._sdf_digest:
+        known = self._points.all()
+        if problem.points.digest != known.digest or problem.sdf.digest != self._sdf_digest:
             raise RecordingError(
                 f"the problem of step {event.step} has points or an SDF grid that the events "
                 "before it do not give"
@@ -286,10 +324,13 @@ class McapRecorder(Recorder):
         if len(found.object_from_world) > 0:
             time, poses = self._time(event.step), inverse(found.object_from_world)
             self._add("/hypothesis_poses", time, poses_in_world(poses, time))
+            for name in ("hypothesis_meshes", "hypothesis_surfaces") if self._scene else ():
+                time = self._time(event.step)
+                self._add(f"/{name}", time, getattr(self._scene, name)(found, time))
 
     def _record(self, topic: str, step: int, values: dict[str, Any]) -> bytes:
         """Write a message of the project's own; its bytes."""
-        values = values if topic == "/contents" else {"step": step, **values}
+        values = values if topic == CONTENTS else {"step": step, **values}
         data = encode(RECORDS[topic], values)
         self._add(topic, self._time(step), data)
         return data
@@ -299,8 +340,28 @@ class McapRecorder(Recorder):
         return (step - BEFORE_ALL_STEPS) * STEP_TIME + self._count
 
     def _add(self, topic: str, time: int, data: bytes) -> None:
-        self._writer.add_message(self._channels[topic], time, data, time, sequence=self._count)
+        channel = self._channels[topic]
+        self._writer.add_message(channel, time, data, time, sequence=self._count)
+        self._chain.write(topic, Message(channel, time, data, time, self._count))
         self._count += 1
+        self._step = time // STEP_TIME + BEFORE_ALL_STEPS
+        self._unflushed += len(data)
+        if self._unflushed > _CHUNK_SIZE and topic != CONTENTS:
+            self._end_chunk()
+
+    def _seal(self) -> None:
+        """Close the messages since the last seal, if there are any, with one of their own."""
+        if self._chain.is_open and self._count > 0:
+            time = self._time(self._step)
+            values = self._chain.sealed(self._step, self._count, time)
+            self._add(SEAL, time, encode(RECORDS[SEAL], values))
+
+    def _end_chunk(self) -> None:
+        """End the chunk in progress with a seal, and hand it to the operating system."""
+        self._unflushed = 0
+        self._seal()
+        self._writer.flush()
+        self._unflushed = 0
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

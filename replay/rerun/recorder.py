@@ -12,6 +12,7 @@ import rerun as rr
 from chsel.errors import RecordingError
 from chsel.problem import ArchiveSnapshot, Hypotheses
 from replay import events
+from replay.disk import sync_file, sync_folder
 from replay.events import Recorder
 from replay.rerun.archive import ArchiveMap, map_frame
 from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
@@ -46,6 +47,7 @@ class RerunRecorder(Recorder):
         self._stream = rr.RecordingStream(APPLICATION, send_properties=False)
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
+        self._path = path
         self._open(path, live=live)
         self._closed = False
         self._clock = Clock(self._stream)
@@ -87,11 +89,25 @@ class RerunRecorder(Recorder):
                 warnings.warn(f"the live view or the file does not follow: {error}", stacklevel=2)
 
     def close(self) -> None:
-        """Finish the file. Closing twice is closing once."""
+        """Finish the file, and wait until it is on the disk. Closing twice is closing once.
+
+        Raises RecordingError if it does not get there.
+        """
         if not self._closed:
             self._closed = True
             self.flush()
             self._stream.disconnect()
+            if self._path is not None:
+                self._sync(self._path)
+
+    def _sync(self, path: Path) -> None:
+        try:
+            sync_file(path)
+        except OSError as error:
+            raise RecordingError(
+                f"{path} cannot be written ({error.strerror}); accepted: a new .rrd file"
+            ) from None
+        sync_folder(path.parent)
 
     def _open(self, path: Path | None, *, live: bool) -> None:
         sinks: list[rr.FileSink | rr.GrpcSink] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,14 +30,20 @@ def session_markdown(started: SessionStarted) -> str:
     }
     if started.source:
         rows["problems of"] = f"recording {started.source}"
-    lines = [f"| {name} | **{text}** |" for name, text in rows.items()]
+    lines = [f"| {name} | **{_literal(text)}** |" for name, text in rows.items()]
     table = [lines[0], "|---|---|", *lines[1:]]
     parts = ["\n".join(table)]
     for title, mapping in (("Configuration", started.config), ("Environment", started.environment)):
         if mapping:
             text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False)
-            parts.append(f"**{title}**\n```\n{text}```")
+            fence = "`" * (1 + max([2, *map(len, re.findall("`+", text))]))
+            parts.append(f"**{title}**\n{fence}\n{text}{fence}")
     return "\n\n".join(parts) + "\n"
+
+
+def _literal(text: Any) -> str:
+    """Text that Markdown takes for nothing else."""
+    return re.sub(r"([\\`*_\[\]<>|#~$&])", r"\\\1", str(text))
 
 
 def _find(config: Mapping[str, Any], name: str) -> Any:

@@ -100,8 +100,8 @@ def _go_to(step: int, viewer: subprocess.Popen[bytes], port: int) -> None:
             if not state.loading and any(shown.timelines for shown in state.recordings):
                 client.set_time(PROBE, sequence=step, play_state="paused")
                 return
-        except (RuntimeError, ConnectionError, ValueError):
-            pass  # it is not ready yet
+        except (RuntimeError, OSError, ValueError):
+            pass  # it is not ready yet, or busy
         time.sleep(0.3)
 
 

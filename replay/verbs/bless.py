@@ -9,11 +9,12 @@ import sys
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from chsel.errors import RecordingError
 from replay.blessing import Change, changes, write_blessed
+from replay.console import Console
+from replay.disk import sync_folder
 from replay.file_verification import recordings_in
 from replay.mcap.reader import read_recording
 from replay.verification import environment_differences
@@ -34,7 +35,7 @@ def run(given: argparse.Namespace) -> int:
 
 
 def _bless(path: Path, *, ask: bool) -> int:
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(soft_wrap=True)
     recording = read_recording(path)
     new = path.with_name(f"{path.name}.{os.getpid()}.new")
     try:
@@ -45,11 +46,12 @@ def _bless(path: Path, *, ask: bool) -> int:
             return 0
         console.print(_table(path, differing, len(found)))
         for line in environment_differences(recording.start):
-            console.print(f"  {line}", markup=False)
+            console.print(f"  {line}")
         if ask and console.input("record these results as the expected ones? [y/N] ") != "y":
             console.print(f"{path}: left as it was")
             return 1
         new.replace(path)
+        sync_folder(path.parent)
         console.print(f"{path}: {len(differing)} of {len(found)} results are new")
         return 0
     finally:

@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn
 from rich.table import Table
 
 from chsel.errors import RecordingError, SettingError
@@ -32,6 +30,7 @@ from replay.comparing.comparison import (
 from replay.comparing.contenders import METHODS_HELP, Contender, contenders
 from replay.comparing.csv_file import write_csv
 from replay.comparing.plausible import PlausibleSets
+from replay.console import Console, Progress, TextColumn
 from replay.mcap.reader import Recording, read_recording
 from replay.step_ranges import STEPS_HELP, chosen_steps
 
@@ -85,13 +84,14 @@ def run(given: argparse.Namespace) -> int:
     sets = PlausibleSets(recording, given.plausible, given.definition)
     with threads(given.threads):
         outcomes = _compared(recording, methods, steps, cost, sets)
-    console = Console(highlight=False)
+    console = Console()
     each = given.each or len(steps) <= _FEW_STEPS
-    _tell(console, recording, methods, outcomes, cost, each=each, count=given.threads)
+    of_sets = f"plausible sets by definition {given.definition}"
+    _tell(console, recording, methods, outcomes, cost, of_sets, each=each, count=given.threads)
     _save(given, recording, methods, outcomes, cost)
     for path in (given.save_csv, given.save_plot, given.save_rerun):
         if path is not None:
-            console.print(f"written: {path}", markup=False, soft_wrap=True)
+            console.print(f"written: {path}", soft_wrap=True)
     again = {method.label for method in methods}
     return int(any(outcome.failure for outcome in outcomes if outcome.label in again))
 
@@ -138,27 +138,26 @@ def _tell(
     methods: Sequence[Contender],
     outcomes: Sequence[Outcome],
     cost: CommonCost,
+    of_sets: str,
     *,
     each: bool,
     count: int,
 ) -> None:
     columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
-    of_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
+    to_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
     of_all = tuple(column for column in columns if column.name not in PLAUSIBLE)
     _tell_tables(console, _costs(cost), of_all, outcomes, each=each)
-    if of_sets:
-        _tell_tables(console, "plausible sets", of_sets, outcomes, each=each)
+    if to_sets:
+        _tell_tables(console, of_sets, to_sets, outcomes, each=each)
     console.print(_legend(columns, count))
     for method in methods:
         if method.changes:
-            console.print(
-                f"{method.label} with {', '.join(method.changes)}", markup=False, soft_wrap=True
-            )
+            console.print(f"{method.label} with {', '.join(method.changes)}", soft_wrap=True)
         _tell_bits(console, method, [o for o in outcomes if o.label == method.label])
     for outcome in outcomes:
         if outcome.failure:
             what = f"step {outcome.step}, {outcome.label}: {outcome.failure}"
-            console.print(what, markup=False, soft_wrap=True)
+            console.print(what, soft_wrap=True)
 
 
 def _tell_tables(
@@ -224,7 +223,7 @@ def _add(table: Table, texts: list[str], columns: Sequence[Column], outcome: Out
     style = "dim" if outcome.label.startswith("recorded:") else ""
     if outcome.failure and columns:
         cells[0] = "failed"
-    table.add_row(*map(escape, texts), *cells, style=style)
+    table.add_row(*texts, *cells, style=style)
 
 
 def _tell_bits(console: Console, method: Contender, outcomes: Sequence[Outcome]) -> None:
@@ -239,7 +238,7 @@ def _tell_bits(console: Console, method: Contender, outcomes: Sequence[Outcome])
         text += f"{', '.join(other)} (verify tells where)"
     else:
         text += f"its {len(known)} results are those recorded, to the bit"
-    console.print(text, markup=False, soft_wrap=True)
+    console.print(text, soft_wrap=True)
 
 
 def _save(
@@ -250,7 +249,7 @@ def _save(
     cost: CommonCost,
 ) -> None:
     if given.save_csv is not None:
-        write_csv(given.save_csv, outcomes, methods, cost)
+        write_csv(given.save_csv, outcomes, methods, cost, given.definition)
     if given.save_plot is not None:
         from replay.comparing.plot import write_plot
 

@@ -10,12 +10,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from replay.comparing.message_content import printable
 from replay.comparing.recording_diff import Ignored, RecordingDiff, TopicDiff, recording_diff
+from replay.console import Console
 
 _SHOWN = 20
 _MANY_ULPS = 10**6
@@ -42,7 +41,7 @@ def run(given: argparse.Namespace) -> int:
     found = recording_diff(
         given.first, given.second, ignored=ignored, keep=None if given.all else 1
     )
-    console = Console(highlight=False)
+    console = Console()
     but = f", leaving out {', '.join(given.ignore)}" if given.ignore else ""
     if found.same_bytes:
         console.print("equal to the byte")
@@ -51,13 +50,13 @@ def run(given: argparse.Namespace) -> int:
         console.print(f"equal in content{but}; the files differ in other bytes", soft_wrap=True)
         return 0
     first = f"first difference: {found.differences[0]}"
-    console.print(first, markup=False, soft_wrap=True)
+    console.print(first, soft_wrap=True)
     console.print(_table(found), "")
     equal = sum(topic.is_equal for topic in found.topics.values())
     console.print(f"{equal} of {len(found.topics)} topics and attachments are equal")
     if given.all:
         for item in found.differences:
-            console.print(str(item), markup=False, soft_wrap=True)
+            console.print(str(item), soft_wrap=True)
     else:
         _tell_session(console, found)
     return 1
@@ -73,7 +72,7 @@ def _table(found: RecordingDiff) -> Table:
     for name, topic in found.topics.items():
         if not topic.is_equal:
             counts = (topic.differing, topic.count, topic.only_first, topic.only_second)
-            texts = map(escape, (printable(name), _ranges(topic.steps), _fields(topic)))
+            texts = (printable(name), _ranges(topic.steps), _fields(topic))
             table.add_row(*texts, *map(str, counts), _largest(topic))
     return table
 
@@ -82,7 +81,7 @@ def _tell_session(console: Console, found: RecordingDiff) -> None:
     """The settings and the environment that differ, beyond the line that was printed first."""
     of_start = [item for item in found.differences[1:] if item.key.topic == "/session"]
     for item in of_start[:_SHOWN]:
-        console.print(str(item), markup=False, soft_wrap=True)
+        console.print(str(item), soft_wrap=True)
     if len(of_start) > _SHOWN:
         console.print(f"{len(of_start) - _SHOWN} more on /session; --all lists every difference")
 

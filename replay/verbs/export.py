@@ -6,10 +6,10 @@ import argparse
 import inspect
 from pathlib import Path
 
-from rich.console import Console
 from rich.filesize import decimal
 
 from chsel.errors import SettingError
+from replay.console import Console
 from replay.export import FORMATS, write_export
 from replay.export_content import EXPORTS, exported_archive
 from replay.mcap.reader import read_recording
@@ -44,8 +44,8 @@ def run(given: argparse.Namespace) -> int:
         exported = EXPORTS[given.what](recording, given.steps)
     path = given.out or Path(f"{recording.path.stem}_{given.what}.{file_format}")
     write_export(exported, path, file_format)
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"{path}  {decimal(path.stat().st_size)}", markup=False)
+    console = Console(soft_wrap=True)
+    console.print(f"{path}  {decimal(path.stat().st_size)}")
     if given.what == "points" and file_format != "json":
         lower, upper = recording.start.workspace.lower, recording.start.workspace.upper
         bounds = ",".join(f"[{a!r},{b!r}]" for a, b in zip(lower, upper, strict=True))
@@ -53,7 +53,6 @@ def run(given: argparse.Namespace) -> int:
             f"probe with these: python -m runners.probe object=NAME session=points "
             f"session.path={path} 'session.workspace=[{bounds}]' "
             f"session.free_resolution={recording.start.free_resolution!r}",
-            markup=False,
         )
     return 0
 

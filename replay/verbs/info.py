@@ -13,12 +13,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.filesize import decimal
 from rich.table import Table
-from rich.text import Text
 
 from chsel.errors import RecordingError
+from replay.console import Console, print_error
 from replay.recording_info import RecordingInfo, recording_info
 
 _IN_FULL = 3  # files; of more, each is a line
@@ -42,7 +41,7 @@ def run(given: argparse.Namespace) -> int:
         try:
             info = recording_info(file, check=given.check)
         except RecordingError as error:
-            print(f"error: {_printable(str(error))}", file=sys.stderr)
+            print_error(str(error))
             documents.append({"path": file, "error": str(error)})
             status = 2
             continue
@@ -51,18 +50,18 @@ def run(given: argparse.Namespace) -> int:
         status = max(status, int(info.damage is not None))
     if given.json:
         document = documents if len(documents) > 1 else documents[0]
-        print(json.dumps(document, indent=2, allow_nan=False))
+        sys.stdout.write(json.dumps(document, indent=2, allow_nan=False) + "\n")
     else:
-        _show(Console(highlight=False), infos, brief=len(given.files) > _IN_FULL, all_=given.steps)
+        _show(Console(), infos, brief=len(given.files) > _IN_FULL, all_=given.steps)
     return status
 
 
 def _show(console: Console, infos: Sequence[RecordingInfo], *, brief: bool, all_: bool) -> None:
     for info in infos:
         if brief:
-            console.print(Text(_overview(info)), soft_wrap=True)
+            console.print(_overview(info), soft_wrap=True)
         else:
-            console.print(Text(_printable(str(info.path)), style="bold"), soft_wrap=True)
+            console.print(str(info.path), style="bold", soft_wrap=True)
             console.print(_facts(info))
             if info.steps:
                 console.print(_step_table(info.steps, all_=all_))
@@ -77,7 +76,7 @@ def _overview(info: RecordingInfo) -> str:
         decimal(info.size),
         "whole" if info.damage is None else info.damage,
     ]
-    return _printable(f"{info.path}: {', '.join(facts)}")
+    return f"{info.path}: {', '.join(facts)}"
 
 
 def _facts(info: RecordingInfo) -> Table:
@@ -94,10 +93,12 @@ def _facts(info: RecordingInfo) -> Table:
         "rig": "" if info.rig is None else f"{info.rig['name']}, raw log {info.rig['source']}",
         "true pose": "known" if session["true_pose"] else "unknown",
         "outcome": info.outcome or "not told: the session did not end",
+        "lost": ", ".join(session["lost"]),
         "size": f"{decimal(info.size)}, of that, uncompressed: {files}",
         "messages": _messages(info),
         "environment": _environment(session["environment"]),
         "format": f"version {session['format_version']}",
+        "digest": info.digest,
         "integrity": info.integrity,
     }
     table = Table.grid(padding=(0, 2))
@@ -105,20 +106,30 @@ def _facts(info: RecordingInfo) -> Table:
     table.add_column(overflow="fold")
     for name, fact in facts.items():
         if fact:
-            table.add_row(f"  {name}", Text(_printable(fact)))
+            table.add_row(f"  {name}", fact)
     return table
 
 
 def _messages(info: RecordingInfo) -> str:
     """How many on each topic, with bytes where they are known, the most first."""
-    sizes = info.message_bytes
-    if sizes is None:
-        ordered = sorted(info.messages.items(), key=lambda item: -item[1])
+    counts = _grouped(info.messages)
+    if info.message_bytes is None:
+        ordered = sorted(counts.items(), key=lambda item: -item[1])
         return ", ".join(f"{count} {topic}" for topic, count in ordered)
+    sizes = _grouped(info.message_bytes)
     return ", ".join(
-        f"{info.messages[topic]} {topic} ({decimal(size)})"
+        f"{counts[topic]} {topic} ({decimal(size)})"
         for topic, size in sorted(sizes.items(), key=lambda item: -item[1])
     )
+
+
+def _grouped(numbers: Mapping[str, int]) -> dict[str, int]:
+    """Sums over the topics that are parts of one cloud."""
+    sums: dict[str, int] = {}
+    for topic, number in numbers.items():
+        name = "/all_points" if topic.startswith("/all_points/") else topic
+        sums[name] = sums.get(name, 0) + number
+    return sums
 
 
 def _environment(environment: Mapping[str, str]) -> str:
@@ -150,8 +161,3 @@ def _cells(step: Mapping[str, Any]) -> list[str]:
         return [*points, "no result" if step["posed"] else "", "", ""]
     cost = "" if math.isnan(step["best_cost"]) else f"{step['best_cost']:.4g}"
     return [*points, str(step["hypotheses"]), str(step["distinct"]), cost]
-
-
-def _printable(text: str) -> str:
-    """The text without signs that would steer a terminal: a file may hold any."""
-    return "".join(sign if sign.isprintable() else "\N{REPLACEMENT CHARACTER}" for sign in text)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
+from replay.console import Console
 from replay.mcap.recovery import Recovered, recover
 
 
@@ -28,20 +28,21 @@ def run(given: argparse.Namespace) -> int:
     """Write the new recording, and tell what was kept and what was lost."""
     path, out = given.file.expanduser(), given.out.expanduser()
     found = recover(path, out)
-    console = Console(highlight=False, soft_wrap=True)
-    _tell_losses(console, found)
+    console = Console(soft_wrap=True)
+    if found.damage is None:
+        console.print("nothing is lost: the recording is whole")
     kept = f"{len(found.probes)} probes, {len(found.problems)} registration problems, "
     images = f", {found.images} images" if found.images else ""
     console.print(f"kept: {kept}{len(found.results)} results{images}")
-    console.print(str(out), markup=False)
+    console.print(str(out))
+    _tell_losses(console, found)
     return 0
 
 
 def _tell_losses(console: Console, found: Recovered) -> None:
     if found.damage is None:
-        console.print("nothing is lost: the recording is whole")
         return
-    console.print(found.damage, markup=False)
+    console.print(f"the file was not whole: it {found.damage}")
     if found.damages:
         table = Table(title="bytes lost", title_justify="left", box=SIMPLE_HEAD)
         table.add_column("from", justify="right")
@@ -49,7 +50,7 @@ def _tell_losses(console: Console, found: Recovered) -> None:
         table.add_column("why")
         for damage in found.damages:
             table.add_row(str(damage.start), str(damage.end), damage.reason)
-        Console(highlight=False, markup=False).print(table)
+        Console().print(table)
     if found.nothing_lost:
         console.print("nothing of the session is lost")
     if found.messages:
@@ -60,8 +61,12 @@ def _tell_losses(console: Console, found: Recovered) -> None:
         console.print(f"lost probes: {doubt}those of step {', '.join(spans)}")
     _tell_steps(console, "lost registration problems", found.lost_problems)
     _tell_steps(console, "lost results", found.lost_results)
+    for name in found.remade:
+        console.print(f"{name} was lost and is there again, made from the mesh, to the bit")
+    for name in found.attachments:
+        console.print(f"lost: {name}; what needs it says so")
     for event in found.events:
-        console.print(f"lost: {event}", markup=False)
+        console.print(f"lost: {event}")
     if not found.complete:
         console.print("the session's end is missing: what else was in it cannot be known")
 

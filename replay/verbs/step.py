@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from chsel.engine import CompiledCost
 from chsel.errors import SettingError
 from chsel.methods import METHODS
 from replay.comparing.comparison import common_cost, numbers_under
+from replay.console import Console
 from replay.mcap.reader import Recording, read_recording
 from replay.registration import other_method
 from replay.rerun.drawing import check_new, draw_recording
@@ -66,14 +66,14 @@ def run(given: argparse.Namespace) -> int:
         again = register_step_again(
             recording, given.step, method, path, preset=preset, interval=interval
         )
-    console = Console(highlight=False)
+    console = Console()
     console.print(_table(recording, again))
     console.print(_verdict(again), soft_wrap=True)
     console.print(f"registered in {again.seconds:.2f} s")
-    console.print(f"written: {path}", markup=False, soft_wrap=True)
+    console.print(f"written: {path}", soft_wrap=True)
     if given.save_rerun is not None:
         draw_recording(again.recording, given.save_rerun)
-        console.print(f"written: {given.save_rerun}", markup=False, soft_wrap=True)
+        console.print(f"written: {given.save_rerun}", soft_wrap=True)
     return int(again.as_recorded and again.recorded is not None and not again.equal)
 
 

@@ -6,13 +6,10 @@ Status 0 if all bits are equal, 1 if not, 2 if a file cannot be used.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 
-from rich.console import Console
-from rich.progress import Progress
-
 from chsel.errors import SettingError
+from replay.console import Console, Progress, print_error
 from replay.file_verification import FileVerdict, recordings_in, verified_files
 from replay.verification import NO_RESULT
 
@@ -30,7 +27,7 @@ def run(given: argparse.Namespace) -> int:
     """Print a line for each file, and a report for each step that differs."""
     if given.jobs < 1:
         raise SettingError(f"--jobs is {given.jobs}; accepted: at least 1")
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(soft_wrap=True)
     paths = recordings_in(given.files)
     begun, status, equal, total = time.perf_counter(), 0, 0, 0
     waiting = Console(stderr=True)
@@ -52,7 +49,7 @@ def run(given: argparse.Namespace) -> int:
 
 def _tell(console: Console, file: FileVerdict) -> None:
     if file.unusable:
-        print(f"error: {file.unusable}", file=sys.stderr)
+        print_error(file.unusable)
         return
     compared = [verdict for verdict in file.verdicts if verdict.outcome != NO_RESULT]
     methods = ", ".join(sorted({verdict.method for verdict in file.verdicts})) or "no method"
@@ -61,7 +58,10 @@ def _tell(console: Console, file: FileVerdict) -> None:
     without = len(file.verdicts) - len(compared)
     if without:
         line += f", {without} without a result"
+    if file.digest:
+        line += f", digest {file.digest}"
     console.print(line)
     for verdict in compared:
         if file.status == 1 and verdict.outcome != "equal":
-            console.print(verdict.report(), markup=False)
+            for line in verdict.report().split("\n"):
+                console.print(line)

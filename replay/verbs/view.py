@@ -8,9 +8,8 @@ import webbrowser
 from contextlib import suppress
 from pathlib import Path
 
-from rich.console import Console
-
 from chsel.errors import RecordingError
+from replay.console import Console
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.drawing import check_new, draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
@@ -40,14 +39,14 @@ def run(given: argparse.Namespace) -> int:
         )
     recording = read_recording(given.file, partial=True)
     _check_step(recording, given.step)
-    said = Console(highlight=False)
+    said = Console()
     if recording.damage is not None:
-        warnings = Console(highlight=False, stderr=True)
+        warnings = Console(stderr=True)
         what = f"warning: {given.file} is {recording.damage}; what is whole of it is shown"
-        warnings.print(what, soft_wrap=True, markup=False)
+        warnings.print(what, soft_wrap=True)
     if given.save is not None:
         _draw(recording, given.save, given.step)
-        said.print(str(given.save), soft_wrap=True, markup=False)
+        said.print(str(given.save), soft_wrap=True)
         return 0
     with tempfile.TemporaryDirectory(prefix="replay-view-") as folder:
         rrd = Path(folder) / "recording.rrd"
@@ -64,7 +63,7 @@ def run(given: argparse.Namespace) -> int:
 def _show_in_browser(rrd: Path, said: Console) -> None:
     """Serve the viewer until Ctrl-C."""
     with suppress(KeyboardInterrupt), web_server(rrd) as (server, address):
-        said.print(address, soft_wrap=True, markup=False)
+        said.print(address, soft_wrap=True)
         said.print("Ctrl-C ends it")
         if has_screen():  # else a browser for text might take the terminal over
             webbrowser.open(address)

@@ -71,7 +71,7 @@ def main(task: dict[str, Any]) -> None:
         steps = Steps(**task["steps"])
         posed = PosedProblem.load(Path(task["problem"]))
         register(posed, task["preset"], steps, steps.search)
-    print(json.dumps({"bytes": peak_memory()}))
+    sys.stdout.write(json.dumps({"bytes": peak_memory()}) + "\n")
 
 
 if __name__ == "__main__":

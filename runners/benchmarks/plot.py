@@ -11,6 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from runners.benchmarks.report import number
+from runners.recording import IN_RUN_FOLDER
+from runners.whole_file import whole_file
 
 Values = Mapping[str, Any]
 
@@ -45,7 +47,8 @@ def draw(report: Values, path: Path) -> None:
         axes = figure.add_subplot(grid[rows - 1, column])
         _draw_growth(axes, [r for r in report["alone"] if r["measure"] == measure], label)
     figure.suptitle(_title(report["machine"]), fontsize=10)
-    figure.savefig(path, dpi=120)
+    with whole_file(path, IN_RUN_FOLDER) as beside:
+        figure.savefig(beside, format="png", dpi=120)
 
 
 def _title(machine: Values) -> str:

@@ -1,36 +1,50 @@
-"""What a benchmark found: tables on the terminal, and the same numbers as JSON."""
+"""What a benchmark found: tables on the terminal and in Markdown, and the same numbers as JSON."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.box import MARKDOWN, SIMPLE_HEAD, Box
 from rich.table import Table
 
+from replay.console import Console
 from runners.benchmarks.ours import PRESETS
+from runners.recording import write_in_run_folder
 
 Values = Mapping[str, Any]
+_PAGE_WIDTH = 160  # characters: no table is wider
 
 
 def write(path: Path, report: Values) -> None:
     """The report as JSON."""
-    path.write_text(json.dumps(report, indent=2) + "\n")
+    write_in_run_folder(path, json.dumps(report, indent=2) + "\n")
 
 
-def show(console: Console, report: Values) -> None:
+def show(console: Console, report: Values, box: Box = SIMPLE_HEAD) -> None:
     """The report as tables."""
     for line in _machine(report["machine"]):
         console.print(line, soft_wrap=True)
+        console.print()
     if report["comparison"]:
-        console.print(f"\n{report['what']}\n")
-        _show_comparison(console, report["comparison"])
+        console.print(report["what"], soft_wrap=box is MARKDOWN)
+        console.print()
+        _show_comparison(console, report["comparison"], box)
         _show_calls(console, report["problems"])
     if report["alone"]:
-        _show_alone(console, report["alone"])
+        _show_alone(console, report["alone"], box)
+
+
+def write_markdown(path: Path, report: Values) -> None:
+    """The same tables as a page: docs/speed.md is one of them."""
+    page = StringIO()
+    show(Console(file=page, width=_PAGE_WIDTH), report, MARKDOWN)
+    lines = [line.rstrip() for line in page.getvalue().splitlines()]
+    lines = ["# Speed", "", "Written by `python -m runners.benchmark`.", "", *lines, ""]
+    write_in_run_folder(path, "\n".join(lines))
 
 
 def number(value: float) -> str:
@@ -65,13 +79,14 @@ def _machine(machine: Values) -> list[str]:
     return lines
 
 
-def _show_comparison(console: Console, rows: Sequence[Values]) -> None:
+def _show_comparison(console: Console, rows: Sequence[Values], box: Box) -> None:
     compared = any(row["times_ours"] for row in rows)
     title = "one registration in ms"
     if compared:
         title += "; x ref, pap, def: times ours in preset reference, paper, default"
-    title += "\ncost: of the best pose, by Eq. 7 with nearest lookup for all"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
+    for line in (title, "cost: of the best pose, by Eq. 7 with nearest lookup for all", ""):
+        console.print(line, soft_wrap=True)
+    table = Table(box=box, show_edge=box is MARKDOWN, collapse_padding=True)
     for name in ("problem", "registration"):
         table.add_column(name, no_wrap=True)
     ratio_names = [f"x {preset[:3]}" for preset in PRESETS] if compared else []
@@ -93,19 +108,22 @@ def _show_calls(console: Console, problems: Mapping[str, Values]) -> None:
     }
     if calls:
         counts = ", ".join(f"{name} {count}" for name, count in calls.items())
-        console.print(f"cost calls of the package, counted: {counts}\n")
+        for line in ("", f"cost calls of the package, counted: {counts}", ""):
+            console.print(line)
 
 
-def _show_alone(console: Console, rows: Sequence[Values]) -> None:
-    title = "this library alone: median and quartiles"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
+def _show_alone(console: Console, rows: Sequence[Values], box: Box) -> None:
+    console.print("this library alone: median and quartiles")
+    console.print()
+    table = Table(box=box, show_edge=box is MARKDOWN, collapse_padding=True)
     for name in ("measure", "case", "preset"):
         table.add_column(name)
     for name in ("median", "quartiles", ""):
         table.add_column(name, justify="right")
     previous = ""
     for row in rows:
-        measure = "" if row["measure"] == previous else row["measure"]
+        repeated = row["measure"] == previous and box is not MARKDOWN
+        measure = "" if repeated else row["measure"]
         previous = row["measure"]
         cells = [measure, row["case"], row["who"], number(row["median"])]
         table.add_row(*cells, _quartiles(row), row["unit"])

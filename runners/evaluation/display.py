@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn
 from rich.table import Table
 
+from replay.console import Console, Progress, TextColumn
 from runners.evaluation import schedule
 from runners.evaluation.true_poses import FoundPose
 
@@ -26,7 +26,7 @@ class Display:
     """A bar with what is at work, or a line a minute where there is no terminal; then a table."""
 
     def __init__(self) -> None:
-        self._console = Console(highlight=False)
+        self._console = Console()
         terminal = self._console.is_terminal
         self._bar = Progress(
             TextColumn("{task.completed}/{task.total} units"),
@@ -41,7 +41,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """A line of its own."""
-        self._console.print(text, soft_wrap=True, markup=False)
+        self._console.print(text, soft_wrap=True)
 
     def progress(self, state: schedule.Progress) -> None:
         """Show how far it is."""
@@ -66,8 +66,11 @@ class Display:
         if len(shown) < len(state.failed):
             self.say(f"and {len(state.failed) - len(shown)} more, see the table")
 
-    def summary(self, results: pa.Table, methods: Sequence[str]) -> None:
-        """Median PD by object and method, and milliseconds a registration."""
+    def summary(self, results: pa.Table, methods: Sequence[str], definition: str) -> None:
+        """Median PD by object and method, and milliseconds a registration.
+
+        definition: of the plausible sets, as text.
+        """
         names = np.array(results["object"].to_pylist(), dtype=object)
         labels = np.array(results["method"].to_pylist(), dtype=object)
         there = [label for label in methods if (labels == label).any()]
@@ -87,6 +90,7 @@ class Display:
             table.add_row(label, *cells, _median(1000.0 * seconds[own]))
         self.say("medians over all steps of all trials: PD in mm² by object, ms a registration")
         self._console.print(table)
+        self.say(f"plausible sets: {definition}")
 
     def true_poses(self, found: Sequence[FoundPose]) -> None:
         """How far the true poses that were sought are from guesses, and from a simulated truth."""

@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from runners.evaluation.claims import claimed
+from runners.evaluation.definition import definition_label
 from runners.evaluation.experiment import read_experiment
 from runners.evaluation.table import (
     ITERATIONS,
@@ -26,11 +27,12 @@ def gather(folder: Path) -> pa.Table:
     """
     with claimed(folder, "tables", wait=True):
         experiment = read_experiment(folder)
+        definition = definition_label(experiment["definition"])
         if experiment["iterations"]["every"] is not None:
             parts = list(_parts(folder, experiment, ".iterations.parquet"))
-            write_table(folder, "iterations", parts, ITERATIONS, ITERATIONS_ORDER)
+            write_table(folder, "iterations", parts, ITERATIONS, ITERATIONS_ORDER, definition)
         parts = list(_parts(folder, experiment, ".parquet", ".failed.parquet"))
-        return write_table(folder, "results", parts, RESULTS, RESULTS_ORDER)
+        return write_table(folder, "results", parts, RESULTS, RESULTS_ORDER, definition)
 
 
 def _parts(folder: Path, experiment: Mapping[str, Any], *suffixes: str) -> Iterable[Path]:

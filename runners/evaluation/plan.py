@@ -24,6 +24,7 @@ from runners.evaluation.configurations import (
     recorded_object,
 )
 from runners.evaluation.contenders import Contender
+from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import MetricsConfig
 from runners.objects.loader import ObjectConfig
 from runners.sessions import session_settings
@@ -113,10 +114,12 @@ class Plan:
 
     def plausible_settings(self, epsilon: float) -> PlausibleSettings:
         """The definition of the plausible sets of an object of this epsilon, metres."""
-        values = {key: value for key, value in self.definition.items() if key != "name"}
-        if values.get("epsilon") is None:
-            values["epsilon"] = epsilon
-        return build_settings(PlausibleSettings, values, "definition")
+        return definition_settings(self.definition, epsilon)
+
+    @cached_property
+    def definition_label(self) -> str:
+        """The name of that definition in tables."""
+        return definition_label(self.definition)
 
     def probes_of(self, configuration: str) -> range:
         """The indices that probes of a configuration may have."""

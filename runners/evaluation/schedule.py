@@ -135,6 +135,7 @@ class Schedule:
                 "seed": trial.seed,
                 "method": unit.label,
                 "preset": preset,
+                "definition": plan.definition_label,
                 "step": step,
                 "status": f"failed: {reason}",
             }

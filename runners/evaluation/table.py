@@ -15,6 +15,8 @@ from runners.whole_file import whole_file
 
 Row = Mapping[str, Any]
 
+DEFINITION = "definition"
+"""The column with the label of the definition of the plausible sets behind a row's numbers."""
 _KEYS = [("object", pa.string()), ("configuration", pa.string()), ("seed", pa.int64())]
 _KEYS += [("method", pa.string())]
 _INTEGERS = ("contacts", "free_points", "occupied_points")
@@ -23,6 +25,7 @@ RESULTS = pa.schema(
     [
         *_KEYS,
         ("preset", pa.string()),
+        (DEFINITION, pa.string()),
         ("step", pa.int64()),
         *((name, pa.int64()) for name in _INTEGERS),
         ("status", pa.string()),
@@ -42,6 +45,7 @@ plausibility and diversity (PD) in mm^2 and root, of PD, in mm. status: "ok", "f
 ITERATIONS = pa.schema(
     [
         *_KEYS[1:],
+        (DEFINITION, pa.string()),
         ("step", pa.int64()),
         ("iteration", pa.int64()),
         ("filled", pa.int64()),
@@ -61,15 +65,30 @@ def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, about: str = 
         pa.parquet.write_table(table.replace_schema_metadata({"about": about}), beside)
 
 
-def read_part(path: Path, schema: pa.Schema) -> pa.Table:
-    """A part. Raises RecordingError if it is damaged or of another version."""
+def read_part(path: Path, schema: pa.Schema, definition: str) -> pa.Table:
+    """A part. Raises RecordingError if it is damaged, of another version or definition.
+
+    definition: label of that of the evaluation. A part from before there was a column of it has it.
+    """
     try:
-        return pa.parquet.read_table(path).replace_schema_metadata().cast(schema)
+        table = pa.parquet.read_table(path).replace_schema_metadata()
+        if DEFINITION not in table.column_names:
+            place = schema.get_field_index(DEFINITION)
+            labels = pa.array([definition] * table.num_rows, pa.string())
+            table = table.add_column(place, DEFINITION, labels)
+        table = table.cast(schema)
     except (pa.ArrowException, ValueError, OSError) as error:
         reason = " ".join(str(error).split())
         raise RecordingError(
             f"{path} cannot be read ({reason}); remove it to have it made again"
         ) from None
+    others = set(table[DEFINITION].to_pylist()) - {definition}
+    if others:
+        raise RecordingError(
+            f"{path} has numbers by the definition {others.pop()} of plausible sets; accepted in "
+            f"this folder: {definition}, so remove the file to have it made again"
+        )
+    return table
 
 
 def is_part(path: Path) -> bool:
@@ -91,10 +110,15 @@ def about_part(path: Path) -> str:
 
 
 def write_table(
-    folder: Path, name: str, parts: Sequence[Path], schema: pa.Schema, order: Sequence[str]
+    folder: Path,
+    name: str,
+    parts: Sequence[Path],
+    schema: pa.Schema,
+    order: Sequence[str],
+    definition: str,
 ) -> pa.Table:
-    """Put parts together in order, as NAME.parquet and NAME.csv."""
-    tables = [read_part(path, schema) for path in parts]
+    """Put parts by one definition together in order, as NAME.parquet and NAME.csv."""
+    tables = [read_part(path, schema, definition) for path in parts]
     table = pa.concat_tables([schema.empty_table(), *tables])
     table = table.sort_by([(key, "ascending") for key in order]).combine_chunks()
     with whole_file(folder / f"{name}.parquet") as beside:

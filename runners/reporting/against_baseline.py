@@ -14,6 +14,7 @@ from runners.reporting.statistics import Spread, grouped, spread, trial_of
 from runners.reporting.tables import DIVERSITY
 
 LEAST_PD = 1.0  # mm^2: a PD below counts as this in geometric means, which a 0 would make 0
+_WORSE = 1.0 + 1e-9  # a ratio above; the rounding of a geometric mean makes no PD worse
 MISSED = 0.003  # m: a best energy above this is none of the right pose's
 _ENERGY = ("anchored",)  # methods whose cost is an energy in metres
 Styles = Mapping[str, MethodStyle]
@@ -72,7 +73,7 @@ def _summary(
         rows = by_method.get(method, [])
         pd, seconds = spread(rows, DIVERSITY), spread(rows, "seconds")
         ratios = pd_ratios(rows, base)
-        worse = "-" if method == baseline else _share(ratio > 1.0 for ratio in ratios)
+        worse = "-" if method == baseline else _share(ratio > _WORSE for ratio in ratios)
         exact, distinct = spread(rows, "exact_members"), spread(rows, "distinct")
         least = f"[{min(distinct.values):.0f}]" if distinct.count else ""
         lines.append(
@@ -105,10 +106,12 @@ def _summary(
     )
     note = (
         "Ratio: the geometric mean of all. Members: the mean share of hypotheses that are members "
-        "of the plausible set by its definition. Distinct: poses, the mean. Misses: registrations "
-        f"whose best energy is above {1000.0 * MISSED:g} mm, where the cost is an energy."
+        f"of the plausible set by its definition, {evaluation.definition_text}. Distinct: poses, "
+        f"the mean. Misses: registrations whose best energy is above {1000.0 * MISSED:g} mm, where "
+        "the cost is an energy."
     )
-    return Table("PD and its ratios over all registrations", header, tuple(lines), note=note)
+    title = f"PD and its ratios over all registrations, by {evaluation.definition}"
+    return Table(title, header, tuple(lines), note=note)
 
 
 def _ratios(

@@ -22,6 +22,7 @@ from chsel.observer import NullObserver
 from chsel.pose import apply, compose, inverse
 from chsel.problem import RegistrationProblem
 from chsel.space import search_space, transforms_of
+from replay.console import print_error
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.panels import drawn, new_figure
 from runners.reporting.silhouette import VIEWS, Frame, Silhouettes
@@ -155,7 +156,7 @@ def main() -> int:
         picture = picture_of_stages(recording, step, settings, given.view)
         given.png.write_bytes(picture)
     except (ChselError, OSError) as error:
-        print(error, file=sys.stderr)
+        print_error(str(error))
         return 2
     return 0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ import pyarrow
 import pyarrow.parquet
 
 from chsel.errors import ChselError
+from runners.evaluation.definition import definition_label, definition_text
 from runners.evaluation.draws import draw_of
 
 EXPERIMENT = "experiment.json"
@@ -25,6 +27,7 @@ _NEEDED = {
     ITERATIONS: ("configuration", "seed", "method", "step", "iteration", "diversity"),
 }
 _KEYS = ("object", "configuration", "seed", "method", "status")
+_UNNAMED = "an unnamed definition"
 Row = Mapping[str, Any]
 Trial = tuple[str, int]
 """Name of the configuration, and seed."""
@@ -42,7 +45,7 @@ class Evaluation:
     where there is no finite number; sorted by object, configuration, seed, method, step, draw.
     Draws of a method are told apart by their `draw` alone, 0 for the first. iterations: the same
     of moments within registrations. gathered: whether the rows come from finished parts, as there
-    is no table of all yet.
+    is no table of all yet. definition: label of that of the plausible sets behind all PD.
     """
 
     folder: Path
@@ -50,6 +53,16 @@ class Evaluation:
     rows: Sequence[Row]
     iterations: Sequence[Row]
     gathered: bool = False
+    definition: str = ""
+
+    @property
+    def definition_text(self) -> str:
+        """The definition of the plausible sets, and which poses are members by it."""
+        asked = self.experiment.get("definition")
+        if isinstance(asked, Mapping) and _label(asked) == self.definition:
+            with suppress(ChselError):  # of another version of this package
+                return definition_text(asked)
+        return self.definition
 
     @cached_property
     def objects(self) -> list[str]:
@@ -91,7 +104,32 @@ def open_evaluation(folder: Path) -> Evaluation:
     rows.sort(key=lambda row: [_sortable(row[name]) for name in (*order, "draw")])
     moments = (*order[1:], "iteration", "draw")
     iterations.sort(key=lambda row: [_sortable(row[name]) for name in moments])
-    return Evaluation(folder, experiment, rows, iterations, gathered)
+    definition = _definition(folder, experiment, [*rows, *iterations])
+    return Evaluation(folder, experiment, rows, iterations, gathered, definition)
+
+
+def _definition(folder: Path, experiment: Mapping[str, Any], rows: Sequence[Row]) -> str:
+    """The label of the one definition of plausible sets by which all rows were measured.
+
+    Rows from before there was a column of it have that of experiment.json. Raises ReportError if
+    there are several: medians over numbers by different definitions mean nothing.
+    """
+    asked = experiment.get("definition")
+    ours = _label(asked) if isinstance(asked, Mapping) else _UNNAMED
+    labels = sorted({str(row.get("definition") or ours) for row in rows})
+    if len(labels) > 1:
+        raise ReportError(
+            f"{folder} has numbers by {len(labels)} definitions of plausible sets, "
+            f"{', '.join(labels)}; accepted: one, so evaluate each into an out=DIR of its own"
+        )
+    return labels[0] if labels else ours
+
+
+def _label(definition: Mapping[str, Any]) -> str:
+    try:
+        return definition_label(definition)
+    except ChselError:  # of another version of this package
+        return str(definition.get("name") or _UNNAMED)
 
 
 def asked_labels(experiment: Mapping[str, Any]) -> list[str]:

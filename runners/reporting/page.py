@@ -37,6 +37,7 @@ def page_of(evaluation: Evaluation, sections: Sequence[Section], command: str) -
         f"objects: {len(evaluation.rows)} registrations. PD is plausible diversity in mm², lower "
         "is better; the best median of a row is bold, in brackets are its quartiles, and n is how "
         "many numbers are behind it.",
+        f"Plausible sets are by the definition {evaluation.definition_text}.",
     ]
     if evaluation.gathered:
         lead.append("There is no table of the whole evaluation yet: this is what is finished.")
@@ -111,7 +112,7 @@ def _markdown_cell(cell: Cell) -> str:
 
 def _text(text: str) -> str:
     """Text that Markdown takes for nothing else."""
-    return re.sub(r"([\\`*_<>|#])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"([\\`*_<>|#]|(?<=\])\()", r"\\\1", " ".join(text.split()))
 
 
 def _made(experiment: Mapping[str, Any]) -> list[Table]:

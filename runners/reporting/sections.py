@@ -106,7 +106,7 @@ def sections_of(
         _gradients(evaluation, sequence),
         _sequence(evaluation, styles, sequence),
     ]
-    return sections + _calibration(half, styles)
+    return sections + _calibration(half, styles, evaluation.definition)
 
 
 def _over_probes(evaluation: Evaluation, styles: Styles) -> Section:
@@ -251,7 +251,7 @@ def _sequence(evaluation: Evaluation, styles: Styles, sequence: SequenceConfig) 
     return Section("sequence", title, text, picture, missing)
 
 
-def _calibration(half: Sequence[Row], styles: Styles) -> list[Section]:
+def _calibration(half: Sequence[Row], styles: Styles, definition: str) -> list[Section]:
     """Where they were computed: the truth's rank, and how many hypotheses are plausible."""
     titles: dict[str, tuple[str, str, Best]] = {
         "rank": (
@@ -262,7 +262,8 @@ def _calibration(half: Sequence[Row], styles: Styles) -> list[Section]:
         ),
         "exact_members": (
             "Share of hypotheses in the plausible set",
-            "Of hypotheses that fulfil the definition of the plausible set themselves; 1 is best.",
+            f"Of hypotheses that fulfil the definition of the plausible set themselves, "
+            f"{definition}; 1 is best.",
             max,
         ),
     }

@@ -6,6 +6,7 @@ import csv
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,16 @@ class PointClass:
 
     def at(self, step: int) -> PointClass:
         """Those that become known at a step, in the order of the file."""
-        now = self.steps == step
+        order, steps = self._by_step
+        first, last = np.searchsorted(steps, (step, step + 1))
+        now = order[first:last]
         return PointClass(self.points[now], self.sdf[now], self.steps[now])
+
+    @cached_property
+    def _by_step(self) -> tuple[IntArray, IntArray]:
+        """The points (N,) in the order of their steps, and these steps (N,)."""
+        order = np.argsort(self.steps, kind="stable")
+        return order, self.steps[order]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import contextlib
 import faulthandler
 import re
 import resource
+import struct
 import sys
 import tempfile
 import time
@@ -31,7 +32,8 @@ from replay.recording_info import recording_info
 from replay.registration import recorded_method
 from replay.verification import DIFFERS, EQUAL, Verdict, verify
 from tests.replay.conftest import same_bits
-from tests.replay.mutations import LAYERS, Random, meaning
+from tests.replay.mutations import LAYERS, Random, file_of, meaning, split
+from tests.replay.seals import resealed
 from tests.replay.small_recordings import (
     METHODS,
     registered_session,
@@ -40,7 +42,8 @@ from tests.replay.small_recordings import (
 )
 
 MEANING = "meaning"
-SHARES = {"raw": 0.25, "records": 0.2, "messages": 0.3, MEANING: 0.25}
+SHARES = {"raw": 0.2, "records": 0.2, "messages": 0.25, "tampered": 0.1, MEANING: 0.25}
+RESEALED = {"records": 0.5, "messages": 1.0}  # how often the seals of a changed file are right
 HANGS_AFTER = 60.0  # seconds of one case: the process ends with a traceback
 _WARM = 200  # cases after which memory should grow no more
 
@@ -93,6 +96,8 @@ def run_case(index: int, seed: int, whole: Sequence[Original], folder: Path, tal
     else:
         path.write_bytes(data)
         outcome = judge(path, original, tally)
+        if layer == "tampered" and outcome != "refused":
+            raise WrongOutcome(f"a message that is not the one written is read: {outcome}")
         if index % 3 == 0:
             judge_partial(path, original, prefix=layer in ("raw", "records"))
         elif index % 3 == 1:
@@ -107,7 +112,11 @@ def changed(original: Original, layer: str, path: Path, random: Random) -> bytes
     """The bytes of a changed recording, None if the change cannot be made."""
     if layer == MEANING:
         return meaning(original.events, path, random)
-    return LAYERS[layer](original.data, random)
+    data = LAYERS[layer](original.data, random)
+    if data is not None and random.random() < RESEALED.get(layer, 0.0):
+        with contextlib.suppress(ValueError, struct.error):  # no records any more
+            data = file_of(resealed(split(data[8:-8])))
+    return data
 
 
 def judge(path: Path, original: Original, tally: Tally) -> str:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import struct
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -97,7 +97,7 @@ def messages(whole: bytes, random: Random) -> bytes:
         everything[place] = (kind, _other_attachment(everything[place][1], random))
         return file_of(everything)
     inside = split(unpacked(everything[place][1]))
-    topics = _topics(everything)
+    topics = topics_of(everything)
     within = [i for i, (opcode, _) in enumerate(inside) if opcode == Opcode.MESSAGE]
     for _ in range(int(random.integers(1, 3))):
         chosen = int(random.choice(within))
@@ -108,6 +108,63 @@ def messages(whole: bytes, random: Random) -> bytes:
         inside[chosen] = (Opcode.MESSAGE, head + _other_content(topic, content, random))
     everything[place] = (Opcode.CHUNK, packed(joined(inside)))
     return file_of(everything)
+
+
+def tampered(whole: bytes, random: Random) -> bytes | None:
+    """One message on any topic changed or left out, all checksums and numbers right, no seal.
+
+    None if the change leaves it as it was.
+    """
+    everything = split(whole[len(MCAP0_MAGIC) : -len(MCAP0_MAGIC)])
+    topics = topics_of(everything)
+    count = sum(1 for _ in _messages_in(everything))
+    chosen = int(random.integers(count))
+
+    def change(topic: str, number: int, content: bytes) -> bytes | None:
+        if number != chosen or topic == "/seal":
+            return content
+        return None if random.random() < 0.2 else _other_content(topic, content, random)
+
+    made = changed_messages(everything, topics, change)
+    return None if made == everything else file_of(made)
+
+
+def changed_messages(
+    everything: Sequence[Record],
+    topics: Mapping[int, str],
+    change: Callable[[str, int, bytes], bytes | None],
+) -> list[Record]:
+    """Records with other messages, numbered anew; seals stay as they are.
+
+    change: gets topic, number and bytes of a message, and gives its new bytes, None to drop it.
+    """
+    made, number, dropped = [], 0, 0
+    for opcode, content in everything:
+        if opcode == Opcode.CHUNK:
+            inside: list[Record] = []
+            for kind, data in split(unpacked(content)):
+                if kind == Opcode.MESSAGE:
+                    channel = struct.unpack_from("<H", data)[0]
+                    other = change(topics[channel], number, data[22:])
+                    number += 1
+                    if other is None:
+                        dropped += 1
+                        continue
+                    sequence = struct.pack("<I", number - 1 - dropped)
+                    data = data[:2] + sequence + data[6:22] + other
+                inside.append((kind, data))
+            if joined(inside) != unpacked(content):
+                content = packed(joined(inside))
+        made.append((opcode, content))
+    return made
+
+
+def _messages_in(everything: Sequence[Record]) -> Iterator[bytes]:
+    for opcode, content in everything:
+        if opcode == Opcode.CHUNK:
+            for kind, data in split(unpacked(content)):
+                if kind == Opcode.MESSAGE:
+                    yield data
 
 
 def meaning(events: Sequence[Event], path: Path, random: Random) -> bytes | None:
@@ -196,7 +253,7 @@ def _rearranged(parts: Sequence[Record], random: Random) -> list[Record]:
     return parts
 
 
-def _topics(everything: Sequence[Record]) -> dict[int, str]:
+def topics_of(everything: Sequence[Record]) -> dict[int, str]:
     """Topics by channel, from the summary."""
     topics = {}
     for opcode, content in everything:
@@ -433,9 +490,10 @@ def _consistent(events: list[Event]) -> list[Event]:
     return made
 
 
-LAYERS: dict[str, Callable[[bytes, Random], bytes]] = {
+LAYERS: dict[str, Callable[[bytes, Random], bytes | None]] = {
     "raw": raw,
     "records": records,
     "messages": messages,
+    "tampered": tampered,
 }
-"""Those that take a file; the fourth is `meaning`."""
+"""Those that take a file; the fifth is `meaning`."""

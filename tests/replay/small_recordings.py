@@ -18,9 +18,7 @@ from chsel.settings import settings_mapping
 from chsel.streams import StreamKey
 from replay.events import (
     Event,
-    HypothesesFound,
     Logged,
-    Measured,
     Probe,
     ProblemPosed,
     RigDescribed,
@@ -30,7 +28,7 @@ from replay.events import (
 )
 from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
-from replay.step_observer import StepObserver
+from replay.registration import register_recorded
 
 _SIDES = (0.1, 0.06, 0.04)
 _DESCENT = {"restarts": 2, "iterations": 4, "stop_below": None}
@@ -86,10 +84,10 @@ def registered_session(name: str, *, seed: int = 3) -> list[Event]:
             method.online,
             previous,
         )
-        recorder.record(ProblemPosed(step, problem))
-        previous = method.register(problem, StepObserver(recorder, step, 6, lambda *_: None))
-        recorder.record(HypothesesFound(step, previous))
-        recorder.record(Measured(step, {"known_points": float(points.count)}))
+        posed = ProblemPosed(step, problem)
+        truth = start.world_from_object
+        registered = register_recorded(posed, method, recorder, truth, snapshot_interval=6)
+        previous = registered.hypotheses
         recorder.record(Logged(step, "info", f"probe {step}: contact"))
     recorder.record(SessionEnded(1, "finished"))
     return recorder.events

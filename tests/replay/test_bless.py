@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import shutil
 import sys
@@ -14,6 +15,7 @@ from chsel import online
 from chsel.evaluation.plausible_file import save_plausible
 from chsel.evaluation.plausible_set import plausible_set
 from chsel.evaluation.plausible_settings import plausible_settings
+from chsel.pose import axis_angle, inverse
 from chsel.problem import Hypotheses
 from replay.__main__ import main
 from replay.blessing import _change
@@ -102,6 +104,35 @@ def test_results_without_poses_are_compared_as_well(stored: Path) -> None:
         assert np.isnan(change.position)
         assert change.position_error is None
         assert change.distinct == tuple(one.distinct for one in pair)
+
+
+@pytest.mark.parametrize("better", [False, True])
+def test_errors_stand_as_before_and_after(stored: Path, better: bool) -> None:
+    """A result that is 10 mm and 0.1 rad off becomes one that is 30 mm and 0.4 rad off, or back."""
+    recording = read_recording(stored)
+    start, found = recording.start, recording.hypotheses(9)
+    truth = start.world_from_object
+    assert truth is not None
+
+    def off_by(metres: float, radians: float) -> Hypotheses:
+        pose = truth.copy()
+        turn = axis_angle(np.array([[0.0, 0.0, 1.0]]), np.array([radians]))[0]
+        pose[:3, :3] = turn @ truth[:3, :3]
+        pose[:3, 3] += [metres, 0.0, 0.0]
+        return dataclasses.replace(found, object_from_world=inverse(pose[None]), cost=np.zeros(1))
+
+    pair = [off_by(0.01, 0.1), off_by(0.03, 0.4)]
+    errors = [(0.01, 0.1), (0.03, 0.4)]
+    if better:
+        pair.reverse()
+        errors.reverse()
+    change = _change(9, *pair, truth, [{"diversity": 1.0}, {"diversity": 2.0}], equal=False)
+    positions, rotations = zip(*errors, strict=True)
+    assert change.position_error == pytest.approx(positions, abs=1e-9)
+    assert change.rotation_error == pytest.approx(rotations, abs=1e-9)
+    assert change.diversity == (1.0, 2.0)
+    assert change.rotation == pytest.approx(0.3, abs=1e-9)
+    assert change.position == pytest.approx(0.02, abs=1e-9)
 
 
 class Terminal(io.StringIO):

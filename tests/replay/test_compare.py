@@ -148,6 +148,27 @@ def test_millimetres_are_shown_in_few_characters(value, shown):
     assert column.shown(value) == shown
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "shown"),
+    [
+        ("best_position_error", 0.0123, "12.3"),  # metres as millimetres
+        ("closest_position_error", 0.0042, "4.2"),
+        ("best_rotation_error", math.pi / 8, "22.5"),  # radians as degrees
+        ("closest_rotation_error", math.pi, "180"),
+        ("seconds", 0.0251, "25.1"),  # as milliseconds
+        ("best_cost", 12.34, "12.3"),
+        ("median_cost", 1234.0, "1.23e+03"),
+        ("distinct", 28.0, "28"),
+        ("coverage", 56.78, "56.8"),  # mm^2 stay mm^2
+        ("plausibility", 5.678, "5.68"),
+        ("diversity", 62.46, "62.5"),
+    ],
+)
+def test_every_number_is_shown_in_the_unit_of_its_heading(name, value, shown):
+    (column,) = (column for column in COLUMNS if column.name == name)
+    assert column.shown(value) == shown
+
+
 @pytest.mark.parametrize("columns", ["80", "120"])
 def test_tables_fit_the_terminal(path, capsys, monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", columns)
@@ -378,7 +399,9 @@ def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(
     save_plausible(tmp_path / "plausible", members)
     arguments = ["compare", str(path), "--steps", "8,9", "--methods", "icp"]
     assert main([*arguments, "--save-csv", str(tmp_path / "out.csv")]) == 0
-    assert "PD" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "PD" in shown
+    assert "each step, plausible sets by definition default" in shown
     rows = list(csv.DictReader((tmp_path / "out.csv").open()))
     (recorded,) = (row for row in rows if row["step"] == "9" and row["label"] != "icp")
     points = surface_points(start.mesh, 500, StreamKey(start.seed, 0))
@@ -389,6 +412,7 @@ def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(
     assert float(recorded["diversity_mm2"]) == pytest.approx(expected.diversity, rel=1e-6)
     assert float(recorded["coverage_mm2"]) == pytest.approx(expected.coverage, rel=1e-6)
     assert {row["diversity_mm2"] for row in rows if row["step"] == "8"} == {""}
+    assert {(row["step"], row["definition"]) for row in rows} == {("8", ""), ("9", "default")}
     assert main([*arguments, "--definition", "paper", "--each"]) == 0
     assert "PD" not in capsys.readouterr().out
     assert main([*arguments, "--plausible", str(tmp_path / "nowhere")]) == 2

@@ -126,7 +126,7 @@ def test_what_is_whole_of_an_unfinished_file_is_told(events, write_steps, capsys
     assert len(info.steps) < 3
     assert main(["info", str(path)]) == 1
     shown = capsys.readouterr().out
-    assert "unfinished; what is whole was read, and `recover` may save it" in shown
+    assert "unfinished; what is whole was read, and `python -m replay recover" in shown
     assert "the session did not end" in shown
 
 

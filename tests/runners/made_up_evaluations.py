@@ -12,10 +12,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
+from chsel.evaluation.plausible_settings import plausible_settings
+from chsel.settings import settings_mapping
 from runners.evaluation.table import ITERATIONS, RESULTS
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 Row = dict[str, Any]
+DEFINITION = {
+    "name": "default",
+    **settings_mapping(plausible_settings("default", 1.0)),
+    "epsilon": None,
+}
 METHODS = {  # PD in mm^2 at the first step, seconds
     "chsel": (300.0, 0.15),
     "chsel_cma_me": (400.0, 0.11),
@@ -91,6 +98,7 @@ def write_evaluation(
         "name": "made_up",
         "preset": "default",
         "session": {"kind": "kinematic"},
+        "definition": DEFINITION,
         "commands": ["python -m runners.evaluate experiment=made_up"],
         "environment": {"python": "3.11", "package numpy": "2.4"},
         **experiment,

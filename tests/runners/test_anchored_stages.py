@@ -6,11 +6,15 @@ import io
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from chsel.methods.anchored import Anchored, AnchoredSettings, Effort
+from chsel.pose import apply, inverse
 from replay.mcap.reader import read_recording
+from runners.reporting import panels
 from runners.reporting.anchored_stages import main, picture_of_stages, stages_of
+from tests.runners.drawn_figures import outlines_of
 from tests.runners.made_up_evaluations import REPLAYS
 
 SETTINGS = AnchoredSettings(effort=Effort(5_000, 40, 6, 20, 6, 8, 20, 8, 40, 4, 40))
@@ -31,11 +35,38 @@ def test_stages_are_those_of_the_registration_and_come_closer() -> None:
     assert apart.max() < 1e-9  # metres; rotations are orthonormal again
 
 
-def test_the_picture_is_a_small_file() -> None:
+def test_the_picture_is_a_small_file_of_poses_in_the_world(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    caught: list[Figure] = []
+    real = panels.png
+
+    def watched(figure: Figure) -> bytes:
+        caught.append(figure)
+        return real(figure)
+
+    monkeypatch.setattr(panels, "png", watched)
     recording = read_recording(REPLAYS / "mustard_chsel.mcap")
-    picture = picture_of_stages(recording, recording.steps[0], SETTINGS, "xz")
+    step = recording.steps[0]
+    picture = picture_of_stages(recording, step, SETTINGS, "xz")
     assert len(picture) < 200_000
     assert Image.open(io.BytesIO(picture)).width == 1440
+    chosen = stages_of(recording.problem(step), SETTINGS)[-1]
+    axes = caught[0].axes[-1]
+    outlines = outlines_of(axes)
+    poses = [*inverse(chosen.poses), recording.start.world_from_object]
+    assert len(outlines) == len(poses) == 31
+    assert [style for _, _, style in outlines] == ["solid"] * 30 + ["dashed"]
+    lower, upper = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    mesh = np.asarray(recording.start.mesh.vertices)
+    for (vertices, _, _), pose in zip(outlines, poses, strict=True):
+        corners = apply(pose, mesh)[:, [0, 2]]
+        in_view = np.clip([corners.min(axis=0), corners.max(axis=0)], lower, upper)
+        drawn = [vertices.min(axis=0), vertices.max(axis=0)]
+        np.testing.assert_allclose(drawn, in_view, atol=2.5 * (upper - lower).max() / 160.0)
+    (contacts,) = (line for line in axes.lines if line.get_marker() == "o")
+    known = [probe.contacts for probe in recording.probes if probe.step <= step]
+    np.testing.assert_array_equal(contacts.get_xydata(), np.concatenate(known)[:, [0, 2]])
 
 
 def test_a_step_that_is_not_there_is_one_line(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -35,6 +36,13 @@ SMALL = (
     "metrics.points=50",
 )
 METHODS = "methods=[chsel,icp]"
+DEFINITION_OF = {
+    "anchored": "wide_means",
+    "anchored_10mm": "wide_means_10mm",
+    "anchored_sums": "wide_sums",
+    "paper_real": "default",
+    "paper_sim": "default",
+}
 TRIAL = Path("trials") / "mustard" / "seed_0"
 
 
@@ -45,6 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = evaluated(folder, METHODS)
     assert (done.returncode, done.stderr) == (0, "")
     assert "1 trials, 2 methods, 3 units, of which 0 are finished" in done.stdout
+    assert re.search(r"plausible sets: default~\w{8}, cost by means over points, ", done.stdout)
     return folder
 
 
@@ -75,6 +84,8 @@ def test_every_experiment_can_be_planned(
     ((plan, trials),) = planned
     assert plan.contenders
     assert trials
+    if path.stem in DEFINITION_OF:
+        assert plan.definition_label == DEFINITION_OF[path.stem]
     if path.stem == "anchored_10mm":  # what it is for, beside what it takes from `anchored`
         settings = plan.plausible_settings(0.001)
         assert (settings.cost.tolerance, settings.fill_to) == (0.01, 300)
@@ -92,6 +103,7 @@ def test_the_table_has_a_row_a_registration_that_the_recordings_confirm(folder: 
     for row in results:
         assert row["status"] == "ok"
         assert (row["object"], row["configuration"], row["seed"]) == ("mustard", "mustard", 0)
+        assert re.fullmatch(r"default~[0-9a-f]{8}", row["definition"])  # of a smaller grid
         assert row["diversity"] == pytest.approx(row["coverage"] + row["plausibility"])
         assert row["root"] == pytest.approx(row["diversity"] ** 0.5)
         assert row["seconds"] > 0.0

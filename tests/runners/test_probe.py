@@ -83,6 +83,9 @@ def test_a_run_leaves_recordings_config_and_summary(
     assert names == {"recording.mcap", "recording.rrd", "config.yaml", "summary.json"}
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["outcome"] == "finished"
+    recording = read_recording(folder / "recording.mcap")
+    assert summary["recording_digest"] == recording.digest
+    assert len(recording.digest) == 32
     assert [row["step"] for row in summary["steps"]] == [0, 1, 2]
     assert [row["contacts"] for row in summary["steps"]] == [5, 10, 15]
     assert set(summary["steps"][0]["seconds_by_stage"]) >= {"probe", "descent", "cma_mega"}
@@ -126,6 +129,7 @@ def test_recording_snapshots_and_threads_change_no_result(
     assert done.returncode == 0, done.stderr
     folder = run_folder(tmp_path)
     assert {file.name for file in folder.iterdir()} == {"config.yaml", "summary.json"}
+    assert json.loads((folder / "summary.json").read_text())["recording_digest"] is None
     digests = [
         [row["digest"] for row in json.loads((f / "summary.json").read_text())["steps"]]
         for f in (folder, finished[0])

@@ -297,7 +297,7 @@ def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -
     for index, (name, seed) in enumerate([(names[0], 0), (names[0], 1), (names[1], 0)]):
         truth: dict[str, Any] = {"cost": 0.001, "guess_cost": 0.1, "mean_distance": 0.001}
         truth["violations"] = index
-        truth["from_guess"] = {"position": 0.002 * index, "rotation": 0.0}
+        truth["from_guess"] = {"position": 0.002 * index, "rotation": 0.034906585 * index}
         if name == names[0]:
             truth["from_simulated"] = {"position": 0.003 + 0.002 * index, "rotation": 0.01745329}
         folder = tmp_path / "trials" / name / f"seed_{seed}"
@@ -307,6 +307,6 @@ def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -
     assert (done.returncode, done.stderr) == (0, "")
     table = page_of(tmp_path / "report").tables["True poses found"]
     assert [line[:2] for line in table[1:]] == [[names[0], "2"], [names[1], "1"], ["all", "3"]]
-    assert table[1][2:] == ["1 [1]", "0.5 [1]", "1 [2]", "0 [0]", "4 [5]", "1 [1]"]
-    assert table[2][3:] == ["2 [2]", "4 [4]", "0 [0]", "-", "-"]
+    assert table[1][2:] == ["1 [1]", "0.5 [1]", "1 [2]", "1 [2]", "4 [5]", "1 [1]"]
+    assert table[2][3:] == ["2 [2]", "4 [4]", "4 [4]", "-", "-"]
     assert "True poses found" in (tmp_path / "report" / "report.md").read_text()

@@ -12,7 +12,7 @@ from tests.runners.in_process import run
 from tests.runners.made_up_evaluations import row, write_evaluation
 from tests.runners.test_report import page_of
 
-SUMMARY = "PD and its ratios over all registrations"
+SUMMARY = "PD and its ratios over all registrations, by default"
 
 
 @pytest.fixture

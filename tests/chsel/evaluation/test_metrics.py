@@ -200,6 +200,20 @@ def test_a_truth_far_from_all_hypotheses_is_outside_of_their_spread(
     assert off.error > 3.0 * centre.error
 
 
+def test_spread_and_error_are_root_mean_squares_without_the_distances_to_oneself(
+    ball: tuple[SdfGrid, trimesh.Trimesh],
+) -> None:
+    """A ball that is shifted by t is at t^2 / 3 from where it was, see above: two hypotheses at
+    +t and -t are at 4 t^2 / 3 from each other, and at t^2 / 3 from the truth between them."""
+    shift = 2.0  # mm
+    shifts = np.array([[1e-3 * shift, 0.0, 0.0], [-1e-3 * shift, 0.0, 0.0]])
+    estimates = inverse(compose(np.tile(np.eye(3), (2, 1, 1)), shifts))
+    found = calibration(distance_of(ball, 4000, method="exact"), estimates, np.eye(4))
+    assert found.error == pytest.approx(shift / 3.0**0.5, rel=0.02)
+    assert found.spread == pytest.approx(2.0 * shift / 3.0**0.5, rel=0.02)
+    assert found.rank == 1.0
+
+
 def test_the_rank_of_a_truth_drawn_like_the_hypotheses_is_uniform(
     box: tuple[SdfGrid, trimesh.Trimesh],
 ) -> None:

@@ -130,13 +130,16 @@ def test_modes_take_the_places_of_others_where_there_are_too_many() -> None:
     np.testing.assert_array_equal(found.truth, np.eye(4))
 
 
-def test_sets_without_a_search_keep_their_names() -> None:
-    """As files and evaluations from before there was one are found by this digest."""
+def test_sets_keep_their_names() -> None:
+    """As files and evaluations of before are found by this digest."""
     digests = {name: plausible_settings(name, 0.001).digest for name in DEFINITIONS}
     assert digests == {
         "default": "9e9d529fee8cd42535e67929c57c0075",
         "paper": "bf832c1245e3394032873ce1e366283b",
         "reference": "d721b4c2811b591fa041b54762af51d0",
+        "wide_means": "cc5bc72edea18cb43dd72805b873c3c2",
+        "wide_means_10mm": "220767fd151ae03a35da706bdcb0faa8",
+        "wide_sums": "7fc3f2378e9ee80e910331c0c63575a6",
     }
     assert "modes" not in PLAIN.text
     others = [SEARCH, replace(SEARCH, modes=ModeSearchSettings(31)), PLAIN]

@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SettingError
+from chsel.evaluation import true_pose
 from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_settings import EvaluationCostSettings
+from chsel.evaluation.plausible_set import PoseGrid
+from chsel.evaluation.plausible_settings import EvaluationCostSettings, Offsets
 from chsel.evaluation.true_pose import TruePoseSettings, find_true_pose
 from chsel.points import KnownPoints
 from chsel.pose import apply, compose, inverse, rotation_angle, rotation_vector
@@ -44,6 +47,35 @@ def test_the_true_pose_is_found_from_a_guess_some_centimetres_off() -> None:
     cost = EvaluationCost(problem, QUICK.cost)
     assert found.cost == cost.evaluate(inverse(found.world_from_object)[None])[0]
     assert find_true_pose(problem, guess, replace(QUICK, passes=1)).cost >= found.cost
+
+
+def test_every_pass_looks_closer_around_the_best_pose_so_far(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Reach becomes a spacing; spacing and angle shrink by their ratio, here to a quarter."""
+    problem, truth = scene(np.random.default_rng(3), box(HALF))
+    seen: list[PoseGrid] = []
+
+    def watched(centre: FloatArray, offsets: Offsets, rotations: FloatArray) -> PoseGrid:
+        seen.append(PoseGrid(centre, offsets, rotations))
+        return seen[-1]
+
+    monkeypatch.setattr(true_pose, "PoseGrid", watched)
+    settings = replace(QUICK, reach=0.08, spacing=0.02, rotations=400, angle=0.2, passes=3)
+    best = truth
+    for passes in (1, 2, 3):
+        seen.clear()
+        found = find_true_pose(problem, truth, replace(settings, passes=passes))
+        last, closer = seen[-1], 0.25 ** (passes - 1)
+        offsets = last.offsets.points()
+        assert np.abs(offsets).max() == pytest.approx(0.08 * closer)
+        assert np.diff(np.unique(offsets[:, 2]))[0] == pytest.approx(0.02 * closer)
+        np.testing.assert_array_equal(last.centre, best[:3, 3])
+        np.testing.assert_allclose(last.rotations[0], best[:3, :3], atol=1e-12)
+        angles = rotation_angle(last.rotations[1:] @ best[:3, :3].T)
+        spread = np.sqrt((angles**2).mean())  # of three normal coordinates
+        assert spread == pytest.approx(3.0**0.5 * 0.2 * closer, rel=0.1)
+        best = found.world_from_object
 
 
 def test_a_guess_that_nothing_beats_stays() -> None:

@@ -43,6 +43,7 @@ from replay.mcap.reader import read_recording
 from replay.mcap.schemas import RECORDS, message_class
 from replay.mcap.writer import McapRecorder
 from tests.replay.mutations import file_of, joined, packed, split, unpacked
+from tests.replay.seals import resealed
 
 Records = list[tuple[int, bytes]]
 Change = Callable[[Records], None]
@@ -58,7 +59,7 @@ def refused(
         path = write(make_events(steps=2, elites=3, free=3))
         everything = split(path.read_bytes()[8:-8])
         change(everything)
-        path.write_bytes(file_of(everything))
+        path.write_bytes(file_of(resealed(everything)))
         with pytest.raises(RecordingError, match=message) as caught:
             read_recording(path)
         assert "\n" not in str(caught.value)
@@ -218,7 +219,6 @@ def number(field: str, place: int, value: float) -> Callable[[Any], None]:
         ("/trace", set_field("median_cost", float("nan")), "accepted: lowest, median, highest"),
         ("/trace", set_field("stage", "a\x07b"), "without control characters"),
         ("/problem", number("initial_set", 5, 7.0), "initial set of step 1.* is not a rigid"),
-        ("/problem", set_field("points_digest", "a\nb"), "all points before the problem of step 1"),
         ("/problem", set_field("sdf_digest", "0"), "the SDF grid of the problem of step 1"),
         ("/problem", set_field("free_resolution", 0.0), "free_resolution is 0.0"),
         ("/measured", repeat_name("values"), "measured has a name twice"),
@@ -398,7 +398,7 @@ def test_an_older_recording_without_newer_topics_and_optional_fields_is_read(
         if not (opcode == Opcode.CHANNEL and any(topic in content for topic in late))
     ]
     everything[place] = (Opcode.CHUNK, packed(joined(inside)))
-    path.write_bytes(file_of(everything))
+    path.write_bytes(file_of(resealed(everything)))
     assert_same(read_recording(path).events(), events)
 
 
@@ -413,7 +413,7 @@ def test_unknown_fields_of_a_message_are_passed_by(
         message.MergeFromString(b"\xfa\x3e\x03new")  # field 1007
 
     changed_message("/probe", longer)(everything)
-    path.write_bytes(file_of(everything))
+    path.write_bytes(file_of(resealed(everything)))
     assert_same(read_recording(path).events(), events)
 
 

@@ -25,15 +25,18 @@ from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SnapshotT
 from replay.mcap.encoding import decode, encode
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS, message_class
+from tests.replay.seals import reseal_file
 
 Change = Callable[[str, bytes], bytes | None]
 
 
-def rewritten(path: Path, change: Change, *, topics: tuple[str, ...] = ()) -> Path:
+def rewritten(
+    path: Path, change: Change, *, topics: tuple[str, ...] = (), reseal: bool = True
+) -> Path:
     """A whole, checksummed copy of a recording with other messages or attachments.
 
-    `change` gets topic or attachment name and the bytes, and gives new bytes or None to leave out.
-    Topics named in `topics` are left out altogether.
+    reseal: whether its seals are right as well. `change` gets topic or attachment name and the
+    bytes, and gives new bytes or None to leave out. Topics in `topics` are left out altogether.
     """
     copy = path.with_suffix(".changed.mcap")
     with path.open("rb") as source, copy.open("wb") as target:
@@ -59,7 +62,7 @@ def rewritten(path: Path, change: Change, *, topics: tuple[str, ...] = ()) -> Pa
                 writer.add_message(channels[channel.topic], time, data, time, sequence)
                 sequence += 1
         writer.finish()
-    return copy
+    return reseal_file(copy) if reseal else copy
 
 
 def edited(topic: str, **values) -> Change:
@@ -236,7 +239,7 @@ def test_a_cut_anywhere_is_unfinished_and_keeps_whole_events(make_events, write,
     kept = set()
     for length in [8, 9, 30, *range(100, len(whole), 211), len(whole) - 1]:
         path.write_bytes(whole[:length])
-        with pytest.raises(RecordingError, match="is unfinished; accepted: a closed recording"):
+        with pytest.raises(RecordingError, match="is unfinished; `python -m replay recover"):
             read_recording(path)
         found = events_of(path)
         assert_same(found, events[: len(found)])
@@ -334,7 +337,7 @@ def test_another_format_version_is_named_before_all_else(events, write):
         session.ClearField("workspace")
         return session.SerializeToString()
 
-    with pytest.raises(RecordingError, match="newer version: format 3; this one reads up to 2"):
+    with pytest.raises(RecordingError, match="newer version: format 4; this one reads up to 3"):
         read_recording(rewritten(write(events), newer))
 
 
@@ -394,6 +397,13 @@ def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write, change
         recording.problem(2)
     with pytest.raises(RecordingError, match="the problem of step 1 has digest"):
         list(recording.events())
+
+
+def test_a_problem_of_other_points_than_recorded_is_refused(events, write):
+    change = edited("/problem", points_digest="a\nb")
+    recording = read_recording(rewritten(write(events), change))
+    with pytest.raises(RecordingError, match=r"all points of step 1 has digest .* not a b as rec"):
+        recording.problem(1)
 
 
 def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):

@@ -31,6 +31,7 @@ from replay.mcap.whole_records import WholeRecords
 from replay.mcap.writer import McapRecorder
 from replay.verification import EQUAL, NO_RESULT, verify
 from tests.replay.kill import PROBES, quick_session
+from tests.replay.mutations import joined, packed, split, unpacked
 
 PAGE = 4096
 Same = Callable[[object, object], None]
@@ -305,6 +306,55 @@ def test_two_recordings_in_one_file_are_never_mixed(
         assert_same(kept, one[: len(kept)])
 
 
+@pytest.mark.parametrize("at", [1, 2, 4])
+@pytest.mark.parametrize("gap", [0, 1])
+def test_probes_of_another_session_are_refused_though_their_numbers_fit(
+    tmp_path: Path,
+    make_events: Callable[..., list[Event]],
+    assert_same: Same,
+    capsys: pytest.CaptureFixture[str],
+    at: int,
+    gap: int,
+) -> None:
+    """Two sessions with as many messages, spliced between two chunks, or where one is missing."""
+    one, other = make_events(steps=6, seed=1), make_events(steps=6, seed=2)
+    first = recorded(tmp_path / "one.mcap", one)
+    second = recorded(tmp_path / "other.mcap", other)
+    start = chunks_of(second, "/probe")[at + gap][0]
+    spliced = first[: chunks_of(first, "/probe")[at][0]] + second[start:]
+    kept, found = recovered(tmp_path, spliced)
+    assert_same(probes(kept), probes(one)[:at])
+    assert_same(without_marks(kept), one[: len(without_marks(kept))])
+    mixed = [damage for damage in found.damages if "two recordings are mixed" in damage.reason]
+    assert len(mixed) == 6 - at - gap + 1  # and the end
+    assert not found.complete
+    path = tmp_path / "spliced.mcap"
+    path.write_bytes(spliced)
+    assert main(["verify", str(path)]) == 2
+    expected = ["two recordings are mixed in this file", "is missing, "]
+    assert expected[gap] in capsys.readouterr().err
+    assert main(["recover", str(path), "-o", str(tmp_path / "out.mcap")]) == 0
+    shown = capsys.readouterr()
+    assert (shown.err, shown.out[:6]) == ("", "kept: ")
+    assert "two recordings are mixed" in " ".join(shown.out.split())
+
+
+def test_a_session_that_goes_on_in_a_file_of_older_format_is_refused(
+    tmp_path: Path, make_events: Callable[..., list[Event]]
+) -> None:
+    """Chunks without a seal belong to no recording of this format."""
+    one = make_events(steps=6)
+    data = recorded(tmp_path / "one.mcap", one)
+    chunk = chunks_of(data, "/probe")[2]
+    record = split(data[slice(*chunk)])[0]
+    inside = split(unpacked(record[1]))
+    unsealed = [part for part in inside[:-1] if part[0] == Opcode.MESSAGE]
+    changed = data[: chunk[0]] + joined([(Opcode.CHUNK, packed(joined(unsealed)))])
+    _, found = recovered(tmp_path, changed + data[chunk[1] :])
+    assert found.probes == [0, 1, 3, 4, 5]
+    assert any("the chunk has no seal of this recording" in d.reason for d in found.damages)
+
+
 def test_repeated_and_swapped_chunks_are_not_believed_twice(
     tmp_path: Path, many: list[Event], assert_same: Same
 ) -> None:
@@ -409,15 +459,13 @@ def test_losses_are_told_in_the_recording_where_they_are(tmp_path: Path, many: l
     assert not any(isinstance(event, SessionStarted) for event in kept[1:])
 
 
-@pytest.mark.parametrize("damaged", ["mesh", "grid", "session"])
 def test_without_the_start_nothing_can_be_recovered(
-    tmp_path: Path, events: list[Event], damaged: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, events: list[Event], capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = recorded(tmp_path / "whole.mcap", events)
-    (start, end) = chunks_of(data)[0]
-    at = {"mesh": data.index(b"end_header"), "grid": start - 200, "session": (start + end) // 2}
+    middle = sum(chunks_of(data)[0]) // 2
     path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
-    path.write_bytes(data[: at[damaged]] + bytes(8) + data[at[damaged] + 8 :])
+    path.write_bytes(data[:middle] + bytes(8) + data[middle + 8 :])
     assert main(["recover", str(path), "-o", str(out)]) == 2
     errors = capsys.readouterr().err
     assert errors.count("\n") == 1

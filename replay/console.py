@@ -1,0 +1,105 @@
+"""What commands print: a name is shown as it is, never read as markup or sent as a control."""
+
+from __future__ import annotations
+
+import sys
+import unicodedata
+from typing import IO, Any
+
+import rich.console
+import rich.progress
+from rich.status import Status
+from rich.text import Text
+
+# Control and format characters (such as those that reverse the direction of what follows), halves
+# of surrogate pairs (bytes of file names that are not UTF-8), ends of lines and paragraphs.
+_NOT_SHOWN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+def printable(text: str, *, keep: str = "") -> str:
+    """The text with every character that would steer a terminal escaped, such as \\x1b.
+
+    keep: characters that stay as they are.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        repr(sign)[1:-1] if unicodedata.category(sign) in _NOT_SHOWN and sign not in keep else sign
+        for sign in text
+    )
+
+
+def print_error(text: str) -> None:
+    """Print one line about what is wrong, on stderr."""
+    print(f"error: {printable(text)}", file=sys.stderr)
+
+
+def print_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Print a warning as one line on stderr; takes the place of `warnings.showwarning`."""
+    print(f"warning: {printable(str(message))}", file=sys.stderr)
+
+
+class Console(rich.console.Console):
+    """A terminal, or a file. A text that is printed is one line; cells and titles may have more."""
+
+    def __init__(
+        self,
+        *,
+        stderr: bool = False,
+        soft_wrap: bool = False,
+        file: IO[str] | None = None,
+        width: int | None = None,
+    ) -> None:
+        super().__init__(
+            stderr=stderr,
+            soft_wrap=soft_wrap,
+            file=file,
+            width=width,
+            markup=False,
+            emoji=False,
+            highlight=False,
+        )
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print texts and tables; a newline within a text is shown, not sent."""
+        shown = (printable(text) if isinstance(text, str) else text for text in objects)
+        super().print(*shown, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Every text comes through here: what is printed, and each cell and title of a table."""
+        options |= {"markup": False, "emoji": False}
+        return super().render_str(printable(text, keep="\n"), **options)
+
+    def status(self, status: Any, **options: Any) -> Status:
+        """A line that stays while something is done."""
+        return _PlainStatus(_plain(status), console=self, **options)
+
+
+class Progress(rich.progress.Progress):
+    """A progress bar whose descriptions are shown as they are."""
+
+    @classmethod
+    def get_default_columns(cls) -> tuple[rich.progress.ProgressColumn, ...]:
+        """The description, the bar, and how much is done."""
+        _, *columns = super().get_default_columns()
+        return (TextColumn("{task.description}"), *columns)
+
+
+class TextColumn(rich.progress.TextColumn):
+    """A column of text, such as "{task.description}"."""
+
+    def __init__(self, text_format: str) -> None:
+        super().__init__(text_format, markup=False)
+
+    def render(self, task: rich.progress.Task) -> Text:
+        """The text of a task."""
+        return Text(printable(self.text_format.format(task=task)))
+
+
+class _PlainStatus(Status):
+    def update(self, status: Any = None, **options: Any) -> None:
+        super().update(None if status is None else _plain(status), **options)
+
+
+def _plain(text: Any) -> Any:
+    return Text(printable(text)) if isinstance(text, str) else text

@@ -1,0 +1,43 @@
+"""Whether the numbers that are recorded about a result follow from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from chsel.evaluation.result_numbers import result_numbers
+from chsel.problem import Hypotheses, RegistrationProblem
+from replay.events import Measured, SessionStarted
+
+RELATIVE, ABSOLUTE = 1e-9, 1e-12
+"""How far a number may be from the recorded one: libraries beneath may round otherwise."""
+
+
+def measured_differences(
+    start: SessionStarted,
+    problem: RegistrationProblem,
+    hypotheses: Hypotheses,
+    recorded: Sequence[Measured],
+) -> list[str]:
+    """Lines about measured values of one registration that are not those of its result."""
+    if len(recorded) != 1:
+        return [f"there are {len(recorded)} messages of measured values; accepted: one"]
+    values = recorded[0].values
+    again = result_numbers(hypotheses, problem, start.world_from_object)
+    return [
+        f"measured {name}: {_shown(values, name)} recorded, {_shown(again, name)} computed"
+        for name in sorted({*values, *again})
+        if not _close(values.get(name), again.get(name))
+    ]
+
+
+def _close(recorded: float | None, computed: float | None) -> bool:
+    if recorded is None or computed is None:
+        return False
+    if math.isnan(recorded) or math.isnan(computed):
+        return math.isnan(recorded) and math.isnan(computed)
+    return math.isclose(recorded, computed, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
+
+
+def _shown(values: Mapping[str, float], name: str) -> str:
+    return repr(values[name]) if name in values else "not"

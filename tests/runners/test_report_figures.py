@@ -1,0 +1,301 @@
+"""The numbers that the report's figures draw, read back from their axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.container import BarContainer
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.quiver import Quiver
+
+from chsel.arrays import FloatArray
+from chsel.pose import apply, inverse
+from replay.mcap.reader import Recording, read_recording
+from runners.reporting import panels
+from runners.reporting.box_plots import picture_of_boxes
+from runners.reporting.cost_gradients import picture_of_gradients, recorded_cost
+from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.method_style import method_styles
+from runners.reporting.over_iterations import picture_over_iterations, tables_over_iterations
+from runners.reporting.over_probes import picture_over_probes
+from runners.reporting.probing_sequence import CONTACT, picture_of_sequence
+from runners.reporting.registration_times import picture_of_times
+from tests.runners.drawn_figures import bands_of, legend_of, line_of, outlines_of
+from tests.runners.made_up_evaluations import REPLAYS, row, write_evaluation
+
+DRILL, HAMMER = REPLAYS / "drill_chsel.mcap", REPLAYS / "hammer_chsel.mcap"
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Every figure that is drawn during a test, in order. Nothing is rendered to pixels."""
+    caught: list[Figure] = []
+
+    def caught_png(figure: Figure) -> bytes:
+        caught.append(figure)
+        return b"png"
+
+    monkeypatch.setattr(panels, "png", caught_png)
+    return caught
+
+
+def looks(styles: Any) -> dict[str, tuple[object, object, object]]:
+    """What a legend must show of methods."""
+    return {style.title: (style.color, style.marker, style.line) for style in styles.values()}
+
+
+def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(
+    tmp_path: Any, figures: list[Figure]
+) -> None:
+    numbers = {"can": {4: (16.0, 1.0, 4.0), 5: (25.0, 9.0)}, "box": {5: (100.0, 400.0)}}
+    rows = [
+        row(name, seed, method, step, diversity=factor * value, root=value**0.5, coverage=1.0)
+        for name, steps in numbers.items()
+        for step, values in steps.items()
+        for seed, value in enumerate(values)
+        for method, factor in (("chsel", 1.0), ("icp", 3.0))
+        if (method, step) != ("icp", 4)  # a gap
+    ]
+    styles = method_styles(["chsel", "icp"])
+    evaluation = open_evaluation(write_evaluation(tmp_path, rows))
+    picture_over_probes(evaluation, styles, "pd.png")
+    (figure,) = figures
+    box, can = figure.axes
+    assert [box.get_title(), can.get_title()] == ["box", "can"]
+    assert bands_of(can, styles["chsel"]) == {4.0: (2.5, 4.0, 10.0), 5.0: (13.0, 17.0, 21.0)}
+    assert bands_of(can, styles["icp"]) == {5.0: (39.0, 51.0, 63.0)}
+    assert bands_of(box, styles["chsel"]) == {5.0: (175.0, 250.0, 325.0)}
+    assert legend_of(figure) == looks(styles)
+    assert line_of(can, styles["icp"]).get_marker() == styles["icp"].marker
+    assert box.get_ylabel() == "PD in mm²"
+
+
+def test_boxes_are_quartiles_with_whiskers_within_one_and_a_half_boxes(
+    figures: list[Figure],
+) -> None:
+    values = {"icp": (1.0, 2.0, 3.0, 4.0, 5.0, 100.0), "chsel": (10.0, 10.0, 11.0, 12.0)}
+    rows = [
+        row("can", seed, method, 4, diversity=value, root=7.0)
+        for method, some in values.items()
+        for seed, value in enumerate(some)
+    ]
+    styles = method_styles(["chsel", "icp"])
+    picture_of_boxes(rows, styles, "boxes.png")
+    (axes,) = figures[0].axes
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["CHSEL", "ICP"]
+    boxes = [patch for patch in axes.patches if isinstance(patch, PathPatch)]
+    assert [to_hex(patch.get_facecolor()) for patch in boxes] == [
+        styles[method].color for method in ("chsel", "icp")
+    ]
+    heights = [patch.get_path().vertices[:, 1] for patch in boxes]
+    assert [(part.min(), part.max()) for part in heights] == [(10.0, 11.25), (2.25, 4.75)]
+    segments = {
+        tuple(map(float, line.get_ydata())) for line in axes.lines if len(line.get_xdata()) == 2
+    }
+    whiskers = {(10.0, 10.0), (11.25, 12.0), (2.25, 1.0), (4.75, 5.0)}  # 5 <= 4.75 + 1.5 * 2.5
+    caps = {(12.0, 12.0), (1.0, 1.0), (5.0, 5.0)}
+    medians = {(10.5, 10.5), (3.5, 3.5)}
+    assert segments == whiskers | caps | medians
+    outliers = [line.get_ydata().tolist() for line in axes.lines if line.get_marker() == "D"]
+    assert outliers == [[], [100.0]]
+
+
+def test_bars_of_time_are_means_with_one_standard_deviation(figures: list[Figure]) -> None:
+    seconds = {"chsel": (0.1, 0.1, 0.1, 0.5), "icp": (0.02, 0.04)}
+    rows = [
+        row("can", seed, method, 4, seconds=value)
+        for method, values in seconds.items()
+        for seed, value in enumerate(values)
+    ]
+    styles = method_styles(list(seconds))
+    picture = picture_of_times(rows, styles, "times.png")
+    assert "CHSEL 200 ms, ICP 30 ms" in picture.alt
+    (axes,) = figures[0].axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["CHSEL", "ICP"]
+    bars = [one.patches[0] for one in axes.containers if isinstance(one, BarContainer)]
+    assert [bar.get_width() for bar in bars] == pytest.approx([200.0, 30.0])
+    assert [to_hex(bar.get_facecolor()) for bar in bars] == [
+        style.color for style in styles.values()
+    ]
+    assert [text.get_text() for text in axes.texts] == ["200 ms", "30 ms"]
+    (ends,) = axes.containers[1].lines[2][0].get_segments()
+    deviation = 1e3 * 0.1 * 3.0**0.5  # of 1, 1, 1 and 5: the variance is 3
+    # The axis begins at half of the least time.
+    np.testing.assert_allclose(ends[:, 0], [max(10.0, 200.0 - deviation), 200.0 + deviation])
+
+
+def moments(method: str, cost: float) -> list[dict[str, Any]]:
+    """Three searches, measured at two iterations."""
+    return [
+        {
+            "configuration": "drill",
+            "seed": seed,
+            "method": method,
+            "step": 4,
+            "iteration": iteration,
+            "diversity": 10.0 * value,
+            "mean_cost": cost * value,
+            "best_cost": 0.5,
+            "coverage": 1.0,
+        }
+        for seed, value in enumerate((1.0, 3.0, 8.0))
+        for iteration, value in ((0, 2.0 * value), (25, value))
+    ]
+
+
+def test_numbers_over_iterations_are_medians_and_quartiles_and_costs_of_one_kind(
+    tmp_path: Any, figures: list[Figure]
+) -> None:
+    methods = {"chsel": 1.0, "chsel_cma_me": 2.0, "medial_constraint_cma_me": 1000.0}
+    rows = [moment for method, cost in methods.items() for moment in moments(method, cost)]
+    evaluation = open_evaluation(write_evaluation(tmp_path, [], rows))
+    styles = method_styles(list(methods))
+    picture_over_iterations(evaluation, styles, "over_iterations.png")
+    (figure,) = figures
+    diversity, cost = figure.axes
+    assert diversity.get_ylabel() == "PD in mm²"
+    assert cost.get_ylabel() == "mean relaxed cost of the best cells"
+    for method in methods:
+        assert bands_of(diversity, styles[method]) == {
+            0.0: (40.0, 60.0, 110.0),
+            25.0: (20.0, 30.0, 55.0),
+        }
+    for method in ("chsel", "chsel_cma_me"):
+        factor = methods[method]
+        assert bands_of(cost, styles[method]) == {
+            0.0: (4.0 * factor, 6.0 * factor, 11.0 * factor),
+            25.0: (2.0 * factor, 3.0 * factor, 5.5 * factor),
+        }
+    # Costs of the Medial Constraint are in m², those of the others are relaxed costs.
+    assert len(cost.lines) == len(cost.collections) == 2
+    assert legend_of(figure) == looks(styles)
+    of_diversity, of_cost = tables_over_iterations(evaluation, styles)
+    assert of_diversity.header == ("iteration", "n", *(style.title for style in styles.values()))
+    assert of_cost.header == ("iteration", "n", "CHSEL", "CHSEL (CMA-ME)")
+    assert [[cell.text for cell in line] for line in of_cost.rows] == [
+        ["0", "3", "6", "12"],
+        ["25", "3", "3", "6"],
+    ]
+
+
+def section_at(
+    recording: Recording, x: FloatArray, z: FloatArray, lookup: str
+) -> tuple[FloatArray, FloatArray]:
+    """Signed distances (N,) and normals (N, 2) in the drawn plane, of the object's SDF grid."""
+    sdf = recording.start.sdf
+    inside = (sdf.values < 0.0).sum(axis=(0, 2))
+    y = sdf.origin[1] + sdf.resolution * int(np.argmax(inside))
+    points = np.stack([x, np.full(len(x), y), z], axis=1)
+    values, gradients = sdf.query(points, lookup=lookup)
+    return np.asarray(values), np.asarray(gradients)[:, [0, 2]]
+
+
+def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surface(
+    figures: list[Figure],
+) -> None:
+    recording = read_recording(DRILL)
+    settings = recorded_cost(recording.start.config, "chsel")
+    tolerance = settings.penetration_tolerance
+    picture_of_gradients(DRILL, "gradients.png")
+    (figure,) = figures
+    free, occupied, known = (axes for axes in figure.axes)
+    # Where each of them is pushed, and along which multiple of the outward normal.
+    pushed = {
+        free: (lambda s: s < tolerance, lambda s: tolerance - s),
+        occupied: (lambda s: s > -tolerance, lambda s: -tolerance - s),
+        known: (lambda s: abs(s) > 0.0, lambda s: -s),
+    }
+    for axes, (violated, strength) in pushed.items():
+        (arrows,) = (one for one in axes.collections if isinstance(one, Quiver))
+        drawn = np.column_stack([arrows.U, arrows.V])
+        assert len(drawn) > 20
+        distances, normals = section_at(recording, arrows.X, arrows.Y, settings.lookup)
+        assert violated(distances).all(), axes.get_title()
+        push = strength(distances)[:, None] * normals
+        along = (drawn * push).sum(axis=1)
+        lengths = np.hypot(*drawn.T) * np.hypot(*push.T)
+        np.testing.assert_allclose(along, lengths, rtol=1e-6, err_msg=axes.get_title())
+        order = np.argsort(np.hypot(*push.T))
+        assert (np.diff(np.hypot(*drawn.T)[order]) > -1e-9).all()  # longer where more is violated
+    assert [axes.get_title() for axes in figure.axes] == [
+        "free points leave the object",
+        "occupied points enter it",
+        "surface points go to its surface",
+    ]
+
+
+def test_lines_of_a_section_are_the_surface_and_the_tolerance_of_each_class(
+    figures: list[Figure],
+) -> None:
+    recording = read_recording(DRILL)
+    tolerance = recorded_cost(recording.start.config, "chsel").penetration_tolerance
+    picture_of_gradients(DRILL, "gradients.png")
+    levels = {0: [0.0, tolerance], 1: [0.0, -tolerance], 2: [0.0]}
+    for panel, axes in enumerate(figures[0].axes):
+        contours = [one for one in axes.collections if isinstance(one, QuadContourSet)]
+        assert len(contours) == len(levels[panel])
+        for contour, level in zip(contours, levels[panel], strict=True):
+            vertices = np.concatenate([path.vertices for path in contour.get_paths()])
+            assert len(vertices) > 20
+            distances, _ = section_at(recording, *vertices.T, lookup="trilinear")
+            np.testing.assert_allclose(distances, level, atol=1e-9)
+        assert axes.get_xlabel() == "x in m"
+
+
+def test_a_probing_sequence_shows_poses_in_the_world_and_the_contacts_so_far(
+    figures: list[Figure],
+) -> None:
+    recording = read_recording(HAMMER)
+    styles = method_styles(["chsel"])
+    touching = {probe.step for probe in recording.probes if len(probe.contacts)}
+    last = max(touching & set(recording.steps[1:]))
+    shown = [last - 1, last]  # before and after a contact
+    picture_of_sequence({"chsel": HAMMER}, styles, "sequence.png", steps=shown, view="xz")
+    (figure,) = figures
+    assert [axes.get_title() for axes in figure.axes] == [f"step {step}" for step in shown]
+    assert figure.axes[0].get_ylabel() == "CHSEL\nz in m"
+    for axes, step in zip(figure.axes, shown, strict=True):
+        assert axes.get_xlabel() == "x in m"
+        check_outlines(axes, recording, step, styles["chsel"].color)
+        check_contacts(axes, recording, step)
+
+
+def check_outlines(axes: Axes, recording: Recording, step: int, color: str) -> None:
+    start = recording.start
+    lower = np.array([axes.get_xlim()[0], axes.get_ylim()[0]])
+    upper = np.array([axes.get_xlim()[1], axes.get_ylim()[1]])
+    pixel = (upper - lower).max() / 160.0
+    poses = inverse(recording.hypotheses(step).object_from_world)
+    expected = [(pose, color, "solid") for pose in poses[::-1]]  # the best on top
+    expected.append((start.world_from_object, "#000000", "dashed"))
+    outlines = outlines_of(axes)
+    assert len(outlines) == len(expected) == 31
+    for (vertices, drawn_color, style), (pose, wanted_color, wanted_style) in zip(
+        outlines, expected, strict=True
+    ):
+        assert (drawn_color, style) == (wanted_color, wanted_style)
+        corners = apply(pose, np.asarray(start.mesh.vertices))[:, [0, 2]]
+        in_view = np.clip([corners.min(axis=0), corners.max(axis=0)], lower, upper)
+        np.testing.assert_allclose(
+            [vertices.min(axis=0), vertices.max(axis=0)], in_view, atol=2.5 * pixel
+        )
+
+
+def check_contacts(axes: Axes, recording: Recording, step: int) -> None:
+    probes = [probe for probe in recording.probes if probe.step <= step]
+    contacts = np.concatenate([probe.contacts for probe in probes])
+    assert len(contacts) > 0
+    orange = [line for line in axes.lines if line.get_color() == CONTACT]
+    dots = [line.get_xydata()[0] for line in orange if line.get_marker() == "o"]
+    np.testing.assert_array_equal(dots, contacts[:, [0, 2]])
+    ways = [line.get_xydata() for line in orange if line.get_marker() != "o"]
+    np.testing.assert_array_equal([way[1] for way in ways], contacts[:, [0, 2]])
+    lengths = [np.hypot(*(way[1] - way[0])) for way in ways]
+    assert max(lengths) == pytest.approx(0.05, abs=1e-3)  # metres, the probes move along x
+    assert all(way[0][0] < way[1][0] for way in ways)
