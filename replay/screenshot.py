@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     width, height = given.size
     try:
         save_screenshot(given.rrd, given.png, step=given.step, width=width, height=height)
-    except (RecordingError, OSError) as error:
+    except RecordingError as error:
         print_error(str(error))
         return 2
     return 0

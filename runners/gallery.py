@@ -18,6 +18,7 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 from chsel.errors import ChselError, RecordingError
+from replay.console import print_error
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.headless import headless_viewer
 from replay.screenshot import save_screenshot
@@ -168,7 +169,7 @@ def main() -> int:
                 (REPOSITORY / name).write_bytes(content)
                 print(f"{name}: {len(content) / 1000:.0f} kB", flush=True)
     except (ChselError, OSError) as error:
-        print(error, file=sys.stderr)
+        print_error(str(error))
         return 2
     return 0
 

@@ -18,11 +18,9 @@ from replay.rerun.clock import PROBE
 from replay.rerun.live import HOST, is_listening, viewer_program
 from replay.rerun.viewer import free_port
 
-START_SECONDS = 60.0  # until the viewer has read the file
-ANSWER_SECONDS = 60.0  # for one request, after which the viewer itself may have given up many times
+LIMIT_SECONDS = 120.0  # for one answer: the viewer gives up a picture after 15 s, and may hang
 SETTLE_SECONDS = 8.0  # until the layout stands and the notice of the start is gone
 _RETRY_SECONDS = 0.5
-_FAILURES = (RuntimeError, OSError, ValueError)  # of a request, its timeout among them
 Answer = TypeVar("Answer")
 
 
@@ -34,8 +32,8 @@ class HeadlessViewer:
         self._output = output
         self._url = f"rerun+http://{HOST}:{port}/proxy"
         self._port = port
-        self._ask(_check_loaded, START_SECONDS)
-        self._ask(lambda client: client.take_screenshot(), START_SECONDS)
+        self._ask(_check_loaded)
+        self._ask(lambda client: client.take_screenshot())
         time.sleep(SETTLE_SECONDS)
 
     def go_to(self, step: int) -> None:
@@ -55,31 +53,31 @@ class HeadlessViewer:
             return client.take_screenshot(view_id=found)
 
         last, picture = b"", self._ask(take)
-        deadline = time.monotonic() + ANSWER_SECONDS
+        deadline = time.monotonic() + LIMIT_SECONDS
         while picture != last and time.monotonic() < deadline:
             last, picture = picture, self._ask(take)
         return picture
 
-    def _ask(
-        self, question: Callable[[ViewerClient], Answer], seconds: float = ANSWER_SECONDS
-    ) -> Answer:
+    def _ask(self, question: Callable[[ViewerClient], Answer]) -> Answer:
         """The answer; asks again until there is one, the viewer has ended or the time is over."""
-        deadline = time.monotonic() + seconds
-        reason = f"no answer within {seconds:g} s"
-        # A request to a viewer that hangs has no time limit of its own: it ends with the viewer.
-        late = threading.Timer(seconds, self._viewer.kill)
+        deadline = time.monotonic() + LIMIT_SECONDS
+        # A call to a viewer that hangs has no time limit of its own: it ends with the viewer.
+        late = threading.Timer(LIMIT_SECONDS + 1.0, self._viewer.kill)
         late.start()
+        reason = "it does not answer"
         try:
             while time.monotonic() < deadline and self._viewer.poll() is None:
                 try:
                     if is_listening(self._port):
                         return question(ViewerClient.connect(self._url))
-                except _FAILURES as error:
-                    reason = " ".join(str(error).split())
+                except (RuntimeError, OSError, ValueError) as error:  # time-outs are OSErrors
+                    reason = " ".join(str(error).split()) or type(error).__name__
                 time.sleep(_RETRY_SECONDS)
         finally:
             late.cancel()
-        if time.monotonic() < deadline:
+        if time.monotonic() >= deadline:
+            reason = f"after {LIMIT_SECONDS:.0f} s, {reason}"
+        elif self._viewer.poll() is not None:
             self._output.seek(0)
             reason = _reason_of_end(self._output.read())
         raise RecordingError(f"the Rerun viewer gave no picture: {reason}")
@@ -89,8 +87,9 @@ class HeadlessViewer:
 def headless_viewer(rrd: Path, *, width: int = 1600, height: int = 900) -> Iterator[HeadlessViewer]:
     """The viewer on `rrd`, in points of a screen that is not there; it ends with the block.
 
-    Needs Vulkan: a graphics card's, or the software one (Debian: mesa-vulkan-drivers). Raises
-    RecordingError if the file does not exist or the viewer gives no picture, with the reason.
+    Needs Vulkan: a graphics card's, or the software one (Debian: mesa-vulkan-drivers). On a busy
+    machine the viewer may not paint in its own time; it is asked again. Raises RecordingError if
+    the file does not exist or the viewer gives no answer within LIMIT_SECONDS, with the reason.
     """
     if not rrd.is_file():
         raise RecordingError(f"recording {rrd} does not exist; accepted: a .rrd file")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import socket
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,15 +15,41 @@ import pytest
 from chsel.errors import RecordingError
 from replay.rerun import headless
 from replay.rerun.headless import headless_viewer
-from replay.rerun.live import is_listening
 from replay.screenshot import main, save_screenshot
 
-# A viewer that listens at its port and answers nothing.
+# A viewer that listens at its port and answers nothing; or one that ends with a message.
 _SILENT = """
 import socket, sys, time
 server = socket.create_server(("127.0.0.1", int(sys.argv[sys.argv.index("--port") + 1])))
 time.sleep(600)
 """
+_ENDING = "print('no\\x1b[31m graphics'); raise SystemExit(3)"
+_VIEWS = [SimpleNamespace(name="Scene", view_id="3"), SimpleNamespace(name="Log", view_id="4")]
+_LOADED = SimpleNamespace(
+    loading=[], recordings=[SimpleNamespace(timelines=["probe"])], views=_VIEWS
+)
+
+
+class Client:
+    """Answers as a viewer does; pictures: what requests for one give, the last one ever after."""
+
+    def __init__(self, *pictures: bytes | Exception) -> None:
+        self._pictures = [*pictures]
+        self.asked: list[str | None] = []
+        self.times: list[dict[str, Any]] = []
+
+    def get_state(self) -> SimpleNamespace:
+        return _LOADED
+
+    def take_screenshot(self, view_id: str | None = None) -> bytes:
+        self.asked.append(view_id)
+        picture = self._pictures.pop(0) if len(self._pictures) > 1 else self._pictures[0]
+        if isinstance(picture, Exception):
+            raise picture
+        return picture
+
+    def set_time(self, timeline: str, **given: Any) -> None:
+        self.times.append({"timeline": timeline, **given})
 
 
 class HangingClient:
@@ -36,54 +64,29 @@ class HangingClient:
         raise RuntimeError("transport error")
 
 
-class Client:
-    """A viewer that needs a while to read the file, and fails at the first picture of each kind."""
+@pytest.fixture
+def rrd(tmp_path: Path) -> Path:
+    path = tmp_path / "recording.rrd"
+    path.touch()
+    return path
 
-    def __init__(self) -> None:
-        self.failures: list[Exception] = [
-            RuntimeError("Viewer control timed out"),
-            TimeoutError("deadline"),
-            ConnectionError("refused"),
-        ]
-        self.times: list[dict[str, Any]] = []
-        self.loading: list[bytes] = []  # signs of it on the next pictures
 
-    def get_state(self) -> SimpleNamespace:
-        if self.failures:
-            raise self.failures.pop()
-        views = [
-            SimpleNamespace(name="Scene", view_id="3"),
-            SimpleNamespace(name="Log", view_id="4"),
-        ]
-        return SimpleNamespace(
-            loading=[], recordings=[SimpleNamespace(timelines=["probe"])], views=views
-        )
-
-    def take_screenshot(self, view_id: str | None = None) -> bytes:
-        self.failures, failures = [], self.failures
-        if failures:
-            raise failures[0]
-        what = b"all" if view_id is None else f"view {view_id}".encode()
-        return what + self.loading.pop() if self.loading else what
-
-    def set_time(self, timeline: str, **given: Any) -> None:
-        self.times.append({"timeline": timeline, **given})
+Viewer = Callable[[str, Callable[[str], object]], None]
 
 
 @pytest.fixture
-def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Client:
-    """In place of the viewer's own, to a program that only waits."""
-    program = tmp_path / "viewer"
-    program.write_text("#!/bin/sh\nexec sleep 60\n")
-    program.chmod(0o700)
-    client = Client()
-    monkeypatch.setattr(headless, "viewer_program", lambda: program)
-    monkeypatch.setattr(headless, "is_listening", lambda port: True)
-    monkeypatch.setattr(headless.ViewerClient, "connect", lambda url: client)
-    monkeypatch.setattr(headless, "SETTLE_SECONDS", 0.0)
-    monkeypatch.setattr(headless, "_RETRY_SECONDS", 0.001)
-    (tmp_path / "a.rrd").touch()
-    return client
+def viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Viewer:
+    """Puts a program in the viewer's place."""
+
+    def program(code: str, client: Callable[[str], object]) -> None:
+        path = tmp_path / "viewer"
+        path.write_text(f"#!{sys.executable}\n{code}")
+        path.chmod(0o755)
+        monkeypatch.setattr(headless, "viewer_program", lambda: path)
+        monkeypatch.setattr(headless, "ViewerClient", SimpleNamespace(connect=client))
+        monkeypatch.setattr(headless, "SETTLE_SECONDS", 0.0)
+
+    return program
 
 
 def test_a_recording_that_does_not_exist_is_named(tmp_path: Path) -> None:
@@ -92,59 +95,69 @@ def test_a_recording_that_does_not_exist_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "out.png").exists()
 
 
-def test_timeouts_of_the_viewer_are_survived(client: Client, tmp_path: Path) -> None:
-    client.failures *= 3
-    save_screenshot(tmp_path / "a.rrd", tmp_path / "new" / "out.png", step=7)
-    assert (tmp_path / "new" / "out.png").read_bytes() == b"all"
+@pytest.mark.parametrize("error", [TimeoutError, ConnectionError, RuntimeError])
+def test_a_viewer_that_does_not_paint_in_its_time_is_asked_again(
+    error: type[Exception], rrd: Path, viewer: Viewer
+) -> None:
+    late = error("the viewer has not painted within 15 s")
+    viewer(_SILENT, lambda _: client)
+    client = Client(late, late, b"first", late, b"png")
+    out = rrd.with_name("new") / "out.png"
+    save_screenshot(rrd, out, step=7)
+    assert out.read_bytes() == b"png"
     assert client.times == [{"timeline": "probe", "sequence": 7, "play_state": "paused"}]
 
 
-def test_a_picture_is_taken_again_until_all_is_loaded(client: Client, tmp_path: Path) -> None:
-    with headless_viewer(tmp_path / "a.rrd") as viewer:
-        client.loading = [b".", b"..", b"..."]
-        assert viewer.picture() == b"all"
-
-
-def test_a_view_is_found_by_its_name(client: Client, tmp_path: Path) -> None:
-    with headless_viewer(tmp_path / "a.rrd") as viewer:
-        client.failures = [TimeoutError("deadline")]
-        assert viewer.picture("Log") == b"view 4"
-
-
-def test_a_viewer_that_never_answers_is_named_with_its_last_reason(
-    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_picture_is_taken_again_until_all_that_it_shows_is_loaded(
+    rrd: Path, viewer: Viewer
 ) -> None:
-    monkeypatch.setattr(headless, "START_SECONDS", 0.05)
-    monkeypatch.setattr(client, "get_state", lambda: 1 / 0)
-    monkeypatch.setattr(headless, "_FAILURES", (ArithmeticError,))
-    with pytest.raises(RecordingError, match="gave no picture: division by zero"):
-        save_screenshot(tmp_path / "a.rrd", tmp_path / "out.png")
+    client = Client(b"first", b"loading.", b"loading..", b"all")
+    viewer(_SILENT, lambda _: client)
+    with headless_viewer(rrd) as shown:
+        assert shown.picture() == b"all"
+
+
+def test_a_view_is_found_by_its_name(rrd: Path, viewer: Viewer) -> None:
+    client = Client(b"png")
+    viewer(_SILENT, lambda _: client)
+    with headless_viewer(rrd) as shown:
+        client.asked.clear()
+        shown.picture("Log")
+    assert set(client.asked) == {"4"}
+
+
+def test_a_viewer_that_never_paints_is_one_error(
+    rrd: Path,
+    viewer: Viewer,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(headless, "LIMIT_SECONDS", 2.0)
+    client = Client(TimeoutError("not painted\n  within 15 s"))
+    viewer(_SILENT, lambda _: client)
+    assert main([str(rrd), str(rrd.with_suffix(".png"))]) == 2
+    assert capsys.readouterr().err == (
+        "error: the Rerun viewer gave no picture: after 2 s, not painted within 15 s\n"
+    )
+    assert not rrd.with_suffix(".png").exists()
 
 
 def test_a_viewer_that_hangs_is_given_up(
-    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rrd: Path, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "viewer").write_text(f"#!{sys.executable}\n{_SILENT}")
-    monkeypatch.setattr(headless, "START_SECONDS", 2.0)
-    monkeypatch.setattr(headless, "is_listening", is_listening)
-    monkeypatch.setattr(headless.ViewerClient, "connect", HangingClient)
-    with pytest.raises(RecordingError, match="gave no picture: "):
-        save_screenshot(tmp_path / "a.rrd", tmp_path / "out.png")
-    assert not (tmp_path / "out.png").exists()
+    monkeypatch.setattr(headless, "LIMIT_SECONDS", 2.0)
+    viewer(_SILENT, HangingClient)
+    begun = time.monotonic()
+    with pytest.raises(RecordingError, match="gave no picture: after 2 s, "):
+        save_screenshot(rrd, rrd.with_suffix(".png"))
+    assert time.monotonic() - begun < 60.0
 
 
-def test_a_viewer_that_ends_is_named_with_what_it_printed(client: Client, tmp_path: Path) -> None:
-    (tmp_path / "viewer").write_text("#!/bin/sh\necho No graphics adapter was found\n")
-    client.failures *= 1000
-    with pytest.raises(RecordingError, match="found no Vulkan driver; accepted: a graphics card's"):
-        save_screenshot(tmp_path / "a.rrd", tmp_path / "out.png")
-
-
-def test_the_command_prints_one_line_without_controls(
-    client: Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_viewer_that_ends_is_quoted(
+    rrd: Path, viewer: Viewer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "viewer").write_text("#!/bin/sh\nprintf 'no \\033[31m graphics'\n")
-    client.failures *= 1000
-    assert main([str(tmp_path / "a.rrd"), str(tmp_path / "out.png")]) == 2
-    expected = "error: the Rerun viewer gave no picture: it ended: no \\x1b[31m graphics\n"
-    assert capsys.readouterr().err == expected
+    viewer(_ENDING, Client)
+    assert main([str(rrd), str(rrd.with_suffix(".png"))]) == 2
+    assert capsys.readouterr().err == (
+        "error: the Rerun viewer gave no picture: it ended: no\\x1b[31m graphics\n"
+    )
