@@ -84,7 +84,7 @@ def main(config: DictConfig) -> None:
         console.print(_table(rows))
     for failure in failures:
         console.print(failure, soft_wrap=True)
-    console.print(f"{len(rows)} sets in")
+    console.print(f"written: {len(rows)} sets, in")
     console.print(str(folder), soft_wrap=True)
     if failures:
         sys.exit(1)
