@@ -204,9 +204,9 @@ def read_recording(
         raise DamagedRecordingError(path, f"ends within an event on {events.within}")
     if not events.closed and events.entries and file.damage is None:
         raise DamagedRecordingError(path, "ends without its contents")
-    sealed = bool(file.chain.session) or not events.entries
-    if events.version >= SEALED_SINCE and not sealed and file.damage is None:
-        raise DamagedRecordingError(path, "has no seals; accepted: those of its format")
+    sealed = bool(file.chain.session) or events.version < SEALED_SINCE
+    if not sealed and events.entries and file.damage is None:
+        raise DamagedRecordingError(path, "has no seals, which its format should have")
     sizes = {name: len(data) for name, data in file.attachments.items()}
     return Recording(
         path,

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from chsel.errors import ChselError, RecordingError
-from chsel.points import GrowingPoints
-from chsel.sdf import SdfGrid
+from chsel.errors import RecordingError
 from replay.events import (
     Event,
     HypothesesFound,
@@ -25,26 +21,22 @@ from replay.events import (
     Traced,
 )
 from replay.lost_attachment import LostAttachment
-from replay.mcap.attachments import MESH, SDF_GRID
-from replay.mcap.contents import Row, rows
-from replay.mcap.encoding import decode
-from replay.mcap.event_checks import RECOVERED, check_event
+from replay.mcap.event_checks import RECOVERED
 from replay.mcap.event_order import EventOrder
-from replay.mcap.event_reader import Entry, EventReader, RecordedProblem, attached
+from replay.mcap.event_reader import Entry, RecordedProblem
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import FOXGLOVE
-from replay.mcap.plain_config import config_from_json
+from replay.mcap.gap_reader import WRONG, GapReader
 from replay.mcap.reader import read_recording
 from replay.mcap.salvage import Gap, Salvage
 from replay.mcap.schemas import RECORDS, STEP_TIME, message_class
-from replay.mcap.sensor_messages import ImagePlace, image
+from replay.mcap.sensor_messages import ImagePlace
 from replay.mcap.texts import one_line
 from replay.mcap.whole_records import Damage
 from replay.mcap.writer import McapRecorder
 from replay.new_file import new_file
 
 _OF_REGISTRATION = (Traced, SnapshotTaken, HypothesesFound)
-_WRONG = (ChselError, ValueError, RecursionError)  # what reading a message may raise
 _OF_POINTS = ("/points/free", "/points/occupied", "/points/known", "/known_points")
 
 
@@ -161,7 +153,7 @@ class _Recovery:
         names = {topic: message_class(name).DESCRIPTOR.full_name for topic, name in RECORDS.items()}
         names |= {topic: kind.DESCRIPTOR.full_name for topic, kind in FOXGLOVE.items()}
         self._file = file = Salvage(self._path, names)
-        reader = _GapReader(file.attachments, self._path.stat().st_size)
+        reader = GapReader(file.attachments, self._path.stat().st_size)
         unsure: list[tuple[int, int]] = []  # first and last step of those with missing messages
         gap = False
         for message in file.messages():
@@ -180,12 +172,12 @@ class _Recovery:
         yield from self._end(reader, file)
         self._account(reader, unsure)
 
-    def _taken(self, reader: _GapReader, message: StoredMessage) -> Iterator[Event]:
+    def _taken(self, reader: GapReader, message: StoredMessage) -> Iterator[Event]:
         """The events that a message completes, or a warning if one is lost with it."""
         try:
             reader.take(message)
             entries = reader.drained()
-        except _WRONG as error:
+        except WRONG as error:
             if reader.start is None:
                 raise RecordingError(f"{self._nothing()}: {one_line(str(error))}") from error
             reader.gap()
@@ -199,7 +191,7 @@ class _Recovery:
                 self._note_attachments(entry, reader)
             yield from self._kept(reader, entry)
 
-    def _kept(self, reader: _GapReader, entry: Entry) -> Iterator[Event]:
+    def _kept(self, reader: GapReader, entry: Entry) -> Iterator[Event]:
         """The event, if it still makes sense where it is; else a warning, once a registration."""
         step = getattr(entry, "step", -1)
         if isinstance(entry, ImagePlace):
@@ -214,7 +206,7 @@ class _Recovery:
         try:
             event = reader.completed(entry) if isinstance(entry, RecordedProblem) else entry
             self._order.take(event)
-        except _WRONG as error:
+        except WRONG as error:
             what, reason = f"{type(entry).__name__} of step {step}", one_line(str(error))
             if isinstance(entry, (RecordedProblem, *_OF_REGISTRATION)):
                 self._lost_steps.add(step)
@@ -224,7 +216,7 @@ class _Recovery:
         else:
             yield event
 
-    def _end(self, reader: _GapReader, file: Salvage) -> Iterator[Event]:
+    def _end(self, reader: GapReader, file: Salvage) -> Iterator[Event]:
         """What a recording without its end needs."""
         self.found.damages = file.damages
         self.found.complete = reader.closed
@@ -236,7 +228,7 @@ class _Recovery:
             yield SessionEnded(self._order.step, f"{RECOVERED}how the session ended is not known")
             self.found.ended = None  # that was no outcome
 
-    def _account(self, reader: _GapReader, unsure: Sequence[tuple[int, int]]) -> None:
+    def _account(self, reader: GapReader, unsure: Sequence[tuple[int, int]]) -> None:
         """Which steps are lost: as the contents say, or else as far as can be known."""
         found = self.found
         kept = sorted(set(found.probes))
@@ -261,13 +253,13 @@ class _Recovery:
             self._order.take(warning)
             yield warning
 
-    def _note_attachments(self, start: SessionStarted, reader: _GapReader) -> None:
+    def _note_attachments(self, start: SessionStarted, reader: GapReader) -> None:
         for part in (start.mesh, start.sdf):
             if isinstance(part, LostAttachment):
                 self.found.attachments.append(part.name)
         self.found.remade = reader.remade
 
-    def _check_started(self, reader: _GapReader) -> None:
+    def _check_started(self, reader: GapReader) -> None:
         """Raise RecordingError if the session's start is not there by now."""
         if reader.start is None:
             raise RecordingError(f"{self._nothing()}: the start of its session is not there")
@@ -277,94 +269,6 @@ class _Recovery:
         damages = self._file.damages[:1]
         where = [f" (bytes {d.start} to {d.end}: {d.reason})" for d in damages]
         return f"nothing can be recovered from {self._path}{''.join(where)}"
-
-
-class _GapReader(EventReader):
-    """Joins messages to events where some messages may be missing.
-
-    start: how the session began. remade: attachments that were lost and are there again. wanting:
-    whether messages were lost by now. rows: of the contents, once they were there.
-    """
-
-    def __init__(self, attachments: dict[str, bytes], size: int) -> None:
-        super().__init__(attachments, size)
-        self.start: SessionStarted | None = None
-        self.rows: list[Row] = []
-        self.remade: list[str] = []
-        self._points: GrowingPoints | None = None
-        self.wanting = False
-
-    def gap(self) -> None:
-        """Messages are missing here: what they belonged to is lost."""
-        self.wanting = True
-        self.within, self._opening = None, {}
-        self._clouds.clear()
-        self._last_snapshot = None
-
-    def drained(self) -> list[Entry]:
-        """The events since the last call; the session's start stays, as the first of all."""
-        keep = 0 if self.start is None else 1
-        news = self.entries[keep:]
-        del self.entries[1:]
-        for entry in news:
-            if isinstance(entry, SessionStarted):
-                self.start, self._points = entry, GrowingPoints(entry.initial_points)
-            elif isinstance(entry, Probe) and self._points is not None:
-                self._points.add(entry.new_points)
-        return news
-
-    def completed(self, entry: RecordedProblem) -> ProblemPosed:
-        """The whole problem; RecordingError if points or elites of lost messages are missing."""
-        assert self.start is not None
-        assert self._points is not None
-        return ProblemPosed(entry.step, entry.completed(self.start.sdf, self._points.all()))
-
-    def _append(self, entry: Entry) -> None:
-        if not isinstance(entry, RecordedProblem | ImagePlace):
-            check_event(entry)
-        self.entries.append(entry)
-
-    def _image(self, values: dict[str, Any]) -> SensorImage:
-        self._count_pixels(values)
-        return image(values)
-
-    def _close(self, values: dict[str, Any]) -> SessionStarted | Probe:
-        if self.wanting:  # points that are lost were counted; the new ones must all be there
-            self._counts = {name: values[name] - values[f"new_{name}"] for name in self._counts}
-        return super()._close(values)
-
-    def _attached(self, name: str, digest: str) -> Any:
-        """The mesh or the grid, made again if that is possible, or what stands for a lost one."""
-        with suppress(*_WRONG):
-            return attached(self._attachments, name, digest)
-        if name == SDF_GRID:
-            with suppress(*_WRONG):
-                grid = self._grid_again()
-                if grid.digest == digest:
-                    self.remade.append(name)
-                    return grid
-        return LostAttachment(name, digest)
-
-    def _grid_again(self) -> SdfGrid:
-        """The grid of the mesh, as the session's configuration says; any of _WRONG if it cannot."""
-        mesh: Any = attached(self._attachments, MESH, self._opening["mesh_digest"])
-        session = config_from_json(self._opening["config"]).get("session")
-        if not isinstance(session, dict):
-            raise RecordingError("the configuration does not say how the grid was made")
-        named = (session.get("object_resolution"), session.get("object_padding"))
-        resolution, padding = (float(x) if isinstance(x, int | float) else 0.0 for x in named)
-        return SdfGrid.from_mesh(mesh, resolution, padding=padding)
-
-    def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
-        try:
-            return super()._hypotheses(values)
-        except _WRONG:
-            self._last_elites = values["elites"]  # the next problem, if it refers to them, is
-            raise  # believed for its own digest alone
-
-    def _compare_contents(self, data: bytes) -> None:
-        self.closed = True
-        self.rows = rows(decode(RECORDS["/contents"], data))
 
 
 def _missing(steps: Iterable[int], kept: Iterable[int]) -> list[int]:
