@@ -90,7 +90,7 @@ class Display:
             table.add_row(label, *cells, _median(1000.0 * seconds[own]))
         self.say("medians over all steps of all trials: PD in mm² by object, ms a registration")
         self._console.print(table)
-        self.say(f"plausible sets: {definition}")
+        self._console.print(f"plausible sets: {definition}", markup=False)
 
     def true_poses(self, found: Sequence[FoundPose]) -> None:
         """How far the true poses that were sought are from guesses, and from a simulated truth."""
