@@ -16,10 +16,13 @@ import pytest
 from chsel.errors import ChselError, RecordingError
 from chsel.evaluation.plausible_file import read_plausible
 from chsel.evaluation.plausible_settings import plausible_settings
+from chsel.evaluation.pose_error import pose_errors
+from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
 from chsel.methods.icp import Icp
 from chsel.pose import axis_angle
 from chsel.problem import Hypotheses
 from chsel.settings import settings_mapping
+from replay.events import Measured
 from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, NO_RESULT, verify
 from runners.evaluation import registering, work
@@ -307,6 +310,27 @@ def test_a_damaged_file_is_made_again(make_plan: MakePlan, name: str) -> None:
     for row in before + after:
         row.pop("seconds")
     assert after == before
+
+
+def test_errors_are_modulo_symmetries_at_the_centre(make_plan: MakePlan) -> None:
+    plan = make_plan()
+    Schedule(plan, [TRIAL], 1, lambda _: None).run()
+    recording = read_recording(TRIAL.folder(plan) / "icp.mcap")
+    truth, symmetry = recording.start.world_from_object, object_symmetry(recording.start.mesh)
+    assert truth is not None
+    assert len(symmetry.rotations) == 2
+    events = [event for event in recording.events() if isinstance(event, Measured)]
+    recorded = {event.step: event.values for event in events}
+    rows = results(plan)
+    assert [row["step"] for row in rows] == [4, 5]
+    for row in rows:
+        best = recording.hypotheses(row["step"]).object_from_world[:1]
+        errors = [float(one[0]) for one in pose_errors(best, truth, symmetry)]
+        assert errors[0] != pose_errors(best, truth, ObjectSymmetry())[0][0]
+        assert [row["position_error"], row["rotation_error"]] == pytest.approx(errors, abs=1e-9)
+        values = recorded[row["step"]]
+        found = [values["best_position_error"], values["best_rotation_error"]]
+        assert found == pytest.approx(errors, abs=1e-9)
 
 
 def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Path) -> None:

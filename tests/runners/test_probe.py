@@ -17,8 +17,11 @@ import trimesh
 import yaml
 
 from chsel.errors import RecordingError
+from chsel.evaluation.result_numbers import result_numbers
+from chsel.evaluation.symmetry import object_symmetry
 from chsel.methods import METHODS, build_method
 from chsel.pose import apply, axis_angle, compose
+from replay.events import Measured
 from replay.mcap.reader import read_recording
 
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
@@ -73,6 +76,20 @@ def finished(
     done = run(logs, *points, *QUICK)
     assert done.returncode == 0, done.stderr
     return run_folder(logs), done
+
+
+def test_recorded_errors_are_modulo_symmetries(
+    finished: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    recording = read_recording(finished[0] / "recording.mcap")
+    symmetry = object_symmetry(recording.start.mesh)
+    assert len(symmetry.rotations) == 4
+    measured = [event for event in recording.events() if isinstance(event, Measured)]
+    assert [event.step for event in measured] == [0, 1, 2]
+    for event in measured:
+        found, problem = recording.hypotheses(event.step), recording.problem(event.step)
+        expected = result_numbers(found, problem, recording.start.world_from_object, symmetry)
+        assert event.values == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_run_leaves_recordings_config_and_summary(

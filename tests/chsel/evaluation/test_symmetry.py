@@ -191,6 +191,8 @@ def test_the_tolerance_is_a_share_of_the_diameter() -> None:
     """A quarter turn of a bar whose sides differ by 3 and by 8 parts in 100."""
     assert len(object_symmetry(trimesh.creation.box((1.0, 1.03, 3.0))).rotations) == 8
     assert len(object_symmetry(trimesh.creation.box((1.0, 1.08, 3.0))).rotations) == 4
+    # Quarter turns about two axes would be within it alone, but not what they make together.
+    assert len(object_symmetry(trimesh.creation.box((1.0, 1.02, 1.04))).rotations) == 8
 
 
 def test_a_small_knob_is_seen_and_a_tiny_one_is_not() -> None:
