@@ -114,6 +114,8 @@ class SdfGrid:
         progress: called with the number of nodes done and of all, before each part of a large
         grid; it changes no bit.
         """
+        import trimesh
+
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             accepted = "a Trimesh with faces, such as chsel.load_mesh(path)"
             raise MeshError(f"mesh is {quoted(mesh)}; accepted: {accepted}")

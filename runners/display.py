@@ -83,11 +83,11 @@ class Display:
     def probe(self, row: Mapping[str, Any]) -> None:
         """A probe, and the registration after it if there was one, are done."""
         self._bar.clear()
-        text = f"probe {row['step']:>3}  {row['outcome']:<7}  {row['contacts']:>3} contacts"
-        text += f"  {row['free_points']:>6} free"
+        text = f"probe {row['step']:>3} {row['outcome']:<7} {row['contacts']:>3} contacts"
+        text += f" {row['free_points']:>6} free"
         if "best_cost" in row:
-            text += f"  cost {row['best_cost']:.3g}  {row['distinct']:>2} distinct"
-        self._console.print(f"{text}  {row['seconds']:.2f} s")
+            text += f"  cost {row['best_cost']:<8.3g} {row['distinct']:>2} distinct"
+        self._console.print(f"{text} {row['seconds']:>5.2f} s")
 
     def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
         """Warnings that were not shown before, each kind once."""
