@@ -29,6 +29,11 @@ def printable(text: str, *, keep: str = "") -> str:
     )
 
 
+def print_page(text: str) -> None:
+    """Print a text of several lines, such as a command's help."""
+    print(printable(text, keep="\n"))
+
+
 def print_error(text: str) -> None:
     """Print one line about what is wrong, on stderr."""
     print(f"error: {printable(text)}", file=sys.stderr)

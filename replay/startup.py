@@ -27,7 +27,7 @@ def begin() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     if not chsel_is_ours():
-        print(f"error: {WRONG_PACKAGE}", file=sys.stderr)
+        sys.stderr.write(f"error: {WRONG_PACKAGE}\n")
         sys.exit(2)
 
 

@@ -27,7 +27,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from chsel.errors import ChselError
-from replay.console import print_error, print_warning
+from replay.console import print_error, print_page, print_warning
 from replay.startup import ready
 from runners.command_help import asked_for, help_text
 from runners.path_values import literal_paths
@@ -81,7 +81,7 @@ def prepared(config_name: str, words: list[str]) -> list[str]:
 
 
 def _print_help(config_name: str, words: list[str]) -> None:
-    print(help_text(config_name, words))
+    print_page(help_text(config_name, words))
 
 
 @dataclass(frozen=True)

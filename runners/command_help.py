@@ -46,6 +46,7 @@ def help_at_once() -> None:
     given = sys.orig_argv
     command = given[given.index("-m") + 1] if "-m" in given else ""
     package, _, name = command.partition(".")
+    from replay.console import print_page
     from runners.cli import CONF, prepared
 
     if package != "runners" or not (CONF / f"{name}.yaml").is_file():
@@ -54,5 +55,5 @@ def help_at_once() -> None:
         text = help_text(name, prepared(name, words))
     except Exception:
         return
-    print(text)
+    print_page(text)
     sys.exit(0)

@@ -18,7 +18,7 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 from chsel.errors import ChselError, RecordingError
-from replay.console import print_error
+from replay.console import Console, print_error
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.headless import headless_viewer
 from replay.screenshot import save_screenshot
@@ -113,7 +113,7 @@ class Sessions:
 
 def _run(module: str, *arguments: str) -> None:
     command = ["python", "-m", module, *arguments]
-    print(shlex.join(command), flush=True)
+    Console().print(shlex.join(command), soft_wrap=True)
     done = subprocess.run(
         [sys.executable, *command[1:]], cwd=REPOSITORY, capture_output=True, text=True, check=False
     )
@@ -167,7 +167,7 @@ def main() -> int:
             for name in given.pictures or PICTURES:
                 content = PICTURES[name](sessions)
                 (REPOSITORY / name).write_bytes(content)
-                print(f"{name}: {len(content) / 1000:.0f} kB", flush=True)
+                Console().print(f"{name}: {len(content) / 1000:.0f} kB")
     except (ChselError, OSError) as error:
         print_error(str(error))
         return 2

@@ -223,6 +223,8 @@ def run(
     display: Display,
 ) -> bool:
     """Run the session to its end or to Ctrl-C; whether it was interrupted."""
+    if started.session == "recorded":  # the title was printed before its object was known
+        display.say(f"object: {started.object}")
     display.probes(scene.session.count)
 
     def show(stage: str, iteration: int, total: int) -> None:
