@@ -15,7 +15,7 @@ RELATIVE, ABSOLUTE = 1e-9, 1e-12
 """How far a number may be from the recorded one: libraries beneath may round otherwise."""
 
 ERRORS = 1e-4
-"""m or rad: how far errors to the true pose may be, as symmetries are found by LAPACK and libigl."""
+"""m or rad: how far errors to the true pose may be, as symmetries depend on LAPACK and libigl."""
 
 
 def measured_differences(

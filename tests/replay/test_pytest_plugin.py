@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from chsel.settings import settings_mapping
 from replay.events import Event, HypothesesFound
 from replay.mcap.reader import read_recording
 
@@ -91,10 +92,22 @@ def test_every_object_and_method_has_stored_replays_of_a_modest_size() -> None:
     files = list(REPLAYS.glob("*.mcap"))
     sizes = [file.stat().st_size for file in files]
     assert max(sizes) <= 2**20
-    assert sum(sizes) <= 16 * 2**20
+    assert sum(sizes) <= 15 * 2**20
     starts = [read_recording(file).start for file in files]
     models = Path(__file__).resolve().parents[2].glob("conf/object/*.yaml")
     objects = {file.stem for file in models} - {"mesh"}
     found = {(start.object, start.method) for start in starts}
-    assert {(name, method) for name in objects for method in METHODS} <= found
+    chsel = ("chsel", "chsel_cma_me", "gradient_descent")
+    assert {(name, method) for name in objects for method in chsel} <= found
+    for method in METHODS:
+        assert len({name for name, stored in found if stored == method}) >= 4, method
     assert {"simulated", "points"} <= {start.session for start in starts}
+
+
+def test_a_stored_replay_of_every_method_has_todays_default_settings() -> None:
+    from chsel.methods import METHODS, preset_settings
+
+    stored = [read_recording(file).start.config["method"] for file in REPLAYS.glob("*.mcap")]
+    for method in METHODS:
+        expected = {"name": method, **settings_mapping(preset_settings(method, "default"))}
+        assert expected in stored, f"{method}: make a stored replay with today's settings"

@@ -2,6 +2,9 @@
 
 Existing files stay as they are, as the bits that later code must give; to accept new bits, use
 `python -m replay bless`. Needs PyBullet for simulated sessions.
+
+`points_default_METHOD` has the settings of preset `default` without any change: when the preset
+changes, it is made again. The others keep older settings, and many an older format.
 """
 
 from __future__ import annotations
@@ -23,7 +26,10 @@ from runners.objects.loader import ObjectConfig, load_object
 FOLDER = Path(__file__).parent
 MOST_BYTES = 2**20
 _POINTS = "points.npz"
-_SMALL = ["session.object_resolution=0.02", "recording=mcap", "recording.snapshot_interval=0"]
+_BRIEF = ["recording=mcap", "recording.snapshot_interval=0"]
+_SMALL = ["session.object_resolution=0.03", "session.free_resolution=0.05"]
+_OF_POINTS = ["object.scale=1", "session=points", f"session.path={_POINTS}", *_BRIEF]
+_FEW = [*_OF_POINTS, "session.object_resolution=0.015", "session.start_probe=2"]  # the last two
 _QUICK = ["method.archive.bins=10", "method.emitter.iterations=30"]
 _CHSEL = ("chsel", "chsel_cma_me")
 _BASELINES: dict[str, list[str]] = {  # with what keeps those brief that take long
@@ -35,45 +41,52 @@ _BASELINES: dict[str, list[str]] = {  # with what keeps those brief that take lo
     "medial_constraint_cma_me": ["method.cma_es.generations=40", *_QUICK],
     "anchored": ["method.size=small", "method.archive.bins=10"],
 }
-_OBJECTS = {  # with the session and the preset of CHSEL, CHSEL with CMA-ME, gradient descent
-    "drill": ("simulated default", "simulated paper", "simulated reference"),
-    "mustard": ("simulated paper", "simulated reference", "kinematic default"),
-    "hammer": ("simulated reference", "kinematic default", "simulated paper"),
-    "cracker_box": ("kinematic default", "simulated paper", "simulated default"),
-    "spam_can": ("simulated paper", "simulated default", "kinematic reference"),
-    "clamp": ("simulated default", "kinematic reference", "simulated paper"),
+_OBJECTS = {  # with the preset of CHSEL, CHSEL with CMA-ME, gradient descent
+    "drill": ("default", "paper", "reference"),
+    "mustard": ("paper", "reference", "default"),
+    "hammer": ("reference", "default", "paper"),
+    "cracker_box": ("default", "paper", "default"),
+    "spam_can": ("paper", "default", "reference"),
+    "clamp": ("default", "reference", "paper"),
 }
+# Not stored, as the meshes and grids of these objects are large.
+_LARGE = {f"{name}_{method}" for name in ("drill", "hammer") for method in _BASELINES}
+_LARGE -= {
+    "drill_svgd",
+    "hammer_icp",
+}  # are not stored, as their objects' meshes and grids are large
+_FULL = ("chsel", "chsel_cma_me", "gradient_descent", "cvo", "cvo_no_free_space")
+_FULL += ("medial_constraint", "medial_constraint_cma_me", "anchored")  # not brief in any other
 
 
 def cases() -> dict[str, list[str]]:
-    """What is stored, by name: arguments of `python -m runners.probe`."""
+    """Arguments of `python -m runners.probe` by name; older files were made with other ones."""
     found = {}
-    for name, choices in _OBJECTS.items():
-        for method, choice in zip((*_CHSEL, "gradient_descent"), choices, strict=True):
-            session, preset = choice.split()
+    for name, presets in _OBJECTS.items():
+        for method, preset in zip((*_CHSEL, "gradient_descent"), presets, strict=True):
             found[f"{name}_{method}"] = [
                 f"object={name}",
-                f"session={session}",
                 f"preset={preset}",
                 f"method={method}",
-                f"session.start_probe={18 if name == 'drill' else 8}",
-                *_SMALL,
+                *_FEW,
                 *(_QUICK if method in _CHSEL else []),
             ]
         for index, (method, brief) in enumerate(_BASELINES.items()):
+            if f"{name}_{method}" in _LARGE:
+                continue
             found[f"{name}_{method}"] = [
                 f"object={name}",
                 f"session={('kinematic', 'simulated')[index % 2]}",
                 f"preset={PRESETS[(index + len(name)) % len(PRESETS)]}",
                 f"method={method}",
-                *_SMALL[1:],
-                "session.object_resolution=0.03",
-                "session.free_resolution=0.05",
+                *_BRIEF,
+                *_SMALL,
                 f"session.start_probe={25 if name == 'drill' else 10}",
                 *brief,
             ]
-    points = ["object.scale=1", "session=points", f"session.path={_POINTS}", *_SMALL[1:]]
-    points.append("session.object_resolution=0.01")
+    for method in _FULL:
+        found[f"points_default_{method}"] = ["object=spam_can", f"method={method}", *_FEW]
+    points = [*_OF_POINTS, "session.object_resolution=0.01"]
     plane = "method.plane={plane_height: 0.0}"
     return found | {
         "points_mustard": ["object=mustard", *points, *_QUICK, "recording.snapshot_interval=10"],
