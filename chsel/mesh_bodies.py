@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from chsel.errors import MeshWarning
+
+if TYPE_CHECKING:
+    import trimesh
 
 _NEAR = 0.5  # diameters of the largest body; a part of an object is nearer to its other parts
 _MOST_BODIES = 1000  # the largest ones are compared

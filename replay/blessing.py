@@ -11,7 +11,7 @@ from pathlib import Path
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
 from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
+from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.online import pose_problem
 from chsel.pose import inverse
 from chsel.problem import Hypotheses
@@ -32,7 +32,12 @@ from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import tells_loss
 from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
-from replay.registration import recorded_method, register_recorded, symmetry_for_errors
+from replay.registration import (
+    recorded_method,
+    recorded_symmetry,
+    register_recorded,
+    symmetry_for_errors,
+)
 from replay.verification import snapshot_interval
 
 _RESULTS = (SnapshotTaken, Traced, HypothesesFound, Measured, Timed)
@@ -87,7 +92,7 @@ def write_blessed(recording: Recording, path: Path) -> Recording:
 def changes(recorded: Recording, new: Recording) -> list[Change]:
     """What differs, step by step, between results that are there in both."""
     sets, truth = PlausibleSets(recorded), recorded.start.world_from_object
-    symmetry = object_symmetry(recorded.start.mesh)
+    symmetry = recorded_symmetry(recorded.start)
     before, after = _outputs(recorded), _outputs(new)
     found = []
     for event in recorded.events(images=False):

@@ -12,7 +12,7 @@ import yaml
 from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError
 from chsel.evaluation.result_numbers import result_numbers
-from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
+from chsel.evaluation.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.presets import PRESETS
@@ -88,10 +88,13 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
 
 
 def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
-    """The symmetries of a session's object; None without a true pose, or if its mesh is lost."""
-    if start.world_from_object is None or is_lost(start.mesh):
-        return None
-    return object_symmetry(start.mesh)
+    """The symmetries of a session's object; None if no true pose is known to need them."""
+    return None if start.world_from_object is None else recorded_symmetry(start)
+
+
+def recorded_symmetry(start: SessionStarted) -> ObjectSymmetry:
+    """The symmetries of a session's object; only the centre of its grid if the mesh is lost."""
+    return grid_symmetry(start.sdf) if is_lost(start.mesh) else object_symmetry(start.mesh)
 
 
 def register_recorded(

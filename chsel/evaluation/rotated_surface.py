@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import igl
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
 from scipy.ndimage import distance_transform_edt
 
 from chsel.arrays import FloatArray, IntArray
 from chsel.evaluation.surface_distance import surface_points
 from chsel.quaternions import rotations
 from chsel.streams import StreamKey
+
+if TYPE_CHECKING:
+    import trimesh
 
 TOLERANCE = 0.0085  # of the diameter
 _TESTED = 1000  # points by which a rotation is judged
@@ -41,6 +44,9 @@ class RotatedSurface:
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         """Only centre and radius are set for a mesh without an area."""
+        import igl
+        import trimesh
+
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
         corners, normals = _corners_normals(vertices, faces)
         areas = np.sqrt((normals**2).sum(axis=1))  # twice the areas of faces

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.evaluation.rotated_surface import RotatedSurface
@@ -16,6 +16,9 @@ from chsel.mesh import mesh_digest
 from chsel.pose import product, rotated, rotation_angle
 from chsel.sdf import SdfGrid
 from chsel.surface import has_surface, object_centre
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from chsel.cost_settings import CostSettings
 from chsel.engine import CompiledCost
 from chsel.errors import ChselError
 from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import object_symmetry
 from chsel.presets import COST
 from chsel.problem import Hypotheses
 from replay.comparing.contenders import Contender, recorded_or_none
@@ -19,7 +18,7 @@ from replay.comparing.plausible import PlausibleSets
 from replay.events import ProblemPosed, SessionStarted
 from replay.mcap.reader import Recording
 from replay.recorder import NullRecorder
-from replay.registration import register_recorded
+from replay.registration import recorded_symmetry, register_recorded
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +104,8 @@ def numbers_under(
     numbers["best_cost"] = float(costs[best])
     numbers["median_cost"] = float(np.median(costs))
     if start.world_from_object is not None:
-        position, rotation = pose_errors(
-            poses, start.world_from_object, object_symmetry(start.mesh)
-        )
+        symmetry = recorded_symmetry(start)
+        position, rotation = pose_errors(poses, start.world_from_object, symmetry)
         for name, index in (("best", best), ("closest", int(np.argmin(position)))):
             numbers[f"{name}_position_error"] = float(position[index])
             numbers[f"{name}_rotation_error"] = float(rotation[index])

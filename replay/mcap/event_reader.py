@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from google.protobuf.message import DecodeError
 
 from chsel.arrays import FloatArray
@@ -50,6 +49,9 @@ from replay.mcap.schemas import (
 from replay.mcap.seal import CONTENTS, SEAL
 from replay.mcap.sensor_messages import ImagePlace, check_image, plausible_pixels, rig
 from replay.mcap.wire import check_wire
+
+if TYPE_CHECKING:
+    import trimesh
 
 _CLOUDS = {"/points/free": 3, "/points/occupied": 3, "/points/known": 4}  # columns
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from chsel.arrays import FloatArray
+
+if TYPE_CHECKING:
+    import trimesh
 
 MOST_FACES = 400
 _FINEST, _COARSEST = 40, 4  # cells along the longest side of the bounds

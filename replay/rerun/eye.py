@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 import rerun.blueprint as rrb
-import trimesh
 
 from chsel.arrays import FloatArray
 from chsel.pose import apply, inverse
@@ -33,6 +32,8 @@ def bounds_in_sight(started: SessionStarted, sets: Iterable[Hypotheses]) -> Boun
         return None
     if started.world_from_object is not None:
         poses = np.concatenate([poses, started.world_from_object[None]])
+    import trimesh
+
     corners = trimesh.bounds.corners(started.mesh.bounds)
     places = np.concatenate([apply(pose, corners) for pose in poses])
     ends = np.quantile(places, [_OUT_OF_SIGHT, 1.0 - _OUT_OF_SIGHT], axis=0)

@@ -86,7 +86,7 @@ def test_verify_finds_a_method_that_was_changed(folder: Path) -> None:
 
 def test_without_the_package_the_recording_can_still_be_read(folder: Path, tmp_path: Path) -> None:
     path = recording(folder, 10)
-    for verb in ("info --check", "export --what hypotheses --format json -o out"):
+    for verb in ("info --check", "export --what hypotheses --format json -o out.json"):
         done = shell(f"python -m replay {verb.replace(' ', f' {path} ', 1)}", tmp_path)
         assert done.returncode == 0, done.stderr
     done = shell(f"python -m replay verify {path}", tmp_path)

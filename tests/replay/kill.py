@@ -33,6 +33,7 @@ from replay.events import Event, Probe, ProblemPosed, SessionEnded
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
 from runners.cli import CONF, plain
+from runners.display import Display
 from runners.interrupt import Interrupt
 from runners.presets import store_presets
 from runners.probe import ProbeConfig, open_scene, run, session_started
@@ -170,7 +171,7 @@ def quick_session(folder: Path, method_name: str) -> Callable[[Path], None]:
 
     def session(logs: Path) -> None:
         folder = make_run_folder(logs / "probe", scene.object_name, method_name)
-        run(folder, checked, method, scene, started, Interrupt())
+        run(folder, checked, method, scene, started, Interrupt(), Display("killed"))
 
     return session
 

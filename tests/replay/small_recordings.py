@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from chsel.evaluation.result_numbers import result_numbers
 from chsel.methods import build_method
 from chsel.online import pose_problem
 from chsel.points import KnownPoints, Workspace
@@ -18,7 +19,9 @@ from chsel.settings import settings_mapping
 from chsel.streams import StreamKey
 from replay.events import (
     Event,
+    HypothesesFound,
     Logged,
+    Measured,
     Probe,
     ProblemPosed,
     RigDescribed,
@@ -28,7 +31,7 @@ from replay.events import (
 )
 from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
-from replay.registration import register_recorded
+from replay.registration import register_recorded, symmetry_for_errors
 
 _SIDES = (0.1, 0.06, 0.04)
 _DESCENT = {"restarts": 2, "iterations": 4, "stop_below": None}
@@ -85,8 +88,10 @@ def registered_session(name: str, *, seed: int = 3) -> list[Event]:
             previous,
         )
         posed = ProblemPosed(step, problem)
-        truth = start.world_from_object
-        registered = register_recorded(posed, method, recorder, truth, snapshot_interval=6)
+        truth, symmetry = start.world_from_object, symmetry_for_errors(start)
+        registered = register_recorded(
+            posed, method, recorder, truth, symmetry, snapshot_interval=6
+        )
         previous = registered.hypotheses
         recorder.record(Logged(step, "info", f"probe {step}: contact"))
     recorder.record(SessionEnded(1, "finished"))
@@ -136,3 +141,23 @@ def _probe(random: np.random.Generator, step: int) -> Probe:
         known_sdf=np.repeat([0.0, 0.01], 5),
     )
     return Probe(step, "contact", new, np.eye(4)[None].repeat(2, axis=0), surface, normals)
+
+
+def measured_again(events: Iterable[Event]) -> list[Event]:
+    """The events with the measured values that follow from their results by today's definition."""
+    found: list[Event] = []
+    start: Any = None
+    problem: Any = None
+    hypotheses: Any = None
+    for event in events:
+        if isinstance(event, SessionStarted):
+            start = event
+        elif isinstance(event, ProblemPosed):
+            problem = event.problem
+        elif isinstance(event, HypothesesFound):
+            hypotheses = event.hypotheses
+        elif isinstance(event, Measured):
+            truth, symmetry = start.world_from_object, symmetry_for_errors(start)
+            event = Measured(event.step, result_numbers(hypotheses, problem, truth, symmetry))
+        found.append(event)
+    return found

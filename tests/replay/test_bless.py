@@ -15,7 +15,7 @@ from chsel import online
 from chsel.evaluation.plausible_file import save_plausible
 from chsel.evaluation.plausible_set import plausible_set
 from chsel.evaluation.plausible_settings import plausible_settings
-from chsel.evaluation.symmetry import object_symmetry
+from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
 from chsel.pose import axis_angle, inverse
 from chsel.problem import Hypotheses
 from replay.__main__ import main
@@ -128,7 +128,8 @@ def test_errors_stand_as_before_and_after(stored: Path, better: bool) -> None:
     if better:
         pair.reverse()
         errors.reverse()
-    change = _change(9, *pair, truth, [{"diversity": 1.0}, {"diversity": 2.0}], equal=False)
+    sets = [{"diversity": 1.0}, {"diversity": 2.0}]
+    change = _change(9, *pair, truth, sets, symmetry=ObjectSymmetry(), equal=False)
     positions, rotations = zip(*errors, strict=True)
     assert change.position_error == pytest.approx(positions, abs=1e-9)
     assert change.rotation_error == pytest.approx(rotations, abs=1e-9)

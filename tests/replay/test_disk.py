@@ -169,12 +169,12 @@ def test_a_full_disk_under_a_file_of_a_run_is_named(
 ) -> None:
     from runners.probe import main as probe
 
-    source = write(make_events(steps=2))
+    source = write(make_events(steps=2, seed=1))
     full_disk(name)
     more = ("method=icp", "method.iterations=2", "recording=mcap", f"logs={tmp_path / 'logs'}")
     done = run(probe, "session=recorded", f"session.path={source}", *more)
+    assert done.returncode == 2, done.stderr
     (folder,) = (tmp_path / "logs" / "probe").iterdir()
-    assert done.returncode == 2
     assert done.stderr == (
         f"error: {folder / name} cannot be written (No space left on device); "
         "accepted: a logs=DIR that can be written\n"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from chsel.errors import RecordingError, SettingError
 from chsel.points import KnownPoints
@@ -64,7 +66,8 @@ def test_a_points_session_on_exported_points_has_the_recorded_problems(
 ):
     path = exported(recording, tmp_path, "points", file_format)
     workspace = tuple(zip(*recording.start.workspace.bounds.tolist(), strict=True))
-    session = PointsSession(PointsSettings(str(path), workspace), None)
+    large: Any = SimpleNamespace(mesh=trimesh.creation.box((3.0, 3.0, 3.0)))
+    session = PointsSession(PointsSettings(str(path), workspace), large)
     assert session.workspace == recording.start.workspace
     points, steps = KnownPoints(), []
     for probe, original in zip(session.probes(), recording.probes, strict=True):

@@ -13,6 +13,7 @@ import pytest
 from chsel.settings import settings_mapping
 from replay.events import Event, HypothesesFound
 from replay.mcap.reader import read_recording
+from tests.replay.small_recordings import measured_again
 
 pytest_plugins = ["pytester"]
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
@@ -60,7 +61,7 @@ def test_a_failing_item_says_what_verify_says(
     cost = event.hypotheses.cost * (1.0 + 1e-15)
     changed = dataclasses.replace(event.hypotheses, cost=np.sort(cost))
     events[at] = HypothesesFound(event.step, changed)
-    shutil.move(write(events), stored / "changed.mcap")
+    shutil.move(write(measured_again(events)), stored / "changed.mcap")
     result = pytester.runpytest_inprocess("--replays", str(stored))
     result.assert_outcomes(passed=7, failed=1)
     result.stdout.fnmatch_lines(

@@ -17,12 +17,19 @@ from replay.events import Event, HypothesesFound, Probe, SessionStarted, Traced
 from replay.file_verification import verified_files
 from replay.mcap.reader import read_recording
 from replay.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verify
+from tests.replay.small_recordings import measured_again
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 DESCENT = REPLAYS / "cracker_box_gradient_descent.mcap"
 CHSEL = REPLAYS / "points_mustard.mcap"
 
 Write = Callable[[list[Event]], Path]
+
+
+@pytest.fixture
+def write_today(write: Write) -> Write:
+    """Records events of older recordings as well, whose measured values had another definition."""
+    return lambda events: write(measured_again(events))
 
 
 def events_of(path: Path) -> list[Event]:
@@ -61,12 +68,12 @@ def test_equal_bits_are_status_0(path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_one_cost_that_is_one_ulp_larger_is_found(
-    write: Write, capsys: pytest.CaptureFixture[str]
+    write_today: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:
     events = events_of(DESCENT)
     cost = result(events, 1).cost.copy()
     cost[3] = np.nextafter(cost[3], 0.0)
-    path = write(with_result(events, 1, cost=cost))
+    path = write_today(with_result(events, 1, cost=cost))
     found = verdicts(path)
     assert [verdict.outcome for verdict in found] == [EQUAL, DIFFERS, EQUAL, EQUAL]
     assert found[1].stage == "choosing the hypotheses"
@@ -79,38 +86,38 @@ def test_one_cost_that_is_one_ulp_larger_is_found(
     assert "environment: " in shown
 
 
-def test_the_sign_of_a_zero_is_a_difference(write: Write) -> None:
+def test_the_sign_of_a_zero_is_a_difference(write_today: Write) -> None:
     events = events_of(DESCENT)
     poses = result(events, 0).object_from_world.copy()
     assert poses[0, 3, 0] == 0.0
     poses[0, 3, 0] = -0.0
-    found = verdicts(write(with_result(events, 0, object_from_world=poses)))
+    found = verdicts(write_today(with_result(events, 0, object_from_world=poses)))
     assert found[0].outcome == DIFFERS
     assert found[0].largest_ulps == 1
 
 
-def test_another_last_result_shows_in_how_the_next_sets_follow(write: Write) -> None:
+def test_another_last_result_shows_in_how_the_next_sets_follow(write_today: Write) -> None:
     """E_0 and E_l of the next problem were not made from this result."""
     events = events_of(DESCENT)
     poses = result(events, 0).object_from_world.copy()
     poses[0, 0, 3] += 0.01
-    found = verdicts(write(with_result(events, 0, object_from_world=poses)))
+    found = verdicts(write_today(with_result(events, 0, object_from_world=poses)))
     assert [verdict.outcome for verdict in found] == [DIFFERS, DIFFERS, EQUAL, EQUAL]
     assert found[1].stage == "making E_0"
 
 
-def test_problems_of_another_recording_are_taken_as_they_are(write: Write) -> None:
+def test_problems_of_another_recording_are_taken_as_they_are(write_today: Write) -> None:
     events = events_of(DESCENT)
     start = events[0]
     assert isinstance(start, SessionStarted)
     poses = result(events, 0).object_from_world.copy()
     poses[0, 0, 3] += 0.01
     changed = [dataclasses.replace(start, source="0" * 32), *events[1:]]
-    found = verdicts(write(with_result(changed, 0, object_from_world=poses)))
+    found = verdicts(write_today(with_result(changed, 0, object_from_world=poses)))
     assert [verdict.outcome for verdict in found] == [DIFFERS, EQUAL, EQUAL, EQUAL]
 
 
-def test_a_changed_trace_names_its_iteration(write: Write) -> None:
+def test_a_changed_trace_names_its_iteration(write_today: Write) -> None:
     events = events_of(CHSEL)
     at = next(
         i
@@ -118,18 +125,18 @@ def test_a_changed_trace_names_its_iteration(write: Write) -> None:
         if isinstance(event, Traced) and (event.stage, event.iteration) == ("cma_mega", 20)
     )
     events[at] = dataclasses.replace(events[at], digest="0" * 32)
-    found = verdicts(write(events))
+    found = verdicts(write_today(events))
     assert [verdict.outcome for verdict in found] == [DIFFERS, EQUAL, EQUAL, EQUAL]
     assert found[0].stage == "cma_mega, iteration 20"
     assert "12 recorded stages before it are equal" not in found[0].report()
 
 
 def test_a_registration_that_was_interrupted_has_nothing_to_compare(
-    write: Write, capsys: pytest.CaptureFixture[str]
+    write_today: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:
     events = events_of(DESCENT)
     last = [i for i, event in enumerate(events) if isinstance(event, HypothesesFound)][-1]
-    path = write(events[:last])
+    path = write_today(events[:last])
     assert [verdict.outcome for verdict in verdicts(path)] == [EQUAL, EQUAL, EQUAL, NO_RESULT]
     assert main(["verify", str(path)]) == 0
     assert "3 of 3 steps equal (gradient_descent)" in capsys.readouterr().out
@@ -137,46 +144,46 @@ def test_a_registration_that_was_interrupted_has_nothing_to_compare(
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_file_without_a_result_cannot_be_verified(
-    write: Write, capsys: pytest.CaptureFixture[str], jobs: str
+    write_today: Write, capsys: pytest.CaptureFixture[str], jobs: str
 ) -> None:
     events = events_of(DESCENT)
     first = next(i for i, e in enumerate(events) if isinstance(e, HypothesesFound))
-    posed = write(events[:first])
+    posed = write_today(events[:first])
     assert main(["verify", str(posed), "--jobs", jobs]) == 2
     shown = capsys.readouterr()
     message = "has no registration with a result to verify; accepted: a recording of at least one"
     assert shown.err == f"error: recording {posed} {message}\n"
     assert shown.out == ""
     probes = [e for e in events if isinstance(e, SessionStarted | Probe)]
-    path = write(probes)
+    path = write_today(probes)
     assert main(["verify", str(path), "--jobs", jobs]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_other_settings_than_those_that_gave_the_result_are_found(write: Write) -> None:
+def test_other_settings_than_those_that_gave_the_result_are_found(write_today: Write) -> None:
     events = events_of(DESCENT)
     start = events[0]
     assert isinstance(start, SessionStarted)
     config = {**start.config, "method": {**start.config["method"], "descent": {"restarts": 3}}}
-    found = verdicts(write([dataclasses.replace(start, config=config), *events[1:]]))
+    found = verdicts(write_today([dataclasses.replace(start, config=config), *events[1:]]))
     assert {verdict.outcome for verdict in found} == {DIFFERS}
     assert "which does not come about" in found[0].stage
 
 
-def test_a_registration_that_goes_on_for_ever_is_stopped(write: Write) -> None:
+def test_a_registration_that_goes_on_for_ever_is_stopped(write_today: Write) -> None:
     events = events_of(DESCENT)
     start = events[0]
     assert isinstance(start, SessionStarted)
     method = dict(start.config["method"])
     method["descent"] = {**method["descent"], "restarts": 15_000, "stop_below": None}
     changed = dataclasses.replace(start, config={**start.config, "method": method})
-    (verdict,) = verify(read_recording(write([changed, *events[1:]])), [8])
+    (verdict,) = verify(read_recording(write_today([changed, *events[1:]])), [8])
     assert verdict.outcome == DIFFERS
     assert "is far beyond the last recorded one" in verdict.differences[-1]
 
 
 def test_several_files_and_processes_give_the_same_verdicts(
-    tmp_path: Path, write: Write, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, write_today: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "several"
     folder.mkdir()

@@ -263,7 +263,7 @@ def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
     folder, report = found(tmp_path)
     names = {file.name for file in folder.iterdir()}
-    assert names == {"benchmark.json", "benchmark.png", "config.yaml"}
+    assert names == {"benchmark.json", "benchmark.png", "config.yaml", "speed.md"}
     assert (folder / "benchmark.png").read_bytes().startswith(b"\x89PNG")
     who = [row["who"] for row in report["comparison"]]
     assert who == [f"ours, {preset}" for preset in PRESETS]

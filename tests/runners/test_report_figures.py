@@ -29,7 +29,7 @@ from runners.reporting.registration_times import picture_of_times
 from tests.runners.drawn_figures import bands_of, legend_of, line_of, outlines_of
 from tests.runners.made_up_evaluations import REPLAYS, row, write_evaluation
 
-DRILL, HAMMER = REPLAYS / "drill_chsel.mcap", REPLAYS / "hammer_chsel.mcap"
+DRILL, HAMMER = REPLAYS / "drill_chsel.mcap", REPLAYS / "hammer_icp.mcap"
 
 
 @pytest.fixture

@@ -80,13 +80,16 @@ def test_silhouettes_are_the_projections_of_the_mesh() -> None:
 
 
 def test_steps_shown_are_those_that_all_recordings_have() -> None:
-    recordings = [read_recording(REPLAYS / f"drill_{name}.mcap") for name in ("chsel", "icp")]
+    recordings = [read_recording(REPLAYS / f"clamp_{name}.mcap") for name in ("chsel", "icp")]
     assert recordings[0].steps[0] < recordings[1].steps[0]
-    assert shown_steps(recordings, None) == [25, 26, 28, 29]
-    assert shown_steps(recordings[:1], None)[0] == 18
-    assert shown_steps(recordings, [29, 25]) == [29, 25]
-    with pytest.raises(NotDrawn, match="step 18 has no result"):
-        shown_steps(recordings, [18])
+    assert shown_steps(recordings, None) == [10, 11]
+    assert shown_steps(recordings[:1], None)[0] == 8
+    assert shown_steps(recordings, [11, 10]) == [11, 10]
+    with pytest.raises(NotDrawn, match="step 8 has no result"):
+        shown_steps(recordings, [8])
+    many = read_recording(REPLAYS / "mustard_icp.mcap")
+    assert many.steps == (10, 11, 12, 13, 14, 15)
+    assert shown_steps([many], None) == [10, 12, 13, 15]
 
 
 def test_the_usual_trial_is_the_recorded_one_of_the_median_pd_of_the_drill(tmp_path: Path) -> None:

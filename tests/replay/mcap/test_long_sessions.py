@@ -116,6 +116,7 @@ def test_a_run_touches_every_point_once(long_session: list[Event], costs: Simple
         seed=0,
         start=(0, STEPS),
         recording=RecordingConfig(),
+        symmetry=None,
         show=lambda *_: None,
     )
     rows = [row for _, row in run.steps()]
