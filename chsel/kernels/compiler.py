@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numba
+from filelock import FileLock
 from numba.core import event
 
 from chsel.kernels.cache_directory import cache_directory, has_kernels
@@ -27,10 +28,25 @@ def compiled(function: Function) -> Function:
     previous = config.CACHE_DIR
     config.CACHE_DIR = str(cache_directory())
     try:
-        made: Function = _njit(cache=True, nogil=True, error_model="numpy")(function)
+        made: Any = _njit(cache=True, nogil=True, error_model="numpy")(function)
+        made._cache.save_overload = _one_at_a_time(made._cache.save_overload)
         return made
     finally:
         config.CACHE_DIR = previous
+
+
+def _one_at_a_time(save: Callable[..., None]) -> Callable[..., None]:
+    """Saving that waits for other processes.
+
+    Numba reads the index of a kernel, names a file of machine code and writes both. Two processes
+    at once, with different types of arguments, would give their code the same name.
+    """
+
+    def locked(*arguments: Any) -> None:
+        with FileLock(cache_directory() / "saving.lock"):
+            save(*arguments)
+
+    return locked
 
 
 def inner(function: Function) -> Function:

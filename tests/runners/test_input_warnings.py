@@ -145,7 +145,7 @@ def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path: Path) -> 
     (recording,) = (tmp_path / "logs").rglob("recording.mcap")
     again = tmp_path / "again"
     source = ["session=recorded", f"session.path={recording}", f"logs={again}"]
-    done = run(main, *source, *QUICK)
+    done = run(main, *source, *QUICK, columns=1000)
     assert done.returncode == 0, done.stderr
     (summary,) = again.rglob("summary.json")
     assert json.loads(summary.read_text())["warnings"] == told
@@ -175,7 +175,7 @@ def test_a_recording_of_points_in_millimetres_is_refused_as_well(tmp_path: Path)
     recorder.record(SessionEnded(0, "finished"))
     recorder.close()
     logs = tmp_path / "logs"
-    done = run(main, "session=recorded", f"session.path={path}", f"logs={logs}")
+    done = run(main, "session=recorded", f"session.path={path}", f"logs={logs}", columns=1000)
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: recording {path}: points on the object span ")
     assert not logs.exists()

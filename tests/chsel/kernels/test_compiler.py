@@ -6,8 +6,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from chsel.kernels import compiler
 
 ROOT = Path(__file__).resolve().parents[3]
 COMPUTE = """
@@ -160,3 +163,28 @@ def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(
     _, said = result_of(start(code, tmp_path, **names))
     assert len(kernels_in(tmp_path)) > 0
     assert str(tmp_path) in said
+
+
+def twice(value: float) -> float:
+    return 2.0 * value
+
+
+def test_kernels_are_saved_while_no_other_process_saves(monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+
+    class Lock:
+        def __init__(self, path: Path) -> None:
+            assert path.parent == compiler.cache_directory()
+
+        def __enter__(self) -> None:
+            events.append("locked")
+
+        def __exit__(self, *_: object) -> None:
+            events.append("free")
+
+    monkeypatch.setattr(compiler, "FileLock", Lock)
+    save = compiler._one_at_a_time(lambda *arguments: events.extend(arguments))
+    save("signature", "code")
+    assert events == ["locked", "signature", "code", "free"]
+    kernel: Any = compiler.compiled(twice)
+    assert kernel._cache.save_overload.__qualname__.startswith("_one_at_a_time")
