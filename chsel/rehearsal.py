@@ -38,7 +38,9 @@ def warm_up(method: Method) -> None:
             warnings.simplefilter("ignore")  # about a ball that nobody has asked for
             _register_twice(method)
     except Exception:
-        return  # settings that fit no such ball; kernels are compiled when they are needed
+        # Settings that fit no such ball, or another package's method that fails on it: its kernels
+        # are compiled when they are needed.
+        return
 
 
 def warm_up_sensing() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from chsel.arrays import FloatArray
 
-LARGEST = 60  # the icosahedron's; no larger one is told from a surface of revolution
+LARGEST = 60  # the icosahedron's; a larger one cannot be distinguished from revolution
 _SAME = np.deg2rad(10.0)  # between two approximations of one element
 _IMPROVEMENTS = 5
 
