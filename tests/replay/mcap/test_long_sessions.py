@@ -105,6 +105,8 @@ def test_a_run_touches_every_point_once(long_session: list[Event], costs: Simple
     assert isinstance(start, SessionStarted)
     session: Any = SimpleNamespace(
         initial_points=start.initial_points,
+        workspace=start.workspace,
+        free_resolution=start.free_resolution,
         probes=lambda: iter(event for event in long_session if isinstance(event, Probe)),
     )
     never: Any = None
