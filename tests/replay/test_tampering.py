@@ -21,6 +21,7 @@ from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover
 from replay.mcap.schemas import RECORDS
+from replay.measured import _close
 from replay.recording_info import recording_digest, recording_info
 from replay.verification import DIFFERS, EQUAL, verify
 from tests.replay.mutations import (
@@ -354,3 +355,10 @@ def test_recover_leaves_out_what_was_changed(whole: bytes, tmp_path: Path) -> No
     assert any("/measured was changed" in damage.reason for damage in found.damages)
     events: list[Event] = list(read_recording(tmp_path / "out.mcap").events())
     assert max(getattr(event, "step", -1) for event in events) <= 1
+
+
+def test_pose_errors_may_differ_by_a_tenth_of_a_millimetre_and_nothing_else_may() -> None:
+    assert _close(0.01, 0.01 + 0.9e-4, "best_position_error")
+    assert not _close(0.01, 0.01 + 1.1e-4, "best_position_error")
+    assert not _close(0.01, 0.01 + 1e-6, "archive_coverage")
+    assert not _close(0.01, None, "best_position_error")
