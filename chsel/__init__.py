@@ -17,14 +17,14 @@ if os.path.exists(os.path.join(os.path.dirname(__file__), "wrapper.py")):  # a f
 
 if TYPE_CHECKING:
     from chsel.api import register
-    from chsel.cost import RelaxedCost
-    from chsel.cost_settings import CostSettings
-    from chsel.engine import CompiledCost
+    from chsel.cost.compiled_cost import CompiledCost
+    from chsel.cost.cost_settings import CostSettings
+    from chsel.cost.torch_cost import RelaxedCost
     from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
-    from chsel.mesh import load_mesh
-    from chsel.points import KnownPoints, Workspace
-    from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-    from chsel.sdf import SdfGrid
+    from chsel.problem.mesh import load_mesh
+    from chsel.problem.points import KnownPoints, Workspace
+    from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+    from chsel.problem.sdf_grid import SdfGrid
 
 __all__ = [
     "ArchiveSnapshot",
@@ -45,20 +45,20 @@ __all__ = [
 ]
 
 _PLACES = {
-    "ArchiveSnapshot": "problem",
+    "ArchiveSnapshot": "problem.registration_problem",
     "ChselError": "errors",
-    "CompiledCost": "engine",
-    "CostSettings": "cost_settings",
-    "Hypotheses": "problem",
+    "CompiledCost": "cost.compiled_cost",
+    "CostSettings": "cost.cost_settings",
+    "Hypotheses": "problem.registration_problem",
     "InputWarning": "errors",
-    "KnownPoints": "points",
+    "KnownPoints": "problem.points",
     "MeshWarning": "errors",
     "PointsWarning": "errors",
-    "RegistrationProblem": "problem",
-    "RelaxedCost": "cost",
-    "SdfGrid": "sdf",
-    "Workspace": "points",
-    "load_mesh": "mesh",
+    "RegistrationProblem": "problem.registration_problem",
+    "RelaxedCost": "cost.torch_cost",
+    "SdfGrid": "problem.sdf_grid",
+    "Workspace": "problem.points",
+    "load_mesh": "problem.mesh",
     "register": "api",
 }
 

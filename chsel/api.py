@@ -12,19 +12,17 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from chsel.arrays import frozen
 from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
-from chsel.fit_check import check_fit
-from chsel.mesh import clean_mesh
 from chsel.methods import build_method, noise_of, preset_settings
-from chsel.observer import Observer
-from chsel.online import pose_problem
-from chsel.point_checks import check_contacts, check_points
-from chsel.points import KnownPoints, Workspace
-from chsel.problem import Hypotheses
-from chsel.sdf import SdfGrid
-from chsel.settings import settings_mapping
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import frozen
+from chsel.problem.input_checks import check_contacts, check_fit, check_points
+from chsel.problem.mesh import clean_mesh
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import Hypotheses, Observer
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import settings_mapping
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 
 _VOXELS_PER_EXTENT = 20
 
@@ -66,8 +64,8 @@ def register(
 
     Returns hypotheses with costs, best first, repeated poses flagged.
     Raises ChselError, with what is accepted, for malformed input; at least one point is needed.
-    Warns with PointsWarning about points that are hardly meant, see chsel.point_checks, and where
-    no hypothesis explains them, see chsel.fit_check.
+    Warns with PointsWarning about points that are hardly meant, and where no hypothesis explains
+    them, see chsel.problem.input_checks.
     """
     points = _known_points(surface, free, occupied, known, known_sdf)
     if workspace is not None:

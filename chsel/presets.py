@@ -19,12 +19,12 @@ it give the same bits.
 
 from __future__ import annotations
 
-from chsel.cost_settings import CostSettings
-from chsel.descent import DescentSettings
-from chsel.emitters import EmitterSettings
-from chsel.online import OnlineSettings
-from chsel.selection import ArchiveSettings, OutputSettings
-from chsel.starts import AnchoredStarts
+from chsel.cost.cost_settings import CostSettings
+from chsel.methods.anchored.anchor_sampling import AnchoredStarts
+from chsel.methods.gradient_descent import DescentSettings
+from chsel.problem.warm_start import OnlineSettings
+from chsel.qd.emitters import EmitterSettings
+from chsel.qd.selection import ArchiveSettings, OutputSettings
 
 PRESETS = ("default", "paper", "reference")
 

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from chsel.evaluation.result_numbers import result_numbers
 from chsel.methods.method import Method
-from chsel.online import pose_problem
-from chsel.points import KnownPoints, Workspace
-from chsel.problem import Hypotheses
-from chsel.sdf import SdfGrid
-from chsel.sensing.camera import PinholeCamera
-from chsel.sensing.depth import occlusion_edges
+from chsel.plausible.pose_metrics import result_numbers
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
+from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
-from chsel.streams import StreamKey
 
 _RADIUS = 0.025
 _SPACING = 0.01

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.online import pose_problem
-from chsel.pose import inverse
-from chsel.problem import Hypotheses
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.warm_start import pose_problem
 from replay.comparing.plausible import PlausibleSets
 from replay.differences import apart
 from replay.environment import environment

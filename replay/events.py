@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints, Workspace
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
 
 if TYPE_CHECKING:
     import trimesh

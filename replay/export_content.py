@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
-from chsel.pose import inverse
-from chsel.problem import ArchiveSnapshot, Hypotheses
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay.events import Measured, Timed
 from replay.export import Exported, require_any
 from replay.export_images import exported_images

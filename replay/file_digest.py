@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 
 from chsel.errors import RecordingError
-from chsel.special_file import refuse_special_file
+from chsel.problem.file_checks import refuse_special_file
 
 _DIGEST_SIZE = 16  # bytes
 

@@ -11,7 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
-from chsel.threads import threads
+from chsel.numerics.threads import threads
 from replay.mcap.reader import read_recording
 from replay.verification import DIFFERS, EQUAL, Verdict, verify
 

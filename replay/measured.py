@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from chsel.evaluation.result_numbers import result_numbers
-from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.plausible.pose_metrics import result_numbers
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.events import Measured, SessionStarted
 from replay.lost_attachment import is_lost
 from replay.registration import symmetry_for_errors

@@ -9,15 +9,15 @@ from typing import Any
 
 import yaml
 
-from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError
-from chsel.evaluation.result_numbers import result_numbers
-from chsel.evaluation.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.pose_metrics import result_numbers
+from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
 from chsel.presets import PRESETS
-from chsel.problem import Hypotheses
-from chsel.settings import settings_mapping
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.settings import settings_mapping
 from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder, SessionStarted
 from replay.lost_attachment import is_lost
 from replay.mcap.reader import Recording

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 THEIRS = "wrapper.py"  # a file of the published package that ours does not have
-OURS = "problem.py"
+OURS = "api.py"
 WRONG_PACKAGE = (
     "package chsel of PyPI is installed beside this one, chsel-replay, and files of both are "
     "mixed, as both are imported as chsel; to mend it: pip uninstall -y chsel chsel-replay, "

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.comparing.contenders import recorded_or_none
 from replay.environment import environment
 from replay.events import Event, Probe, ProblemPosed, SessionEnded, SessionStarted

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from chsel.arrays import FloatArray, digest
-from chsel.problem import ArchiveSnapshot
+from chsel.numerics.arrays import FloatArray, digest
+from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.events import Recorder, SnapshotTaken, Traced
 
 

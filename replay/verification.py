@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chsel.errors import ChselError, RecordingError
-from chsel.online import pose_problem
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.warm_start import pose_problem
 from replay.differences import apart, difference
 from replay.environment import environment
 from replay.events import (

@@ -13,16 +13,16 @@ from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
-from chsel.evaluation.true_pose import TruePose, TruePoseSettings, find_true_pose
-from chsel.pose import compose, inverse, roll_pitch_yaw
-from chsel.problem import RegistrationProblem
-from chsel.settings import build_settings, settings_mapping
-from chsel.streams import StreamKey
-from chsel.threads import require_threads, threads
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import require_threads, threads
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.plausible.true_pose import TruePose, TruePoseSettings, find_true_pose
+from chsel.problem.poses import compose, inverse, roll_pitch_yaw
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.streams import StreamKey
 from replay.console import Console
 from runners.align_view import save_view
 from runners.alignment_fit import Fit, fit_of

@@ -8,8 +8,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.problem import RegistrationProblem
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import RegistrationProblem
 from replay.rerun.blueprint import at_last_probe, scene_view
 from replay.rerun.clock import PROBE
 from replay.rerun.file_stream import new_file_stream

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.plausible_settings import EvaluationCostSettings
-from chsel.pose import apply, inverse
-from chsel.problem import RegistrationProblem
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.plausible_settings import EvaluationCostSettings
+from chsel.problem.poses import apply, inverse
+from chsel.problem.registration_problem import RegistrationProblem
 
 
 @dataclass(frozen=True, eq=False)

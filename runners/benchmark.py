@@ -12,10 +12,10 @@ import torch
 import yaml
 from omegaconf import DictConfig
 
-from chsel.device import device_named, gpus
+from chsel.cost.torch_cost import device_named, gpus
 from chsel.errors import require_choice, require_positive
-from chsel.settings import build_settings
-from chsel.streams import StreamKey
+from chsel.problem.settings import build_settings
+from chsel.problem.streams import StreamKey
 from replay.console import Console
 from runners.benchmarks import report
 from runners.benchmarks.alone import MEASURES

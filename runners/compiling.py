@@ -7,9 +7,8 @@ from typing import Self
 
 from rich.progress import TaskID, TimeElapsedColumn
 
-from chsel.kernels.cache_directory import has_kernels
-from chsel.kernels.compiler import watched
 from chsel.methods.method import Method
+from chsel.numerics.compiler import has_kernels, watched
 from chsel.rehearsal import warm_up, warm_up_sensing
 from replay.console import Console, Progress, TextColumn
 

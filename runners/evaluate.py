@@ -16,10 +16,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from chsel.errors import RecordingError, SettingError, require_choice, require_positive
-from chsel.evaluation.true_pose import TruePoseSettings
 from chsel.methods import METHODS
-from chsel.settings import build_settings
-from chsel.threads import require_threads
+from chsel.numerics.threads import require_threads
+from chsel.plausible.true_pose import TruePoseSettings
+from chsel.problem.settings import build_settings
 from runners.cli import command, plain
 from runners.evaluation.configurations import SENSORS
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label

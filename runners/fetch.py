@@ -18,7 +18,7 @@ from rich.progress import (
 )
 
 from chsel.errors import ChselError, MeshError, SettingError
-from chsel.settings import build_settings
+from chsel.problem.settings import build_settings
 from replay.console import Console, TextColumn
 from replay.console import Progress as ProgressBar
 from runners.cli import command, plain

@@ -13,19 +13,17 @@ from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.plausible_file import load_plausible, save_plausible
-from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
-from chsel.evaluation.plausible_settings import (
-    PlausibleSettings,
-)
-from chsel.evaluation.true_pose import find_true_pose
-from chsel.problem import RegistrationProblem
-from chsel.settings import build_settings
-from chsel.streams import StreamKey
-from chsel.threads import require_threads, threads
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import require_threads, threads
+from chsel.plausible.plausible_file import load_plausible, save_plausible
+from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_settings import PlausibleSettings
+from chsel.plausible.pose_metrics import EvaluationError
+from chsel.plausible.true_pose import find_true_pose
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.settings import build_settings
+from chsel.problem.streams import StreamKey
 from replay.console import Console, Progress
 from replay.step_ranges import chosen_steps
 from runners.cli import command, plain

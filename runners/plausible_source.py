@@ -15,14 +15,14 @@ from mcap.exceptions import McapError
 from mcap.records import Header
 from mcap.stream_reader import StreamReader
 
-from chsel.arrays import FloatArray
 from chsel.errors import RecordingError, SettingError
-from chsel.points import KnownPoints
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.settings import build_settings
-from chsel.special_file import refuse_special_file
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.file_checks import refuse_special_file
+from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import build_settings
+from chsel.problem.streams import StreamKey
 from replay.events import Event, Probe, RigDescribed, SessionStarted
 from replay.file_digest import file_digest
 from replay.mcap.reader import Recording, read_recording

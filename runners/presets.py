@@ -8,10 +8,10 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 
 from chsel.errors import SettingError
-from chsel.evaluation.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.methods import METHODS, OURS, preset_settings
+from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.presets import PRESETS
-from chsel.settings import settings_mapping
+from chsel.problem.settings import settings_mapping
 from runners.sensors.rig import Rig
 from runners.sessions.probing import PROBING_PRESETS
 

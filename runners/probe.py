@@ -17,10 +17,10 @@ from omegaconf import DictConfig
 from chsel.errors import InputWarning, RecordingError
 from chsel.methods import build_method
 from chsel.methods.method import Method
-from chsel.sdf import SdfGrid
-from chsel.settings import build_settings
-from chsel.streams import StreamKey
-from chsel.threads import require_threads
+from chsel.numerics.threads import require_threads
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import build_settings
+from chsel.problem.streams import StreamKey
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.recording_info import recording_digest

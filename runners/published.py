@@ -14,7 +14,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from chsel.errors import SettingError
-from chsel.settings import build_settings
+from chsel.problem.settings import build_settings
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
 from runners.cli import command, plain
 from runners.evaluation.display import Display

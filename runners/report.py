@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from chsel.errors import SettingError
-from chsel.settings import build_settings, settings_mapping
+from chsel.problem.settings import build_settings, settings_mapping
 from replay.console import Console, print_error
 from runners.cli import command, plain
 from runners.path_values import is_setting, quoted

@@ -7,16 +7,15 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from chsel.errors import InputWarning
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.fit_check import check_fit
 from chsel.methods import noise_of
 from chsel.methods.method import Method
-from chsel.online import pose_problem
-from chsel.point_checks import check_contacts, check_points
-from chsel.points import GrowingPoints
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.input_checks import check_contacts, check_fit, check_points
+from chsel.problem.points import GrowingPoints
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 from replay.events import (
     Logged,
     Probe,

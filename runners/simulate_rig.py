@@ -13,8 +13,8 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, TimeElapsedColumn
 
 from chsel.errors import SettingError
-from chsel.settings import build_settings
-from chsel.streams import StreamKey
+from chsel.problem.settings import build_settings
+from chsel.problem.streams import StreamKey
 from replay.console import Console, Progress, TextColumn
 from runners.cli import command, plain
 from runners.objects.loader import ObjectConfig, load_object

@@ -8,20 +8,21 @@ from typing import Any
 
 from chsel import presets
 from chsel.errors import SettingError, require_choice, require_instance
-from chsel.methods.anchored import Anchored, AnchoredSettings, preset_anchored
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, preset_anchored
 from chsel.methods.chsel import Chsel, ChselSettings
-from chsel.methods.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
+from chsel.methods.cvo.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
-from chsel.methods.icp import Icp, preset_icp
+from chsel.methods.icp.icp import Icp, preset_icp
 from chsel.methods.installed import installed_method, installed_names, offering_packages
-from chsel.methods.medial_constraint import MedialConstraint, preset_medial_constraint
-from chsel.methods.medial_constraint_cma_me import (
+from chsel.methods.medial_constraint.medial_constraint import (
+    MedialConstraint,
     MedialConstraintCmaMe,
+    preset_medial_constraint,
     preset_medial_constraint_cma_me,
 )
 from chsel.methods.method import Method
 from chsel.methods.svgd import Svgd, preset_svgd
-from chsel.settings import build_settings
+from chsel.problem.settings import build_settings
 
 
 def _chsel(preset: str) -> ChselSettings:

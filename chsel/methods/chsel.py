@@ -6,19 +6,25 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.cost_settings import CostSettings
-from chsel.descent import DescentSettings, descend
-from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.objective import Objective
 from chsel.errors import require_at_most, require_choice, require_positive
-from chsel.measures import measure_named
-from chsel.objective import Objective
-from chsel.observer import NullObserver, Observer
-from chsel.online import OnlineSettings
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.refinement import resampled_around_best
-from chsel.selection import (
+from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
+from chsel.methods.gradient_descent import DescentSettings, descend
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import (
+    Hypotheses,
+    NullObserver,
+    Observer,
+    RegistrationProblem,
+)
+from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space, transforms_of
+from chsel.problem.streams import Purpose, normals
+from chsel.problem.warm_start import OnlineSettings
+from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
+from chsel.qd.measures import measure_named
+from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
     ranked_hypotheses,
@@ -26,9 +32,26 @@ from chsel.selection import (
     sized_archive,
     within_workspace,
 )
-from chsel.space import PlaneSettings, search_space, transforms_of
-from chsel.starts import AnchoredStarts, anchored_starts
-from chsel.streams import Purpose
+
+_BEST = 0.2
+
+
+def resampled_around_best(
+    estimates: FloatArray, costs: FloatArray, space: SearchSpace, stream: np.random.Generator
+) -> FloatArray:
+    """Transforms (B, 4, 4) drawn around the best fifth of estimates (B, 4, 4) with costs (B,).
+
+    Mean and deviation (ddof 1) of each coordinate of the search vectors; the best fifth itself
+    comes first, unchanged.
+    """
+    count = len(estimates)
+    best = np.argsort(costs, kind="stable")[: max(1, int(_BEST * count))]
+    vectors = space.encode(estimates[best])
+    deviation = vectors.std(axis=0, ddof=1) if len(best) > 1 else np.zeros(space.dimension)
+    drawn = vectors.mean(axis=0) + deviation * normals(stream, (count, space.dimension))
+    drawn[: len(best)] = vectors
+    return transforms_of(space, drawn)
+
 
 MOST_PASSES = 10_000
 
@@ -116,7 +139,7 @@ class Chsel:
         estimates, costs = estimates[inside], costs[inside]
         # 2: P <- m(E')
         vectors = space.encode(estimates)
-        measures = objective.measures(measure, vectors)
+        measures = measure.values(space, vectors)
         # 3, 4: M <- grid with dimensions mean(P) +- b_sigma std(P)
         archive = sized_archive(
             measure, measures, costs, settings.archive, known_count, space.dimension

@@ -4,15 +4,86 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from chsel.cost_settings import CostSettings
-from chsel.descent import DescentSettings, descend
-from chsel.engine import CompiledCost
-from chsel.objective import Objective
-from chsel.observer import NullObserver, Observer
-from chsel.online import OnlineSettings
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.selection import ranked_hypotheses
-from chsel.space import PlaneSettings, search_space
+import numpy as np
+
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.objective import Objective
+from chsel.errors import SettingError, require_at_most, require_positive
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import (
+    Hypotheses,
+    NullObserver,
+    Observer,
+    RegistrationProblem,
+)
+from chsel.problem.search_space import PlaneSettings, search_space, transforms_of
+from chsel.problem.warm_start import OnlineSettings
+from chsel.qd.selection import ranked_hypotheses
+
+MOST_ITERATIONS = 1_000_000
+
+
+@dataclass(frozen=True)
+class DescentSettings:
+    """Adam on all starts at once.
+
+    restarts x iterations: after each block of iterations Adam starts afresh and the rotations are
+    made orthonormal again. rate: Adam's step size. stop_below: end when a block lowers the costs
+    by no more than this fraction in the mean over the starts; None: never end early.
+    """
+
+    restarts: int = 10
+    iterations: int = 50
+    rate: float = 0.01
+    stop_below: float | None = 1e-6
+
+    def __post_init__(self) -> None:
+        require_positive("restarts", self.restarts, zero=True)
+        require_positive("iterations", self.iterations)
+        for name in ("restarts", "iterations"):
+            require_at_most(name, getattr(self, name), MOST_ITERATIONS)
+        require_at_most("restarts x iterations", self.restarts * self.iterations, MOST_ITERATIONS)
+        require_positive("rate", self.rate)
+        if self.stop_below is not None and not np.isfinite(self.stop_below):
+            raise SettingError(f"stop_below is {self.stop_below}; accepted: a number, or null")
+
+
+def descend(
+    objective: Objective,
+    initial_set: FloatArray,
+    settings: DescentSettings,
+    observer: Observer,
+) -> tuple[FloatArray, FloatArray]:
+    """Estimates E' as transforms (B, 4, 4), with their costs (B,), from E_0 (B, 4, 4).
+
+    Each start runs on its own; the costs are those of the returned transforms.
+    """
+    estimates = initial_set
+    vectors = objective.space.encode(estimates)
+    costs = previous = objective.costs(vectors)
+    observer.trace("descent", 0, vectors.copy(), costs.copy())
+    count = len(estimates)
+    for restart in range(settings.restarts):
+        vectors = objective.space.encode(estimates)
+        vectors = objective.descended(vectors, count, settings.rate, settings.iterations)
+        estimates = transforms_of(objective.space, vectors)
+        vectors = objective.space.encode(estimates)
+        costs = objective.costs(vectors)
+        done = (restart + 1) * settings.iterations
+        observer.trace("descent", done, vectors.copy(), costs.copy())
+        observer.progress("descent", done, settings.restarts * settings.iterations)
+        stop_below = settings.stop_below
+        if stop_below is not None and _mean_gain(previous, costs) <= stop_below:
+            break
+        previous = costs
+    return transforms_of(objective.space, objective.space.encode(estimates)), costs
+
+
+def _mean_gain(before: FloatArray, after: FloatArray) -> float:
+    """Mean over the starts of the fraction by which the cost fell; a cost of 0 gains nothing."""
+    gain = np.where(before > 0.0, (before - after) / np.where(before > 0.0, before, 1.0), 0.0)
+    return float(gain.mean())
 
 
 @dataclass(frozen=True)

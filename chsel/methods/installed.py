@@ -13,7 +13,7 @@ from typing import Any
 
 from chsel.errors import SettingError
 from chsel.methods.method import Method
-from chsel.online import OnlineSettings
+from chsel.problem.warm_start import OnlineSettings
 
 GROUP = "chsel.methods"
 _IMPLEMENTED = "docs/writing_a_method.md"

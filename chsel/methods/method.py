@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from chsel.observer import Observer
-from chsel.online import OnlineSettings
-from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
+from chsel.problem.warm_start import OnlineSettings
 
 
 class Method(Protocol):

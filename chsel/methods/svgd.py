@@ -3,19 +3,211 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from chsel import presets
-from chsel.arrays import FloatArray
-from chsel.cost_settings import CostSettings
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_kernels import MOST_SLACK, Model, Neighbours, evaluate, neighbours_of
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.objective import Objective
+from chsel.cost.objective_kernels import BETA1, BETA2, EPSILON, adam_step
 from chsel.errors import require_at_most, require_choice, require_positive
-from chsel.kernels.svgd import particles_at, surroundings_of, svgd
-from chsel.objective import Objective
-from chsel.observer import NullObserver, Observer
-from chsel.online import OnlineSettings
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.selection import ranked_hypotheses
-from chsel.space import PlaneSettings, search_space, transforms_of
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.compiler import compiled, inner, spliced
+from chsel.numerics.elementary import exp, log
+from chsel.numerics.octree import Found
+from chsel.numerics.pose_tuples import decode, pull_back
+from chsel.problem.registration_problem import (
+    Hypotheses,
+    NullObserver,
+    Observer,
+    RegistrationProblem,
+)
+from chsel.problem.search_space import PlaneSettings, search_space, transforms_of
+from chsel.problem.warm_start import OnlineSettings
+from chsel.qd.selection import ranked_hypotheses
+
+_LEAST = 1e-8  # of 2 h^2, which keeps gamma finite
+_MOST_REMEMBERED = 20_000_000  # points around all particles, 28 bytes each
+
+
+class Particles(NamedTuple):
+    """State of the particles: vectors (B, d), and moments (B, 2, d) and powers (2,) of Adam.
+
+    Scratch: scores (B, d), gradients of log p; directions phi (B, d); squares (B (B - 1) / 2,),
+    squared distances of pairs; selected, of that size: where their median is found.
+    """
+
+    vectors: FloatArray
+    moments: FloatArray
+    powers: FloatArray
+    scores: FloatArray
+    directions: FloatArray
+    squares: FloatArray
+    selected: FloatArray
+
+
+def particles_at(vectors: FloatArray) -> Particles:
+    """Particles at search vectors (B, d), which stay the caller's."""
+    count, dimension = vectors.shape
+    pairs = count * (count - 1) // 2
+    return Particles(
+        vectors=np.array(vectors, dtype=np.float64),
+        moments=np.zeros((count, 2, dimension)),
+        powers=np.ones(2),
+        scores=np.zeros((count, dimension)),
+        directions=np.zeros((count, dimension)),
+        squares=np.zeros(pairs),
+        selected=np.zeros(pairs),
+    )
+
+
+class Surroundings(NamedTuple):
+    """What each particle has around it, see Neighbours: x, y, z, kept (P, S) and memory (P, 32).
+
+    P is B, so that each remembers its own, or 1 where that would be too large. found: the scratch
+    that all share.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    kept: Any
+    memory: FloatArray
+    found: Found
+
+
+def surroundings_of(model: Model, count: int) -> Surroundings:
+    """Those of so many particles, met for the first time."""
+    found, memory = neighbours_of(model)
+    size = len(found.x)
+    rows = count if count * size <= _MOST_REMEMBERED else 1
+    x, y, z = (np.empty((rows, size)) for _ in range(3))
+    kept = np.empty((rows, size), dtype=found.kept.dtype)
+    return Surroundings(x, y, z, kept, np.full((rows, len(memory)), -1.0), found)
+
+
+@compiled
+def svgd(
+    model: Any,
+    space: Any,
+    particles: Any,
+    sharpness: Any,
+    scale: Any,
+    median: Any,
+    rate: Any,
+    iterations: Any,
+    around: Any,
+) -> None:
+    """Move particles up log p = -beta C, and apart, by so many steps of Adam.
+
+    sharpness: beta. scale: h of the kernel; median: it follows from the particles instead. around:
+    their surroundings.
+    """
+    vectors, powers = particles.vectors, particles.powers
+    for _ in range(iterations):
+        for n in range(len(vectors)):
+            _score(model, space, vectors[n], sharpness, around, n, particles.scores[n])
+        direct(particles, scale, median)
+        powers[0] *= BETA1
+        powers[1] *= BETA2
+        for n in range(len(vectors)):
+            moments, vector, direction = particles.moments[n], vectors[n], particles.directions[n]
+            for j in range(len(vector)):
+                vector[j] += adam_step(direction[j], moments, j, powers, rate, EPSILON)
+
+
+@spliced
+def _score(
+    model: Any, space: Any, vector: Any, sharpness: Any, around: Any, n: Any, score: Any
+) -> None:
+    """Fill the gradient (d,) of log p by the n-th vector."""
+    row = n if len(around.memory) > 1 else 0
+    most_slack = MOST_SLACK if len(around.memory) > 1 else 0.0
+    x, y, z, kept, shared = around.x, around.y, around.z, around.kept, around.found
+    found = Found(x[row], y[row], z[row], shared.radius, shared.places, shared.nodes, kept[row])
+    near = Neighbours(found, around.memory[row])
+    sums = evaluate(model, decode(space, vector), near, most_slack)
+    pull_back(space, vector, sums[4:13] + sums[1:4], score)
+    for j in range(len(score)):
+        score[j] *= -sharpness
+
+
+@inner
+def direct(particles: Any, scale: Any, median: Any) -> None:
+    """Fill phi_i = 1/B sum_j k(X_j, X_i) score_j + 2 gamma k(X_j, X_i) (X_i - X_j).
+
+    k(a, b) = exp(-gamma |a - b|^2), gamma = 1 / (2 h^2 + 1e-8), h = scale or, if median, from
+    h^2 = median |X_i - X_j|^2 / (2 ln(B + 1)) over pairs (Liu and Wang, 2016, Sec. 5). A pair out
+    of reach adds nothing.
+    """
+    vectors, scores, directions = particles.vectors, particles.scores, particles.directions
+    count, dimension = vectors.shape
+    _measure(vectors, particles.squares)
+    square = scale * scale
+    if median and count > 1:
+        for pair in range(len(particles.squares)):
+            particles.selected[pair] = particles.squares[pair]
+        square = _median(particles.selected) / (2.0 * log(count + 1.0))
+    gamma = 1.0 / (2.0 * square + _LEAST)
+    pair = 0
+    for i in range(count):
+        for d in range(dimension):
+            directions[i, d] = scores[i, d]
+        for j in range(i):
+            near = exp(-gamma * particles.squares[pair])
+            pair += 1
+            if near > 0.0:
+                apart = 2.0 * gamma * near
+                for d in range(dimension):
+                    push = apart * (vectors[i, d] - vectors[j, d])
+                    directions[i, d] += near * scores[j, d] + push
+                    directions[j, d] += near * scores[i, d] - push
+    for i in range(count):
+        for d in range(dimension):
+            directions[i, d] /= count
+
+
+@inner
+def _measure(vectors: Any, squares: Any) -> None:
+    """Fill squares with the squared distances of vectors (B, d), pair i, j < i after pair."""
+    pair = 0
+    for i in range(len(vectors)):
+        for j in range(i):
+            total = 0.0
+            for d in range(vectors.shape[1]):
+                total += (vectors[i, d] - vectors[j, d]) * (vectors[i, d] - vectors[j, d])
+            squares[pair] = total
+            pair += 1
+
+
+@inner
+def _median(values: Any) -> Any:
+    """The median of values (S,), S > 0, whose order changes; of an even count, the middle mean."""
+    middle = len(values) // 2
+    first, last = 0, len(values) - 1
+    while first < last:  # quickselect (Hoare, 1961): values of [first, last] hold the middle one
+        pivot = values[(first + last) // 2]
+        left, right = first, last
+        while left <= right:
+            while values[left] < pivot:
+                left += 1
+            while values[right] > pivot:
+                right -= 1
+            if left <= right:
+                values[left], values[right] = values[right], values[left]
+                left += 1
+                right -= 1
+        first, last = (left if middle > right else first), (right if middle < left else last)
+    if len(values) % 2 == 1:
+        return values[middle]
+    below = values[0]
+    for n in range(1, middle):
+        below = max(below, values[n])
+    return 0.5 * (below + values[middle])
+
 
 MOST_ITERATIONS = 1_000_000
 MOST_PARTICLES = 10_000  # every pair of them is held

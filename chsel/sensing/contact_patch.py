@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from chsel.arrays import BoolArray, FloatArray, IntArray
 from chsel.errors import PointsError, require_positive
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 
 
 def deformation(

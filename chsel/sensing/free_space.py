@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray, frozen
 from chsel.errors import PointsError, PoseError, SettingError, require_positive
-from chsel.kernels.rays import mark_image, mark_points, mark_segments, settle
-from chsel.points import Lattice, Workspace
-from chsel.pose import check_rigid
-from chsel.sensing.camera import PinholeCamera
-from chsel.threads import spread
+from chsel.numerics.arrays import BoolArray, FloatArray, frozen
+from chsel.numerics.threads import spread
+from chsel.problem.points import Lattice, Workspace
+from chsel.problem.poses import check_rigid
+from chsel.sensing.depth_camera import PinholeCamera
+from chsel.sensing.ray_kernels import mark_image, mark_points, mark_segments, settle
 
 MOST_VOXELS = 200_000_000  # two bytes each
 MOST_VIEWS = 250

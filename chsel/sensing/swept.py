@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from chsel.arrays import FloatArray, frozen
 from chsel.errors import PoseError, SettingError, require_positive
-from chsel.pose import check_rigid, product, rotation_angle
-from chsel.sdf import mesh_sdf
+from chsel.numerics.arrays import FloatArray, frozen
+from chsel.problem.poses import check_rigid, interpolated, product, rotation_angle
+from chsel.problem.sdf_grid import mesh_sdf
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.slerp import interpolated
 
 if TYPE_CHECKING:
     import trimesh

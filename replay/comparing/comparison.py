@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from chsel.cost_settings import CostSettings
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_settings import CostSettings
 from chsel.errors import ChselError
-from chsel.evaluation.pose_error import pose_errors
+from chsel.plausible.pose_metrics import pose_errors
 from chsel.presets import COST
-from chsel.problem import Hypotheses
+from chsel.problem.registration_problem import Hypotheses
 from replay.comparing.contenders import Contender, recorded_or_none
 from replay.comparing.plausible import PlausibleSets
 from replay.events import ProblemPosed, SessionStarted

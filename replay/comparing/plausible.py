@@ -6,13 +6,13 @@ from functools import cached_property
 from pathlib import Path
 
 from chsel.errors import RecordingError, require_choice
-from chsel.evaluation.plausible_diversity import plausible_diversity
-from chsel.evaluation.plausible_file import read_plausible
-from chsel.evaluation.plausible_set import PlausibleSet
-from chsel.evaluation.plausible_settings import DEFINITIONS, plausible_settings
-from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.streams import StreamKey
+from chsel.plausible.plausible_file import read_plausible
+from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
+from chsel.plausible.pose_metrics import plausible_diversity
+from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.streams import StreamKey
 from replay.mcap.reader import Recording
 
 

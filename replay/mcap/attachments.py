@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from chsel.errors import RecordingError
-from chsel.sdf import SdfGrid
+from chsel.problem.sdf_grid import SdfGrid
 from replay.mcap.encoding import decode, encode
 from replay.mcap.schemas import MESH, SDF_GRID
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from chsel.points import KnownPoints
+from chsel.problem.points import KnownPoints
 from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SessionStarted
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 
 LEVELS = 4
 _BLOCKS = 8  # that one level holds before they move to the next

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import FloatArray
 from chsel.errors import PoseError, RecordingError
-from chsel.pose import check_rigid
-from chsel.problem import ArchiveSnapshot, Hypotheses
-from chsel.sdf import COARSEST, FINEST
-from chsel.selection import MOST_CELLS
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import check_rigid
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
+from chsel.problem.sdf_grid import COARSEST, FINEST
+from chsel.qd.selection import MOST_CELLS
 from replay.events import (
     Event,
     HypothesesFound,

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
-from chsel.mesh import mesh_digest
-from chsel.points import KnownPoints, Workspace
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.mesh import mesh_digest
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.events import (
     Event,
     HypothesesFound,

@@ -14,7 +14,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
-from chsel.special_file import refuse_special_file
+from chsel.problem.file_checks import refuse_special_file
 from replay.mcap.chunk_records import DAMAGE, check_size, chunk_records, plausible_size
 from replay.mcap.damaged import DamagedRecordingError
 from replay.mcap.schemas import PROFILE

@@ -14,9 +14,9 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import DecodeError, Message
 
-from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
-from chsel.quaternions import quaternions
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import quaternions
 from replay.mcap.cumulative_points import LEVELS
 from replay.mcap.wire import check_wire
 

@@ -6,8 +6,8 @@ from contextlib import suppress
 from typing import Any
 
 from chsel.errors import ChselError, RecordingError
-from chsel.points import GrowingPoints
-from chsel.sdf import SdfGrid
+from chsel.problem.points import GrowingPoints
+from chsel.problem.sdf_grid import SdfGrid
 from replay.events import HypothesesFound, Probe, ProblemPosed, SensorImage, SessionStarted
 from replay.lost_attachment import LostAttachment
 from replay.mcap.attachments import MESH, SDF_GRID

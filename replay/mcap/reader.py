@@ -8,8 +8,8 @@ from functools import cached_property
 from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
-from chsel.points import GrowingPoints
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.points import GrowingPoints
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.events import (
     Event,
     HypothesesFound,

@@ -14,10 +14,9 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 
-from chsel.arrays import FloatArray
-from chsel.pose import inverse
-from chsel.problem import Hypotheses
-from chsel.quaternions import quaternions
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import inverse, quaternions
+from chsel.problem.registration_problem import Hypotheses
 from replay.mcap.foxglove_messages import OBJECT, VIEWS, WORLD, set_pose, set_stamp
 from replay.mcap.simple_mesh import SimpleMesh
 from replay.rerun.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
     import trimesh

@@ -12,12 +12,12 @@ import numpy as np
 from mcap.records import Attachment, Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
-from chsel.arrays import FloatArray
 from chsel.errors import RecordingError
-from chsel.mesh import mesh_digest
-from chsel.points import GrowingPoints, KnownPoints
-from chsel.pose import inverse
-from chsel.problem import ArchiveSnapshot
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.mesh import mesh_digest
+from chsel.problem.points import GrowingPoints, KnownPoints
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.disk import sync_folder
 from replay.events import (
     Event,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 
-from chsel.arrays import FloatArray, IntArray
-from chsel.problem import ArchiveSnapshot, Hypotheses
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay.rerun.clock import ITERATION, PROBE, REGISTRATION
 from replay.rerun.colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
 from replay.rerun.hypotheses import shown_hypotheses

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint import encodings
 
-from chsel.points import Workspace
+from chsel.problem.points import Workspace
 from replay.rerun.clock import PROBE, REGISTRATION, TIMELINES
 from replay.rerun.colors import BACKGROUND, GRID
 from replay.rerun.curves import SEARCH_FRAME, SPREADS

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 
 Rgb = tuple[int, int, int]
 ColorArray = NDArray[np.uint8]

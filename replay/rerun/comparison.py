@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
-from chsel.evaluation.spread import spread
-from chsel.problem import Hypotheses, RegistrationProblem
+from chsel.plausible.pose_metrics import spread
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.comparing.comparison import CommonCost, common_cost, numbers_under
 from replay.events import Probe, ProblemPosed
 from replay.mcap.reader import Recording

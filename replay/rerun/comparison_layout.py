@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import rerun.blueprint as rrb
 
-from chsel.points import Workspace
+from chsel.problem.points import Workspace
 from replay.rerun.blueprint import (
     at_first_registration,
     curves_view,

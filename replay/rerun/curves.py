@@ -7,9 +7,9 @@ import math
 import numpy as np
 import rerun as rr
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.spread import spread
-from chsel.problem import Hypotheses
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.pose_metrics import spread
+from chsel.problem.registration_problem import Hypotheses
 from replay.events import Traced
 from replay.rerun.clock import ITERATION
 from replay.rerun.colors import CURVES, SERIES, CostScale, Rgb, number

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 import rerun.blueprint as rrb
 
-from chsel.arrays import FloatArray
-from chsel.pose import apply, inverse
-from chsel.problem import Hypotheses
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, inverse
+from chsel.problem.registration_problem import Hypotheses
 from replay.events import SessionStarted
 from replay.rerun.hypotheses import shown_hypotheses
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from replay.events import Probe
 from replay.rerun.colors import HAND
 from replay.rerun.hypotheses import DISPLAY_FACES, coarsened

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
-from chsel.arrays import FloatArray, IntArray
-from chsel.pose import inverse
-from chsel.problem import Hypotheses
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import Hypotheses
 from replay.rerun.colors import CostScale, cost_colors
 from replay.rerun.scene import display_mesh
 

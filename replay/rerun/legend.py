@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from chsel.points import KnownPoints
-from chsel.problem import Hypotheses
+from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import Hypotheses
 from replay.rerun.colors import (
     CONTACT,
     FREE,

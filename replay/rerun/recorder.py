@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from chsel.errors import RecordingError
-from chsel.problem import ArchiveSnapshot, Hypotheses
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay import events
 from replay.disk import sync_file, sync_folder
 from replay.events import Recorder

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints, Workspace
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
 from replay.events import Probe
 from replay.rerun.colors import (
     CONTACT,

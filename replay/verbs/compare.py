@@ -14,9 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn
 from rich.table import Table
 
 from chsel.errors import RecordingError
-from chsel.evaluation.plausible_settings import DEFINITIONS
-from chsel.problem import Hypotheses
-from chsel.threads import require_threads, threads
+from chsel.numerics.threads import require_threads, threads
+from chsel.plausible.plausible_settings import DEFINITIONS
+from chsel.problem.registration_problem import Hypotheses
 from replay.comparing.columns import PLAUSIBLE, Column, columns_in_table
 from replay.comparing.comparison import (
     CommonCost,

@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import SettingError
 from chsel.methods import METHODS
 from replay.comparing.comparison import common_cost, numbers_under

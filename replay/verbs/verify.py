@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from chsel.threads import require_threads
+from chsel.numerics.threads import require_threads
 from replay.console import Console, Progress, print_error
 from replay.file_verification import FileVerdict, recordings_in, verified_files
 from replay.verification import NO_RESULT

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.cost import RelaxedCost
-from chsel.engine import CompiledCost
-from chsel.online import OnlineSettings, first_initial_set
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.torch_cost import RelaxedCost
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads as use_threads
 from chsel.presets import COST
-from chsel.streams import StreamKey
-from chsel.threads import threads as use_threads
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from runners.benchmarks.depth_images import depth_images
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
 from runners.benchmarks.methods import methods

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.benchmarks.ours import PRESETS, StageTimer, Steps, common_costs, register
 from runners.benchmarks.problems import PROBLEMS, PosedProblem, pose
 from runners.benchmarks.published import BenchmarkError, PublishedPackage

@@ -8,13 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray
-from chsel.points import Lattice, Workspace
-from chsel.pose import axis_angle, compose
-from chsel.sensing.camera import PinholeCamera
-from chsel.sensing.depth import occlusion_edges, valid_pixels
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.threads import threads as use_threads
+from chsel.problem.points import Lattice, Workspace
+from chsel.problem.poses import axis_angle, compose
+from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges, valid_pixels
 from chsel.sensing.free_space import SCALES, FreeGrid
-from chsel.threads import threads as use_threads
 from runners.benchmarks.machine import cores
 from runners.benchmarks.scope import Scope
 from runners.benchmarks.timing import Row, in_turn

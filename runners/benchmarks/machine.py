@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from chsel.device import gpus
+from chsel.cost.torch_cost import gpus
 from replay.environment import environment
 
 _PACKAGES = ("numba", "llvmlite", "scipy")

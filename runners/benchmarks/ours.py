@@ -6,14 +6,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from chsel.arrays import FloatArray
-from chsel.cost import RelaxedCost
+from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import require_positive
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
-from chsel.observer import Observer
+from chsel.numerics.arrays import FloatArray
 from chsel.presets import COST
-from chsel.problem import ArchiveSnapshot, Hypotheses
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Observer
 from runners.benchmarks.problems import PosedProblem
 
 PRESETS = ("reference", "paper", "default")

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.plausible_set import grid_around, plausible_set, rotation_seed
-from chsel.evaluation.plausible_settings import plausible_settings
-from chsel.online import OnlineSettings, first_initial_set
-from chsel.problem import RegistrationProblem
-from chsel.streams import StreamKey
-from chsel.threads import threads as use_threads
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads as use_threads
+from chsel.plausible.plausible_set import grid_around, plausible_set, rotation_seed
+from chsel.plausible.plausible_settings import plausible_settings
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from replay.events import Probe
 from runners.benchmarks.problems import PROBLEMS, drill, pose
 from runners.benchmarks.scope import Scope

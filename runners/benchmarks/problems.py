@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.online import OnlineSettings, first_initial_set
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, axis_angle, compose, inverse
-from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid, mesh_sdf
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from runners.objects.loader import ObjectConfig, load_object
 
 SDF_RESOLUTION = 0.01

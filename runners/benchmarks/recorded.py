@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from chsel.points import KnownPoints
+from chsel.problem.points import KnownPoints
 from replay.environment import environment
 from replay.events import HypothesesFound, Probe, ProblemPosed, Recorder, SessionStarted
 from replay.step_observer import StepObserver

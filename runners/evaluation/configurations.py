@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from chsel.errors import SettingError
-from chsel.settings import build_settings
+from chsel.problem.settings import build_settings
 from runners.cli import CONF
 from runners.objects.loader import ObjectConfig
 from runners.sessions.configurations import CONFIGURATIONS

@@ -11,7 +11,7 @@ from chsel.errors import SettingError, require_choice
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.presets import PRESETS
-from chsel.settings import build_settings, settings_mapping
+from chsel.problem.settings import build_settings, settings_mapping
 from replay.comparing.contenders import METHODS_HELP
 from runners.evaluation.draws import draw_label, require_draws
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from chsel.evaluation.plausible_settings import PlausibleSettings, definition_name
-from chsel.settings import build_settings
+from chsel.plausible.plausible_settings import PlausibleSettings, definition_name
+from chsel.problem.settings import build_settings
 
 _COMBINED = {"sums": "sums over points (the paper's)", "means": "means over points"}
 

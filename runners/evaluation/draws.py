@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection
 
 from chsel.errors import require_at_most, require_positive
-from chsel.streams import StreamKey
+from chsel.problem.streams import StreamKey
 
 MOST_DRAWS = 1000
 _APART = 2**32  # between the seeds of two draws, so that these are no seeds of other sessions

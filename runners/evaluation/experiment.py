@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from chsel.errors import RecordingError, SettingError
-from chsel.settings import settings_mapping
+from chsel.problem.settings import settings_mapping
 from replay.environment import environment
 from runners.evaluation.claims import claimed
 from runners.evaluation.configurations import SENSORS

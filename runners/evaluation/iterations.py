@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.selection import ranked, select_elites
-from chsel.space import search_space, transforms_of
-from chsel.streams import Purpose
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.search_space import search_space, transforms_of
+from chsel.problem.streams import Purpose
+from chsel.qd.selection import ranked, select_elites
 
 
 def hypotheses_of(

@@ -7,13 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from chsel.errors import ChselError
-from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_set import PlausibleSet
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import object_symmetry
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.streams import StreamKey
+from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.pose_metrics import EvaluationError, pose_errors
+from chsel.plausible.scan import EvaluationCost
+from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.streams import StreamKey
 from runners.evaluation.iterations import hypotheses_of
 from runners.evaluation.measure import Measure
 from runners.evaluation.plan import Plan, Trial

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.calibration import calibration
-from chsel.evaluation.plausible_diversity import cheapest, plausible_diversity
-from chsel.evaluation.plausible_set import PlausibleSet
-from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.pose_metrics import calibration, cheapest, plausible_diversity
+from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.streams import StreamKey
 
 
 @dataclass(frozen=True)

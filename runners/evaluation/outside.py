@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import FloatArray, frozen
 from chsel.errors import ChselError
-from chsel.npz_file import read_npz
-from chsel.pose import inverse
-from chsel.problem import Hypotheses
-from chsel.selection import repeated
+from chsel.numerics.arrays import FloatArray, frozen
+from chsel.problem.file_checks import read_npz
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import Hypotheses
+from chsel.qd.selection import repeated
 from replay.file_digest import file_digest
 from runners.evaluation.draws import MOST_DRAWS, draw_label
 from runners.evaluation.judge import Judge

@@ -10,14 +10,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import PoseError
-from chsel.online import pose_problem
-from chsel.pose import inverse, nearest_rigid
+from chsel.numerics.arrays import FloatArray
 from chsel.presets import ONLINE
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.selection import repeated
-from chsel.streams import Purpose, StreamKey
+from chsel.problem.poses import inverse, nearest_rigid
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.warm_start import pose_problem
+from chsel.qd.selection import repeated
 from runners.benchmarks.published import PublishedPackage, RefusedError
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from chsel.errors import require_choice
-from chsel.evaluation.plausible_settings import PlausibleSettings
-from chsel.evaluation.true_pose import TruePoseSettings
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
-from chsel.settings import build_settings
+from chsel.plausible.plausible_settings import PlausibleSettings
+from chsel.plausible.true_pose import TruePoseSettings
+from chsel.problem.settings import build_settings
 from replay.step_ranges import chosen_steps
 from runners.evaluation.configurations import (
     MOST_PROBES,

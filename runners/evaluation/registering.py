@@ -7,11 +7,15 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
-from chsel.evaluation.symmetry import object_symmetry
 from chsel.methods.method import Method
-from chsel.observer import Observer
-from chsel.online import OnlineSettings
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.registration_problem import (
+    ArchiveSnapshot,
+    Hypotheses,
+    Observer,
+    RegistrationProblem,
+)
+from chsel.problem.warm_start import OnlineSettings
 from replay.environment import environment
 from replay.events import (
     Event,

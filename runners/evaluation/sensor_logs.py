@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.pose import compose, roll_pitch_yaw
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose, roll_pitch_yaw
 from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose

@@ -6,8 +6,8 @@ import warnings
 from collections.abc import Iterable
 from typing import Any
 
-from chsel.arrays import FloatArray
-from chsel.sdf import SdfGrid
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.sdf_grid import SdfGrid
 from replay.environment import environment
 from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
 from runners.evaluation.configurations import SENSORS

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chsel.errors import RecordingError
-from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.plausible_file import load_plausible, save_plausible
-from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
-from chsel.evaluation.plausible_settings import PlausibleSettings
-from chsel.online import OnlineSettings, pose_problem
-from chsel.problem import RegistrationProblem
-from chsel.streams import StreamKey
+from chsel.plausible.plausible_file import load_plausible, save_plausible
+from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_settings import PlausibleSettings
+from chsel.plausible.pose_metrics import EvaluationError
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import OnlineSettings, pose_problem
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.session_recording import TRUTH, record_session

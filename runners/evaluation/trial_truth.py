@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import SessionError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
-from chsel.evaluation.true_pose import TruePose, find_true_pose
-from chsel.points import KnownPoints
-from chsel.pose import inverse
-from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.plausible.true_pose import TruePose, find_true_pose
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.events import Event, Probe
 from runners.alignment_fit import fit_of
 from runners.evaluation.plan import Plan, Trial

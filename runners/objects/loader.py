@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chsel.errors import SettingError, require_choice, require_positive
-from chsel.mesh import clean_mesh, load_mesh
+from chsel.problem.mesh import clean_mesh, load_mesh
 from runners.objects.scans import scan_file
 
 if TYPE_CHECKING:

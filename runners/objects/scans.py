@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from chsel.errors import MeshError, SettingError
-from chsel.mesh import load_mesh
+from chsel.problem.mesh import load_mesh
 from runners.download import require_web_address
 
 # By official folder: the choice's name, and the scan's extents in metres.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from chsel.errors import MeshWarning
-from chsel.points import Workspace
+from chsel.problem.points import Workspace
 from runners.objects.loader import ObjectModel
 
 

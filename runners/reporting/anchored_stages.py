@@ -13,15 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from chsel.anchors import anchored_poses, bounds_of, in_telling_order
-from chsel.arrays import FloatArray
-from chsel.energy import Energy
 from chsel.errors import ChselError
-from chsel.methods.anchored import EFFORTS, Anchored, AnchoredSettings
-from chsel.observer import NullObserver
-from chsel.pose import apply, compose, inverse
-from chsel.problem import RegistrationProblem
-from chsel.space import search_space, transforms_of
+from chsel.methods.anchored.anchor_sampling import anchored_poses, in_telling_order
+from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings
+from chsel.methods.anchored.energy import Energy
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, compose, inverse
+from chsel.problem.registration_problem import NullObserver, RegistrationProblem
+from chsel.problem.search_space import origin_bounds, search_space, transforms_of
 from replay.console import print_error
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.panels import drawn, new_figure
@@ -69,7 +68,7 @@ def stages_of(problem: RegistrationProblem, settings: AnchoredSettings) -> list[
     sampled = anchored_poses(
         problem, known, space, anchors, samples=effort.samples, most=effort.kept
     )
-    bounds = bounds_of(problem, space, anchors.margin)
+    bounds = origin_bounds(problem.workspace, space, anchors.margin)
     energy = Energy(problem, known, space, settings.penetration_tolerance, bounds)
     traces = _Traces()
     found = Anchored(settings).register(problem, traces)

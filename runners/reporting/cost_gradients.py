@@ -13,13 +13,13 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from chsel.arrays import FloatArray
-from chsel.cost import RelaxedCost
-from chsel.cost_settings import CostSettings
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
-from chsel.points import KnownPoints
-from chsel.sdf import SdfGrid
-from chsel.settings import build_settings
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import build_settings
 from replay.mcap.reader import read_recording
 from runners.reporting.panels import drawn, new_figure
 from runners.reporting.section import NotDrawn, Picture

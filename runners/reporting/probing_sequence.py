@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from chsel.arrays import FloatArray
 from chsel.errors import ChselError
-from chsel.pose import apply, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, inverse
 from replay.events import Probe
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.method_style import MethodStyle

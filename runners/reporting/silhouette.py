@@ -9,10 +9,10 @@ import trimesh
 from matplotlib.axes import Axes
 from scipy.ndimage import binary_closing, binary_fill_holes, gaussian_filter
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.surface_distance import surface_points
-from chsel.pose import apply
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.surface_distance import surface_points
+from chsel.problem.poses import apply
+from chsel.problem.streams import StreamKey
 
 VIEWS = {"xz": (0, 2), "xy": (0, 1), "yz": (1, 2)}
 """The axes of the world that are drawn to the right and upwards."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray
-from chsel.points import Workspace
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.points import Workspace
 from chsel.sensing.free_space import FreeGrid
 from runners.sensors.remarks import Remarks
 from runners.sensors.tally import Tally

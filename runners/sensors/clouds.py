@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray
-from chsel.points import Lattice
-from chsel.pose import apply
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.points import Lattice
+from chsel.problem.poses import apply
 from runners.sensors.cell import Cell
 from runners.sensors.messages import CloudMessage
 from runners.sensors.rig import CloudRig

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chsel.complete_file import check_complete
 from chsel.errors import SettingError
+from chsel.problem.file_checks import check_complete
 
 if TYPE_CHECKING:
     import trimesh

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.streams import Purpose, StreamKey
 from chsel.sensing.contact_patch import contact_subset, share
-from chsel.streams import Purpose, StreamKey
 from runners.sensors.cell import Cell
 from runners.sensors.pad import Imprint, Pad
 from runners.sensors.push_end import PushEnd

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from chsel.arrays import BoolArray
-from chsel.sensing.camera import PinholeCamera
-from chsel.sensing.depth import occlusion_edges
+from chsel.numerics.arrays import BoolArray
+from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 from replay.events import SensorImage
 from runners.sensors.cell import Cell

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from chsel.arrays import BoolArray, FloatArray, frozen
 from chsel.errors import ChselError, SessionError, SettingError
-from chsel.pose import nearest_rigid
-from chsel.sensing.camera import PinholeCamera
-from chsel.special_file import refuse_special_file
+from chsel.numerics.arrays import BoolArray, FloatArray, frozen
+from chsel.problem.file_checks import refuse_special_file
+from chsel.problem.poses import nearest_rigid
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.image_file import read_image
 
 SUFFIXES = (".yaml", ".yml")

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from chsel.arrays import BoolArray, FloatArray
 from chsel.errors import SessionError, SettingError
-from chsel.points import KnownPoints, Lattice, Workspace
-from chsel.pose import apply
-from chsel.sensing.depth import occlusion_edges, valid_pixels
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.points import KnownPoints, Lattice, Workspace
+from chsel.problem.poses import apply
+from chsel.sensing.depth_camera import occlusion_edges, valid_pixels
 from chsel.sensing.free_space import FreeGrid
 from runners.sensors.depth_frame import DepthFrame
 from runners.sensors.rig import CameraRig, Rig

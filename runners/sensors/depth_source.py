@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray
-from chsel.sensing.camera import PinholeCamera
-from chsel.sensing.depth import valid_pixels
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from runners.sensors.cell import Cell
 from runners.sensors.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, CameraRig

@@ -10,7 +10,7 @@ from typing import Any
 from google.protobuf.message import DecodeError
 
 from chsel.errors import RecordingError
-from chsel.pose import apply
+from chsel.problem.poses import apply
 from replay.mcap.wire import check_wire
 from runners.sensors.images import pixel_rows, png_pixels
 from runners.sensors.messages import CloudMessage, Content, ImageMessage, PoseMessage

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chsel.arrays import frozen
 from chsel.errors import SettingError
-from chsel.pose import compose, roll_pitch_yaw
+from chsel.numerics.arrays import frozen
+from chsel.problem.poses import compose, roll_pitch_yaw
 from runners.sensors.rig import BoxRig, HandRig
 from runners.sensors.urdf import Linkage
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from chsel.arrays import FloatArray, IntArray
-from chsel.points import Lattice
-from chsel.pose import apply, inverse
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.problem.points import Lattice
+from chsel.problem.poses import apply, inverse
 from chsel.sensing.swept import between, interior_lattice, sweep
 from runners.sensors.cell import Cell
 from runners.sensors.hand import HandModel

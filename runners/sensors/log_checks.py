@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from chsel.arrays import IntArray
 from chsel.errors import SessionError, SettingError
-from chsel.sensing.camera import PinholeCamera
+from chsel.numerics.arrays import IntArray
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.clocks import ClockCorrection
 from runners.sensors.first_pass import FirstPass
 from runners.sensors.log import RawLog

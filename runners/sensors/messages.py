@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from chsel.arrays import IntArray
+from chsel.numerics.arrays import IntArray
 from runners.sensors.clocks import ClockCorrection
 from runners.sensors.joint_history import JointHistory
 from runners.sensors.messages import JointsMessage, PoseMessage, Received, TransformMessage

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.sensors.unusable import UnusableMessage
 
 MOST_POINTS = 2**25

@@ -7,10 +7,10 @@ from math import sqrt
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray
-from chsel.pose import apply, inverse, rotated, rotation_angle
-from chsel.sensing.camera import PinholeCamera
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.poses import apply, inverse, rotated, rotation_angle
 from chsel.sensing.contact_patch import contact_mask, deformation, smooth
+from chsel.sensing.depth_camera import PinholeCamera
 from replay.events import SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.depth_source import DepthSource, View, intrinsics_of, recorded

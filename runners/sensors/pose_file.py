@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SessionError
-from chsel.pose import nearest_rigid
-from chsel.special_file import refuse_special_file
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.file_checks import refuse_special_file
+from chsel.problem.poses import nearest_rigid
 from replay.new_file import new_file
 from runners.whole_file import whole_file
 

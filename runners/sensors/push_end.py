@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.sensors.cell import Cell
 from runners.sensors.depth_source import View
 from runners.sensors.pad import Pad

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.sensors.unusable import UnusableMessage
 
 _FURTHEST = 1e9  # metres: no robot works further from the origin of its frame

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.clouds import Clouds

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.arrays import FloatArray
 from chsel.errors import SessionError
-from chsel.sensing.camera import PinholeCamera
-from chsel.sensing.depth import valid_pixels
+from chsel.numerics.arrays import FloatArray
+from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from runners.sensors.depth_source import metres
 from runners.sensors.image_file import read_image
 from runners.sensors.rig import BubbleRig

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from chsel.arrays import frozen
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
-from chsel.points import Workspace
+from chsel.numerics.arrays import frozen
+from chsel.problem.points import Workspace
 
 _LARGEST_HAND = 100.0  # metres
 _LONGEST = 1e9  # seconds; they are counted in nanoseconds

@@ -7,7 +7,7 @@ from collections import Counter
 
 import numpy as np
 
-from chsel.arrays import IntArray
+from chsel.numerics.arrays import IntArray
 from runners.sensors.clocks import ClockCorrection
 from runners.sensors.messages import CloudMessage, ImageMessage, MarkerMessage, Received
 

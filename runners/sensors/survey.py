@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from chsel.arrays import FloatArray, IntArray
-from chsel.sensing.camera import PinholeCamera
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.clocks import ClockCorrection
 from runners.sensors.first_pass import FirstPass
 from runners.sensors.joint_history import JointHistory

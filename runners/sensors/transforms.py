@@ -7,10 +7,9 @@ from collections import Counter
 
 import numpy as np
 
-from chsel.arrays import BoolArray, FloatArray, IntArray
 from chsel.errors import SessionError
-from chsel.pose import compose, inverse
-from chsel.quaternions import rotations, slerp
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.problem.poses import compose, inverse, rotations, slerp
 from runners.sensors.messages import TransformMessage
 from runners.sensors.quaternions import unit_quaternion
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from chsel.errors import SessionError
-from chsel.sensing.depth import valid_pixels
+from chsel.sensing.depth_camera import valid_pixels
 from runners.sensors.depth_source import metres
 from runners.sensors.rig import BubbleRig, CameraRig
 

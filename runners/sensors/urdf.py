@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.pose import axis_angle, compose
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import axis_angle, compose
 from runners.sensors.collision_mesh import MeshFiles
 from runners.sensors.collision_shape import collision_solid
 from runners.sensors.urdf_file import read_robot

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from chsel.errors import require_choice
-from chsel.settings import build_settings
+from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
 from runners.sessions.configurations import find_configuration
 from runners.sessions.points import PointsSession, PointsSettings

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import pi
 
 from chsel.errors import SessionError
-from chsel.points import Workspace
+from chsel.problem.points import Workspace
 
 Triple = tuple[float, float, float]
 

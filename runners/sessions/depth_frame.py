@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.point_checks import check_points
-from chsel.points import KnownPoints
+from chsel.problem.input_checks import check_points
+from chsel.problem.points import KnownPoints
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from replay.file_digest import file_digest
 from runners.objects.loader import ObjectModel

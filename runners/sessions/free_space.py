@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.points import Lattice, Workspace
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import Lattice, Workspace
 
 SLAB_MARGIN = 0.15  # m: by which the floor slab is wider than the object
 SLAB_LAYERS = 2

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.pose import compose
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose
 
 if TYPE_CHECKING:
     import trimesh

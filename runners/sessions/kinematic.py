@@ -9,8 +9,8 @@ import igl
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.pose import apply
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply
 from runners.sessions import hand
 from runners.sessions.configurations import find_configuration
 from runners.sessions.placement import laid_down

@@ -6,9 +6,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
-from chsel.arrays import FloatArray
 from chsel.errors import SessionError
-from chsel.pose import apply, axis_angle, compose, roll_pitch_yaw
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, axis_angle, compose, roll_pitch_yaw
 from runners.sessions.configurations import MESH_YAW, Configuration
 
 _FLAT = 1e-6  # m: vertices lower than this touch the floor

@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import FloatArray, IntArray, frozen
-from chsel.complete_file import check_complete
 from chsel.errors import ChselError, PointsError, PoseError
-from chsel.npz_file import read_npz
-from chsel.points import KnownPoints
-from chsel.pose import nearest_rigid
-from chsel.special_file import refuse_special_file
-from chsel.streams import LAST_STEP
+from chsel.numerics.arrays import FloatArray, IntArray, frozen
+from chsel.problem.file_checks import check_complete, read_npz, refuse_special_file
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import nearest_rigid
+from chsel.problem.streams import LAST_STEP
 
 KINDS = ("surface", "free", "occupied", "known")
 _LONGEST_TEXT = 60  # characters that an error quotes of a file

@@ -9,8 +9,8 @@ from functools import reduce
 import numpy as np
 
 from chsel.errors import PointsError, SettingError, require_positive
-from chsel.point_checks import check_points
-from chsel.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.problem.input_checks import check_points
+from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from replay.events import Probe
 from runners.objects.loader import ObjectModel
 from runners.sessions.point_files import read_points

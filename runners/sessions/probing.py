@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from chsel.arrays import FloatArray
 from chsel.errors import require_choice, require_positive
-from chsel.points import FreeVoxels, KnownPoints, Lattice, Workspace
-from chsel.pose import apply, inverse
-from chsel.sdf import mesh_sdf
-from chsel.streams import Purpose, StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import mesh_sdf
+from chsel.problem.streams import Purpose, StreamKey
 from replay.events import Probe
 from runners.sessions import hand
 from runners.sessions.configurations import WORKSPACE, Configuration

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import reduce
 
 from chsel.errors import PointsError, SettingError
-from chsel.point_checks import check_points
-from chsel.points import KnownPoints
+from chsel.problem.input_checks import check_points
+from chsel.problem.points import KnownPoints
 from replay.events import Probe
 from replay.mcap.reader import read_recording
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError, require_positive
-from chsel.points import KnownPoints
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints
 from replay.events import Logged, RigDescribed
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import Cell, FreeMap

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints, Workspace
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 
 SessionEvent = RigDescribed | SensorImage | Logged | Probe

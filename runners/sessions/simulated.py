@@ -12,8 +12,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from chsel.arrays import FloatArray
-from chsel.pose import apply, compose, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, compose, inverse
 from runners.physics_engine import connect, silent
 from runners.sessions import hand
 from runners.sessions.configurations import Configuration, find_configuration

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.pose import compose
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose
 from runners.sensors.rig import BoxRig
 from runners.twin.joined import joined
 

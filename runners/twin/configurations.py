@@ -8,10 +8,10 @@ from math import pi
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import SessionError
-from chsel.points import Workspace
-from chsel.pose import apply
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import Workspace
+from chsel.problem.poses import apply
 from runners.sessions.configurations import Configuration
 from runners.sessions.placement import laid_down
 

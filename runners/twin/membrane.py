@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.twin.pinhole import Pinhole
 
 CAP = (0.042, 0.031, 0.022)  # m: semi-axes of the half ellipsoid; x, y, z of its camera

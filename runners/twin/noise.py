@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from chsel.arrays import FloatArray
-from chsel.streams import normals
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.streams import normals
 from runners.twin.pinhole import Pinhole
 from runners.twin.settings import TwinBubbles, TwinCamera
 

@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from scipy import ndimage
 
-from chsel.arrays import FloatArray
-from chsel.pose import apply, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, inverse
 from runners.sensors.rig import ContactRig
 from runners.twin import wrist
 from runners.twin.membrane import CAP, CAP_BASE, Membrane

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.streams import Purpose, StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.streams import Purpose, StreamKey
 from runners.twin import cabinet, ros_messages, wrist
 from runners.twin.log_writer import LogWriter
 from runners.twin.noise import bubble_depth, stereo_depth

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.twin.pinhole import Pinhole
 
 _SECOND = 1_000_000_000  # ns

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from chsel.arrays import FloatArray
-from chsel.pose import compose, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose, inverse
 from runners.physics_engine import connect, silent
 from runners.sensors.rig import BoxRig
 from runners.twin import cabinet, wrist

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.streams import Purpose, StreamKey, normals
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.streams import Purpose, StreamKey, normals
 from runners.twin import wrist
 from runners.twin.configurations import REST, CabinetConfiguration, stood_on_shelf
 from runners.twin.log_writer import LogWriter

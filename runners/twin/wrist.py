@@ -10,8 +10,8 @@ from math import cos, pi, sin
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.pose import axis_angle, compose
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import axis_angle, compose
 from runners.sensors.rig import BoxRig
 from runners.twin.joined import joined
 from runners.twin.membrane import CAP, CAP_BASE

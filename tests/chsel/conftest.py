@@ -8,8 +8,8 @@ from typing import Any
 import numba
 import pytest
 
-from chsel.emitters import SEARCHES
-from chsel.kernels import emitters as kernels
+from chsel.qd import emitter_kernels as kernels
+from chsel.qd.emitters import SEARCHES
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.kernels.cvo import flow_at
-from chsel.kernels.pose import pose_at
-from chsel.points import KnownPoints
-from chsel.pose import apply, compose, rotation_vector
-from chsel.sdf import SdfGrid
+from chsel.methods.cvo.cvo_kernels import flow_at
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.pose_tuples import pose_at
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import apply, compose, rotation_vector
+from chsel.problem.sdf_grid import SdfGrid
 
 SIGMA, S_SIGMA, S_ELL = 0.1, 0.8, 0.1
 FREE, SURFACE = np.array([0.9, 0.1]), np.array([0.1, 0.9])

@@ -6,16 +6,20 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.anchors import AnchorSettings, anchored_poses, bounds_of, in_telling_order
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, axis_angle, compose
-from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.space import PlaneSettings, search_space
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.methods.anchored.anchor_sampling import (
+    AnchorSettings,
+    anchored_poses,
+    in_telling_order,
+)
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
+from chsel.problem.streams import StreamKey
 
 MESH = trimesh.creation.box((0.2, 0.12, 0.08))
 GRID = SdfGrid.from_mesh(MESH, 0.01)
@@ -75,7 +79,7 @@ def test_a_point_of_known_distance_is_met_at_that_distance(value: float) -> None
 def test_rotations_are_rigid_and_objects_within_bounds() -> None:
     points = KnownPoints(known=CONTACTS)
     problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
-    lower, upper = bounds_of(problem, search_space(None, GRID), 0.15)
+    lower, upper = origin_bounds(problem.workspace, search_space(None, GRID), 0.15)
     np.testing.assert_allclose(lower, np.array(WORKSPACE.lower) - 0.15)
     poses = drawn(points, AnchorSettings())
     rotations = poses[:, :9].reshape(-1, 3, 3)

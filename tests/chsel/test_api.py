@@ -11,13 +11,13 @@ import torch
 import trimesh
 
 import chsel
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
 from chsel.methods import build_method, preset_settings
-from chsel.online import pose_problem
-from chsel.pose import apply, axis_angle, compose, inverse
-from chsel.settings import settings_mapping
-from chsel.streams import StreamKey
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.settings import settings_mapping
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.4)), np.array([0.3, 0.1, 0.2]))

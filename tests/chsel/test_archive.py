@@ -4,11 +4,9 @@ import numba
 import numpy as np
 import pytest
 
-from chsel.archive import GridArchive
 from chsel.errors import ChselError
-from chsel.kernels.archive import sampled_cell
-from chsel.kernels.measures import VECTOR, MeasureCode
-from chsel.measures import MEASURES, Measure
+from chsel.qd.archive import GridArchive, sampled_cell
+from chsel.qd.measures import MEASURES, VECTOR, Measure, MeasureCode
 
 XY = Measure(("x", "y"), MeasureCode(VECTOR, 2))
 

@@ -11,14 +11,14 @@ import numba
 import numpy as np
 import pytest
 
-import chsel.cma_es
-from chsel.arrays import FloatArray
-from chsel.cma_es import CmaEsSettings, evolved, run_all
+import chsel.methods.medial_constraint.cma_es
 from chsel.errors import SettingError
-from chsel.kernels import cma_es as kernels
-from chsel.kernels.cma_es import BEST, GENERATIONS, STOPPED, Run
-from chsel.observer import NullObserver
-from chsel.streams import StreamKey
+from chsel.methods.medial_constraint import cma_es_kernels as kernels
+from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved, run_all
+from chsel.methods.medial_constraint.cma_es_kernels import BEST, GENERATIONS, STOPPED, Run
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import NullObserver
+from chsel.problem.streams import StreamKey
 
 SPHERE, ELLIPSOID, ROSENBROCK, FLAT, NOT_FINITE, NOISE = range(6)
 D = 9
@@ -52,7 +52,11 @@ def _on_landscapes() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "cost_of", cost_of)
         loop: Any = kernels.evolve
-        patch.setattr(chsel.cma_es, "evolve", numba.njit(error_model="numpy")(loop.py_func))
+        patch.setattr(
+            chsel.methods.medial_constraint.cma_es,
+            "evolve",
+            numba.njit(error_model="numpy")(loop.py_func),
+        )
         yield
 
 
@@ -110,7 +114,7 @@ def test_every_start_draws_from_a_stream_of_its_own() -> None:
 def test_blocks_of_any_length_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(UNENDING, generations=60)
     expected = runs_on(SPHERE, settings, np.ones((1, D)))[0]
-    monkeypatch.setattr(chsel.cma_es, "_BLOCK", 7)
+    monkeypatch.setattr(chsel.methods.medial_constraint.cma_es, "_BLOCK", 7)
     found = runs_on(SPHERE, settings, np.ones((1, D)))[0]
     np.testing.assert_array_equal(found.best, expected.best)
     np.testing.assert_array_equal(found.strategy.covariance, expected.strategy.covariance)

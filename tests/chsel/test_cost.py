@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.objective import Objective
 from chsel.errors import SettingError
-from chsel.objective import Objective
-from chsel.pose import compose, random_rotations
-from chsel.space import SE3Space
+from chsel.problem.poses import compose, random_rotations
+from chsel.problem.search_space import SE3Space
 
 RADIUS = 0.1
 EYE = torch.eye(3, dtype=torch.float64)[None]

@@ -9,14 +9,14 @@ import trimesh
 from torch import Tensor
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
-from chsel.arrays import FloatArray
-from chsel.descent import DescentSettings, descend
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.objective import Objective
 from chsel.errors import SettingError
-from chsel.objective import Objective
-from chsel.observer import NullObserver
-from chsel.pose import compose, random_rotations
-from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+from chsel.methods.gradient_descent import DescentSettings, descend
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose, random_rotations
+from chsel.problem.registration_problem import NullObserver
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 
 SIDES = np.array([0.12, 0.08, 0.06])
 BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)

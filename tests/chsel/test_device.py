@@ -13,12 +13,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
-from chsel.arrays import FloatArray
-from chsel.device import gpus
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.torch_cost import gpus
 from chsel.errors import EngineError, SettingError
-from chsel.pose import compose, random_rotations
-from chsel.space import PlaneSettings, SE2Space, SE3Space
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose, random_rotations
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
 
 needs_gpu = pytest.mark.skipif(gpus() == 0, reason="torch finds no GPU here")
 SETTINGS = [
@@ -117,7 +117,7 @@ class PretendedDevice(TorchDispatchMode):
 
 @pytest.fixture
 def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[PretendedDevice]]:
-    monkeypatch.setattr("chsel.cost.device_named", lambda name: PRETENDED)
+    monkeypatch.setattr("chsel.cost.torch_cost.device_named", lambda name: PRETENDED)
     monkeypatch.setattr(PretendedDevice, "copies", [])
     monkeypatch.setattr(PretendedDevice, "largest", 0)
     with PretendedDevice():
@@ -178,7 +178,7 @@ def test_gradients_stay_on_the_device(
     vectors = space.encode(poses(9, reach=0.05))
     here = RelaxedCost(grid, points, settings, free_resolution=0.015)
     expected = costs_and_gradients(here, space, vectors)
-    monkeypatch.setattr("chsel.cost.device_named", lambda name: PRETENDED)
+    monkeypatch.setattr("chsel.cost.torch_cost.device_named", lambda name: PRETENDED)
     with PretendedDevice():
         there = RelaxedCost(grid, points, settings, free_resolution=0.015, device="cuda")
         found = costs_and_gradients(there, space, vectors)

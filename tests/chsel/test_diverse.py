@@ -5,18 +5,14 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray, IntArray
-from chsel.diverse import outlined, representative, spaced
-from chsel.engine import poses_of
-from chsel.evaluation.surface_distance import (
-    SQUARE_MILLIMETRES,
-    DistanceSettings,
-    SurfaceDistance,
-)
-from chsel.pose import axis_angle, compose, inverse
-from chsel.sdf import SdfGrid
-from chsel.streams import Purpose, StreamKey
-from chsel.surface import surface_points
+from chsel.cost.compiled_cost import poses_of
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.plausible.surface_distance import SQUARE_MILLIMETRES, DistanceSettings, SurfaceDistance
+from chsel.problem.poses import axis_angle, compose, inverse
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.subset import outlined, representative, spaced
+from chsel.problem.surface import surface_points
 
 GRID = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.12, 0.08)), 0.01)
 

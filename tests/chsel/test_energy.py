@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.anchors import bounds_of, in_telling_order
-from chsel.arrays import FloatArray
-from chsel.energy import Energy
-from chsel.engine import poses_of
-from chsel.kernels.energy import energies_below, found_around
-from chsel.kernels.threshold_walk import Chains
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, axis_angle, compose, inverse, random_rotations
-from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.space import PlaneSettings, search_space, transforms_of
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.cost.compiled_cost import poses_of
+from chsel.methods.anchored.anchor_sampling import in_telling_order
+from chsel.methods.anchored.energy import Energy
+from chsel.methods.anchored.energy_kernels import energies_below, found_around
+from chsel.methods.anchored.walk_kernels import Chains
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose, inverse, random_rotations
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space, transforms_of
+from chsel.problem.streams import StreamKey
 
 MESH = trimesh.creation.box((0.2, 0.12, 0.08))
 GRID = SdfGrid.from_mesh(MESH, 0.01)
@@ -44,7 +44,7 @@ def energy_of(
     """The energy for points, and the bounds of its walks."""
     problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
     space = search_space(plane, GRID)
-    bounds = bounds_of(problem, space, MARGIN)
+    bounds = origin_bounds(problem.workspace, space, MARGIN)
     return Energy(problem, in_telling_order(points), space, tolerance, bounds), bounds
 
 

@@ -16,14 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
-from chsel.arrays import FloatArray
-from chsel.engine import CompiledCost, poses_of
+from chsel.cost.compiled_cost import CompiledCost, poses_of
+from chsel.cost.objective import Objective
+from chsel.cost.objective_kernels import BETA1, BETA2, EPSILON
 from chsel.errors import EngineError, PointsError, PoseError, SettingError
-from chsel.kernels.adam import BETA1, BETA2, EPSILON
-from chsel.objective import Objective
-from chsel.pose import compose, random_rotations
-from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace
-from chsel.threads import threads
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.problem.poses import compose, random_rotations
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 
 pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
 BOX_SIDES = (0.12, 0.08, 0.06)

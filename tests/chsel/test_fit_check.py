@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.fit_check import check_fit
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import compose, inverse
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.input_checks import check_fit
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import compose, inverse
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 
 RADIUS, SIDE = 0.1, 0.01
 GRID = SdfGrid.from_mesh(trimesh.creation.icosphere(4, RADIUS), 0.005, padding=0.2)

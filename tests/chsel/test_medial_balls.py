@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.arrays import BoolArray, FloatArray, IntArray
 from chsel.errors import SettingError
-from chsel.medial_balls import Balls, medial_balls
-from chsel.points import Workspace
+from chsel.methods.medial_constraint.medial_cost import Balls, medial_balls
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.problem.points import Workspace
 
 SIDE = 0.025
 ORIGIN = np.array([0.3, -0.2, 0.011])

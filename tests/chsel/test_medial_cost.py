@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.medial_balls import Balls
-from chsel.medial_cost import MedialCost, MedialCostSettings
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, compose, random_rotations
-from chsel.problem import RegistrationProblem
-from chsel.sdf import LOOKUPS, OUTSIDE, SdfGrid
-from chsel.streams import StreamKey
+from chsel.methods.medial_constraint.medial_cost import Balls, MedialCost, MedialCostSettings
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, compose, random_rotations
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
+from chsel.problem.streams import StreamKey
 
 RADIUS = 0.1
 IDENTITY = np.eye(4)[None]

@@ -10,8 +10,7 @@ import pytest
 import trimesh
 
 from chsel.errors import MeshError, MeshWarning, SettingError
-from chsel.mesh import clean_mesh, load_mesh, mesh_digest
-from chsel.mesh_bodies import check_bodies
+from chsel.problem.mesh import check_bodies, clean_mesh, load_mesh, mesh_digest
 
 EXTENTS = (0.1, 0.2, 0.3)
 
@@ -118,7 +117,7 @@ def test_an_open_mesh_is_kept_with_a_warning_that_names_it(box, tmp_path):
 
 
 def test_a_mesh_of_many_faces_is_kept_with_a_warning_that_names_its_size(box, monkeypatch):
-    monkeypatch.setattr("chsel.mesh.MANY_FACES", 12)
+    monkeypatch.setattr("chsel.problem.mesh.MANY_FACES", 12)
     clean_mesh(box.vertices, box.faces)
     finer = box.subdivide().subdivide()
     message = r"^bowl has 192 faces: .* signed distance grid .*; a decimated mesh of 50,000 faces"

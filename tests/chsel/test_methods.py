@@ -11,20 +11,20 @@ import torch
 import trimesh
 
 from chsel import Hypotheses, KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.cost import RelaxedCost
-from chsel.cost_settings import CostSettings
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods import METHODS, build_method, preset_settings
+from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods.method import Method
-from chsel.online import pose_problem
-from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.problem import ArchiveSnapshot
-from chsel.settings import settings_mapping
-from chsel.streams import StreamKey
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.registration_problem import ArchiveSnapshot
+from chsel.problem.settings import settings_mapping
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, MESH, TRUTH
 
 WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import PointsError
-from chsel.point_checks import check_contacts, check_points
-from chsel.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.input_checks import check_contacts, check_points
+from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 
 BOX = trimesh.creation.box((0.2, 0.1, 0.05))
 DIAMETER = float(np.linalg.norm(BOX.extents))  # 0.229 m

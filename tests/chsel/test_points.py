@@ -7,11 +7,11 @@ import torch
 from chsel import KnownPoints, Workspace
 from chsel.errors import PointsError, PoseError, SettingError
 from chsel.methods import METHODS, ChselSettings, build_method, preset_settings
-from chsel.points import FreeVoxels, Lattice
-from chsel.pose import check_rigid, nearest_rigid
 from chsel.presets import PRESETS
-from chsel.settings import build_settings, settings_mapping
-from chsel.streams import Purpose, StreamKey
+from chsel.problem.points import FreeVoxels, Lattice
+from chsel.problem.poses import check_rigid, nearest_rigid
+from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.streams import Purpose, StreamKey
 
 
 def test_points_are_copied_and_can_not_be_changed() -> None:

@@ -10,15 +10,14 @@ import numba
 import numpy as np
 import pytest
 
-import chsel.emitters
-from chsel.archive import GridArchive
-from chsel.arrays import FloatArray
-from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
-from chsel.kernels.emitters import mega_search
-from chsel.kernels.measures import VECTOR, MeasureCode
-from chsel.measures import Measure
-from chsel.observer import NullObserver
-from chsel.streams import StreamKey
+import chsel.qd.emitters
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import NullObserver
+from chsel.problem.streams import StreamKey
+from chsel.qd.archive import GridArchive
+from chsel.qd.emitter_kernels import mega_search
+from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.qd.measures import VECTOR, Measure, MeasureCode
 
 ribs_archives = pytest.importorskip("ribs.archives", reason="pyribs is a test dependency")
 ribs_emitters = pytest.importorskip("ribs.emitters", reason="pyribs is a test dependency")
@@ -187,7 +186,7 @@ def test_with_its_formulas_and_shared_random_numbers_the_archive_is_that_of_pyri
     name: str, sigma0: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # pyribs adds Adam's epsilon before the bias correction; without it the two are one formula.
-    monkeypatch.setattr(chsel.emitters, "mega_search", partial(mega_search, epsilon=0.0))
+    monkeypatch.setattr(chsel.qd.emitters, "mega_search", partial(mega_search, epsilon=0.0))
     ours = search(name, 3, sigma0=sigma0, ribs_parity=True)
     data = ribs_search(name, 3, sigma0=sigma0, shared=True).data(return_type="dict")
     order = np.argsort(data["index"])

@@ -4,13 +4,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel import KnownPoints, SdfGrid, rkhs_cloud, rkhs_field
-from chsel.arrays import FloatArray
-from chsel.engine import poses_of
+from chsel import KnownPoints, SdfGrid
+from chsel.cost.compiled_cost import poses_of
 from chsel.errors import SettingError
-from chsel.kernels.cvo import Product, products, scratch
-from chsel.rkhs_cloud import blocks_of, cloud_norm, of_block
-from chsel.rkhs_field import Kernel, free_field, surface_field
+from chsel.methods.cvo import rkhs_fields as rkhs_cloud
+from chsel.methods.cvo import rkhs_fields as rkhs_field
+from chsel.methods.cvo.cvo_kernels import Product, products, scratch
+from chsel.methods.cvo.rkhs_fields import (
+    Kernel,
+    blocks_of,
+    cloud_norm,
+    free_field,
+    of_block,
+    surface_field,
+)
+from chsel.numerics.arrays import FloatArray
 from tests.chsel.dense_cvo import DenseClouds, flows, nearby
 
 SDF = SdfGrid.from_mesh(trimesh.creation.box([0.12, 0.08, 0.06]), 0.01, padding=0.03)

@@ -9,8 +9,8 @@ import trimesh
 
 from chsel import SdfGrid
 from chsel.errors import MeshError, SdfError, SettingError
-from chsel.mesh import load_mesh
-from chsel.sdf import _parts, mesh_sdf
+from chsel.problem.mesh import load_mesh
+from chsel.problem.sdf_grid import _parts, mesh_sdf
 
 SIZE = np.array([0.2, 0.12, 0.08])
 
@@ -88,10 +88,10 @@ def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
 
     assert remade().digest == grid.digest
     assert told == [(0, nodes)]
-    monkeypatch.setattr("chsel.sdf._PART_NODES", 1000)
+    monkeypatch.setattr("chsel.problem.sdf_grid._PART_NODES", 1000)
     assert remade().digest == grid.digest
     assert told == [(done, nodes) for done in range(0, nodes, 1000)]
-    monkeypatch.setattr("chsel.sdf._PART_NODES", 1)
+    monkeypatch.setattr("chsel.problem.sdf_grid._PART_NODES", 1)
     parts = _parts(np.zeros((10, 3)), face_count=20)  # of a large mesh, parts are large
     assert [len(part) for part in parts] == [4, 4, 2]
 

@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.measures import MEASURES
-from chsel.pose import compose, inverse
-from chsel.selection import ArchiveSettings, OutputSettings, repeated, select_elites, sized_archive
-from chsel.space import search_space
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose, inverse
+from chsel.problem.search_space import search_space
+from chsel.problem.streams import StreamKey
+from chsel.qd.measures import MEASURES
+from chsel.qd.selection import (
+    ArchiveSettings,
+    OutputSettings,
+    repeated,
+    select_elites,
+    sized_archive,
+)
 
 COSTS = np.array([3.0, 0.1, 9.0, 0.2, 0.4, 0.6])
 

@@ -7,12 +7,19 @@ import trimesh
 from scipy.optimize import minimize_scalar
 
 from chsel import KnownPoints, SdfGrid
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.objective import Objective
 from chsel.errors import SettingError
-from chsel.measures import MEASURES, Measure, measure_named
-from chsel.objective import Objective
-from chsel.pose import apply, axis_angle, compose, inverse, random_rotations, rotation_vector
-from chsel.space import PlaneSettings, SE2Space, SE3Space, SearchSpace, transforms_of
+from chsel.problem.poses import (
+    apply,
+    axis_angle,
+    compose,
+    inverse,
+    random_rotations,
+    rotation_vector,
+)
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace, transforms_of
+from chsel.qd.measures import MEASURES, Measure, measure_named
 
 BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
 STREAM = np.random.default_rng(0)
@@ -113,9 +120,9 @@ def assert_gradients_of_values(space: SearchSpace, measure: Measure) -> None:
     objective, step = objective_in(space), 1e-6
     for vector in np.random.default_rng(1).uniform(-1.0, 1.0, (5, space.dimension)):
         steps = step * np.eye(space.dimension)
-        ahead = objective.measures(measure, vector + steps)
-        behind = objective.measures(measure, vector - steps)
-        gradients = objective.measure_gradients(measure, vector)
+        ahead = measure.values(objective.space, vector + steps)
+        behind = measure.values(objective.space, vector - steps)
+        gradients = measure.gradients(objective.space, vector)
         assert gradients.shape == (measure.count, space.dimension)
         expected = (ahead - behind).T / (2.0 * step)
         np.testing.assert_allclose(gradients, expected, rtol=1e-6, atol=1e-7)
@@ -126,20 +133,22 @@ def test_measures_of_vectors_and_translations_are_their_entries() -> None:
     vectors = STREAM.uniform(-1.0, 1.0, (10, 9))
     objective = objective_in(SE3Space())
     for count in range(1, 7):
-        found = objective.measures(MEASURES[f"rotation_{count}"], vectors)
+        found = MEASURES[f"rotation_{count}"].values(objective.space, vectors)
         np.testing.assert_array_equal(found, vectors[:, :count])
     for count in (2, 3):
-        found = objective.measures(MEASURES[f"position_{count}"], vectors)
+        found = MEASURES[f"position_{count}"].values(objective.space, vectors)
         np.testing.assert_array_equal(found, vectors[:, 6 : 6 + count])
     plane = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.1), BOX)
     poses = STREAM.uniform(-1.0, 1.0, (10, 3))
     on_plane = objective_in(plane)
     np.testing.assert_array_equal(
-        on_plane.measures(MEASURES["plane_position"], poses), poses[:, 1:]
+        MEASURES["plane_position"].values(on_plane.space, poses), poses[:, 1:]
     )
-    np.testing.assert_array_equal(on_plane.measures(MEASURES["plane_angle"], poses), poses[:, :1])
     np.testing.assert_array_equal(
-        on_plane.measures(MEASURES["position_3"], poses), transforms_of(plane, poses)[:, :3, 3]
+        MEASURES["plane_angle"].values(on_plane.space, poses), poses[:, :1]
+    )
+    np.testing.assert_array_equal(
+        MEASURES["position_3"].values(on_plane.space, poses), transforms_of(plane, poses)[:, :3, 3]
     )
 
 
@@ -147,9 +156,9 @@ def test_object_measures_are_of_world_from_object() -> None:
     transforms = random_transforms(10)
     vectors = SE3Space().encode(transforms)
     world, objective = inverse(transforms), objective_in(SE3Space())
-    xy = objective.measures(MEASURES["object_xy"], vectors)
+    xy = MEASURES["object_xy"].values(objective.space, vectors)
     np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
-    yaw = objective.measures(MEASURES["object_yaw"], vectors)[:, 0]
+    yaw = MEASURES["object_yaw"].values(objective.space, vectors)[:, 0]
     np.testing.assert_allclose(yaw, np.arctan2(world[:, 1, 0], world[:, 0, 0]), atol=1e-12)
 
 
@@ -158,8 +167,8 @@ def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it() -> 
     rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     vector = SE3Space().encode(compose(rotation[None], np.zeros((1, 3))))
     objective, yaw = objective_in(SE3Space()), MEASURES["object_yaw"]
-    assert np.isfinite(objective.measures(yaw, vector)).all()
-    np.testing.assert_array_equal(objective.measure_gradients(yaw, vector[0]), np.zeros((1, 9)))
+    assert np.isfinite(yaw.values(objective.space, vector)).all()
+    np.testing.assert_array_equal(yaw.gradients(objective.space, vector[0]), np.zeros((1, 9)))
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -7,17 +7,17 @@ import pytest
 import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
 from chsel.methods import build_method, preset_settings
+from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.chsel import Chsel
-from chsel.observer import NullObserver
-from chsel.pose import apply, axis_angle, compose, inverse
-from chsel.settings import settings_mapping
-from chsel.space import PlaneSettings, search_space
-from chsel.starts import AnchoredStarts, anchored_starts
-from chsel.streams import StreamKey
-from chsel.surface import has_surface
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.registration_problem import NullObserver
+from chsel.problem.search_space import PlaneSettings, search_space
+from chsel.problem.settings import settings_mapping
+from chsel.problem.streams import StreamKey
+from chsel.problem.surface import has_surface
 
 BOX = trimesh.creation.box((0.2, 0.1, 0.05))
 GRID = SdfGrid.from_mesh(BOX, resolution=0.01)

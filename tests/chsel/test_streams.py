@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-from chsel.arrays import digest
 from chsel.errors import SettingError
-from chsel.streams import Purpose, StreamKey, normals, uniforms
+from chsel.numerics.arrays import digest
+from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 
 MANY = 1_000_000
 

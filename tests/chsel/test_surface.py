@@ -5,11 +5,11 @@ import pytest
 import trimesh
 
 from chsel import SdfGrid
-from chsel.arrays import FloatArray
 from chsel.errors import SdfError
-from chsel.sdf import mesh_sdf
-from chsel.streams import Purpose, StreamKey
-from chsel.surface import surface_points
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.sdf_grid import mesh_sdf
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.surface import surface_points
 
 RADIUS, RESOLUTION = 0.05, 0.01
 SIDES = np.array([0.163, 0.107, 0.089])

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from chsel import KnownPoints, SdfGrid
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import EngineError, SettingError
-from chsel.threads import require_threads, spread
-from chsel.threads import threads as use_threads
+from chsel.numerics.threads import require_threads, spread
+from chsel.numerics.threads import threads as use_threads
 
 PATIENCE = 20.0  # seconds until what should have ended long ago counts as stuck
 

@@ -11,7 +11,7 @@ import numpy
 import numpy as np
 import torch
 
-from chsel.arrays import digest
+from chsel.numerics.arrays import digest
 from replay.differences import ulps
 from tests.determinism.stages import Stages
 

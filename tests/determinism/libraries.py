@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import torch
 
-from chsel.arrays import FloatArray, digest
+from chsel.numerics.arrays import FloatArray, digest
 
 
 def digests() -> dict[str, str]:

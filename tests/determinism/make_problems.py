@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, axis_angle, compose, inverse
 from tests.determinism.problems import PROBLEMS_FILE
 
 SPACING = 0.04  # of free points, metres

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints, Workspace
-from chsel.sdf import SdfGrid
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.sdf_grid import SdfGrid
 
 PROBLEMS_FILE = Path(__file__).with_name("problems.npz")
 

@@ -7,19 +7,24 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.cost_settings import CostSettings
-from chsel.emitters import SEARCHES
-from chsel.engine import CompiledCost
-from chsel.measures import MEASURES
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.objective import Objective
 from chsel.methods.method import Method
-from chsel.objective import Objective
-from chsel.observer import NullObserver, Observer
-from chsel.online import pose_problem
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.space import search_space
-from chsel.streams import Purpose, StreamKey, normals
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import (
+    ArchiveSnapshot,
+    Hypotheses,
+    NullObserver,
+    Observer,
+    RegistrationProblem,
+)
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.search_space import search_space
+from chsel.problem.streams import Purpose, StreamKey, normals
+from chsel.problem.warm_start import pose_problem
+from chsel.qd.emitters import SEARCHES
+from chsel.qd.measures import MEASURES
 from tests.determinism.cases import Case
 from tests.determinism.problems import scene
 
@@ -120,8 +125,8 @@ def _keep_start(stages: Stages, method: Method, problem: RegistrationProblem, st
     if not hasattr(settings, "archive"):
         return
     measure = MEASURES[settings.archive.measure]
-    mean, deviation = measure.moments(objective.measures(measure, vectors))
-    slopes = np.array([objective.measure_gradients(measure, vector) for vector in vectors])
+    mean, deviation = measure.moments(measure.values(objective.space, vectors))
+    slopes = np.array([measure.gradients(objective.space, vector) for vector in vectors])
     measures = {"mean": mean, "deviation": deviation, "gradients": slopes}
     keep(stages, f"step {step}: measures of E_0", measures)
 

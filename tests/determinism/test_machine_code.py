@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
-import pkgutil
 import platform
+from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -15,27 +15,26 @@ import pytest
 import trimesh
 from numba.core.registry import CPUDispatcher
 
-import chsel.kernels
-from chsel.archive import GridArchive
-from chsel.arrays import FloatArray
-from chsel.evaluation.plausible_set import plausible_set
-from chsel.evaluation.plausible_settings import PlausibleSettings, PoseGridSettings
-from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance
-from chsel.kernels.compiler import compiled
-from chsel.kernels.gaussian_blur import splat
-from chsel.measures import MEASURES
-from chsel.problem import RegistrationProblem
-from chsel.sensing.camera import PinholeCamera
-from chsel.sensing.depth import occlusion_edges
+from chsel.methods.cvo.blur_kernels import splat
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.compiler import compiled, kernel_sources
+from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
+from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.surface import surface_points
+from chsel.qd.archive import GridArchive
+from chsel.qd.measures import MEASURES
+from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
-from chsel.streams import Purpose, StreamKey
-from chsel.surface import surface_points
 from tests.determinism.cases import CASES
 from tests.determinism.libraries import fused as contracted
 from tests.determinism.machine_code import assembly, called, fused, host, loose, optimised, target
 from tests.determinism.problems import grid, scene
 from tests.determinism.stages import run
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 ENOUGH = ("chsel default", "contacts alone", "chsel reference", "plane_angle", "deep alpha")
 ENOUGH += ("icp default", "svgd default", "SVGD, median", "cvo default", "cvo reference")
 ENOUGH += ("anchored default", "anchored on a plane")
@@ -89,13 +88,14 @@ def code() -> dict[str, str]:
 def _from_python() -> dict[str, Any]:
     """The kernels by full name that Python calls; elementary functions are in their callers."""
     found = {}
-    for module in pkgutil.iter_modules(chsel.kernels.__path__, "chsel.kernels."):
-        for name, kernel in vars(importlib.import_module(module.name)).items():
-            own = isinstance(kernel, CPUDispatcher) and kernel.__module__ == module.name
+    for source in kernel_sources():
+        module = ".".join(source.relative_to(REPOSITORY).with_suffix("").parts)
+        for name, kernel in vars(importlib.import_module(module)).items():
+            own = isinstance(kernel, CPUDispatcher) and kernel.__module__ == module
             if not own or kernel.targetoptions.get("no_cpython_wrapper"):
                 continue
-            if module.name != "chsel.kernels.elementary" or name.startswith("_fill_"):
-                found[f"{module.name}.{name}"] = kernel
+            if module != "chsel.numerics.elementary" or name.startswith("_fill_"):
+                found[f"{module}.{name}"] = kernel
     return found
 
 
@@ -107,7 +107,9 @@ def _on(name: str) -> llvm.TargetMachine:
 
 def test_every_kernel_that_python_calls_is_looked_at(code: dict[str, str]) -> None:
     kernels = _from_python()
-    assert {"chsel.kernels.descent.descend", "chsel.kernels.emitters.cma_me"} < set(kernels)
+    assert {"chsel.cost.objective_kernels.descend", "chsel.qd.emitter_kernels.cma_me"} < set(
+        kernels
+    )
     assert set(kernels) == {name.split()[0] for name in code}
 
 

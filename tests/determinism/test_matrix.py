@@ -8,13 +8,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from chsel.cost_settings import FREE_TERMS, GRADIENTS, CostSettings
-from chsel.emitters import SEARCHES
-from chsel.measures import MEASURES
+from chsel.cost.cost_settings import FREE_TERMS, GRADIENTS, CostSettings
 from chsel.methods import OURS
 from chsel.methods.chsel import ChselSettings
 from chsel.presets import PRESETS
-from chsel.sdf import LOOKUPS, OUTSIDE
+from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
+from chsel.qd.emitters import SEARCHES
+from chsel.qd.measures import MEASURES
 from replay.differences import ulps
 from tests.determinism.cases import CASES
 from tests.determinism.comparison import condensed, differences, other_versions, read_golden

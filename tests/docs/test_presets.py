@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from chsel.evaluation.plausible_settings import plausible_settings
 from chsel.methods import OURS, preset_settings
+from chsel.plausible.plausible_settings import plausible_settings
 from runners.sessions.probing import PROBING_PRESETS
 from tests.docs.page import DOCS
 

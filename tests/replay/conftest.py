@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import digest
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import compose, random_rotations
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import digest
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import compose, random_rotations
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.events import (
     Event,
     HypothesesFound,

@@ -27,8 +27,8 @@ import trimesh
 
 from chsel.errors import RecordingError
 from chsel.methods import build_method
-from chsel.pose import apply, axis_angle, compose
-from chsel.settings import build_settings
+from chsel.problem.poses import apply, axis_angle, compose
+from chsel.problem.settings import build_settings
 from replay.events import Event, Probe, ProblemPosed, SessionEnded
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss

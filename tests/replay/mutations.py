@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import ChselError
-from chsel.points import KnownPoints
+from chsel.problem.points import KnownPoints
 from replay.events import Event, Probe, ProblemPosed, SessionStarted
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.schemas import RECORDS, message_class

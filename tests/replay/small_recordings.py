@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from chsel.evaluation.result_numbers import result_numbers
 from chsel.methods import build_method
-from chsel.online import pose_problem
-from chsel.points import KnownPoints, Workspace
-from chsel.problem import Hypotheses
-from chsel.sdf import SdfGrid
-from chsel.settings import settings_mapping
-from chsel.streams import StreamKey
+from chsel.plausible.pose_metrics import result_numbers
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import settings_mapping
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 from replay.events import (
     Event,
     HypothesesFound,

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chsel import online
-from chsel.evaluation.plausible_file import save_plausible
-from chsel.evaluation.plausible_set import plausible_set
-from chsel.evaluation.plausible_settings import plausible_settings
-from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
-from chsel.pose import axis_angle, inverse
-from chsel.problem import Hypotheses
+from chsel.plausible.plausible_file import save_plausible
+from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_settings import plausible_settings
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.problem import warm_start as online
+from chsel.problem.poses import axis_angle, inverse
+from chsel.problem.registration_problem import Hypotheses
 from replay.__main__ import main
 from replay.blessing import _change
 from replay.mcap.reader import read_recording

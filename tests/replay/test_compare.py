@@ -14,19 +14,19 @@ import pytest
 import trimesh
 from rerun.chunk import RrdReader
 
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import EngineError, RecordingError, SettingError
-from chsel.evaluation.plausible_diversity import plausible_diversity
-from chsel.evaluation.plausible_file import save_plausible
-from chsel.evaluation.plausible_set import plausible_set
-from chsel.evaluation.plausible_settings import plausible_settings
-from chsel.evaluation.surface_distance import DistanceSettings, SurfaceDistance, surface_points
 from chsel.methods import build_method
-from chsel.online import pose_problem
-from chsel.points import KnownPoints, Workspace
+from chsel.plausible.plausible_file import save_plausible
+from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_settings import plausible_settings
+from chsel.plausible.pose_metrics import plausible_diversity
+from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
 from chsel.presets import COST
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 from replay.__main__ import main
 from replay.comparing.columns import COLUMNS
 from replay.comparing.comparison import common_cost, compared, medians, recorded_label

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from chsel.errors import RecordingError, SettingError
-from chsel.sdf import SdfGrid
+from chsel.problem.sdf_grid import SdfGrid
 from replay.__main__ import main
 from replay.comparing.recording_diff import FIRST, SECOND, Ignored, recording_diff
 from replay.events import HypothesesFound, Logged, Measured, SnapshotTaken, Traced

@@ -13,8 +13,8 @@ import pytest
 import trimesh
 
 from chsel.errors import RecordingError, SettingError
-from chsel.points import KnownPoints
-from chsel.pose import inverse
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse
 from replay import export
 from replay.__main__ import main
 from replay.events import HypothesesFound, Probe, SnapshotTaken

@@ -29,18 +29,18 @@ class Plant:
 
 PLANTS = {
     "nothing": Plant(
-        "chsel/selection.py", "def select_elites(", "def select_elites(", "cracker_box_chsel", ""
+        "chsel/qd/selection.py", "def select_elites(", "def select_elites(", "cracker_box_chsel", ""
     ),
     "a constant of the cost": Plant(
-        "chsel/kernels/cost.py",
+        "chsel/cost/cost_kernels.py",
         "value = model.known_scale * excess",
         "value = 1.0000000000001 * model.known_scale * excess",
         "points_exact_descent",
         "descent, iteration 0",
     ),
     "the order of a sum": Plant(
-        "chsel/kernels/cost.py",
-        "def _with_known(sums, model, pose, places):  # type: ignore[no-untyped-def]\n"
+        "chsel/cost/cost_kernels.py",
+        "def _with_known(sums, model, pose, places):\n"
         '    """sum |s - v|, with gradient (s - v) n, over points of known signed distance '
         '(Eq. 10)."""\n'
         "    field, table = model.field, model.field.table\n"
@@ -56,28 +56,28 @@ PLANTS = {
         "descent, iteration 0",
     ),
     "the draws of the search": Plant(
-        "chsel/emitters.py",
+        "chsel/qd/emitters.py",
         "self.key.stream(Purpose.EMITTER, self.refinement)",
         "self.key.stream(Purpose.EMITTER, self.refinement + 1)",
         "cracker_box_chsel",
         "cma_mega, iteration 10",
     ),
     "one draw of E_0": Plant(
-        "chsel/online.py",
+        "chsel/problem/warm_start.py",
         "shift = settings.translation_noise * normals(stream, (count, 3))",
         "shift = settings.translation_noise * normals(stream, (count, 3))[::-1]",
         "cracker_box_chsel",
         "making E_0",
     ),
     "the range of the archive": Plant(
-        "chsel/selection.py",
+        "chsel/qd/selection.py",
         "half = settings.range_sigmas * np.maximum(",
         "half = (settings.range_sigmas + 1e-14) * np.maximum(",
         "cracker_box_chsel",
         "archive, iteration 0",
     ),
     "the choice of hypotheses": Plant(
-        "chsel/selection.py",
+        "chsel/qd/selection.py",
         'order = np.argsort(costs, kind="stable")',
         'order = np.argsort(costs, kind="stable")[1:]',
         "cracker_box_chsel",

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chsel.settings import settings_mapping
+from chsel.problem.settings import settings_mapping
 from replay.events import Event, HypothesesFound
 from replay.mcap.reader import read_recording
 from tests.replay.small_recordings import measured_again

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from chsel.errors import ChselError, MeshError, PointsError, SessionError
-from chsel.mesh import load_mesh
-from chsel.special_file import refuse_special_file
+from chsel.problem.file_checks import refuse_special_file
+from chsel.problem.mesh import load_mesh
 from replay.__main__ import main
 from runners.plausible_source import open_source
 from runners.sensors.depth_frame import read_depth_frame

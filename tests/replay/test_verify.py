@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chsel.problem import Hypotheses
+from chsel.problem.registration_problem import Hypotheses
 from replay.__main__ import main
 from replay.events import Event, HypothesesFound, Probe, SessionStarted, Traced
 from replay.file_verification import verified_files

@@ -10,7 +10,7 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.reporting.method_style import MethodStyle
 
 Bands = dict[float, tuple[float, float, float]]

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from chsel.evaluation.plausible_settings import plausible_settings
-from chsel.settings import settings_mapping
+from chsel.plausible.plausible_settings import plausible_settings
+from chsel.problem.settings import settings_mapping
 from runners.evaluation.table import ITERATIONS, RESULTS
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"

@@ -10,11 +10,11 @@ import pytest
 import trimesh
 import yaml
 
-from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_settings import EvaluationCostSettings
-from chsel.evaluation.symmetry import object_symmetry
-from chsel.mesh import clean_mesh
-from chsel.pose import apply, axis_angle, compose, inverse, roll_pitch_yaw
+from chsel.plausible.plausible_settings import EvaluationCostSettings
+from chsel.plausible.scan import EvaluationCost
+from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.mesh import clean_mesh
+from chsel.problem.poses import apply, axis_angle, compose, inverse, roll_pitch_yaw
 from replay.file_digest import file_digest
 from replay.mcap.reader import read_recording
 from runners import align, plausible, probe

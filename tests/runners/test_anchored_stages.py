@@ -9,8 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from chsel.methods.anchored import Anchored, AnchoredSettings, Effort
-from chsel.pose import apply, inverse
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort
+from chsel.problem.poses import apply, inverse
 from replay.mcap.reader import read_recording
 from runners.reporting import panels
 from runners.reporting.anchored_stages import main, picture_of_stages, stages_of

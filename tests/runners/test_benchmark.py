@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from chsel.pose import apply, inverse
-from chsel.sdf import mesh_sdf
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import mesh_sdf
 from runners.benchmarks.comparison import require_equal
 from runners.benchmarks.methods import methods
 from runners.benchmarks.ours import PRESETS, Steps

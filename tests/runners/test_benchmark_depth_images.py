@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chsel.sensing.camera import PinholeCamera
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.benchmarks.depth_images import CAMERA, POSE, depth_images, scene
 from runners.benchmarks.ours import Steps
 from runners.benchmarks.scope import Scope

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.kernels.compiler import watched
 from chsel.methods import build_method
 from chsel.methods.method import Method
-from chsel.pose import apply, axis_angle, compose
+from chsel.numerics.compiler import watched
+from chsel.problem.poses import apply, axis_angle, compose
 from runners import compiling, probe
 from runners.compiling import Compiling
 from tests.runners.in_process import run
@@ -31,7 +31,7 @@ from runners import probe
 from runners.compiling import Compiling
 
 def specialised():
-    kernels = [module for name, module in sys.modules.items() if name.startswith("chsel.kernels")]
+    kernels = [module for name, module in sys.modules.items() if name.startswith("chsel.")]
     return {
         (kernel.__name__, str(signature))
         for module in kernels
@@ -114,7 +114,7 @@ def two_kernels(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
             def kernel(x: float) -> float:
                 return x + 1.0
 
-            kernel.__module__ = "chsel.kernels.made_up"
+            kernel.__module__ = "chsel.made_up"
             numba.njit(kernel)(1.0)
 
     monkeypatch.setattr(compiling, "warm_up", compile_two)

@@ -11,16 +11,12 @@ import pyarrow.parquet
 import pytest
 
 from chsel.errors import RecordingError, SettingError
-from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_settings import (
-    DEFINITIONS,
-    definition_name,
-    plausible_settings,
-)
-from chsel.points import KnownPoints
-from chsel.problem import RegistrationProblem
-from chsel.settings import settings_mapping
-from chsel.streams import StreamKey
+from chsel.plausible.plausible_settings import DEFINITIONS, definition_name, plausible_settings
+from chsel.plausible.scan import EvaluationCost
+from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.settings import settings_mapping
+from chsel.problem.streams import StreamKey
 from runners import report
 from runners.evaluation.definition import definition_label, definition_text
 from runners.evaluation.table import (

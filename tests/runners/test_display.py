@@ -30,8 +30,8 @@ def test_a_bar_stands_there_before_the_work_begins() -> None:
 def test_the_object_of_a_session_shows_its_size_and_how_far_its_grid_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("chsel.mesh.MANY_FACES", 1000)
-    monkeypatch.setattr("chsel.sdf._PART_NODES", 500)
+    monkeypatch.setattr("chsel.problem.mesh.MANY_FACES", 1000)
+    monkeypatch.setattr("chsel.problem.sdf_grid._PART_NODES", 500)
     trimesh.creation.icosphere(subdivisions=3, radius=0.04).export(tmp_path / "ball.ply")
     np.savez(tmp_path / "points.npz", surface=np.eye(3) * 0.04)
     config = ProbeConfig(

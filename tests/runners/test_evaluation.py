@@ -14,14 +14,14 @@ import pyarrow.parquet
 import pytest
 
 from chsel.errors import ChselError, RecordingError
-from chsel.evaluation.plausible_file import read_plausible
-from chsel.evaluation.plausible_settings import plausible_settings
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry, object_symmetry
-from chsel.methods.icp import Icp
-from chsel.pose import axis_angle
-from chsel.problem import Hypotheses
-from chsel.settings import settings_mapping
+from chsel.methods.icp.icp import Icp
+from chsel.plausible.plausible_file import read_plausible
+from chsel.plausible.plausible_settings import plausible_settings
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.problem.poses import axis_angle
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.settings import settings_mapping
 from replay.events import Measured
 from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, NO_RESULT, verify

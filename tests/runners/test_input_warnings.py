@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, axis_angle, compose, inverse
-from chsel.sdf import SdfGrid, mesh_sdf
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from replay.events import Logged, Probe, SessionEnded, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_set import PlausibleSet
-from chsel.pose import compose, inverse, product, rotation_vector
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.scan import EvaluationCost
+from chsel.problem.poses import compose, inverse, product, rotation_vector
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.streams import StreamKey
 from runners.evaluation.draws import MOST_DRAWS, draw_seed
 from runners.evaluation.judge import Judge
 from runners.evaluation.measure import Measure, MetricsConfig

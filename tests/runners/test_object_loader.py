@@ -13,7 +13,7 @@ import trimesh
 from hydra import compose, initialize_config_dir
 
 from chsel.errors import MeshError, SettingError
-from chsel.settings import build_settings
+from chsel.problem.settings import build_settings
 from runners.cli import CONF, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.models import MODELS

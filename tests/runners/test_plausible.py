@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.evaluation.plausible_file import load_plausible, read_plausible
-from chsel.evaluation.plausible_set import plausible_set
-from chsel.pose import apply, axis_angle, compose, inverse, rotation_vector
+from chsel.plausible.plausible_file import load_plausible, read_plausible
+from chsel.plausible.plausible_set import plausible_set
+from chsel.problem.poses import apply, axis_angle, compose, inverse, rotation_vector
 from replay.mcap.reader import read_recording
 from runners import plausible, probe
 from runners.plausible import named_arguments

@@ -17,10 +17,10 @@ import trimesh
 import yaml
 
 from chsel.errors import RecordingError
-from chsel.evaluation.result_numbers import result_numbers
-from chsel.evaluation.symmetry import object_symmetry
 from chsel.methods import METHODS, build_method
-from chsel.pose import apply, axis_angle, compose
+from chsel.plausible.pose_metrics import result_numbers
+from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.poses import apply, axis_angle, compose
 from replay.events import Measured
 from replay.mcap.reader import read_recording
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from chsel.pose import inverse
+from chsel.problem.poses import inverse
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
 from runners.benchmarks.published import BenchmarkError, RefusedError

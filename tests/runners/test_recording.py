@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import digest
 from chsel.errors import RecordingError
 from chsel.methods import build_method
-from chsel.points import KnownPoints, Workspace
-from chsel.problem import ArchiveSnapshot, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import digest
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.events import Event, SnapshotTaken, Traced
 from replay.recorder import NullRecorder
 from replay.step_observer import StepObserver

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.quiver import Quiver
 
-from chsel.arrays import FloatArray
-from chsel.pose import apply, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, inverse
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting import panels
 from runners.reporting.box_plots import picture_of_boxes

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.cost_settings import CostSettings
-from chsel.pose import axis_angle, compose
-from chsel.sdf import SdfGrid
+from chsel.cost.cost_settings import CostSettings
+from chsel.problem.poses import axis_angle, compose
+from chsel.problem.sdf_grid import SdfGrid
 from replay.mcap.reader import read_recording
 from runners.reporting.cost_gradients import (
     picture_of_gradients,

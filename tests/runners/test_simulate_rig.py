@@ -9,7 +9,7 @@ import pytest
 import yaml
 from hydra import compose, initialize_config_dir
 
-from chsel.settings import build_settings, settings_mapping
+from chsel.problem.settings import build_settings, settings_mapping
 from runners import simulate_rig
 from runners.cli import CONF, plain
 from runners.objects.models import MODELS

@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, compose, random_rotations
-from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, compose, random_rotations
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 
 WORKSPACE = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 RESOLUTION = 0.02

@@ -8,21 +8,19 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SettingError
-from chsel.evaluation.calibration import calibration
-from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.plausible_diversity import cheapest, plausible_diversity
-from chsel.evaluation.surface_distance import (
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.plausible.pose_metrics import EvaluationError, calibration, cheapest, plausible_diversity
+from chsel.plausible.surface_distance import (
     METHODS,
     DistanceSettings,
     SurfaceDistance,
     surface_points,
 )
-from chsel.pose import compose, inverse, random_rotations, rotation_vector
-from chsel.sdf import SdfGrid, mesh_sdf
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.problem.poses import compose, inverse, random_rotations, rotation_vector
+from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
+from chsel.problem.streams import StreamKey
 
 RADIUS = 0.1
 SIDES = np.array([0.08, 0.12, 0.2])

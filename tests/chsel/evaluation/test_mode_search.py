@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_file import load_plausible, save_plausible
-from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
-from chsel.evaluation.plausible_settings import (
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.plausible.plausible_file import load_plausible, save_plausible
+from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_settings import (
     DEFINITIONS,
     EvaluationCostSettings,
     ModeSearchSettings,
@@ -23,13 +22,14 @@ from chsel.evaluation.plausible_settings import (
     PoseGridSettings,
     plausible_settings,
 )
-from chsel.points import KnownPoints
-from chsel.pose import inverse
-from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.settings import build_settings, settings_mapping
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.plausible.pose_metrics import EvaluationError
+from chsel.plausible.scan import EvaluationCost
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.streams import StreamKey
 from tests.chsel.evaluation.scenes import WORKSPACE, ball
 
 OTHER = np.array([0.0, 0.0, -0.16])  # where the ball may be as well

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.plausible_file import load_plausible, plausible_path, save_plausible
-from chsel.evaluation.plausible_set import PlausibleSet, plausible_set
-from chsel.evaluation.plausible_settings import Offsets, PlausibleSettings, PoseGridSettings
-from chsel.pose import apply
-from chsel.problem import RegistrationProblem
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.plausible_file import load_plausible, plausible_path, save_plausible
+from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_settings import Offsets, PlausibleSettings, PoseGridSettings
+from chsel.plausible.pose_metrics import EvaluationError
+from chsel.problem.poses import apply
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import StreamKey
 from tests.chsel.evaluation.scenes import ball, scene
 
 SETTINGS = PlausibleSettings(

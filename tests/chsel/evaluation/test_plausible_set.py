@@ -9,26 +9,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SettingError
-from chsel.evaluation import plausible_set as module
-from chsel.evaluation import position_blocks
-from chsel.evaluation.error import EvaluationError
-from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_set import grid_around, plausible_set, scan
-from chsel.evaluation.plausible_settings import (
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.plausible import plausible_set as module
+from chsel.plausible import scan as position_blocks
+from chsel.plausible.plausible_set import grid_around, plausible_set, scan
+from chsel.plausible.plausible_settings import (
     EvaluationCostSettings,
     Offsets,
     PlausibleSettings,
     PoseGridSettings,
     plausible_settings,
 )
-from chsel.far_apart import far_apart
-from chsel.points import KnownPoints
-from chsel.pose import apply, compose, inverse, rotation_angle
-from chsel.problem import RegistrationProblem
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.plausible.pose_metrics import EvaluationError
+from chsel.plausible.scan import EvaluationCost
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import apply, compose, inverse, rotation_angle
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import StreamKey
+from chsel.problem.subset import far_apart
 from tests.chsel.evaluation.scenes import OBJECTS, WORKSPACE, ball, box, scene
 
 SMALL = PoseGridSettings(

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.result_numbers import result_numbers
-from chsel.evaluation.symmetry import object_symmetry
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import axis_angle, compose, inverse, rotation_vector
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.pose_metrics import pose_errors, result_numbers
+from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import axis_angle, compose, inverse, rotation_vector
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from runners.objects.models import MODELS
 
 TRUTH = compose(rotation_vector(np.array([0.7, -0.4, 1.1])), np.array([0.3, -0.2, 0.9]))

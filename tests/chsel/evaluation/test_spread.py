@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chsel.evaluation.spread import spread
-from chsel.pose import axis_angle, compose, inverse
-from chsel.problem import Hypotheses
+from chsel.plausible.pose_metrics import spread
+from chsel.problem.poses import axis_angle, compose, inverse
+from chsel.problem.registration_problem import Hypotheses
 
 CENTRE = np.array([0.5, 0.0, 0.0])
 TURN = axis_angle(np.array([0.0, 0.0, 1.0]), np.pi / 2)

@@ -10,13 +10,12 @@ import pytest
 import trimesh
 from scipy.optimize import brentq
 
-from chsel.arrays import FloatArray
-from chsel.evaluation.rotated_surface import RotatedSurface
-from chsel.evaluation.rotation_group import generated
-from chsel.evaluation.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
-from chsel.mesh import load_mesh
-from chsel.pose import axis_angle, compose, rotation_vector
-from chsel.sdf import SdfGrid
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.rotated_surface import RotatedSurface
+from chsel.plausible.symmetry import ObjectSymmetry, generated, grid_symmetry, object_symmetry
+from chsel.problem.mesh import load_mesh
+from chsel.problem.poses import axis_angle, compose, rotation_vector
+from chsel.problem.sdf_grid import SdfGrid
 from runners.objects.models import MODELS
 
 ANYWHERE = compose(rotation_vector(np.array([0.7, -0.4, 1.1])), np.array([0.3, -2.0, 0.9]))
@@ -248,7 +247,7 @@ def test_a_mesh_of_a_million_faces_is_merged_first() -> None:
 
 
 def test_the_same_mesh_gives_the_same_bits() -> None:
-    from chsel.evaluation import symmetry
+    from chsel.plausible import symmetry
 
     first = object_symmetry(MODELS["spam_can"]())
     symmetry._found.cache_clear()

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SettingError
-from chsel.evaluation import true_pose
-from chsel.evaluation.evaluation_cost import EvaluationCost
-from chsel.evaluation.plausible_set import PoseGrid
-from chsel.evaluation.plausible_settings import EvaluationCostSettings, Offsets
-from chsel.evaluation.true_pose import TruePoseSettings, find_true_pose
-from chsel.points import KnownPoints
-from chsel.pose import apply, compose, inverse, rotation_angle, rotation_vector
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible import true_pose
+from chsel.plausible.plausible_set import PoseGrid
+from chsel.plausible.plausible_settings import EvaluationCostSettings, Offsets
+from chsel.plausible.scan import EvaluationCost
+from chsel.plausible.true_pose import TruePoseSettings, find_true_pose
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import apply, compose, inverse, rotation_angle, rotation_vector
 from tests.chsel.evaluation.scenes import box, scene
 
 HALF = np.array([0.06, 0.09, 0.12])

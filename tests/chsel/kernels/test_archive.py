@@ -9,10 +9,8 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from chsel.archive import GridArchive
-from chsel.kernels.archive import rank
-from chsel.kernels.measures import VECTOR, MeasureCode
-from chsel.measures import Measure
+from chsel.qd.archive import GridArchive, rank
+from chsel.qd.measures import VECTOR, Measure, MeasureCode
 
 BINS, LOWER, UPPER = 4, -1.0, 1.0
 Solution = tuple[tuple[float, ...], float]

@@ -10,7 +10,7 @@ import pytest
 
 import chsel
 from chsel.errors import EngineError
-from chsel.kernels.arithmetic import require_ieee_arithmetic
+from chsel.numerics.threads import require_ieee_arithmetic
 
 # fesetround's argument, from the C library's <fenv.h>
 MODES = {

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from chsel.kernels import compiler
+from chsel.numerics import compiler
 
 ROOT = Path(__file__).resolve().parents[3]
 COMPUTE = """
 import numpy as np
-from chsel.kernels.elementary import sines_cosines
+from chsel.numerics.elementary import sines_cosines
 print(np.stack(sines_cosines(np.linspace(-9.0, 9.0, 50))).tobytes().hex())
 """
 
@@ -137,8 +137,8 @@ def test_once_is_said_once_and_not_of_kernels_that_come_later(tmp_path: Path) ->
     names = {"CHSEL_CACHE_DIR": str(tmp_path / "kept")}
     _, said = result_of(start(COMPUTE, tmp_path, **names))
     assert said.count("CPU, once:") == 1
-    later = "from chsel.kernels.elementary import logs; logs(np.ones(2))"
-    both = f"{COMPUTE}\n{later}\nfrom chsel.kernels.elementary import arctangents\n"
+    later = "from chsel.numerics.elementary import logs; logs(np.ones(2))"
+    both = f"{COMPUTE}\n{later}\nfrom chsel.numerics.elementary import arctangents\n"
     both += "arctangents(np.ones(2), np.ones(2))"
     _, said = result_of(start(both, tmp_path, **names))
     assert said == f"compiling the kernels that are still missing (kept in {tmp_path / 'kept'})\n"

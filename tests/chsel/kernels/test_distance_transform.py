@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.arrays import BoolArray, IntArray
-from chsel.kernels.distance_transform import squared_clearances
+from chsel.methods.medial_constraint.medial_kernels import squared_clearances
+from chsel.numerics.arrays import BoolArray, IntArray
 
 
 def clearances(inside: BoolArray) -> IntArray:

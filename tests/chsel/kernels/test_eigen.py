@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.arrays import FloatArray
-from chsel.kernels.eigen import decompose
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.eigen import decompose
 
 
 @numba.njit

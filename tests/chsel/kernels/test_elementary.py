@@ -11,8 +11,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray, digest
-from chsel.kernels.elementary import (
+from chsel.numerics.arrays import FloatArray, digest
+from chsel.numerics.elementary import (
     arctangent,
     arctangents,
     exp,
@@ -21,7 +21,7 @@ from chsel.kernels.elementary import (
     sine_cosine,
     sines_cosines,
 )
-from chsel.streams import normals
+from chsel.problem.streams import normals
 
 LIMIT = 0.9  # ulp
 COUNT = 2000
@@ -224,7 +224,7 @@ def test_the_bits_are_those_of_every_other_machine() -> None:
 
 def test_code_for_the_oldest_cpu_gives_the_same_bits(tmp_path: Path) -> None:
     code = (
-        "import runpy, sys; import chsel.kernels.elementary;"
+        "import runpy, sys; import chsel.numerics.elementary;"
         "print(runpy.run_path(sys.argv[1])['sample']())"
     )
     plain = {

@@ -9,17 +9,15 @@ import numba
 import numpy as np
 import pytest
 
-from chsel.archive import GridArchive
-from chsel.arrays import FloatArray, digest
-from chsel.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
-from chsel.kernels import emitters as kernels
-from chsel.kernels.emitters import MegaSearch, MeSearch, me_search, mega_search
-from chsel.kernels.evolution import EVALUATIONS, SIGMA
-from chsel.kernels.measures import VECTOR, MeasureCode
-from chsel.measures import Measure
-from chsel.observer import NullObserver
-from chsel.problem import ArchiveSnapshot
-from chsel.streams import StreamKey
+from chsel.numerics.arrays import FloatArray, digest
+from chsel.problem.registration_problem import ArchiveSnapshot, NullObserver
+from chsel.problem.streams import StreamKey
+from chsel.qd import emitter_kernels as kernels
+from chsel.qd.archive import GridArchive
+from chsel.qd.emitter_kernels import MegaSearch, MeSearch, me_search, mega_search
+from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.qd.evolution_kernels import EVALUATIONS, SIGMA
+from chsel.qd.measures import VECTOR, Measure, MeasureCode
 
 QUADRATIC, FLAT, NAN, INFINITE, NAN_BEYOND, NAN_GRADIENT = range(6)
 MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2))
@@ -37,7 +35,7 @@ class Landscape(NamedTuple):
 
 
 class LandscapeObjective:
-    """What the searches ask for in place of chsel.objective.Objective."""
+    """What the searches ask for in place of chsel.cost.objective.Objective."""
 
     def __init__(self, kind: int) -> None:
         self.model, self.space_arrays = Landscape(kind), 0

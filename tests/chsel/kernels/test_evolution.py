@@ -6,9 +6,9 @@ import numba
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray, IntArray
-from chsel.kernels import evolution
-from chsel.kernels.evolution import DECOMPOSED_AT, EVALUATIONS, SIGMA, Strategy, strategy_around
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.qd import evolution_kernels as evolution
+from chsel.qd.evolution_kernels import DECOMPOSED_AT, EVALUATIONS, SIGMA, Strategy, strategy_around
 
 
 class MatrixStrategy:

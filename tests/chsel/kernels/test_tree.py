@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.arrays import BoolArray, FloatArray, IntArray
 from chsel.errors import PointsError
-from chsel.kernels.region import Region, box_of, clearance_of
-from chsel.kernels.tree import Tree, found_for, octree, walk
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.cell_set import Region, box_of, clearance_of
+from chsel.numerics.octree import Tree, found_for, octree, walk
 
 STAY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from chsel.arrays import FloatArray
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, axis_angle, compose, inverse
-from chsel.sdf import SdfGrid
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.sdf_grid import SdfGrid
 
 TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
 STANDING = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(2.0)), np.array([0.2, 0.1, 0.3]))

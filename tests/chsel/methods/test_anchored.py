@@ -9,24 +9,23 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.anchors import bounds_of, in_telling_order
-from chsel.arrays import FloatArray
-from chsel.energy import Energy
-from chsel.engine import poses_of
+from chsel.cost.compiled_cost import poses_of
 from chsel.errors import ChselError, SettingError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.methods.anchored import EFFORTS, Anchored, AnchoredSettings, Effort
-from chsel.observer import NullObserver
-from chsel.online import pose_problem
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import apply, check_rigid, inverse
-from chsel.problem import Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.settings import build_settings, settings_mapping
-from chsel.space import PlaneSettings, search_space, transforms_of
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.methods.anchored.anchor_sampling import in_telling_order
+from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Effort
+from chsel.methods.anchored.energy import Energy
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, check_rigid, inverse
+from chsel.problem.registration_problem import Hypotheses, NullObserver, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space, transforms_of
+from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
 EFFORT = Effort(4000, 24, 5, 12, 8, 8, 30, 12, 60, 4, 40)
@@ -59,7 +58,7 @@ def energies_of(
     """Energies (B,) of transforms, as the method's settings have them."""
     settings = method.settings
     space = search_space(settings.plane, problem.sdf)
-    bounds = bounds_of(problem, space, settings.anchors.margin)
+    bounds = origin_bounds(problem.workspace, space, settings.anchors.margin)
     known, tolerance = in_telling_order(problem.points), settings.penetration_tolerance
     return Energy(problem, known, space, tolerance, bounds).of(poses_of(object_from_world))
 

@@ -8,22 +8,22 @@ import pytest
 import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.arrays import FloatArray
-from chsel.engine import poses_of
+from chsel.cost.compiled_cost import poses_of
 from chsel.errors import SettingError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.kernels import cvo as kernels
-from chsel.kernels.cvo import DONE, VALUE, Ascent, Product, climb, products, scratch
-from chsel.methods.cvo import Cvo, CvoSettings, preset_cvo, preset_cvo_no_free_space
+from chsel.methods.cvo import cvo_kernels as kernels
+from chsel.methods.cvo.cvo import Cvo, CvoSettings, preset_cvo, preset_cvo_no_free_space
+from chsel.methods.cvo.cvo_kernels import DONE, VALUE, Ascent, Product, climb, products, scratch
+from chsel.methods.cvo.rkhs_fields import Kernel, free_field, surface_field
 from chsel.methods.method import Method
-from chsel.observer import NullObserver
-from chsel.pose import apply, axis_angle, compose, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.rkhs_field import Kernel, free_field, surface_field
-from chsel.settings import build_settings, settings_mapping
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.registration_problem import NullObserver
+from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.streams import StreamKey
 from tests.chsel.dense_cvo import DenseClouds, along, flows, nearby
 
 MESH = trimesh.creation.box([0.12, 0.08, 0.06])

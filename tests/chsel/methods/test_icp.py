@@ -9,16 +9,16 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.arrays import FloatArray
 from chsel.errors import ChselError, SettingError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.methods.icp import Icp, IcpSettings, preset_icp
-from chsel.observer import NullObserver
-from chsel.pose import apply, axis_angle, compose, inverse, product, random_rotations
+from chsel.methods.icp.icp import Icp, IcpSettings, preset_icp
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.problem.poses import apply, axis_angle, compose, inverse, product, random_rotations
+from chsel.problem.registration_problem import NullObserver
+from chsel.problem.streams import StreamKey
 
 MESH = trimesh.boolean.union(
     [

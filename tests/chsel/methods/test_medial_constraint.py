@@ -9,26 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chsel.cma_es import CmaEsSettings
 from chsel.errors import ChselError, SettingError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.methods.medial_constraint import (
+from chsel.methods.medial_constraint.cma_es import CmaEsSettings
+from chsel.methods.medial_constraint.medial_constraint import (
     MedialConstraint,
-    preset_medial_constraint,
-)
-from chsel.methods.medial_constraint_cma_me import (
     MedialConstraintCmaMe,
+    preset_medial_constraint,
     preset_medial_constraint_cma_me,
 )
-from chsel.online import pose_problem
-from chsel.points import KnownPoints
-from chsel.pose import inverse
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.settings import build_settings, settings_mapping
-from chsel.space import PlaneSettings
-from chsel.streams import StreamKey
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.search_space import PlaneSettings
+from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.streams import StreamKey
+from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
 Maker = Callable[[str], Any]

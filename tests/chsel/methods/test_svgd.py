@@ -11,19 +11,18 @@ import trimesh
 from torch import Tensor
 
 from chsel import KnownPoints, RegistrationProblem, RelaxedCost, SdfGrid, Workspace
-from chsel.arrays import FloatArray
 from chsel.errors import ChselError, SettingError
-from chsel.evaluation.pose_error import pose_errors
-from chsel.evaluation.symmetry import ObjectSymmetry
-from chsel.kernels import svgd as kernels
-from chsel.kernels.svgd import Particles, direct, particles_at
-from chsel.methods.svgd import Svgd, SvgdSettings, preset_svgd
-from chsel.observer import NullObserver
-from chsel.pose import apply, axis_angle, compose, encode_9d, inverse, product
+from chsel.methods import svgd as kernels
+from chsel.methods.svgd import Particles, Svgd, SvgdSettings, direct, particles_at, preset_svgd
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.space import PlaneSettings, SE3Space
-from chsel.streams import StreamKey
-from chsel.threads import threads
+from chsel.problem.poses import apply, axis_angle, compose, encode_9d, inverse, product
+from chsel.problem.registration_problem import NullObserver
+from chsel.problem.search_space import PlaneSettings, SE3Space
+from chsel.problem.streams import StreamKey
 
 SIDES = np.array([0.2, 0.12, 0.08])
 MESH = trimesh.creation.box(SIDES)

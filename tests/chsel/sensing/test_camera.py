@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from chsel.errors import PointsError, SettingError
-from chsel.sensing.camera import PinholeCamera
+from chsel.sensing.depth_camera import PinholeCamera
 
 CAMERA = PinholeCamera(4, 3, 2.0, 4.0, 1.0, 1.5)
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chsel.arrays import FloatArray
 from chsel.errors import PointsError
-from chsel.sensing.camera import PinholeCamera
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.streams import Purpose, StreamKey
 from chsel.sensing.contact_patch import contact_mask, contact_subset, deformation, share, smooth
-from chsel.streams import Purpose, StreamKey
+from chsel.sensing.depth_camera import PinholeCamera
 
 CAMERA = PinholeCamera(224, 171, 200.0, 200.0, 112.0, 85.0)
 MEMBRANE, RADIUS, PRESSED = 0.10, 0.03, 0.008  # m: its depth; of a sphere; how deep it is pressed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from chsel.sensing.depth import occlusion_edges, valid_pixels
+from chsel.sensing.depth_camera import occlusion_edges, valid_pixels
 
 
 def test_only_depths_within_the_range_are_valid() -> None:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from chsel.arrays import BoolArray, FloatArray
 from chsel.errors import PointsError, PoseError, SettingError
-from chsel.points import FreeVoxels, Lattice, Workspace
-from chsel.pose import axis_angle, compose, rotated
-from chsel.sensing.camera import PinholeCamera
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.points import FreeVoxels, Lattice, Workspace
+from chsel.problem.poses import axis_angle, compose, rotated
+from chsel.sensing.depth_camera import PinholeCamera
 from chsel.sensing.free_space import SCALES, FreeGrid
 
 SPACING = 0.01

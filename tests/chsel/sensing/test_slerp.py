@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from chsel.pose import axis_angle, compose, random_rotations
-from chsel.quaternions import quaternions, rotations
-from chsel.sensing.slerp import interpolated
+from chsel.problem.poses import (
+    axis_angle,
+    compose,
+    interpolated,
+    quaternions,
+    random_rotations,
+    rotations,
+)
 
 
 def test_quaternions_and_rotations_are_each_others_inverse() -> None:

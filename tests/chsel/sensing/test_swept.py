@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import PoseError, SettingError
-from chsel.points import Workspace
-from chsel.pose import apply, axis_angle, compose, inverse, random_rotations
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import Workspace
+from chsel.problem.poses import apply, axis_angle, compose, inverse, random_rotations
 from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.swept import between, interior_lattice, sweep
 

@@ -9,7 +9,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from scipy.spatial.transform import Rotation
 
 from chsel.errors import RecordingError
-from chsel.pose import compose
+from chsel.problem.poses import compose
 from replay.mcap.foxglove_messages import (
     cloud_points,
     log_level_and_text,

@@ -15,18 +15,18 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from chsel.cost_settings import CostSettings
-from chsel.descent import DescentSettings
-from chsel.emitters import Draws, EmitterSettings
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.interior_points import interior_points
 from chsel.errors import RecordingError, SdfError, SettingError
-from chsel.interior import interior_points
 from chsel.methods.chsel import ChselSettings
-from chsel.online import OnlineSettings
-from chsel.points import KnownPoints
-from chsel.problem import RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.selection import ArchiveSettings
-from chsel.streams import Purpose, StreamKey, normals
+from chsel.methods.gradient_descent import DescentSettings
+from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import Purpose, StreamKey, normals
+from chsel.problem.warm_start import OnlineSettings
+from chsel.qd.emitters import Draws, EmitterSettings
+from chsel.qd.selection import ArchiveSettings
 from replay.events import (
     Event,
     HypothesesFound,

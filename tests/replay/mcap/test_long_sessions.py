@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chsel import points as points_module
-from chsel.points import GrowingPoints, KnownPoints
+from chsel.problem import points as points_module
+from chsel.problem.points import GrowingPoints, KnownPoints
 from replay.events import Event, Logged, Probe, SessionEnded, SessionStarted
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import recover

@@ -16,9 +16,8 @@ from mcap.reader import make_reader
 from rerun.chunk import McapReader
 
 import replay
-from chsel.points import KnownPoints
-from chsel.pose import inverse
-from chsel.quaternions import rotations
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse, rotations
 from replay.comparing.recording_diff import recording_diff
 from replay.events import Event, HypothesesFound, Probe, SessionStarted
 from replay.mcap.cumulative_points import CumulativePoints

@@ -19,8 +19,8 @@ from mcap.records import Chunk, DataEnd, Message
 from mcap.stream_reader import StreamReader
 
 from chsel.errors import RecordingError
-from chsel.points import KnownPoints
-from chsel.pose import inverse
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse
 from replay.events import (
     HypothesesFound,
     Logged,

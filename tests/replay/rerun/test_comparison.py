@@ -12,11 +12,11 @@ import pytest
 from rerun.blueprint.components import PlayState
 from rerun.chunk import RrdReader
 
-from chsel.engine import CompiledCost
+from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
-from chsel.evaluation.spread import spread
-from chsel.pose import compose, inverse
-from chsel.problem import Hypotheses
+from chsel.plausible.pose_metrics import spread
+from chsel.problem.poses import compose, inverse
+from chsel.problem.registration_problem import Hypotheses
 from replay.comparing.comparison import common_cost, numbers_under
 from replay.events import Event
 from replay.mcap.reader import Recording, read_recording

@@ -20,12 +20,12 @@ from rerun.blueprint.components import PlayState
 from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
-from chsel.evaluation.spread import Spread, spread
-from chsel.points import KnownPoints, Workspace
-from chsel.pose import compose, inverse, random_rotations
-from chsel.problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.sdf import SdfGrid
-from chsel.streams import StreamKey
+from chsel.plausible.pose_metrics import Spread, spread
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import compose, inverse, random_rotations
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.background_recorder import BackgroundRecorder
 from replay.events import (
     Event,

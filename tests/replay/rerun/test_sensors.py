@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.pose import compose
+from chsel.problem.poses import compose
 from replay.events import Event, Probe, RigDescribed, SensorImage
 from replay.rerun.hand import deepest
 from replay.rerun.sensors import display_size, pixel_classes

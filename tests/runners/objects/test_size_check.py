@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import trimesh
 
-from chsel.points import Workspace
+from chsel.problem.points import Workspace
 from runners.objects.loader import ObjectModel
 from runners.objects.size_check import check_size
 

@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
-from chsel.pose import check_rigid
+from chsel.problem.poses import check_rigid
 from runners.sensors.clocks import Clocks
 from runners.sensors.log import RawLog
 from runners.sensors.messages import (

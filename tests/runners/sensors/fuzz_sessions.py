@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import ChselError
-from chsel.pose import check_rigid
+from chsel.problem.poses import check_rigid
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, ProbeTimes, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from chsel.arrays import FloatArray
-from chsel.pose import compose, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose, inverse
 from runners.sensors.rig import BoxRig, BubbleRig, CameraRig, ContactRig, HandRig, Rig
 from runners.twin.log_writer import LogWriter
 from runners.twin.pinhole import Pinhole

@@ -16,10 +16,10 @@ from PIL import Image
 
 import chsel
 from chsel.errors import PointsError, SessionError, SettingError
-from chsel.mesh import load_mesh
-from chsel.pose import apply, inverse
-from chsel.sdf import mesh_sdf
-from chsel.settings import build_settings
+from chsel.problem.mesh import load_mesh
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import mesh_sdf
+from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
 from runners.sensors import depth_frame_points as module
 from runners.sensors.depth_frame import DepthFrame, read_depth_frame

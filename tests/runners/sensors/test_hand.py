@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from chsel.errors import SettingError
-from chsel.pose import roll_pitch_yaw
+from chsel.problem.poses import roll_pitch_yaw
 from runners.sensors import collision_mesh
 from runners.sensors import urdf as urdf_module
 from runners.sensors.hand import HandModel, hand_solids

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from chsel.errors import ChselError, RecordingError, SessionError
-from chsel.pose import compose, rotation_vector
+from chsel.problem.poses import compose, rotation_vector
 from runners.sensors.pose_file import beside, read_pose, read_pose_file, write_pose
 
 POSE = compose(rotation_vector(np.array([0.3, -1.2, 0.4])), np.array([0.9, -0.05, 0.31]))

@@ -5,8 +5,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray
-from chsel.pose import axis_angle, compose, inverse, random_rotations, rotation_angle
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, rotation_angle
 from runners.sensors.messages import TransformMessage
 from runners.sensors.quaternions import rigid, unit_quaternion
 from runners.sensors.transforms import TransformError, TransformTree

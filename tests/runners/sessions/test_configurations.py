@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from chsel.errors import SessionError, SettingError
-from chsel.pose import apply, axis_angle, compose, rotation_angle
-from chsel.settings import build_settings
+from chsel.problem.poses import apply, axis_angle, compose, rotation_angle
+from chsel.problem.settings import build_settings
 from runners.objects.models import MODELS
 from runners.sessions.configurations import (
     CONFIGURATIONS,

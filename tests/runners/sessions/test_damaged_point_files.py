@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel import npz_file
 from chsel.errors import ChselError, PointsError
+from chsel.problem import file_checks as npz_file
 from runners.sessions.point_files import PointFile, read_points
 
 POINTS = np.arange(9.0).reshape(3, 3) / 100

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.points import Lattice
-from chsel.pose import apply, inverse
-from chsel.sdf import mesh_sdf
+from chsel.problem.points import Lattice
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.objects.models import MODELS
 from runners.sessions import hand
@@ -187,7 +187,7 @@ def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_work
 
 
 def test_a_real_scan_can_be_probed(ycb_directory) -> None:  # type: ignore[no-untyped-def]
-    from chsel.mesh import load_mesh
+    from chsel.problem.mesh import load_mesh
 
     file = ycb_directory / "010_potted_meat_can" / "google_16k" / "nontextured.ply"
     session = open_kinematic(load_mesh(file, scale=2.5), "can", DEFAULT, 0)

@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
 from chsel.methods import build_method
-from chsel.pose import apply, inverse
-from chsel.sdf import SdfGrid, mesh_sdf
-from chsel.settings import build_settings, settings_mapping
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
+from chsel.problem.settings import build_settings, settings_mapping
 from replay.events import Logged, Probe, RigDescribed, SensorImage, SessionEnded, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import SessionError
-from chsel.pose import apply, inverse
-from chsel.sdf import mesh_sdf
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.objects.models import MODELS
 from runners.sessions import hand

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from chsel.errors import SessionError
-from chsel.pose import apply, inverse
+from chsel.problem.poses import apply, inverse
 from runners.objects.models import MODELS
 from runners.twin import wrist
 from runners.twin.configurations import (

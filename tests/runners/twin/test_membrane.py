@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chsel.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray
 from runners.twin.membrane import CAP, CAP_BASE, TAUTNESS, Membrane
 from runners.twin.pinhole import Pinhole
 from runners.twin.settings import TwinBubbles

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chsel.streams import Purpose, StreamKey
+from chsel.problem.streams import Purpose, StreamKey
 from runners.twin.noise import LOST, bubble_depth, stereo_depth
 from runners.twin.settings import TwinBubbles, TwinCamera
 

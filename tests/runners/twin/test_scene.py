@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.arrays import FloatArray
 from chsel.errors import SessionError
-from chsel.pose import apply
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply
 from runners.objects.models import MODELS
 from runners.twin import cabinet, wrist
 from runners.twin.configurations import CABINET_CONFIGURATIONS, REST, stood_on_shelf

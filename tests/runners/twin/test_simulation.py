@@ -17,9 +17,9 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from chsel.arrays import FloatArray
 from chsel.errors import SettingError
-from chsel.pose import apply, compose, inverse
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, compose, inverse
 from runners.objects.models import MODELS
 from runners.twin.configurations import CABINET_CONFIGURATIONS, REST
 from runners.twin.recorder import START, TICK

@@ -1,0 +1,94 @@
+"""The free term's other form: points inside of the object that must not fall into free voxels."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.cost.cost_settings import CostSettings
+from chsel.errors import SettingError
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.problem.points import Lattice
+from chsel.problem.sdf_grid import SdfGrid
+
+FEW_INTERIOR_POINTS = 25
+_MAX_VOXELS = 100_000_000
+_MAX_NODES = 10_000_000  # of the lattice over the SDF grid
+
+
+@dataclass(frozen=True)
+class InteriorPoints:
+    """Points (M, 3) inside of an object, with their depths (M,) > 0 and SDF gradients (M, 3)."""
+
+    points: FloatArray
+    depth: FloatArray
+    normals: FloatArray
+
+    def in_order(self, order: IntArray) -> InteriorPoints:
+        """The points that `order` (M,) numbers."""
+        return InteriorPoints(self.points[order], self.depth[order], self.normals[order])
+
+
+def interior_spacing(sdf: SdfGrid, settings: CostSettings) -> float:
+    """Metres between interior points."""
+    alpha = settings.penetration_tolerance
+    return settings.interior_spacing or max(-alpha, sdf.resolution / 4)
+
+
+def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
+    """The nodes of a lattice over the grid that are deeper than alpha."""
+    alpha, spacing = settings.penetration_tolerance, interior_spacing(sdf, settings)
+    lower, upper = sdf.bounds
+    counts = np.floor((upper - lower) / spacing).astype(int) + 1
+    if not math.prod(counts.tolist()) <= _MAX_NODES:
+        raise SettingError(
+            f"interior_spacing {spacing} m makes {math.prod(counts.tolist()):.1e} nodes; "
+            f"accepted: at most {_MAX_NODES:.0e}, so a coarser interior_spacing"
+        )
+    nodes = lower + np.indices(counts).reshape(3, -1).T * spacing
+    query = sdf.query(nodes, lookup=settings.lookup, outside=settings.outside)
+    s, n = (part.numpy() for part in query)
+    inside = s < alpha
+    if not bool(inside.any()):
+        raise SettingError(
+            f"free_term interior finds no point deeper than {-alpha} m; accepted: "
+            "a penetration_tolerance nearer to 0, or free_term direct"
+        )
+    if int(inside.sum()) < FEW_INTERIOR_POINTS:
+        warnings.warn(
+            f"free_term interior uses {int(inside.sum())} points; a finer interior_spacing "
+            f"than {spacing} m describes the object better",
+            stacklevel=3,
+        )
+    return InteriorPoints(nodes[inside], -s[inside], n[inside])
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Voxels that hold a free point, with a layer of others around: flags (nx, ny, nz).
+
+    origin (3,): centre of the first voxel. resolution: side, metres.
+    """
+
+    origin: FloatArray
+    resolution: float
+    flags: BoolArray
+
+    @classmethod
+    def around(cls, free: FloatArray, resolution: float) -> VoxelGrid:
+        """The voxels of free points (N, 3), N > 0."""
+        lattice = Lattice(tuple(free.min(axis=0).tolist()), resolution)
+        count = math.prod((np.ptp(free, axis=0) / resolution + 3.0).tolist())
+        if not count <= _MAX_VOXELS:
+            raise SettingError(
+                f"free points span {count:.1e} voxels of {resolution} m; "
+                f"accepted: at most {_MAX_VOXELS:.0e}, so a coarser free_resolution"
+            )
+        voxels = lattice.voxels(free)
+        shape = voxels.max(axis=0) + 3
+        flags = np.zeros(shape, dtype=bool)
+        flags[tuple((voxels + 1).T)] = True
+        return cls(np.array(lattice.origin) - resolution, resolution, flags)

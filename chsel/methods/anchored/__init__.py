@@ -1,0 +1,1 @@
+"""Contact-anchored search."""

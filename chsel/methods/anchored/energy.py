@@ -1,0 +1,130 @@
+"""The energy of poses, and what lowers it or wanders below a limit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.objective import Objective
+from chsel.methods.anchored.energy_kernels import energies_below, found_around
+from chsel.methods.anchored.fit_kernels import Twists, fit_for, fit_poses
+from chsel.methods.anchored.walk_kernels import (
+    DRAWS,
+    Chains,
+    Stride,
+    chains_from,
+    steps_for,
+    walk_below,
+)
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.cell_set import triple
+from chsel.numerics.threads import spread
+from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.search_space import SE2Space, SearchSpace
+from chsel.problem.streams import Purpose
+from chsel.problem.surface import object_centre
+
+_FIT_LEVEL = -0.003  # metres: free points at less depth do not push
+_LEVER = 0.15  # metres that a radian counts for
+_MOST_SHIFT, _MOST_TURN = 0.08, 0.5  # of a step, metres and radians
+_BLOCK = 512  # chains whose moves are drawn at a time
+_AXIS_NONE = (0.0, 0.0, 0.0)
+
+
+class Energy:
+    """E(X) = mean |s - v| over known points + sum max(0, -tau - s) over free ones, in metres.
+
+    The same above tau for occupied points. It is the relaxed cost (CHSEL, Eq. 7) with other
+    weights and alpha = -tau, interpolated. known: the problem's points, see `in_telling_order`.
+    """
+
+    def __init__(
+        self,
+        problem: RegistrationProblem,
+        known: KnownPoints,
+        space: SearchSpace,
+        tolerance: float,
+        bounds: tuple[FloatArray, FloatArray],
+    ) -> None:
+        """tolerance: tau, metres. bounds: where walks keep the object's origin."""
+        sdf = problem.sdf
+        settings = CostSettings(
+            penetration_tolerance=-tolerance,
+            free_scale=1.0,
+            occupied_scale=1.0,
+            known_scale=1.0 / max(len(known.known), 1),
+            gradient="exact",
+        )
+        resolution = problem.free_resolution
+        cost = CompiledCost(sdf, known, settings, free_resolution=resolution, way="tree")
+        self.objective = Objective(cost, space)
+        self._model = cost.model
+        self._fitting = cost.at_level(sdf, _FIT_LEVEL - tolerance)
+        self._key = problem.key
+        planar = isinstance(space, SE2Space)
+        basis = np.eye(6)
+        if isinstance(space, SE2Space):
+            basis = np.zeros((3, 6))
+            basis[0, :3], basis[1, 3:], basis[2, 3:] = space.axis, space.e_u, space.e_v
+        basis[:, :3] /= _LEVER
+        centre = triple(object_centre(sdf))
+        self._twists = Twists(basis, centre, _MOST_SHIFT, _MOST_TURN)
+        self._stride = Stride(
+            planar=planar,
+            axis=triple(space.axis) if isinstance(space, SE2Space) else _AXIS_NONE,
+            pivot=centre,
+            lower=triple(bounds[0]),
+            upper=triple(bounds[1]),
+        )
+
+    def of(self, poses: FloatArray) -> FloatArray:
+        """Energies (B,) of poses (B, 12)."""
+        energies = np.empty(len(poses))
+
+        def run(first: int, last: int, found: Any) -> None:
+            energies_below(self._model, poses, np.inf, energies, first, last, found)
+
+        spread(run, len(poses), lambda: found_around(self._model), least=50)
+        return energies
+
+    def fitted(self, poses: FloatArray, steps: int) -> FloatArray:
+        """Poses (B, 12) after at most so many Levenberg-Marquardt steps."""
+        moved = np.array(poses)
+
+        def run(first: int, last: int, fit: Any) -> None:
+            fit_poses(self._fitting, self._twists, moved, steps, first, last, fit)
+
+        dimension = len(self._twists.basis)
+        spread(run, len(moved), lambda: fit_for(self._fitting, dimension), least=8)
+        return moved
+
+    def walked(
+        self,
+        poses: FloatArray,
+        energies: FloatArray,
+        floor: float,
+        moves: int,
+        *,
+        kept: int,
+        index: int,
+    ) -> Chains:
+        """Chains from poses (C, 12) with energies (C,), after so many moves.
+
+        floor: the limit that they stay below, or come down to. kept: states to keep on the way.
+        index: of the stream.
+        """
+        chains, stream = chains_from(poses, energies, kept), self._key.stream(Purpose.WALKS, index)
+
+        def run(first: int, last: int, steps: Any) -> None:
+            stride, model = self._stride, self._model
+            walk_below(model, stride, floor, chains, draws, before, first, last, steps)
+
+        for before in range(0, len(poses), _BLOCK):
+            count = min(_BLOCK, len(poses) - before)
+            draws = stream.random((count, moves, DRAWS), dtype=np.float32)
+            spread(run, count, lambda: steps_for(self._model), least=2)
+        return chains

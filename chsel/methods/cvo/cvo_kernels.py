@@ -1,0 +1,344 @@
+"""Ascent of the inner product of two labelled clouds (CVO; Zhang et al., 2021), start by start.
+
+Of the cloud in the object frame only its fields are left: f(p) = sum_j a(p, z_j), one per class.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.cell_set import Box, Places, locate, places_for
+from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.elementary import sine_cosine
+from chsel.numerics.pose_tuples import pose_at
+
+BLOCK = 512  # points that are located at once
+STEPS = 16
+VALUE, STEP, STALLED, DONE, MOVED = range(5)  # what the state of a start holds there
+_PATIENCE = 5
+_REFINEMENTS = 3
+_NEAR = 0.05  # lengths of steps that differ by less are not told apart
+
+
+class ClassTerm(NamedTuple):
+    """One class of points and its field.
+
+    points (3, N): of the world, metres. table (nodes, 4): f at the nodes of the box, its gradient.
+    weight: W of the class.
+    """
+
+    points: FloatArray
+    box: Box
+    table: Any
+    weight: float
+
+
+class Product(NamedTuple):
+    """F(X) = sum over classes of W sum_i f(R x_i + t). blocks: of cubes of free points."""
+
+    free: ClassTerm
+    blocks: ClassTerm
+    surface: ClassTerm
+
+
+class Ascent(NamedTuple):
+    """How to climb. steps (16,): tau, ascending. c, d: scales of the flow's parts.
+
+    stop_below: relative gain of F that does not count as one; negative: every gain counts.
+    """
+
+    steps: FloatArray
+    c: float
+    d: float
+    stop_below: float
+
+
+def scratch() -> Places:
+    """Scratch of one thread."""
+    return places_for(BLOCK)
+
+
+@compiled
+def products(product, poses, out, first, last, places):
+    """Fill out (B,) with F at poses (B, 12), from `first` to before `last`."""
+    for n in range(first, last):
+        out[n] = _product_at(product, pose_at(poses, n), places)
+
+
+@compiled
+def climb(product, ascent, poses, states, iterations, first, last, places):
+    """Take poses (B, 12) some iterations uphill, from `first` to before `last`.
+
+    states (B, 5): F, index of the last step's length, iterations in a row that gained nothing,
+    whether the start is done, whether it has moved.
+    """
+    for n in range(first, last):
+        state = states[n]
+        for _ in range(iterations):
+            if state[DONE] == 0.0:
+                pose = pose_at(poses, n)
+                xi, slope = _direction(product, ascent, pose, places)
+                if slope > 0.0:
+                    _step(product, ascent, pose, xi, slope, poses[n], state, places)
+                else:
+                    state[DONE] = 1.0
+
+
+@inner
+def _direction(product, ascent, pose, places):
+    """The flow xi = (omega, u) as a unit vector, and the slope of F along it; 0 without overlap.
+
+    omega = 1/c sum x_i x h_i, u = 1/d sum h_i.
+    """
+    flow = flow_at(product, pose, places)
+    a, b, c = flow[1] / ascent.c, flow[2] / ascent.c, flow[3] / ascent.c
+    d, e, f = flow[4] / ascent.d, flow[5] / ascent.d, flow[6] / ascent.d
+    size = np.sqrt(a * a + b * b + c * c + d * d + e * e + f * f)
+    if not 0.0 < size < np.inf:
+        return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0
+    xi = a / size, b / size, c / size, d / size, e / size, f / size
+    slope = 0.0
+    for i in range(6):
+        slope += xi[i] * flow[i + 1]
+    return xi, slope
+
+
+@inner
+def _step(product, ascent, pose, xi, slope, moved, state, places):
+    """The best step found along the flow, if any is uphill.
+
+    From the last step's length on: longer while F rises, or shorter until it has risen; then where
+    polynomials are highest that have F and its slope at 0, and F at the lengths tried.
+    """
+    steps, before = ascent.steps, state[VALUE]
+    least, most = steps[0] / 1024.0, steps[STEPS - 1]
+    k = int(state[STEP])
+    tau, other, at_other = steps[k], 0.0, 0.0
+    value = _product_at(product, _gone(pose, xi, tau), places)
+    vertex = _vertex(tau, value - before, slope)
+    while value > before and vertex > tau and k + 1 < STEPS:
+        beyond = _product_at(product, _gone(pose, xi, steps[k + 1]), places)
+        if not beyond > value:
+            other, at_other = steps[k + 1], beyond
+            break
+        other, at_other = tau, value
+        k, tau, value = k + 1, steps[k + 1], beyond
+        vertex = _vertex(tau, value - before, slope)
+    while value <= before and tau > least:
+        other, at_other = tau, value
+        tau = max(min(vertex, 0.5 * tau), 0.1 * tau)
+        value = _product_at(product, _gone(pose, xi, tau), places)
+        vertex = _vertex(tau, value - before, slope)
+    if value <= before:
+        state[DONE] = 1.0
+        return
+    ahead = vertex
+    if other > 0.0:
+        ahead = _crest(tau, value - before, other, at_other - before, slope)
+    for _ in range(_REFINEMENTS):
+        if not (ahead <= most and abs(ahead - tau) > _NEAR * tau):
+            break
+        at_ahead = _product_at(product, _gone(pose, xi, ahead), places)
+        if at_ahead > value:
+            tau, value, other, at_other = ahead, at_ahead, tau, value
+        else:
+            other, at_other = ahead, at_ahead
+        ahead = _crest(tau, value - before, other, at_other - before, slope)
+    reached = _gone(pose, xi, tau)
+    for i in range(12):
+        moved[i] = reached[i]
+    while k > 0 and steps[k] > tau:
+        k -= 1
+    small = value - before <= ascent.stop_below * before
+    state[VALUE], state[STEP], state[MOVED] = value, float(k), 1.0
+    state[STALLED] = state[STALLED] + 1.0 if small else 0.0
+    if state[STALLED] >= _PATIENCE:
+        state[DONE] = 1.0
+
+
+@leaf
+def _vertex(tau, gain, slope):
+    """Where a parabola of that slope at 0 and that gain at tau is highest; infinite if nowhere."""
+    bend = (gain / tau - slope) / tau
+    return -0.5 * slope / bend if bend < 0.0 else np.inf
+
+
+@leaf
+def _crest(tau, gain, other, other_gain, slope):
+    """Where a cubic of that slope at 0 and those gains is highest nearby; infinite if nowhere."""
+    near, far = (gain / tau - slope) / tau, (other_gain / other - slope) / other
+    third = (far - near) / (other - tau)
+    second = near - third * tau
+    root = second * second - 3.0 * third * slope
+    below = np.sqrt(root) - second if root >= 0.0 else 0.0
+    return slope / below if below > 0.0 else np.inf
+
+
+@leaf
+def _gone(pose, xi, tau):
+    """G Exp(tau xi) of a pose G = (R, t) and a unit vector xi = (omega, u).
+
+    Exp has the rotation I + sin(a) W + (1 - cos(a)) W^2, a = tau |omega|, W the hat of omega /
+    |omega|, and the translation tau (u + (1 - cos a)/a W u + (a - sin a)/a W^2 u).
+    """
+    size = np.sqrt(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2])
+    angle = tau * size
+    inverse = 1.0 / size if size > 0.0 else 0.0
+    a, b, c = xi[0] * inverse, xi[1] * inverse, xi[2] * inverse
+    sine, cosine = sine_cosine(angle)
+    half, _ = sine_cosine(0.5 * angle)
+    back = 2.0 * half * half  # 1 - cos, which loses no digit of small angles
+    u, v, w = xi[3], xi[4], xi[5]
+    p, q, r = b * w - c * v, c * u - a * w, a * v - b * u
+    i, j, k = b * r - c * q, c * p - a * r, a * q - b * p
+    first = back / angle if angle > 0.0 else 0.0
+    second = _rest_of_sine(angle, sine)
+    x = tau * (u + first * p + second * i)
+    y = tau * (v + first * q + second * j)
+    z = tau * (w + first * r + second * k)
+    turn = (
+        cosine + back * a * a,
+        back * a * b - sine * c,
+        back * a * c + sine * b,
+        back * a * b + sine * c,
+        cosine + back * b * b,
+        back * b * c - sine * a,
+        back * a * c - sine * b,
+        back * b * c + sine * a,
+        cosine + back * c * c,
+    )
+    return (
+        pose[0] * turn[0] + pose[1] * turn[3] + pose[2] * turn[6],
+        pose[0] * turn[1] + pose[1] * turn[4] + pose[2] * turn[7],
+        pose[0] * turn[2] + pose[1] * turn[5] + pose[2] * turn[8],
+        pose[3] * turn[0] + pose[4] * turn[3] + pose[5] * turn[6],
+        pose[3] * turn[1] + pose[4] * turn[4] + pose[5] * turn[7],
+        pose[3] * turn[2] + pose[4] * turn[5] + pose[5] * turn[8],
+        pose[6] * turn[0] + pose[7] * turn[3] + pose[8] * turn[6],
+        pose[6] * turn[1] + pose[7] * turn[4] + pose[8] * turn[7],
+        pose[6] * turn[2] + pose[7] * turn[5] + pose[8] * turn[8],
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
+        pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
+        pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
+    )
+
+
+@leaf
+def _rest_of_sine(angle, sine):
+    """(a - sin a) / a; by its series where the difference would lose digits."""
+    if angle < 0.02:
+        square = angle * angle
+        return square * (1.0 / 6.0 - square * (1.0 / 120.0 - square / 5040.0))
+    return (angle - sine) / angle
+
+
+@inner
+def _product_at(product, pose, places):
+    """F at a pose."""
+    total = _sum_at(product.free, pose, places)
+    total += _sum_at(product.blocks, pose, places)
+    return total + _sum_at(product.surface, pose, places)
+
+
+@inner
+def flow_at(product, pose, places):
+    """F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), in the world."""
+    sums = _moments_at(product.free, pose, places)
+    sums = _added(sums, _moments_at(product.blocks, pose, places))
+    value, x, y, z, p, q, r = _added(sums, _moments_at(product.surface, pose, places))
+    # R (x_i x h_i) = (p_i - t) x grad f(p_i)
+    p -= pose[10] * z - pose[11] * y
+    q -= pose[11] * x - pose[9] * z
+    r -= pose[9] * y - pose[10] * x
+    return (
+        value,
+        pose[0] * p + pose[3] * q + pose[6] * r,
+        pose[1] * p + pose[4] * q + pose[7] * r,
+        pose[2] * p + pose[5] * q + pose[8] * r,
+        pose[0] * x + pose[3] * y + pose[6] * z,
+        pose[1] * x + pose[4] * y + pose[7] * z,
+        pose[2] * x + pose[5] * y + pose[8] * z,
+    )
+
+
+@leaf
+def _added(a, b):
+    return (
+        a[0] + b[0],
+        a[1] + b[1],
+        a[2] + b[2],
+        a[3] + b[3],
+        a[4] + b[4],
+        a[5] + b[5],
+        a[6] + b[6],
+    )
+
+
+@inner
+def _sum_at(term, pose, places):
+    """W times the sum of f(p_i), p_i = R x_i + t; 0 beyond the field."""
+    box, table, points = term.box, term.table, term.points
+    across, along = int(box.across), int(box.along)
+    beyond, cell, u, v, w = places.beyond, places.cell, places.u, places.v, places.w
+    total = 0.0
+    for start in range(0, points.shape[1], BLOCK):
+        end = min(start + BLOCK, points.shape[1])
+        xs, ys, zs = points[0, start:end], points[1, start:end], points[2, start:end]
+        locate(pose, box, xs, ys, zs, places, end - start)
+        for n in range(end - start):
+            if beyond[n] == 0.0:
+                at = cell[n]
+                near = _along(table, at, along, v[n], w[n])
+                far = _along(table, at + across, along, v[n], w[n])
+                total += _between(near, far, u[n])
+    return term.weight * total
+
+
+@leaf
+def _along(table, at, along, v, w):
+    """f between the four nodes around, of those that share the first index."""
+    near = _between(table[at, 0], table[at + 1, 0], w)
+    return _between(near, _between(table[at + along, 0], table[at + along + 1, 0], w), v)
+
+
+@leaf
+def _between(near, far, share):
+    return np.float64(near) + share * (np.float64(far) - np.float64(near))
+
+
+@inner
+def _moments_at(term, pose, places):
+    """W times sums of f, grad f and p x grad f at p_i = R x_i + t, in the object frame."""
+    box, table, points = term.box, term.table, term.points
+    across, along = int(box.across), int(box.along)
+    beyond, cell = places.beyond, places.cell
+    value = gx = gy = gz = p = q = r = 0.0
+    for start in range(0, points.shape[1], BLOCK):
+        end = min(start + BLOCK, points.shape[1])
+        xs, ys, zs = points[0, start:end], points[1, start:end], points[2, start:end]
+        locate(pose, box, xs, ys, zs, places, end - start)
+        for n in range(end - start):
+            if beyond[n] == 0.0:
+                u, v, w = places.u[n], places.v[n], places.w[n]
+                s = nx = ny = nz = 0.0
+                for corner in range(8):
+                    i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
+                    weight = (u if i else 1.0 - u) * (v if j else 1.0 - v) * (w if k else 1.0 - w)
+                    at = cell[n] + i * across + j * along + k
+                    s += weight * table[at, 0]
+                    nx += weight * table[at, 1]
+                    ny += weight * table[at, 2]
+                    nz += weight * table[at, 3]
+                a = pose[0] * xs[n] + pose[1] * ys[n] + pose[2] * zs[n] + pose[9]
+                b = pose[3] * xs[n] + pose[4] * ys[n] + pose[5] * zs[n] + pose[10]
+                c = pose[6] * xs[n] + pose[7] * ys[n] + pose[8] * zs[n] + pose[11]
+                value += s
+                gx, gy, gz = gx + nx, gy + ny, gz + nz
+                p += b * nz - c * ny
+                q += c * nx - a * nz
+                r += a * ny - b * nx
+    m = term.weight
+    return m * value, m * gx, m * gy, m * gz, m * p, m * q, m * r

@@ -1,0 +1,1 @@
+"""Medial Constraint."""

@@ -1,0 +1,178 @@
+"""Quality-diversity search on the Medial Constraint cost (CHSEL, Sec. V-H)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from chsel import presets
+from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved
+from chsel.methods.medial_constraint.medial_cost import (
+    MedialCost,
+    MedialCostSettings,
+    MedialObjective,
+)
+from chsel.methods.medial_constraint.medial_kernels import medial_cma_me
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import (
+    Hypotheses,
+    NullObserver,
+    Observer,
+    RegistrationProblem,
+)
+from chsel.problem.search_space import PlaneSettings, search_space, transforms_of
+from chsel.problem.streams import Purpose
+from chsel.problem.warm_start import OnlineSettings
+from chsel.qd.archive import GridArchive
+from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me, update_cells
+from chsel.qd.measures import measure_named
+from chsel.qd.selection import (
+    ArchiveSettings,
+    OutputSettings,
+    ranked_hypotheses,
+    select_elites,
+    sized_archive,
+)
+
+MEDIAL_COST = {
+    "default": MedialCostSettings(),
+    "paper": MedialCostSettings(lookup="nearest"),
+    "reference": MedialCostSettings(ball_scale=0.0, lookup="nearest", outside="bounding_box"),
+}
+CMA_ES = {
+    "default": CmaEsSettings(),
+    "paper": CmaEsSettings(tolfun=1e-5, tolfunhist=1e-6),
+    "reference": CmaEsSettings(starts="single", tolfun=1e-5, tolfunhist=1e-6),
+}
+
+
+@dataclass(frozen=True)
+class MedialConstraintSettings:
+    """All settings of Medial Constraint; plane restricts the poses to SE(2)."""
+
+    cost: MedialCostSettings = field(default_factory=MedialCostSettings)
+    cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)
+    online: OnlineSettings = field(default_factory=OnlineSettings)
+    plane: PlaneSettings | None = None
+
+
+def preset_medial_constraint(preset: str) -> MedialConstraintSettings:
+    """The settings of a preset, one of chsel.presets.PRESETS."""
+    return MedialConstraintSettings(
+        MEDIAL_COST[preset], CMA_ES[preset], presets.ONLINE[preset], plane=None
+    )
+
+
+class MedialConstraint:
+    """Evolves poses from E_0; costs are in m^2; E_l is not used."""
+
+    def __init__(self, settings: MedialConstraintSettings | None = None) -> None:
+        self.settings = settings or MedialConstraintSettings()
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem."""
+        return self.settings.online
+
+    def register(
+        self, problem: RegistrationProblem, observer: Observer | None = None
+    ) -> Hypotheses:
+        """Hypotheses for the known points of a problem, best first."""
+        observer = observer or NullObserver()
+        space = search_space(self.settings.plane, problem.sdf)
+        objective = MedialObjective(MedialCost(problem, self.settings.cost), space)
+        vectors = evolved(
+            objective, problem.initial_set, self.settings.cma_es, problem.key, observer
+        )
+        estimates = transforms_of(space, vectors)
+        return ranked_hypotheses(objective, estimates, elites=estimates)
+
+
+ITERATIONS = 500
+TOLERANCE = 1e-5  # m^2, of a mean square: that of 3 mm
+
+_ARCHIVE = ArchiveSettings(tolerance_per_point=0.0, tolerance=TOLERANCE)
+_EMITTER = EmitterSettings(iterations=ITERATIONS)
+_OUTPUT = OutputSettings(tolerance_per_point=0.0, free_tolerance=TOLERANCE)
+
+
+@dataclass(frozen=True)
+class MedialConstraintCmaMeSettings:
+    """All settings of Medial Constraint with CMA-ME; plane restricts the poses to SE(2).
+
+    Tolerances of archive and output are in m^2, as the cost is.
+    """
+
+    cost: MedialCostSettings = field(default_factory=MedialCostSettings)
+    cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)
+    archive: ArchiveSettings = _ARCHIVE
+    emitter: EmitterSettings = _EMITTER
+    output: OutputSettings = _OUTPUT
+    online: OnlineSettings = field(default_factory=OnlineSettings)
+    plane: PlaneSettings | None = None
+
+    def __post_init__(self) -> None:
+        measure_named(self.archive.measure, planar=self.plane is not None)
+
+
+def preset_medial_constraint_cma_me(preset: str) -> MedialConstraintCmaMeSettings:
+    """The settings of a preset, one of chsel.presets.PRESETS."""
+    ours = preset == "default"
+    return MedialConstraintCmaMeSettings(
+        cost=MEDIAL_COST[preset],
+        cma_es=CMA_ES[preset],
+        archive=_ARCHIVE if ours else presets.ARCHIVE[preset],
+        emitter=_EMITTER if ours else replace(presets.EMITTER[preset], iterations=ITERATIONS),
+        output=_OUTPUT if ours else presets.OUTPUT[preset],
+        online=presets.ONLINE[preset],
+    )
+
+
+class MedialConstraintCmaMe:
+    """CMA-ES from E_0, then CMA-ME over an archive around what it finds; costs are in m^2."""
+
+    def __init__(self, settings: MedialConstraintCmaMeSettings | None = None) -> None:
+        self.settings = settings or MedialConstraintCmaMeSettings()
+        planar = self.settings.plane is not None
+        self._measure = measure_named(self.settings.archive.measure, planar=planar)
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem."""
+        return self.settings.online
+
+    def register(
+        self, problem: RegistrationProblem, observer: Observer | None = None
+    ) -> Hypotheses:
+        """Hypotheses for the known points of a problem, best first."""
+        observer, settings = observer or NullObserver(), self.settings
+        space = search_space(settings.plane, problem.sdf)
+        objective = MedialObjective(MedialCost(problem, settings.cost), space)
+        key, count = problem.key, len(problem.initial_set)
+        # E' <- CMA-ES on E_0; as poses, so that it holds what hypotheses can be
+        found = evolved(objective, problem.initial_set, settings.cma_es, key, observer)
+        vectors = space.encode(transforms_of(space, found))
+        archive = self._seeded_archive(problem, objective, vectors)
+        # M <- CMA-ME(M, C_M, n_o)
+        first, best = space.encode(problem.initial_set[:1])[0], archive.best_solution
+        start = first if settings.emitter.start == "initial" else best
+        draws, watch = Draws(key), ArchiveWatch(observer, 0, "cma_me")
+        watch.start(archive)
+        cma_me(objective, archive, start, count, settings.emitter, draws, watch, medial_cma_me)
+        # E <- cells of M with the |E_0| lowest costs
+        stream, elites = key.stream(Purpose.RESAMPLE), transforms_of(space, archive.solutions)
+        chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
+        snapshot = archive.snapshot(settings.emitter.iterations, 0)
+        cells = archive.occupied[chosen]
+        return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)
+
+    def _seeded_archive(
+        self, problem: RegistrationProblem, objective: MedialObjective, vectors: FloatArray
+    ) -> GridArchive:
+        """The archive that measures of E', vectors (B, d), size, holding E' and E_l."""
+        settings, measure, space = self.settings.archive, self._measure, objective.space
+        costs, measures = objective.costs(vectors), measure.values(space, vectors)
+        known_count = len(problem.points.known)
+        archive = sized_archive(measure, measures, costs, settings, known_count, space.dimension)
+        update_cells(archive, objective, vectors, costs)
+        update_cells(archive, objective, space.encode(problem.low_cost_set))
+        return archive

@@ -1,0 +1,120 @@
+"""Grids of cells, which cells points fall into, and how far they are from some of the cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt
+
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.compiler import inner, leaf
+
+
+class Box(NamedTuple):
+    """The nodes of a grid and the cells of its points, in numbers alone.
+
+    first, last: corner nodes, metres. inverse: nodes per metre. between: 0 if a point belongs to
+    the cell around the nearest node, 1 if to the cell between nodes, named after its lowest node.
+    most: the greatest index of a cell per axis. across, along: from a node to the next one on the
+    first and on the second axis, in a flat array.
+    """
+
+    first: tuple[float, float, float]
+    last: tuple[float, float, float]
+    inverse: float
+    between: float
+    most: tuple[float, float, float]
+    across: float
+    along: float
+
+
+class Region(NamedTuple):
+    """A set of grid cells, and how far every other cell is from it.
+
+    clearance (nodes,): -1 for a cell of the set, else the squared distance in metres between any
+    point of the cell and any point of the set, or less.
+    """
+
+    box: Box
+    clearance: Any
+
+
+def box_of(
+    first: FloatArray, resolution: float, shape: Sequence[int], *, between: bool = False
+) -> Box:
+    """The box of a grid of nodes (nx, ny, nz) from its first node (3,) on."""
+    x, y, z = (int(count) for count in shape)
+    last = first + (np.array([x, y, z]) - 1) * resolution
+    most = triple(np.array([x, y, z]) - (2 if between else 1))
+    down = 1.0 if between else 0.0
+    return Box(triple(first), triple(last), 1.0 / resolution, down, most, float(y * z), float(z))
+
+
+def triple(values: Sequence[float] | FloatArray) -> tuple[float, float, float]:
+    """Three numbers as a tuple, which costs kernels nothing to pass on."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def clearance_of(cells: BoolArray, resolution: float) -> Any:
+    """Squared distances of grid cells (nx, ny, nz) to those that are set, flat, as in Region."""
+    if not cells.any():
+        return np.full(cells.size, np.inf, dtype=np.float32)
+    # Between cells as boxes: one cell less on every axis than between their centres.
+    touching = binary_dilation(cells, np.ones((3, 3, 3), dtype=bool))
+    distance = distance_transform_edt(~touching) * resolution
+    squared = (distance * (1.0 - 1e-6)) ** 2
+    squared[cells] = -1.0
+    return squared.astype(np.float32).reshape(-1)
+
+
+class Places(NamedTuple):
+    """Where points fall: scratch of one thread.
+
+    beyond (S,): squared distance to the box of the grid. cell (S,): flat index of the cell.
+    u, v, w (S,): how far the point, drawn into the box, is from the cell's node, in cells.
+    """
+
+    beyond: FloatArray
+    cell: Any
+    u: FloatArray
+    v: FloatArray
+    w: FloatArray
+
+
+def places_for(size: int) -> Places:
+    """Scratch for so many points."""
+    u, v, w = (np.empty(size) for _ in range(3))
+    return Places(np.empty(size), np.empty(size, dtype=np.int32), u, v, w)
+
+
+@inner
+def locate(move, box, x, y, z, places, count):
+    """Fill the places of the first `count` points x, y, z once moved; written to be vectorised."""
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    beyond, cell = places.beyond, places.cell
+    u, v, w = places.u, places.v, places.w
+    for n in range(count):
+        a = move[0] * x[n] + move[1] * y[n] + move[2] * z[n] + move[9]
+        b = move[3] * x[n] + move[4] * y[n] + move[5] * z[n] + move[10]
+        c = move[6] * x[n] + move[7] * y[n] + move[8] * z[n] + move[11]
+        d = min(max(first[0], a), last[0])  # in this order, nan ends up in the box
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
+        beyond[n] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
+        d = _node(a, box.between, most[0])
+        e = _node(b, box.between, most[1])
+        f = _node(c, box.between, most[2])
+        u[n], v[n], w[n] = a - d, b - e, c - f
+        cell[n] = np.int32(d * box.across + e * box.along + f)
+
+
+@leaf
+def _node(g, between, most):
+    """The node that names the cell of a grid coordinate: the nearest, or the one below."""
+    nearest = np.rint(g)
+    below = nearest - between
+    return min(below if nearest > g else nearest, most)

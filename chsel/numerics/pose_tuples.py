@@ -1,0 +1,195 @@
+"""Search vectors, poses, and gradients between them, one at a time.
+
+A pose is a tuple of 12: the rotation of object_from_world row by row, then the translation. So is
+a gradient by a pose. Tuples of 9 are matrices, row by row.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.compiler import compiled, leaf
+from chsel.numerics.elementary import sine_cosine
+
+_SHORTEST = 1e-12  # vectors are divided by at least this
+
+Triple = tuple[float, float, float]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+_NO_MATRIX: Matrix = (0.0,) * 9
+
+
+class Space(NamedTuple):
+    """A search space: SE(3), or planar with the plane's constants (see SE2Space).
+
+    axis, e_u, e_v: unit vectors. resting: R_0. turning, turning_squared: hat(a) R_0 and
+    hat(a)^2 R_0. offset: o, metres.
+    """
+
+    planar: bool = False
+    axis: Triple = (0.0, 0.0, 0.0)
+    e_u: Triple = (0.0, 0.0, 0.0)
+    e_v: Triple = (0.0, 0.0, 0.0)
+    resting: Matrix = _NO_MATRIX
+    turning: Matrix = _NO_MATRIX
+    turning_squared: Matrix = _NO_MATRIX
+    offset: float = 0.0
+
+
+def matrix_of(rotation: FloatArray) -> Matrix:
+    """A matrix (3, 3) as nine numbers."""
+    a, b, c, d, e, f, g, h, i = (float(value) for value in rotation.reshape(-1))
+    return a, b, c, d, e, f, g, h, i
+
+
+@leaf
+def decode(space, x):
+    """The pose of a search vector."""
+    if space.planar:
+        return _planar(space, x)
+    return _spatial(x)
+
+
+@leaf
+def _spatial(x):
+    p, q, r, u, v, w, _, _, _ = _gram_schmidt(x)
+    return p, q, r, u, v, w, q * w - r * v, r * u - p * w, p * v - q * u, x[6], x[7], x[8]
+
+
+@leaf
+def _gram_schmidt(x):
+    """Two rows made orthonormal (Zhou et al.; CHSEL, Sec. IV-B): b1 and b2, |a1|, b1 . a2, |u|."""
+    a = _length(x[0], x[1], x[2])
+    p, q, r = x[0] / a, x[1] / a, x[2] / a
+    along = p * x[3] + q * x[4] + r * x[5]
+    u, v, w = x[3] - along * p, x[4] - along * q, x[5] - along * r
+    b = _length(u, v, w)
+    return p, q, r, u / b, v / b, w / b, a, along, b
+
+
+@leaf
+def _planar(space, x):
+    """R = Rot(a, theta) R_0 by Rodrigues' formula, t = o a + u e_u + v e_v."""
+    sine, cosine = sine_cosine(x[0])
+    turn, squared, rest = space.turning, space.turning_squared, space.resting
+    back = 1.0 - cosine
+    return (
+        rest[0] + sine * turn[0] + back * squared[0],
+        rest[1] + sine * turn[1] + back * squared[1],
+        rest[2] + sine * turn[2] + back * squared[2],
+        rest[3] + sine * turn[3] + back * squared[3],
+        rest[4] + sine * turn[4] + back * squared[4],
+        rest[5] + sine * turn[5] + back * squared[5],
+        rest[6] + sine * turn[6] + back * squared[6],
+        rest[7] + sine * turn[7] + back * squared[7],
+        rest[8] + sine * turn[8] + back * squared[8],
+        x[1] * space.e_u[0] + x[2] * space.e_v[0] + space.offset * space.axis[0],
+        x[1] * space.e_u[1] + x[2] * space.e_v[1] + space.offset * space.axis[1],
+        x[1] * space.e_u[2] + x[2] * space.e_v[2] + space.offset * space.axis[2],
+    )
+
+
+@leaf
+def pull_back(space, x, by_pose, gradient):
+    """Fill the gradient (d,) by the search vector x from that by its pose."""
+    if space.planar:
+        _pull_back_planar(space, x, by_pose, gradient)
+    else:
+        _pull_back_spatial(x, by_pose, gradient)
+
+
+@leaf
+def _pull_back_spatial(x, by_pose, gradient):
+    """Back through b3 = b1 x b2, b2 = u / |u|, u = a2 - (b1 . a2) b1, b1 = a1 / |a1|."""
+    p, q, r, u, v, w, a, along, b = _gram_schmidt(x)
+    d, e, f = by_pose[6], by_pose[7], by_pose[8]
+    p2 = by_pose[3] + (e * r - f * q)
+    q2 = by_pose[4] + (f * p - d * r)
+    r2 = by_pose[5] + (d * q - e * p)
+    p1 = by_pose[0] + (v * f - w * e)
+    q1 = by_pose[1] + (w * d - u * f)
+    r1 = by_pose[2] + (u * e - v * d)
+    inward = p2 * u + q2 * v + r2 * w if b > _SHORTEST else 0.0
+    p2, q2, r2 = (p2 - inward * u) / b, (q2 - inward * v) / b, (r2 - inward * w) / b
+    by_along = -(p2 * p + q2 * q + r2 * r)
+    p1 += by_along * x[3] - along * p2
+    q1 += by_along * x[4] - along * q2
+    r1 += by_along * x[5] - along * r2
+    inward = p1 * p + q1 * q + r1 * r if a > _SHORTEST else 0.0
+    gradient[0], gradient[1] = (p1 - inward * p) / a, (q1 - inward * q) / a
+    gradient[2] = (r1 - inward * r) / a
+    gradient[3], gradient[4] = p2 + by_along * p, q2 + by_along * q
+    gradient[5] = r2 + by_along * r
+    gradient[6], gradient[7], gradient[8] = by_pose[9], by_pose[10], by_pose[11]
+
+
+@leaf
+def _pull_back_planar(space, x, by_pose, gradient):
+    sine, cosine = sine_cosine(x[0])
+    by_angle = 0.0
+    for i in range(9):
+        slope = cosine * space.turning[i] + sine * space.turning_squared[i]
+        by_angle += by_pose[i] * slope
+    gradient[0] = by_angle
+    for axis, along in enumerate((space.e_u, space.e_v)):
+        slope = by_pose[9] * along[0] + by_pose[10] * along[1] + by_pose[11] * along[2]
+        gradient[1 + axis] = slope
+
+
+@leaf
+def finite(pose):
+    """Whether a pose holds finite numbers, whose squares are finite, too."""
+    total = 0.0
+    for value in pose:
+        total += value * value
+    return total < np.inf
+
+
+@leaf
+def rigid(pose):
+    """Whether the rows of a pose's rotation are orthonormal, all but for rounding."""
+    worst = 0.0
+    for i in range(3):
+        for j in range(i + 1):
+            product = _dot_rows(pose, i, j)
+            worst = max(worst, abs(product - (1.0 if i == j else 0.0)))
+    return worst < 1e-9
+
+
+@leaf
+def _dot_rows(pose, i, j):
+    a, b = 3 * i, 3 * j
+    return pose[a] * pose[b] + pose[a + 1] * pose[b + 1] + pose[a + 2] * pose[b + 2]
+
+
+@leaf
+def pose_at(poses, n):
+    """Row n of poses (B, 12)."""
+    a, b, c, d = poses[n, 0], poses[n, 1], poses[n, 2], poses[n, 3]
+    e, f, g, h = poses[n, 4], poses[n, 5], poses[n, 6], poses[n, 7]
+    return a, b, c, d, e, f, g, h, poses[n, 8], poses[n, 9], poses[n, 10], poses[n, 11]
+
+
+@leaf
+def origin_within(pose, low, high):
+    """Whether a pose has the object's origin, -R^T t in the world, in a box."""
+    x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
+    y = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
+    z = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
+    return low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
+
+
+@compiled
+def decode_all(space, vectors, poses):
+    """Fill poses (B, 12) from search vectors (B, d)."""
+    for n in range(len(vectors)):
+        pose = decode(space, vectors[n])
+        for i in range(12):
+            poses[n, i] = pose[i]
+
+
+@leaf
+def _length(x, y, z):
+    return max(np.sqrt(x * x + y * y + z * z), _SHORTEST)

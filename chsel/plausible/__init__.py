@@ -1,0 +1,1 @@
+"""The exact plausible set, and how hypotheses are measured by it (CHSEL, Sec. V)."""

@@ -1,0 +1,216 @@
+"""What the plausible set is: the cost that defines it, and the poses that are looked at."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from chsel.errors import SettingError, require_at_most, require_choice, require_positive
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
+from chsel.problem.settings import settings_mapping
+from chsel.problem.streams import StreamKey
+
+DEFINITIONS = ("default", "paper", "reference", "wide_means", "wide_means_10mm", "wide_sums")
+MOST_POSITIONS = 100_000
+MOST_ROTATIONS = 1_000_000
+MOST_STARTS = 20_000
+Axis = tuple[tuple[float, float, int], ...]
+
+
+@dataclass(frozen=True)
+class EvaluationCostSettings:
+    """Settings of the cost C that only evaluation uses (CHSEL, Eq. 2).
+
+    combine: "sums" over points as the paper writes it, "means" over each class of points as the
+    authors' experiments took them. violation: c_max, of a free or occupied point on the wrong
+    side. tolerance: metres that a point may be on the wrong side (0 in the paper). occupied:
+    whether occupied points count. lookup, outside: how the SDF grid is read, see SdfGrid.query.
+    """
+
+    combine: str = "means"
+    violation: float = 1e5
+    tolerance: float = 0.01
+    occupied: bool = True
+    lookup: str = "nearest"
+    outside: str = "surface_point"
+
+    def __post_init__(self) -> None:
+        require_choice("combine", self.combine, ("means", "sums"))
+        require_positive("violation", self.violation)
+        require_positive("tolerance", self.tolerance, zero=True)
+        require_choice("lookup", self.lookup, LOOKUPS)
+        require_choice("outside", self.outside, OUTSIDE)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets in the world, metres: along x, y, z pieces (first, last, count) of even spacing."""
+
+    x: Axis = ((-0.1, 0.15, 15),)
+    y: Axis = ((-0.2, 0.2, 15),)
+    z: Axis = ((0.0, 0.1, 15),)
+
+    def __post_init__(self) -> None:
+        count = 1
+        for name in ("x", "y", "z"):
+            axis = getattr(self, name)
+            if not axis:
+                raise SettingError(f"{name} has no piece; accepted: at least one")
+            for piece in axis:
+                if not np.isfinite(piece[:2]).all() or piece[2] < 1:
+                    raise SettingError(
+                        f"{name} has the piece {list(piece)}; accepted: [first, last, count], "
+                        "finite metres, a count of at least 1"
+                    )
+            count *= sum(piece[2] for piece in axis)
+        require_at_most("the number of offsets", count, MOST_POSITIONS)
+
+    def points(self) -> FloatArray:
+        """All offsets (P, 3), those along z fastest."""
+        axes = [
+            np.concatenate([np.linspace(first, last, count) for first, last, count in axis])
+            for axis in (self.x, self.y, self.z)
+        ]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class PoseGridSettings:
+    """The poses that are looked at: positions around the true one, each with every rotation.
+
+    offsets: of the positions. rotations: how many, uniform on SO(3), absolute. upright: yaws of
+    the object's frame on the world's, evenly spaced. extra: "added" looks at the upright ones and
+    at the true rotation besides, "replaced" puts them in place of the first, as the reference
+    does. seed: of the rotations; by default that of the session.
+    """
+
+    offsets: Offsets = field(default_factory=Offsets)
+    rotations: int = 10_000
+    upright: int = 100
+    extra: str = "added"
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        require_positive("rotations", self.rotations)
+        require_at_most("rotations", self.rotations, MOST_ROTATIONS)
+        require_positive("upright", self.upright, zero=True)
+        require_at_most("upright", self.upright, MOST_ROTATIONS)
+        require_choice("extra", self.extra, ("added", "replaced", "none"))
+        if self.extra == "replaced" and self.rotations <= self.upright:
+            raise SettingError(
+                f"rotations is {self.rotations}; accepted: more than the {self.upright} upright "
+                "ones that replace some of them"
+            )
+        if self.seed is not None:
+            StreamKey(self.seed, 0)
+
+
+@dataclass(frozen=True)
+class ModeSearchSettings:
+    """How members are sought in modes that the grid passes by, see chsel.plausible.mode_search.
+
+    starts: how many poses climb, at most. They are poses of the grid whose mean over known points
+    is less than `distance` above the true pose's, and that violate few points by more than
+    `depth`, metres both. separation: how far the surface of a new mode is from that of all other
+    members, metres, root mean square.
+    """
+
+    starts: int = 1000
+    distance: float = 0.01
+    depth: float = 0.02
+    separation: float = 0.01
+
+    def __post_init__(self) -> None:
+        require_positive("starts", self.starts)
+        require_at_most("starts", self.starts, MOST_STARTS)
+        for name in ("distance", "depth", "separation"):
+            require_positive(name, getattr(self, name))
+
+
+@dataclass(frozen=True)
+class PlausibleSettings:
+    """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V).
+
+    epsilon: eps, metres. cost, grid: what C is, and which X are looked at. members: how many are
+    kept for evaluation at most, a random subset. fill_to: where the grid has fewer members than
+    this, others are sought around them, off the grid, see chsel.plausible.scan; 0: never.
+    modes: how to look for members far from all on the grid; None: not at all.
+    rescan: look at all poses at every step; False: after the first step only at the members of the
+    one before, which is exact only where C cannot fall as points are added, as with sums.
+    """
+
+    epsilon: float = 0.001
+    cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
+    grid: PoseGridSettings = field(default_factory=PoseGridSettings)
+    members: int = 1000
+    fill_to: int = 30
+    rescan: bool = True
+    modes: ModeSearchSettings | None = None
+
+    def __post_init__(self) -> None:
+        require_positive("epsilon", self.epsilon)
+        require_positive("members", self.members)
+        require_positive("fill_to", self.fill_to, zero=True)
+        if self.fill_to > self.members:
+            raise SettingError(f"fill_to is {self.fill_to}; accepted: at most members")
+
+    @property
+    def text(self) -> str:
+        """All settings as JSON; without modes as it was before there was a search for them."""
+        mapping = settings_mapping(self)
+        if self.modes is None:
+            del mapping["modes"]
+        return json.dumps(mapping, sort_keys=True)
+
+    @property
+    def digest(self) -> str:
+        """Digest of all settings."""
+        return hashlib.blake2b(self.text.encode(), digest_size=16).hexdigest()
+
+
+def plausible_settings(definition: str, epsilon: float) -> PlausibleSettings:
+    """The settings of a definition, eps in metres.
+
+    "paper": sums, no tolerance, 10 000 uniform rotations. "reference": as in the authors'
+    simulated experiments, with c_max 1000, a longer x axis and the same rotations for all seeds.
+    "default": the reference's means and tolerance on the paper's grid, with c_max 1e5, occupied
+    points counted, and the upright and the true rotation added.
+
+    "wide_means", "wide_sums": 300 members or more of a set that no box cuts off, from a wider grid
+    and a search for modes that it misses; distances are interpolated, as nearest nodes, 10 mm
+    apart, move the true pose itself by 1 to 4 mm. By means over points as the authors' code, or
+    by sums as the paper's Eq. 2; no free point may be inside of a member. "wide_means_10mm":
+    free points may be 10 mm deep inside of a member, as in the authors' code.
+    """
+    require_choice("definition", definition, DEFINITIONS)
+    default = PlausibleSettings(epsilon=epsilon)
+    if definition == "paper":
+        cost = EvaluationCostSettings("sums", tolerance=0.0, lookup="nearest")
+        return replace(default, cost=cost, grid=PoseGridSettings(upright=0, extra="none"))
+    if definition == "reference":
+        cost = EvaluationCostSettings(
+            violation=1e3, occupied=False, lookup="nearest", outside="bounding_box"
+        )
+        cell = 0.2 / 15
+        offsets = Offsets(x=((-0.1, 0.0, 5), (cell, 0.3, 10)), y=((-0.2, 0.0, 7), (cell, 0.2, 7)))
+        grid = PoseGridSettings(offsets, extra="replaced", seed=0)
+        return replace(default, cost=cost, grid=grid, fill_to=0)
+    if definition.startswith("wide"):
+        combine = "sums" if definition == "wide_sums" else "means"
+        tolerance = 0.01 if definition == "wide_means_10mm" else 0.0
+        cost = EvaluationCostSettings(combine, tolerance=tolerance, lookup="trilinear")
+        sides = ((-0.5, 0.5, 36),)
+        grid = PoseGridSettings(Offsets(sides, sides, ((-0.3, 0.5, 29),)))
+        modes = ModeSearchSettings(starts=8000)
+        return replace(default, cost=cost, grid=grid, fill_to=300, modes=modes)
+    return default
+
+
+def definition_name(settings: PlausibleSettings) -> str | None:
+    """The name of the definition that has these settings, whatever its epsilon; None for none."""
+    named = ((name, plausible_settings(name, settings.epsilon)) for name in DEFINITIONS)
+    return next((name for name, by in named if by == settings), None)

@@ -1,0 +1,172 @@
+"""How far hypotheses are from the true pose and from the plausible set, and from each other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel.errors import ChselError, SettingError
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.surface_distance import SurfaceDistance
+from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
+from chsel.problem.poses import apply, inverse, product, rotated, rotation_angle
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+
+
+class EvaluationError(ChselError):
+    """A plausible set cannot be made, written or read, or does not belong to a problem."""
+
+
+def pose_errors(
+    object_from_world: FloatArray, world_from_object: FloatArray, symmetry: ObjectSymmetry
+) -> tuple[FloatArray, FloatArray]:
+    """Position errors (B,) in metres and rotation errors (B,) in radians, modulo symmetries.
+
+    Of hypotheses object_from_world (B, 4, 4) to the true world_from_object (4, 4): the distance
+    between the places of the object's centre, and the smallest angle of a rotation between the two
+    poses if a symmetry of the object is applied first.
+    """
+    estimated = inverse(object_from_world)
+    centres = rotated(estimated[:, :3, :3], symmetry.centre) + estimated[:, :3, 3]
+    centre = rotated(world_from_object[:3, :3], symmetry.centre) + world_from_object[:3, 3]
+    relative = product(object_from_world[:, :3, :3], world_from_object[:3, :3])
+    distance = np.sqrt(((centres - centre) ** 2).sum(axis=1))
+    return distance, symmetry.rotation_errors(relative)
+
+
+@dataclass(frozen=True)
+class PlausibleDiversity:
+    """coverage: the mean over plausible poses of the distance to the nearest hypothesis;
+    plausibility: the mean over hypotheses of that to the nearest plausible pose; mm^2.
+    """
+
+    coverage: float
+    plausibility: float
+
+    @property
+    def diversity(self) -> float:
+        """PD = coverage + plausibility, mm^2; 0 is best."""
+        return self.coverage + self.plausibility
+
+    @property
+    def root(self) -> float:
+        """The square root of PD, mm, which compares with lengths."""
+        return math.sqrt(self.diversity)
+
+
+def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
+    """The metrics of distances d (B, P) in mm^2, of hypotheses and plausible poses.
+
+    Raises EvaluationError if there is none of either.
+    """
+    if distances.ndim != 2 or 0 in distances.shape:
+        raise EvaluationError(
+            f"distances have shape {distances.shape}; accepted: (B, P), at least one hypothesis "
+            "and one plausible pose"
+        )
+    nearest_hypothesis, nearest_member = distances.min(axis=0), distances.min(axis=1)
+    return PlausibleDiversity(float(nearest_hypothesis.mean()), float(nearest_member.mean()))
+
+
+def cheapest(costs: FloatArray, quantile: float) -> np.ndarray:
+    """Flags (B,) of hypotheses whose cost is at most this quantile of costs (B,); 1: all."""
+    if not 0.0 < quantile <= 1.0:
+        raise SettingError(f"quantile is {quantile}; accepted: above 0, at most 1")
+    return np.asarray(costs <= np.quantile(costs, quantile, method="higher"))
+
+
+class Spread(NamedTuple):
+    """position: metres. rotation: radians."""
+
+    position: float
+    rotation: float
+
+
+def spread(hypotheses: Hypotheses, centre: FloatArray) -> Spread | None:
+    """Spread of the hypotheses that repeat no other; None if there is none.
+
+    position: the root mean square distance of the object's centres from their mean; `centre` (3,)
+    is in the object's frame, metres. rotation: the mean angle between the orientation of the best
+    hypothesis, the first, and those of the others, symmetries of the object not considered; 0
+    without others.
+    """
+    object_from_world = hypotheses.object_from_world[~hypotheses.duplicate]  # (B, 4, 4)
+    if len(object_from_world) == 0:
+        return None
+    centres = np.stack([apply(pose, centre[None])[0] for pose in inverse(object_from_world)])
+    distances = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
+    rotations = object_from_world[:, :3, :3]
+    angles = rotation_angle(rotations[1:] @ rotations[0].T)
+    rotation = float(angles.mean()) if len(angles) else 0.0
+    return Spread(float(np.sqrt(np.mean(distances**2))), rotation)
+
+
+def result_numbers(
+    hypotheses: Hypotheses,
+    problem: RegistrationProblem,
+    world_from_object: FloatArray | None,
+    symmetry: ObjectSymmetry | None,
+) -> dict[str, float]:
+    """Counts and archive measures, and the errors to the true pose (4, 4) where it is known.
+
+    Errors are those of the best hypothesis and of the one closest in position, in metres and
+    radians, as `pose_errors` defines them. symmetry: of the object; None if its mesh is not
+    available: the identity alone, about the centre of the problem's grid.
+    """
+    values = {
+        "distinct_hypotheses": float(hypotheses.distinct),
+        "known_points": float(problem.points.count),
+    }
+    if hypotheses.archive is not None:
+        values["archive_coverage"] = hypotheses.archive.coverage
+        values["archive_qd_score"] = hypotheses.archive.qd_score
+    if world_from_object is not None and len(hypotheses.object_from_world) > 0:
+        symmetry = symmetry or grid_symmetry(problem.sdf)
+        position, rotation = pose_errors(hypotheses.object_from_world, world_from_object, symmetry)
+        closest = int(np.argmin(position))
+        for name, index in (("best", 0), ("closest", closest)):
+            values[f"{name}_position_error"] = float(position[index])
+            values[f"{name}_rotation_error"] = float(rotation[index])
+    return values
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """rank: share of the B + 1 poses that are at least as far out as the true one, in (0, 1].
+
+    Uniform over many registrations if calibrated; small ones say that the truth lies outside of
+    the spread, as of a set too narrow or off. spread, error: root mean squared surface distances,
+    mm, between hypotheses, and from them to the truth.
+    """
+
+    rank: float
+    spread: float
+    error: float
+
+    def within(self, level: float = 0.05) -> bool:
+        """Whether the truth is within the set's spread: not among the outermost `level`."""
+        return self.rank > level
+
+
+def calibration(
+    distance: SurfaceDistance, object_from_world: FloatArray, world_from_object: FloatArray
+) -> Calibration:
+    """Of hypotheses (B, 4, 4) and the true pose (4, 4). Raises EvaluationError for fewer than 2."""
+    count = len(object_from_world)
+    if count < 2:
+        raise EvaluationError(f"calibration of {count} hypotheses; accepted: at least 2")
+    poses = np.concatenate([object_from_world, inverse(world_from_object[None])])
+    distances = distance.between(poses, inverse(poses))
+    distances = (distances + distances.T) / 2.0
+    np.fill_diagonal(distances, 0.0)
+    lengths = np.sqrt(distances)
+    outwards = lengths.sum(axis=1) / count
+    # Rounding must not rank equal poses.
+    rank = (outwards >= outwards[-1] * (1.0 - 1e-9)).mean()
+    between = distances[:-1, :-1].sum() / (count * (count - 1))
+    return Calibration(
+        float(rank), float(np.sqrt(between)), float(np.sqrt(distances[-1, :-1].mean()))
+    )

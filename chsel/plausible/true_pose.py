@@ -1,0 +1,104 @@
+"""Where the object truly is, as far as the data of a real session say, from a pose set by hand.
+
+The first of the two searches by which the authors made the plausible sets of real data: the pose
+of least evaluation cost near a guess is T*; the plausible set is then made around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from chsel.errors import PoseError, SettingError, require_at_most, require_positive
+from chsel.numerics.arrays import FloatArray, frozen
+from chsel.plausible.plausible_set import PoseGrid, scan
+from chsel.plausible.plausible_settings import MOST_ROTATIONS, EvaluationCostSettings, Offsets
+from chsel.plausible.scan import EvaluationCost
+from chsel.problem.poses import inverse, nearest_rigid, product, rotation_vector
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import Purpose, normals
+
+_FIRST_LOOK = 4000  # poses that tell which costs are worth looking for
+_STREAM = 100  # of the plausible rotations' streams, and those after it
+
+
+@dataclass(frozen=True)
+class TruePoseSettings:
+    """reach: metres to either side of the guess, along each axis; spacing: of the positions
+    looked at. rotations: how many, turned from the guess by normal rotation vectors of deviation
+    `angle` (radians), the guess's own besides. passes: each after the first looks around the best
+    pose so far, with a reach of one spacing, and spacing and angle scaled alike.
+    """
+
+    reach: float = 0.08
+    spacing: float = 0.01
+    rotations: int = 2000
+    angle: float = 0.02
+    passes: int = 2
+    cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "spacing", "rotations", "angle", "passes"):
+            require_positive(name, getattr(self, name))
+        require_at_most("rotations", self.rotations, MOST_ROTATIONS)
+        require_at_most("passes", self.passes, 10)
+        if self.reach / self.spacing > 20.0:
+            raise SettingError(
+                f"spacing is {self.spacing} with reach {self.reach}; accepted: at least a "
+                "twentieth of it"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class TruePose:
+    """world_from_object (4, 4), its evaluation cost, and that of the guess."""
+
+    world_from_object: FloatArray
+    cost: float
+    guess_cost: float
+
+
+def find_true_pose(
+    problem: RegistrationProblem, guess: FloatArray, settings: TruePoseSettings | None = None
+) -> TruePose:
+    """The pose of least evaluation cost near a guess, world_from_object (4, 4).
+
+    problem: that of the last step, when most is known. The least of all poses looked at, exactly.
+    """
+    settings = settings or TruePoseSettings()
+    guess = frozen("guess", guess, (4, 4), error=PoseError)
+    best = nearest_rigid("guess", guess[None])[0]
+    cost = EvaluationCost(problem, settings.cost)
+    least = guess_cost = float(cost.evaluate(inverse(best)[None])[0])
+    reach, spacing, angle = settings.reach, settings.spacing, settings.angle
+    for n in range(settings.passes):
+        half = round(reach / spacing)
+        axis = ((-half * spacing, half * spacing, 2 * half + 1),)
+        stream = problem.key.stream(Purpose.PLAUSIBLE_ROTATIONS, _STREAM + n)
+        turns = rotation_vector(angle * normals(stream, (settings.rotations, 3)))
+        turned = np.concatenate([best[None, :3, :3], product(turns, best[:3, :3])])
+        grid = PoseGrid(best[:3, 3], Offsets(axis, axis, axis), turned)
+        best, least = _best(cost, problem, grid, best, least)
+        reach, spacing, angle = spacing, spacing * spacing / reach, angle * spacing / reach
+    return TruePose(best, least, guess_cost)
+
+
+def _best(
+    cost: EvaluationCost,
+    problem: RegistrationProblem,
+    grid: PoseGrid,
+    best: FloatArray,
+    least: float,
+) -> tuple[FloatArray, float]:
+    """The cheapest pose of a grid and its cost; what was best before if none is cheaper."""
+    look = np.arange(0, len(grid), max(1, len(grid) // _FIRST_LOOK))
+    costs = cost.evaluate(inverse(grid.poses(look)))
+    if costs.min() < least:
+        first = int(np.argmin(costs))
+        best, least = grid.poses(look[first : first + 1])[0], float(costs[first])
+    index, costs = scan(cost, problem, grid, least)
+    if len(index) == 0:
+        return best, least
+    first = int(np.argmin(costs))
+    return grid.poses(index[first : first + 1])[0], float(costs[first])

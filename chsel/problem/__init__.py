@@ -1,0 +1,1 @@
+"""What a registration is: points, mesh, distances, poses, random streams, the problem."""

@@ -1,0 +1,226 @@
+"""Whether known points can be those of an object, and whether any hypothesis explains them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from chsel.errors import PointsError, PointsWarning
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.points import KnownPoints, Lattice, Workspace
+from chsel.problem.poses import apply
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+
+MOST_APART = 10.0  # object diameters between contacts, and from a contact to the free points
+NEVER_APART = 100.0  # object diameters between contacts: a tenth of an object, in millimetres
+NEVER_AROUND = 1000.0  # object diameters between any points: an object's size, in millimetres
+MOST_OUTSIDE = 0.2  # object diameters from the workspace to a contact
+_BLOCK = np.array(sorted(np.ndindex(3, 3, 3), key=lambda at: at != (1, 1, 1))) - 1  # centre first
+_MOST_VOXELS = 2.0**62  # that can be numbered
+
+
+def check_points(
+    points: KnownPoints,
+    diameter: float,
+    free_resolution: float,
+    workspace: Workspace | None = None,
+) -> list[PointsWarning]:
+    """What is suspicious about known points; nothing for points that are as a session gives them.
+
+    diameter: of the object, metres. free_resolution: side of a free voxel, metres. workspace: where
+    the object can be, if that was given and not derived from the points.
+    Raises PointsError for points that no object of this size can have.
+    """
+    if points.count == 0 or diameter <= 0.0:
+        return []
+    touching = np.concatenate([points.contacts, points.occupied])
+    warnings = [*_extent(points, touching, diameter), *_distance_to_free(points, diameter)]
+    if workspace is not None:
+        warnings += _outside_of_workspace(touching, diameter, workspace)
+    return warnings + _within_free_space(points.contacts, points.free, free_resolution)
+
+
+def check_contacts(points: KnownPoints) -> list[PointsWarning]:
+    """Whether any point says where the object is, and not only where it is not."""
+    if points.count == 0 or len(points.known) or len(points.occupied):
+        return []
+    text = (
+        "all known points are free: any pose outside of free space fits; add contacts, or occupied "
+        "or other known points"
+    )
+    return [PointsWarning("no_contact", text)]
+
+
+def _extent(points: KnownPoints, touching: FloatArray, diameter: float) -> list[PointsWarning]:
+    """Points on and in one rigid object are a diameter apart at most.
+
+    Far too large a span is an error, unless it is that of a few outliers.
+    """
+    for what, group, most in (
+        ("points on the object", touching, NEVER_APART),
+        ("known points", points.all_points(), NEVER_AROUND),
+    ):
+        if _diagonal(group) > most * diameter and _spread(group) > most * diameter:
+            raise PointsError(
+                f"{what} span {_diagonal(group):.4g} m, and the object is {diameter:.3g} m: are "
+                "they in millimetres? accepted: points in metres, and the object in the same unit"
+            )
+    extent = _diagonal(touching)
+    if extent <= MOST_APART * diameter:
+        return []
+    text = (
+        f"points on the object span {extent:.3g} m, and the object is {diameter:.3g} m; check "
+        "units and frames, and remove outliers"
+    )
+    return [PointsWarning("contacts_apart", text)]
+
+
+def _distance_to_free(points: KnownPoints, diameter: float) -> list[PointsWarning]:
+    contacts, free, most = points.contacts, points.free, MOST_APART * diameter
+    near = _diagonal(np.concatenate([contacts, free])) <= most
+    if near or len(contacts) == 0 or len(free) == 0:
+        return []
+    distance, _ = cKDTree(free).query(contacts)
+    far = distance > most
+    if not far.any():
+        return []
+    text = (
+        f"{_of(far)} are more than {MOST_APART:g} object diameters from all free points, the "
+        f"farthest {distance.max():.3g} m; check that both are in one frame and one unit"
+    )
+    return [PointsWarning("contacts_far_from_free", text)]
+
+
+def _outside_of_workspace(
+    touching: FloatArray, diameter: float, workspace: Workspace
+) -> list[PointsWarning]:
+    if len(touching) == 0:
+        return []
+    lower, upper = workspace.bounds
+    beyond = np.maximum(np.maximum(lower - touching, touching - upper), 0.0)
+    distance = np.sqrt((beyond**2).sum(axis=1))
+    if float(distance.min()) > diameter:
+        raise PointsError(
+            f"all points on the object are outside of the workspace {_box(workspace)}, the nearest "
+            f"{distance.min():.3g} m from it; accepted: a workspace that holds the object"
+        )
+    outside = distance > MOST_OUTSIDE * diameter
+    if not outside.any():
+        return []
+    text = (
+        f"{_of(outside, 'points on the object')} are outside of the workspace {_box(workspace)}, "
+        f"the farthest {distance.max():.3g} m from it; check workspace, units and frames"
+    )
+    return [PointsWarning("contacts_outside", text)]
+
+
+def _within_free_space(
+    contacts: FloatArray, free: FloatArray, resolution: float
+) -> list[PointsWarning]:
+    if len(contacts) == 0 or len(free) == 0:
+        return []
+    within = _enclosed(contacts, free, resolution)
+    if not within.any():
+        return []
+    text = (
+        f"{_of(within)} are in free space: at a free point, or in a free voxel of {resolution:g} "
+        "m with free voxels all around; end free space before the surface"
+    )
+    return [PointsWarning("contacts_in_free_space", text)]
+
+
+def _enclosed(contacts: FloatArray, free: FloatArray, resolution: float) -> BoolArray:
+    """Which contacts (C, 3) are free points, or lie in a free voxel whose 26 neighbours are free.
+
+    A contact in a free voxel is common, as the voxel's centre may be outside of the object; between
+    free neighbours there is no room for an object thicker than a voxel.
+    """
+    lattice = Lattice(tuple(free[0].tolist()), resolution)
+    wanted = lattice.voxels(contacts)[:, None] + _BLOCK  # (C, 27, 3)
+    lower = wanted.min(axis=(0, 1))
+    shape = wanted.max(axis=(0, 1)) - lower + 1
+    if np.prod(shape, dtype=float) > _MOST_VOXELS:
+        return np.zeros(len(contacts), dtype=bool)
+    voxels = lattice.voxels(free) - lower
+    near = ((voxels >= 0) & (voxels < shape)).all(axis=1)
+    numbers = np.ravel_multi_index(tuple(voxels[near].T), tuple(shape))
+    wanted_numbers = np.ravel_multi_index(tuple((wanted - lower).reshape(-1, 3).T), tuple(shape))
+    wanted_numbers = wanted_numbers.reshape(-1, len(_BLOCK))
+    enclosed = np.isin(wanted_numbers, numbers).all(axis=1)
+    beside = free[near][np.isin(numbers, wanted_numbers[:, 0])]
+    places = {point.tobytes() for point in beside}
+    same = np.array([contact.tobytes() in places for contact in contacts])
+    found: BoolArray = enclosed | same
+    return found
+
+
+def _diagonal(points: FloatArray) -> float:
+    """Diagonal in metres of the box around points (N, 3); 0 for none."""
+    return float(np.sqrt((np.ptp(points, axis=0) ** 2).sum())) if len(points) else 0.0
+
+
+def _spread(points: FloatArray) -> float:
+    """Twice the distance (m) from the median point (N, 3) that nine in ten points do not exceed."""
+    away = points - np.median(points, axis=0)
+    distance = np.sqrt((away**2).sum(axis=1))
+    return 2.0 * float(np.percentile(distance, 90.0, method="lower"))
+
+
+def _of(chosen: BoolArray, what: str = "contacts") -> str:
+    return f"{int(chosen.sum())} of {len(chosen)} {what}"
+
+
+def _box(workspace: Workspace) -> str:
+    sides = zip(workspace.lower, workspace.upper, strict=True)
+    return "[" + ", ".join(f"[{low:g}, {high:g}]" for low, high in sides) + "]"
+
+
+MOST_OFF = 0.04  # object diameters by which known points are off on average
+MOST_NOISE = 10.0  # noise levels that a lowest energy can have
+
+
+def check_fit(
+    problem: RegistrationProblem, hypotheses: Hypotheses, noise: float | None = None
+) -> list[PointsWarning]:
+    """A warning if the best hypothesis contradicts the points by more than inexact sensors can.
+
+    What it leaves, by the SDF and whatever the method's cost is: the distance between known points
+    and their level, the depth of free points in the object, the height of occupied ones above it.
+    noise: of known points by the method's settings, metres, if its costs are energies in metres.
+    """
+    sdf, points, best = problem.sdf, problem.points, hypotheses.object_from_world[0]
+
+    def signed(of: FloatArray) -> FloatArray:
+        value: FloatArray = sdf.query(apply(best, of), lookup="trilinear")[0].numpy()
+        return value
+
+    tolerance = max(MOST_OFF * sdf.diameter, sdf.resolution)
+    off = np.abs(signed(points.known) - points.sdf)
+    depth = float(-signed(points.free).min(initial=0.0))
+    height = float(signed(points.occupied).max(initial=0.0))
+    found = []
+    if len(off) and off.mean() > tolerance:
+        mean, most = _length(float(off.mean())), _length(float(off.max()))
+        found.append(f"known points are {mean} off on average (up to {most})")
+    if depth > tolerance + problem.free_resolution:
+        found.append(f"free points are up to {_length(depth)} inside")
+    if height > tolerance + problem.free_resolution:
+        found.append(f"occupied points are up to {_length(height)} outside")
+    if found:
+        text = (
+            f"no hypothesis explains the points: at the best, {', '.join(found)}; check units, "
+            "frames, and the object and its scale"
+        )
+        return [PointsWarning("no_fit", text)]
+    energy = float(hypotheses.cost[0])
+    if noise is None or energy <= MOST_NOISE * noise:
+        return []
+    text = (
+        f"the lowest energy is {_length(energy)}, {energy / noise:.0f} noise levels: no hypothesis "
+        f"explains the points, or sensors are less exact than the method's noise of {noise:g} m"
+    )
+    return [PointsWarning("above_noise", text)]
+
+
+def _length(metres: float) -> str:
+    return f"{1000.0 * metres:.3g} mm" if metres < 1.0 else f"{metres:.3g} m"

@@ -1,0 +1,203 @@
+"""Triangle meshes of objects: read, checked, merged, named by their content."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from chsel.errors import MeshError, MeshWarning, quoted, require_positive
+from chsel.numerics.arrays import digest, frozen
+from chsel.problem.file_checks import check_complete, refuse_special_file
+
+if TYPE_CHECKING:
+    import trimesh
+
+_NEAR = 0.5  # diameters of the largest body; a part of an object is nearer to its other parts
+_MOST_BODIES = 1000  # the largest ones are compared
+
+
+def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
+    """A warning if bodies of a mesh (metres) are too far from one another for a single object.
+
+    The distance between two bodies is that of the boxes around them, and bodies that are near to
+    one another count as one.
+    """
+    lower, upper = _boxes(mesh)
+    apart = np.maximum(np.maximum(lower[:, None] - upper, lower - upper[:, None]), 0.0)
+    distance = np.sqrt((apart**2).sum(axis=2))  # (bodies, bodies)
+    largest = float(np.sqrt(((upper - lower) ** 2).sum(axis=1)).max())
+    count, group = connected_components(distance <= _NEAR * largest, directed=False)
+    if count == 1:
+        return []
+    gap = float(distance[group[:, None] != group].min())
+    text = (
+        f"{name} has {count} bodies at least {gap:.3g} m apart, the largest of {largest:.3g} m; "
+        "they are registered as one rigid object: remove what is not part of it"
+    )
+    return [MeshWarning("bodies_apart", text)]
+
+
+def _boxes(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corners (bodies, 3) of the boxes around what faces connect, largest first."""
+    a, b, c = np.asarray(mesh.faces).T
+    edges = np.concatenate([a, b]), np.concatenate([b, c])
+    count = len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(edges[0]), dtype=bool), edges), shape=(count, count))
+    bodies, body = connected_components(graph, directed=False)
+    vertices = np.asarray(mesh.vertices)[np.argsort(body, kind="stable")]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(body, minlength=bodies))[:-1]])
+    lower, upper = np.minimum.reduceat(vertices, starts), np.maximum.reduceat(vertices, starts)
+    largest_first = np.argsort(-((upper - lower) ** 2).sum(axis=1), kind="stable")[:_MOST_BODIES]
+    return lower[largest_first], upper[largest_first]
+
+
+SMALLEST = 0.005  # m: the largest extent of anything that a gripper probes is above this
+LARGEST = 10.0  # m: above this, a file is in millimetres rather than metres
+MANY_FACES = 200_000  # above this, a mesh takes its time
+ENOUGH_FACES = 50_000  # of an object that a hand holds: sides of 1 mm
+_SECONDS_PER_FACE = 1.5e-5  # of a core: merging vertices, and a grid of 60 000 nodes
+_NOT_MESHES = {"bz2", "dxf", "stl_ascii", "svg", "tar.bz2", "tar.gz", "xyz", "zip"}
+
+
+def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
+    """The mesh in a file of any kind that trimesh reads, ready to be measured against.
+
+    Scenes are joined to one mesh. `scale` multiplies the file's units into metres. Otherwise, and
+    in the errors raised, as `clean_mesh`; MeshError also if the file is not found or not readable.
+    """
+    if not isinstance(path, str | Path):
+        raise MeshError(f"mesh file is {quoted(path)}; accepted: the path of a file")
+    path = Path(path).expanduser()
+    refuse_special_file(f"mesh file {path}", path, MeshError)
+    if not path.is_file():
+        kind = "is a folder" if path.is_dir() else "does not exist"
+        raise MeshError(f"mesh file {path} {kind}; accepted: {_accepted_files()}")
+    loaded = _read(path)
+    return clean_mesh(loaded.vertices, loaded.faces, name=f"mesh file {path}", scale=scale)
+
+
+def clean_mesh(
+    vertices: Any, faces: Any, *, name: str = "mesh", scale: float = 1.0
+) -> trimesh.Trimesh:
+    """A checked mesh in metres: vertices merged, faces turned outward, float64.
+
+    vertices (V, 3) in the file's units; faces (F, 3) indices into them. Vertices at one place
+    become one. A mesh that is still open is kept with a MeshWarning: the winding number decides
+    what is inside it. So is one of bodies that are far apart, and one of more than MANY_FACES
+    faces, of which the warning says what it costs. Raises MeshError if there are no faces, a number
+    is not finite, an index has no vertex, the mesh is flat, or its size in metres is not that of an
+    object.
+    """
+    import trimesh
+
+    require_positive("mesh scale", scale)
+    vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
+    faces = frozen(f"{name}: faces", faces, (None, 3), dtype=np.int64, error=MeshError)
+    _check_faces(name, len(vertices), faces)
+    if len(faces) > MANY_FACES:
+        seconds = len(faces) * _SECONDS_PER_FACE
+        warnings.warn(
+            f"{name} has {len(faces):,} faces: making its signed distance grid takes "
+            f"{seconds:.0f} s or more; a decimated mesh of {ENOUGH_FACES:,} faces is as good",
+            stacklevel=2,
+        )
+    _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale)
+
+    # Only positions are taken over, so seams of texture or normals keep no vertices apart.
+    mesh = trimesh.Trimesh(vertices * scale, faces, process=False)
+    mesh.merge_vertices()
+    a, b, c = mesh.faces.T
+    mesh.update_faces((a != b) & (b != c) & (c != a))  # what merging collapsed to a line
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) == 0:
+        raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
+    _turn_outward(mesh)
+    if not mesh.is_watertight:
+        text = (
+            f"{name} is open even after merging its vertices; the winding number decides what is "
+            "inside, which is inexact near the holes"
+        )
+        warnings.warn(MeshWarning("open_mesh", text), stacklevel=2)
+    for warning in check_bodies(mesh, name):
+        warnings.warn(warning, stacklevel=2)
+    return mesh
+
+
+def mesh_digest(mesh: trimesh.Trimesh) -> str:
+    """A name for the exact content of a mesh: of its vertices as float64 and its faces as int64."""
+    return digest(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+
+
+def _read(path: Path) -> trimesh.Trimesh:
+    """The file as one mesh, as it stands in the file."""
+    import trimesh
+
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in _mesh_formats():
+        raise MeshError(f"mesh file {path} is of no known kind; accepted: {_accepted_files()}")
+    try:
+        check_complete(path, kind)
+        loaded = trimesh.load(
+            str(path), file_type=kind, force="mesh", process=False, skip_materials=True
+        )
+    except Exception as error:  # readers of damaged files raise whatever they stumble over
+        missing = isinstance(error, ImportError)  # only the guess at a text's encoding needs more
+        reason = "it is damaged" if missing else " ".join(str(error).split())
+        raise MeshError(
+            f"mesh file {path} cannot be read as .{kind}: {reason}; accepted: {_accepted_files()}"
+        ) from error
+    if not isinstance(loaded, trimesh.Trimesh):
+        raise MeshError(f"mesh file {path} has no faces; accepted: triangle meshes")
+    return loaded
+
+
+def _check_faces(name: str, vertex_count: int, faces: np.ndarray) -> None:
+    if len(faces) == 0:
+        raise MeshError(f"{name} has no faces; accepted: triangle meshes")
+    outside = (faces < 0) | (faces >= vertex_count)
+    if outside.any():
+        row = int(np.argwhere(outside)[0, 0])
+        raise MeshError(
+            f"{name}: faces[{row}] is {faces[row].tolist()}; "
+            f"accepted: indices of its {vertex_count} vertices"
+        )
+
+
+def _check_size(name: str, extents: np.ndarray) -> None:
+    """Raise MeshError unless extents (3,), in metres, are those of a solid of plausible size."""
+    largest = float(extents.max())
+    size = " x ".join(f"{extent:.4g}" for extent in extents) + " m"
+    accepted = f"accepted: a largest extent of {SMALLEST} m to {LARGEST:g} m"
+    if largest > LARGEST:
+        raise MeshError(
+            f"{name} is {size}; looks like millimetres; pass scale=0.001 ({accepted} after scaling)"
+        )
+    if float(extents.min()) == 0.0:
+        raise MeshError(f"{name} is {size}: flat; accepted: a solid, with three extents above 0")
+    if largest < SMALLEST:
+        raise MeshError(f"{name} is {size}: too small; pass a larger scale ({accepted})")
+
+
+def _turn_outward(mesh: trimesh.Trimesh) -> None:
+    """Make neighbouring faces agree, and the volume of a closed mesh positive."""
+    import trimesh
+
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0.0:
+        mesh.invert()
+
+
+def _mesh_formats() -> set[str]:
+    import trimesh
+
+    return set(trimesh.available_formats()) - _NOT_MESHES
+
+
+def _accepted_files() -> str:
+    return "a mesh in metres as " + ", ".join(f".{kind}" for kind in sorted(_mesh_formats()))

@@ -1,0 +1,198 @@
+"""What touch and sight have told: free, occupied and known-SDF points in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from chsel.errors import PointsError, require_positive
+from chsel.numerics.arrays import FloatArray, digest, frozen
+
+_CLASSES = ("free", "occupied", "known", "known_sdf")
+
+
+def _no_points() -> FloatArray:
+    return np.zeros((0, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPoints:
+    """Known points in world coordinates, in metres (CHSEL, Sec. III: the sets of semantics).
+
+    free (N, 3): outside of the object. occupied (K, 3): inside of it. known (M, 3): points whose
+    signed distance to the surface is known to be known_sdf (M,), 0 for contacts.
+    Raises PointsError for wrong shapes and values that are not finite.
+    """
+
+    free: FloatArray = field(default_factory=_no_points)
+    occupied: FloatArray = field(default_factory=_no_points)
+    known: FloatArray = field(default_factory=_no_points)
+    known_sdf: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("free", "occupied", "known"):
+            object.__setattr__(self, name, frozen(name, getattr(self, name), (None, 3)))
+        sdf = np.zeros(len(self.known)) if self.known_sdf is None else self.known_sdf
+        object.__setattr__(self, "known_sdf", frozen("known_sdf", sdf, (None,)))
+        if len(self.sdf) != len(self.known):
+            raise PointsError(
+                f"known_sdf has {len(self.sdf)} entries; accepted: one per known point, "
+                f"{len(self.known)}"
+            )
+
+    @property
+    def sdf(self) -> FloatArray:
+        """The known signed distances (M,) in metres; always an array."""
+        assert self.known_sdf is not None
+        return self.known_sdf
+
+    @property
+    def count(self) -> int:
+        """How many points there are in all classes."""
+        return len(self.free) + len(self.occupied) + len(self.known)
+
+    @property
+    def contacts(self) -> FloatArray:
+        """The known points on the surface, those of signed distance 0 (M', 3)."""
+        return self.known[self.sdf == 0.0]
+
+    @cached_property
+    def digest(self) -> str:
+        """Digest of all points, in their order."""
+        return digest(*(getattr(self, name) for name in _CLASSES))
+
+    def merged(self, new: KnownPoints) -> KnownPoints:
+        """These points followed by new ones, class by class."""
+        return KnownPoints.joined([self, new])
+
+    @classmethod
+    def joined(cls, parts: Sequence[KnownPoints]) -> KnownPoints:
+        """The points of several parts, at least one, in their order, class by class."""
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in _CLASSES
+        }
+        return cls(**arrays)
+
+    def all_points(self) -> FloatArray:
+        """Every point of every class (N + K + M, 3)."""
+        return np.concatenate([self.free, self.occupied, self.known])
+
+
+class GrowingPoints:
+    """The known points of a session so far: copied only when all are asked for.
+
+    free, occupied, known, contacts: how many there are, without a copy.
+    """
+
+    def __init__(self, initial: KnownPoints) -> None:
+        self._parts = [initial]
+        self._counts = _counts(initial)
+
+    def add(self, new: KnownPoints) -> None:
+        """New points follow those so far."""
+        self._parts.append(new)
+        self._counts = self._counts + _counts(new)
+
+    def all(self) -> KnownPoints:
+        """All points so far; the same value until more are added."""
+        if len(self._parts) > 1:
+            self._parts = [KnownPoints.joined(self._parts)]
+        return self._parts[0]
+
+    @property
+    def free(self) -> int:
+        return int(self._counts[0])
+
+    @property
+    def occupied(self) -> int:
+        return int(self._counts[1])
+
+    @property
+    def known(self) -> int:
+        return int(self._counts[2])
+
+    @property
+    def contacts(self) -> int:
+        return int(self._counts[3])
+
+    @property
+    def count(self) -> int:
+        """How many points there are in all classes."""
+        return self.free + self.occupied + self.known
+
+
+def _counts(points: KnownPoints) -> np.ndarray:
+    """Numbers of points (4,): free, occupied, known, contacts."""
+    return np.array(
+        [len(points.free), len(points.occupied), len(points.known), len(points.contacts)]
+    )
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """The box of the world in which the object must be: lower and upper corner (3,), metres."""
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        lower, upper = frozen("workspace", (self.lower, self.upper), (2, 3))
+        if not (upper > lower).all():
+            raise PointsError(
+                f"workspace runs from {lower.tolist()} to {upper.tolist()}; accepted: every lower "
+                "bound below its upper bound"
+            )
+        object.__setattr__(self, "lower", tuple(float(value) for value in lower))
+        object.__setattr__(self, "upper", tuple(float(value) for value in upper))
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Lower and upper corner (2, 3)."""
+        return np.array([self.lower, self.upper])
+
+    @classmethod
+    def around(cls, points: FloatArray, margin: float) -> Workspace:
+        """The bounds of points (N, 3), N > 0, padded by `margin` on every side."""
+        lower, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+        return cls(tuple(lower.tolist()), tuple(upper.tolist()))
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A regular lattice of voxel centres: origin (3,) plus whole multiples of `spacing` metres."""
+
+    origin: tuple[float, float, float]
+    spacing: float
+
+    def __post_init__(self) -> None:
+        require_positive("voxel spacing", self.spacing)
+
+    def voxels(self, points: FloatArray) -> np.ndarray:
+        """Index (N, 3) of the voxel that holds each point: the nearest centre, ties to even."""
+        return np.rint((points - np.array(self.origin)) / self.spacing).astype(np.int64)
+
+    def centres(self, voxels: np.ndarray) -> FloatArray:
+        """Centres (N, 3) of voxels (N, 3)."""
+        return np.array(self.origin) + voxels * self.spacing
+
+
+class FreeVoxels:
+    """Free space met so far, one point a voxel (the density cap of CHSEL, Sec. IV-B)."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self._seen: set[tuple[int, int, int]] = set()
+
+    def add(self, points: FloatArray) -> FloatArray:
+        """Mark the voxels of points (N, 3); centres (N', 3) of those new, in order of index."""
+        voxels = np.unique(self.lattice.voxels(np.asarray(points, float).reshape(-1, 3)), axis=0)
+        new = [voxel for voxel in map(tuple, voxels.tolist()) if voxel not in self._seen]
+        self._seen.update(new)
+        return self.lattice.centres(np.array(new, dtype=np.int64).reshape(-1, 3))
+
+    def __len__(self) -> int:
+        return len(self._seen)

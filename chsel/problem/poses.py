@@ -1,0 +1,259 @@
+"""Rigid transforms and rotations: matrices, quaternions, the 9-D vectors of CHSEL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from chsel.errors import PoseError
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.elementary import arctangents, sines_cosines
+from chsel.problem.streams import normals
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+RIGID_TOLERANCE = 1e-6
+
+
+def stacked(object_from_world: Any) -> FloatArray:
+    """Transforms (B, 4, 4) as numbers, finite or not; PoseError for another shape."""
+    transforms = np.asarray(object_from_world, dtype=np.float64)
+    if transforms.ndim != 3 or transforms.shape[1:] != (4, 4):
+        raise PoseError(
+            f"object_from_world has shape {transforms.shape}; accepted: (any, 4, 4), several poses"
+        )
+    return transforms
+
+
+def check_rigid(name: str, transforms: FloatArray, tolerance: float = RIGID_TOLERANCE) -> None:
+    """Raise PoseError unless every (4, 4) of transforms (B, 4, 4) is a rotation and translation."""
+    rotations = transforms[:, :3, :3]
+    products = np.einsum("bij,bkj->bik", rotations, rotations) - np.eye(3)
+    handed = np.einsum("bi,bi->b", np.cross(rotations[:, 0], rotations[:, 1]), rotations[:, 2])
+    good = (np.abs(products).max(axis=(1, 2), initial=0.0) < tolerance) & (handed > 0)
+    good &= (transforms[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    if not good.all():
+        index = int(np.argmin(good))
+        raise PoseError(
+            f"{name}[{index}] is not a rigid transform; accepted: a (4, 4) matrix of a rotation "
+            "matrix (determinant +1), a translation, and the last row 0 0 0 1"
+        )
+
+
+def nearest_rigid(name: str, transforms: FloatArray) -> FloatArray:
+    """Transforms (B, 4, 4) with rotations made exact, as numbers from a file are often rounded.
+
+    Raises PoseError unless they are rigid within 1e-3.
+    """
+    check_rigid(name, transforms, 1e-3)
+    left, _, right = np.linalg.svd(transforms[:, :3, :3])
+    return compose(left @ right, transforms[:, :3, 3])
+
+
+def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Homogeneous transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    transforms = np.zeros((*rotation.shape[:-2], 4, 4))
+    transforms[..., :3, :3] = rotation
+    transforms[..., :3, 3] = translation
+    transforms[..., 3, 3] = 1.0
+    return transforms
+
+
+def product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Matrix products (..., 3, 3) of (..., 3, 3), each sum in the order of its index."""
+    total = left[..., :, 0, None] * right[..., None, 0, :]
+    total = total + left[..., :, 1, None] * right[..., None, 1, :]
+    return total + left[..., :, 2, None] * right[..., None, 2, :]
+
+
+def rotated(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 3) turned by rotations (..., 3, 3), each sum in the order of its index."""
+    total = rotation[..., 0] * vectors[..., 0, None]
+    total = total + rotation[..., 1] * vectors[..., 1, None]
+    return total + rotation[..., 2] * vectors[..., 2, None]
+
+
+def inverse(transforms: FloatArray) -> FloatArray:
+    """The inverse of rigid transforms (..., 4, 4)."""
+    rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    return compose(rotation, -rotated(rotation, transforms[..., :3, 3]))
+
+
+def apply(transforms: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (N, 3) moved by transforms (..., 4, 4): (..., N, 3)."""
+    moved = np.einsum("...ij,nj->...ni", transforms[..., :3, :3], points)
+    return moved + transforms[..., None, :3, 3]
+
+
+def axis_angle(axis: FloatArray, angle: FloatArray | float) -> FloatArray:
+    """Rotations (..., 3, 3) about unit axes (..., 3) by angles (...) in radians (Rodrigues)."""
+    sine, cosine = (values[..., None, None] for values in sines_cosines(angle))
+    hat = np.zeros((*axis.shape[:-1], 3, 3))
+    hat[..., 0, 1], hat[..., 0, 2] = -axis[..., 2], axis[..., 1]
+    hat[..., 1, 0], hat[..., 1, 2] = axis[..., 2], -axis[..., 0]
+    hat[..., 2, 0], hat[..., 2, 1] = -axis[..., 1], axis[..., 0]
+    outer = axis[..., :, None] * axis[..., None, :]
+    return cosine * np.eye(3) + sine * hat + (1.0 - cosine) * outer
+
+
+def roll_pitch_yaw(angles: FloatArray) -> FloatArray:
+    """The rotation (3, 3) by angles (3,), radians, about the fixed axes x, y, z, in this order."""
+    about_x, about_y, about_z = axis_angle(np.eye(3), np.asarray(angles, dtype=np.float64))
+    return product(product(about_z, about_y), about_x)
+
+
+def rotation_vector(vectors: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3): the exponential map of SO(3)."""
+    angle = np.sqrt((vectors**2).sum(axis=-1))
+    safe = np.where(angle > 0.0, angle, 1.0)
+    axis = np.where(angle[..., None] > 0.0, vectors / safe[..., None], [1.0, 0.0, 0.0])
+    return axis_angle(axis, angle)
+
+
+def random_rotations(stream: np.random.Generator, count: int) -> FloatArray:
+    """Rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
+    quaternion = normals(stream, (count, 4))
+    w, x, y, z = (quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def rotation_angle(rotation: FloatArray) -> FloatArray:
+    """Angle in radians of rotations (..., 3, 3), in [0, pi], exact for small angles too."""
+    skew = np.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    return arctangents(np.sqrt((skew**2).sum(axis=-1)), trace - 1.0)
+
+
+def encode_9d(object_from_world: FloatArray) -> FloatArray:
+    """The 9-D vectors (B, 9) of transforms (B, 4, 4): first two rows of R, then t (CHSEL, IV-B)."""
+    rows = object_from_world[:, :2, :3].reshape(-1, 6)
+    return np.concatenate([rows, object_from_world[:, :3, 3]], axis=1)
+
+
+def decode_6d(rows: Tensor) -> Tensor:
+    """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
+    import torch
+
+    first, second = rows[:, 0:3], rows[:, 3:6]
+    b1 = first / _length(first)
+    b2 = second - _dot(b1, second) * b1
+    b2 = b2 / _length(b2)
+    b3 = torch.stack(
+        [
+            b1[:, 1] * b2[:, 2] - b1[:, 2] * b2[:, 1],
+            b1[:, 2] * b2[:, 0] - b1[:, 0] * b2[:, 2],
+            b1[:, 0] * b2[:, 1] - b1[:, 1] * b2[:, 0],
+        ],
+        dim=1,
+    )
+    return torch.stack([b1, b2, b3], dim=1)
+
+
+def _length(vectors: Tensor) -> Tensor:
+    # Kept away from 0, so that a degenerate 6-D vector decodes to finite numbers.
+
+    return _dot(vectors, vectors).sqrt().clamp_min(1e-12)
+
+
+def _dot(left: Tensor, right: Tensor) -> Tensor:
+    """Products (B, 1) of vectors (B, 3), each sum in the order of its index."""
+    products = left * right
+    return products[:, 0:1] + products[:, 1:2] + products[:, 2:3]
+
+
+def moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
+    """R x + t (..., 3) of rotations (..., 3, 3), translations (..., 3) and points (..., 3).
+
+    Written out, as a matrix product adds in an order that depends on the machine.
+    """
+    columns = [rotation[..., i] * points[..., i, None] for i in range(3)]
+    return columns[0] + columns[1] + columns[2] + translation
+
+
+def as_tensor(value: Any, device: torch.device | str = "cpu") -> Tensor:
+    """A float64 tensor that shares no memory with a read-only array."""
+    import torch
+
+    return torch.tensor(np.asarray(value), dtype=torch.float64).to(device)
+
+
+_SMALL = 1e-6  # radians, below which a straight line is as good as an arc
+
+
+def quaternions(rotation: FloatArray) -> FloatArray:
+    """Unit quaternions (N, 4) of rotations (N, 3, 3); their sign is arbitrary.
+
+    Each row of the outer product of a quaternion with itself is a multiple of it, and all its
+    entries follow from the rotation without a root; the row of the largest entry is the stablest.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(rotation, 0, -1)
+    outer = np.array(
+        [
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
+        ]
+    )  # (4, 4, N)
+    largest = np.argmax(np.diagonal(outer), axis=1)
+    rows = np.moveaxis(outer, -1, 0)[np.arange(len(rotation)), largest]
+    unit: FloatArray = rows / np.sqrt((rows**2).sum(axis=1, keepdims=True))
+    return unit
+
+
+def rotations(quaternion: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) of unit quaternions (N, 4)."""
+    x, y, z, w = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Unit quaternions (N, 4) at fractions (N,) of the shorter arcs from one to the other (N, 4).
+
+    q(t) = (sin((1 - t) a) p + sin(t a) q) / sin a, with the angle a between p and q or -q. The same
+    bits on every machine.
+    """
+    t = np.asarray(fraction, dtype=np.float64)[:, None]
+    second = np.where(_product(first, second) < 0.0, -second, second)
+    apart, joint = second - first, second + first
+    a = 2.0 * arctangents(np.sqrt(_product(apart, apart)), np.sqrt(_product(joint, joint)))
+    arc = a > _SMALL
+    before = np.where(arc, sines_cosines((1.0 - t) * a)[0], 1.0 - t)
+    after = np.where(arc, sines_cosines(t * a)[0], t)
+    between = before * first + after * second
+    unit: FloatArray = between / np.sqrt(_product(between, between))
+    return unit
+
+
+def _product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Inner products (N, 1) of vectors (N, 4), summed in a fixed order."""
+    terms = left * right
+    return ((terms[:, 0] + terms[:, 1]) + (terms[:, 2] + terms[:, 3]))[:, None]
+
+
+def interpolated(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) on the way from first to second (N, 4, 4), at fraction (N,) of it."""
+    t = np.asarray(fraction, dtype=np.float64)[:, None]
+    position = (1.0 - t) * first[:, :3, 3] + t * second[:, :3, 3]
+    turned = slerp(quaternions(first[:, :3, :3]), quaternions(second[:, :3, :3]), fraction)
+    return compose(rotations(turned), position)

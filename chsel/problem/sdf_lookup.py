@@ -1,0 +1,117 @@
+"""The signed distance grid, as the inner loops read it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.cell_set import Box, box_of
+from chsel.numerics.compiler import leaf
+from chsel.problem.sdf_grid import SdfGrid
+
+
+class Field(NamedTuple):
+    """Signed distances and gradients at the nodes of a grid.
+
+    table (nodes, 4): value and gradient of each node. trilinear: interpolate, else read the
+    nearest node. box_distance: how distances continue outside, see SdfGrid.query.
+    """
+
+    box: Box
+    table: FloatArray
+    trilinear: bool
+    box_distance: bool
+
+
+def field_of(sdf: SdfGrid, lookup: str, outside: str) -> Field:
+    """The field of a signed distance grid."""
+    trilinear = lookup == "trilinear"
+    box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
+    return Field(box, sdf.table, trilinear, outside == "bounding_box")
+
+
+@leaf
+def sample(trilinear, box, table, places, n):
+    """Signed distance and its gradient (s, n_x, n_y, n_z) at a place in the box."""
+    if trilinear:
+        return interpolated(box, table, places.cell[n], places.u[n], places.v[n], places.w[n])
+    at = places.cell[n]
+    return table[at, 0], table[at, 1], table[at, 2], table[at, 3]
+
+
+@leaf
+def interpolated(box, table, base, u, v, w):
+    """The same in the cell of the node `base`, at u, v, w of its sides."""
+    across, along = int(box.across), int(box.along)
+    s = nx = ny = nz = 0.0
+    for corner in range(8):
+        a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+        weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
+        at = base + a * across + b * along + c
+        s += weight * table[at, 0]
+        nx += weight * table[at, 1]
+        ny += weight * table[at, 2]
+        nz += weight * table[at, 3]
+    return s, nx, ny, nz
+
+
+@leaf
+def continued(box_distance, box, inside, x, y, z):
+    """The same at a point beyond the box, from that at the point of the box nearest to it."""
+    s, nx, ny, nz = inside
+    first, last = box.first, box.last
+    ax = x - min(max(x, first[0]), last[0])
+    ay = y - min(max(y, first[1]), last[1])
+    az = z - min(max(z, first[2]), last[2])
+    if not box_distance:
+        length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
+        ax += s * (nx / length)
+        ay += s * (ny / length)
+        az += s * (nz / length)
+    length = max(np.sqrt(ax * ax + ay * ay + az * az), 1e-12)
+    return length, ax / length, ay / length, az / length
+
+
+@leaf
+def distance_at(field, pose, x, y, z):
+    """Signed distance at a world point, interpolated."""
+    return distance_with_gradient(field, pose, x, y, z)[0]
+
+
+@leaf
+def distance_with_gradient(field, pose, x, y, z):
+    """Signed distance and its gradient (s, n_x, n_y, n_z) at a world point, interpolated."""
+    box, table = field.box, field.table
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    a = pose[0] * x + pose[1] * y + pose[2] * z + pose[9]
+    b = pose[3] * x + pose[4] * y + pose[5] * z + pose[10]
+    c = pose[6] * x + pose[7] * y + pose[8] * z + pose[11]
+    d = min(max(first[0], a), last[0])
+    e = min(max(first[1], b), last[1])
+    f = min(max(first[2], c), last[2])
+    u, v, w = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
+    i = min(np.floor(u), most[0])
+    j = min(np.floor(v), most[1])
+    k = min(np.floor(w), most[2])
+    u, v, w = u - i, v - j, w - k
+    across, along = int(box.across), int(box.along)
+    at = int(i) * across + int(j) * along + int(k)
+    s = value_in_cell(table, at, across, along, u, v, w)
+    _, nx, ny, nz = interpolated(box, table, at, u, v, w)
+    if a != d or b != e or c != f:
+        s, nx, ny, nz = continued(field.box_distance, box, (s, nx, ny, nz), a, b, c)
+    return s, nx, ny, nz
+
+
+@leaf
+def value_in_cell(table, at, across, along, u, v, w):
+    """Signed distance in the cell `at`, at u, v, w of its sides."""
+    low, high = 1.0 - w, w
+    a = low * table[at, 0] + high * table[at + 1, 0]
+    b = low * table[at + along, 0] + high * table[at + along + 1, 0]
+    at += across
+    c = low * table[at, 0] + high * table[at + 1, 0]
+    d = low * table[at + along, 0] + high * table[at + along + 1, 0]
+    return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * d)

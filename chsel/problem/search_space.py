@@ -1,0 +1,193 @@
+"""The vectors that optimizers search: 9-D for SE(3), 3-D for an object on a plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from chsel.errors import SettingError
+from chsel.numerics.arrays import FloatArray, frozen
+from chsel.numerics.cell_set import triple
+from chsel.numerics.elementary import arctangents
+from chsel.numerics.pose_tuples import Space, decode_all, matrix_of
+from chsel.problem.points import Workspace
+from chsel.problem.poses import (
+    as_tensor,
+    compose,
+    decode_6d,
+    encode_9d,
+    product,
+    rotated,
+    rotation_vector,
+)
+from chsel.problem.sdf_grid import SdfGrid
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+class SearchSpace(Protocol):
+    """Vectors x (B, d) that stand for transforms object_from_world."""
+
+    dimension: int
+    arrays: Space
+    """The space as the kernels know it."""
+
+    def encode(self, object_from_world: FloatArray) -> FloatArray:
+        """Vectors (B, d) of transforms (B, 4, 4); the nearest ones if the space is smaller."""
+
+    def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotations (B, 3, 3) and translations (B, 3) of vectors (B, d), differentiable."""
+
+
+class SE3Space:
+    """x = [first row of R, second row of R, t] (CHSEL, Sec. IV-C)."""
+
+    dimension = 9
+    arrays = Space()
+
+    def encode(self, object_from_world: FloatArray) -> FloatArray:
+        """The 9-D vectors of transforms."""
+        return encode_9d(object_from_world)
+
+    def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Gram-Schmidt on the two rows; the translation as it is."""
+        return decode_6d(vectors[:, :6]), vectors[:, 6:9]
+
+
+@dataclass(frozen=True)
+class PlaneSettings:
+    """An object that stands on a plane and only turns and slides on it.
+
+    axis: normal of the plane in the object's frame when the object rests (unit vector after
+    normalisation). resting_rotation: rotation vector of object_from_world at rest, radians,
+    for an object that lies on its side. plane_height: of the plane above the world's origin along
+    its normal, metres; or offset: axis . t of object_from_world, metres. Give one of the two.
+    """
+
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    resting_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    plane_height: float | None = None
+    offset: float | None = None
+
+    def __post_init__(self) -> None:
+        axis = frozen("plane.axis", self.axis, (3,), error=SettingError)
+        if not (axis**2).sum() > 1e-12:
+            raise SettingError(f"axis is {self.axis}; accepted: a vector that is not zero")
+        if (self.plane_height is None) == (self.offset is None):
+            raise SettingError("a plane needs either plane_height or offset, and not both")
+
+
+class SE2Space:
+    """x = [theta, u, v]: R = Rot(a, theta) R_0, t = o a + u e_u + v e_v."""
+
+    dimension = 3
+
+    def __init__(self, settings: PlaneSettings, sdf: SdfGrid) -> None:
+        axis = np.array(settings.axis) / np.sqrt((np.array(settings.axis) ** 2).sum())
+        along_z = abs(abs(axis[2]) - 1.0) < 1e-9
+        other = np.array([0.0, -1.0, 0.0]) if along_z else np.array([0.0, 0.0, -1.0])
+        e_u = np.cross(axis, other)
+        e_u = e_u / np.sqrt((e_u**2).sum())
+        offset = settings.offset
+        if offset is None:
+            assert settings.plane_height is not None
+            offset = _lowest_point(sdf, axis) - settings.plane_height
+        self.axis, self.e_u, self.e_v = axis, e_u, np.cross(axis, e_u)
+        self.offset = offset
+        self.resting_rotation = rotation_vector(np.array(settings.resting_rotation))
+        self._axis, self._rest = as_tensor(axis), as_tensor(self.resting_rotation)
+        self._e_u, self._e_v = as_tensor(e_u), as_tensor(self.e_v)
+        x, y, z = axis
+        self._hat = as_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        self._hat_squared = as_tensor(np.outer(axis, axis) - np.eye(3))
+        turning = product(self._hat.numpy(), self.resting_rotation)
+        turning_squared = product(self._hat_squared.numpy(), self.resting_rotation)
+        self.arrays = Space(
+            planar=True,
+            axis=triple(axis),
+            e_u=triple(e_u),
+            e_v=triple(self.e_v),
+            resting=matrix_of(self.resting_rotation),
+            turning=matrix_of(turning),
+            turning_squared=matrix_of(turning_squared),
+            offset=float(offset),
+        )
+
+    @property
+    def upward(self) -> FloatArray:
+        """The plane's axis in the world (3,): R^T a, the same for every pose."""
+        return (self.resting_rotation * self.axis[:, None]).sum(axis=0)
+
+    def encode(self, object_from_world: FloatArray) -> FloatArray:
+        """The plane poses nearest to transforms, by the Frobenius norm of the rotations."""
+        turned = product(object_from_world[:, :3, :3], self.resting_rotation.T)
+        skew = np.stack(
+            [
+                turned[:, 2, 1] - turned[:, 1, 2],
+                turned[:, 0, 2] - turned[:, 2, 0],
+                turned[:, 1, 0] - turned[:, 0, 1],
+            ],
+            axis=1,
+        )
+        along = (rotated(turned, self.axis) * self.axis).sum(axis=1)
+        theta = arctangents(
+            (skew * self.axis).sum(axis=1), np.trace(turned, axis1=1, axis2=2) - along
+        )
+        translation = object_from_world[:, :3, 3]
+        u, v = (translation * self.e_u).sum(axis=1), (translation * self.e_v).sum(axis=1)
+        return np.stack([theta, u, v], axis=1)
+
+    def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Rodrigues' formula about the axis, and a point of the plane."""
+        import torch
+
+        device = vectors.device
+        hat, hat_squared, rest = (
+            part.to(device) for part in (self._hat, self._hat_squared, self._rest)
+        )
+        e_u, e_v, axis = (part.to(device) for part in (self._e_u, self._e_v, self._axis))
+        sine, cosine = torch.sin(vectors[:, 0]), torch.cos(vectors[:, 0])
+        turn = torch.eye(3, dtype=torch.float64, device=device) + sine[:, None, None] * hat
+        turn = turn + (1.0 - cosine)[:, None, None] * hat_squared
+        rotation = (turn[:, :, :, None] * rest[None, None]).sum(dim=2)
+        return rotation, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + self.offset * axis
+
+
+def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:
+    """SE(3), or SE(2) on a plane."""
+    return SE3Space() if plane is None else SE2Space(plane, sdf)
+
+
+def origin_bounds(
+    workspace: Workspace, space: SearchSpace, margin: float
+) -> tuple[FloatArray, FloatArray]:
+    """Where the object's origin may be (3,): the workspace, widened by a margin in metres.
+
+    For an object on a plane, it is widened further until it meets the plane.
+    """
+    lower, upper = workspace.bounds
+    if isinstance(space, SE2Space):
+        upward = space.upward
+        corners = np.where(upward > 0.0, lower, upper), np.where(upward > 0.0, upper, lower)
+        lowest, highest = (float((corner * upward).sum()) for corner in corners)
+        margin += max(lowest + space.offset, -space.offset - highest, 0.0)
+    return lower - margin, upper + margin
+
+
+def transforms_of(space: SearchSpace, vectors: FloatArray) -> FloatArray:
+    """The transforms object_from_world (B, 4, 4) of vectors (B, d)."""
+    vectors = np.array(vectors, dtype=np.float64)
+    poses = np.empty((len(vectors), 12))
+    decode_all(space.arrays, vectors, poses)
+    return compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
+
+
+def _lowest_point(sdf: SdfGrid, axis: FloatArray) -> float:
+    """The least a . x over the object's surface, read off the grid's nodes near the surface."""
+    near = np.abs(sdf.values) < 2.0 * sdf.resolution
+    nodes = sdf.origin + np.argwhere(near) * sdf.resolution
+    surface = nodes - sdf.values[near][:, None] * sdf.gradients[near]
+    return float((surface * axis).sum(axis=1).min())

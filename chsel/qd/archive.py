@@ -1,0 +1,283 @@
+"""The grid archive of quality-diversity search (CHSEL, Sec. IV-C)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel.errors import ChselError
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.compiler import compiled, inner
+from chsel.problem.registration_problem import ArchiveSnapshot
+from chsel.qd.measures import Measure
+
+_ROUNDING = 1e-6  # of a cell: a measure on a border belongs to the cell above it
+_TURN = 2.0 * np.pi
+
+
+class Cells(NamedTuple):
+    """The cells of a grid over k measures, `bins` along each, row-major, last measure fastest.
+
+    lower, upper (k,): the grid's range. circular: the measures are angles. objectives (cells,):
+    -inf where a cell is empty. solutions (cells, d). measures (cells, k).
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    bins: int
+    circular: bool
+    objectives: FloatArray
+    solutions: FloatArray
+    measures: FloatArray
+
+
+class Batch(NamedTuple):
+    """Solutions that are offered to an archive at once, and what becomes of them.
+
+    vectors (B, d), objectives (B,) and measures (B, k) go in; cells (B,), status (B,), value (B,)
+    and order (B,), best first, come out.
+    """
+
+    vectors: FloatArray
+    objectives: FloatArray
+    measures: FloatArray
+    cells: IntArray
+    status: IntArray
+    value: FloatArray
+    order: IntArray
+
+
+def batch_of(count: int, dimension: int, measures: int) -> Batch:
+    """Room for `count` solutions of `dimension` numbers with so many measures."""
+    return Batch(
+        vectors=np.zeros((count, dimension)),
+        objectives=np.full(count, -np.inf),
+        measures=np.zeros((count, measures)),
+        cells=np.full(count, -1),
+        status=np.zeros(count, dtype=np.int64),
+        value=np.full(count, -np.inf),
+        order=np.arange(count),
+    )
+
+
+@inner
+def all_finite(vector: FloatArray) -> bool:
+    """Whether a vector holds neither infinity nor NaN."""
+    finite = True
+    for x in vector:
+        finite &= np.isfinite(x)
+    return finite
+
+
+@inner
+def cell_of(
+    lower: FloatArray, upper: FloatArray, bins: int, circular: bool, measures: FloatArray
+) -> int:
+    """Index of the cell of finite measures (k,); the nearest one for measures out of range."""
+    cell = 0
+    for i in range(len(measures)):
+        x = measures[i]
+        if circular:
+            x -= _TURN * np.rint((x - (lower[i] + upper[i]) / 2.0) / _TURN)
+        index = (bins * (x - lower[i]) + _ROUNDING) / (upper[i] - lower[i])
+        if not index > 0.0:  # written so that NaN, of an endless range, is below too
+            index = 0.0
+        cell = cell * bins + int(min(index, bins - 1.0))
+    return cell
+
+
+@compiled
+def cells_of(archive: Cells, measures: FloatArray, cells: IntArray) -> None:
+    """Fill cells (B,) for measures (B, k); -1 for measures that are not finite."""
+    for i in range(len(cells)):
+        cells[i] = cell_for(archive, 0.0, measures[i], measures[i])
+
+
+@inner
+def cell_for(archive: Cells, objective: float, vector: FloatArray, measures: FloatArray) -> int:
+    """The cell of a solution; -1 if any of its numbers is not finite, which no cell may hold."""
+    if np.isfinite(objective) and all_finite(measures) and all_finite(vector):
+        return cell_of(archive.lower, archive.upper, archive.bins, archive.circular, measures)
+    return -1
+
+
+@inner
+def keep_better(
+    archive: Cells, cell: int, objective: float, vector: FloatArray, measures: FloatArray
+) -> None:
+    """Put a solution into its cell if its objective is higher."""
+    if cell < 0 or objective <= archive.objectives[cell]:
+        return
+    archive.objectives[cell] = objective
+    for j in range(len(vector)):
+        archive.solutions[cell, j] = vector[j]
+    for j in range(len(measures)):
+        archive.measures[cell, j] = measures[j]
+
+
+@compiled
+def insert(archive: Cells, batch: Batch) -> None:
+    """Offer a batch: status and value against the archive before it, then each cell's highest.
+
+    Status 2 for a cell that was empty, 1 for a better objective, 0 for neither. Value: the
+    objective where the cell was empty, else its gain over the cell's. Of a batch, each cell keeps
+    the first of the highest. A solution of which any number is not finite is refused: cell -1,
+    status 0, value -inf.
+    """
+    vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures
+    cells, status, value = batch.cells, batch.status, batch.value
+    for i in range(len(objectives)):
+        cells[i] = cell_for(archive, objectives[i], vectors[i], measures[i])
+        status[i], value[i] = 0, -np.inf
+        if cells[i] < 0:
+            continue
+        old = archive.objectives[cells[i]]
+        if old == -np.inf:
+            status[i], value[i] = 2, objectives[i]
+        else:
+            status[i], value[i] = int(objectives[i] > old), objectives[i] - old
+    for i in range(len(objectives)):
+        keep_better(archive, cells[i], objectives[i], vectors[i], measures[i])
+
+
+@inner
+def _precedes(status: IntArray, value: FloatArray, i: int, j: int) -> bool:
+    if status[i] != status[j]:
+        return status[i] > status[j]
+    if value[i] != value[j]:
+        return value[i] > value[j]
+    return i > j
+
+
+@inner
+def rank(status: IntArray, value: FloatArray, order: IntArray) -> int:
+    """Fill the order (B,): by status, then by value; ties the later first. How many improved.
+
+    By Shell's sort: no two rank alike, so that any way of sorting gives one order.
+    """
+    count, improved = len(order), 0
+    for i in range(count):
+        order[i] = i
+        improved += int(status[i] > 0)
+    gap = count // 2
+    while gap > 0:
+        for i in range(gap, count):
+            item, place = order[i], i
+            while place >= gap and _precedes(status, value, item, order[place - gap]):
+                order[place] = order[place - gap]
+                place -= gap
+            order[place] = item
+        gap //= 2
+    return improved
+
+
+@inner
+def sampled_cell(objectives: FloatArray, uniform: float) -> int:
+    """A cell of objectives (cells,) that is occupied, chosen by a number from [0, 1), or -1."""
+    occupied = 0
+    for objective in objectives:
+        occupied += int(objective > -np.inf)
+    left = int(uniform * occupied)
+    for cell in range(len(objectives)):
+        if objectives[cell] > -np.inf:
+            if left == 0:
+                return cell
+            left -= 1
+    return -1
+
+
+class GridArchive:
+    """Keeps in every cell of a measure grid the solution with the highest objective.
+
+    Objectives are minus costs. Solutions outside of the range go to the cells at its edge.
+    """
+
+    def __init__(
+        self,
+        measure: Measure,
+        lower: FloatArray,
+        upper: FloatArray,
+        *,
+        bins: int,
+        dimension: int,
+    ) -> None:
+        self.measure = measure
+        self.shape = (bins,) * measure.count
+        self.lower, self.upper = lower, upper
+        cells = math.prod(self.shape)
+        self.cells = Cells(
+            lower=np.array(lower, dtype=np.float64),
+            upper=np.array(upper, dtype=np.float64),
+            bins=int(bins),
+            circular=measure.circular,
+            objectives=np.full(cells, -np.inf),
+            solutions=np.zeros((cells, dimension)),
+            measures=np.zeros((cells, measure.count)),
+        )
+
+    def cells_of(self, measures: FloatArray) -> IntArray:
+        """Row-major index (B,) of the cell of measures (B, k), last measure fastest.
+
+        -1 for measures that are not finite.
+        """
+        cells = np.zeros(len(measures), dtype=np.int64)
+        cells_of(self.cells, np.array(measures, dtype=np.float64, order="C"), cells)
+        return cells
+
+    def add(
+        self, solutions: FloatArray, objectives: FloatArray, measures: FloatArray
+    ) -> tuple[IntArray, FloatArray]:
+        """Offer solutions (B, d) with objectives (B,) and measures (B, k).
+
+        Status (B,): 2 for a cell that was empty, 1 for a better objective, 0 for neither, all
+        against the archive before this batch. Value (B,): the objective where the cell was empty,
+        else its gain over the cell's. Of a batch, each cell keeps the highest, the first on a
+        tie. A solution of which any number is not finite is refused: status 0, value -inf.
+        """
+        batch = batch_of(len(solutions), self.cells.solutions.shape[1], self.measure.count)
+        batch.vectors[:], batch.objectives[:], batch.measures[:] = solutions, objectives, measures
+        insert(self.cells, batch)
+        return batch.status, batch.value
+
+    @property
+    def occupied(self) -> IntArray:
+        """Indices (C,) of the cells that hold a solution, ascending."""
+        return np.flatnonzero(~np.isneginf(self.cells.objectives))
+
+    @property
+    def solutions(self) -> FloatArray:
+        """Solutions (C, d) of the occupied cells."""
+        return self.cells.solutions[self.occupied]
+
+    @property
+    def costs(self) -> FloatArray:
+        """Costs (C,) of the occupied cells."""
+        return -self.cells.objectives[self.occupied]
+
+    @property
+    def best_solution(self) -> FloatArray:
+        """The solution (d,) of lowest cost. Raises ChselError if the archive is empty."""
+        if len(self.occupied) == 0:
+            raise ChselError(
+                "the archive is empty, as no pose that was offered to it has a finite cost; "
+                "accepted: points, SDF and scales by which the cost of some pose is finite"
+            )
+        return self.cells.solutions[int(np.argmax(self.cells.objectives))]
+
+    def snapshot(self, iteration: int, refinement: int) -> ArchiveSnapshot:
+        """A copy of the occupied cells."""
+        cells = self.occupied
+        return ArchiveSnapshot(
+            iteration=iteration,
+            refinement=refinement,
+            measure_names=self.measure.axes,
+            shape=self.shape,
+            lower=self.lower.copy(),
+            upper=self.upper.copy(),
+            cells=cells,
+            solutions=self.cells.solutions[cells],
+            objectives=self.cells.objectives[cells],
+            measures=self.cells.measures[cells],
+        )

@@ -1,0 +1,229 @@
+"""The evolution strategy inside both emitters: CMA-ES with a varying number of parents."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.compiler import inner
+from chsel.numerics.eigen import decompose
+from chsel.numerics.elementary import exp, logs
+
+SIGMA, EVALUATIONS, DECOMPOSED_AT, GAP = range(4)
+
+_MAX_CONDITION = 1e14
+_SMALLEST_STEP = 1e-11
+_SMALLEST_EIGENVALUE = 1e-300
+_FLAT = 1e-12
+
+
+class Strategy(NamedTuple):
+    """State of covariance matrix adaptation (Hansen, 2016, "The CMA Evolution Strategy").
+
+    Dimension n, batch L, first step size sigma0. Parents may be any number of the batch, as
+    quality diversity takes those that changed the archive (Fontaine et al., 2020).
+    ribs_parity: divide no evolution path by sigma and apply c1 twice, as pyribs does.
+    mean, path_c, path_s (n,); covariance (n, n); eigenvalues (n,) and eigenvectors (n, n), in
+    columns, of the covariance at the last decomposition. numbers (4,): step size sigma,
+    evaluations since the reset, those at the last decomposition, and how many must lie between.
+    logarithms (2, L): ln i and ln(i + 1/2), from i = 1. weights (L,): of the last parents.
+    scratch (2, n) and work (n, n) hold nothing between two calls.
+    """
+
+    batch: int
+    sigma0: float
+    ribs_parity: bool
+    mean: FloatArray
+    path_c: FloatArray
+    path_s: FloatArray
+    covariance: FloatArray
+    eigenvalues: FloatArray
+    eigenvectors: FloatArray
+    numbers: FloatArray
+    logarithms: FloatArray
+    weights: FloatArray
+    scratch: FloatArray
+    work: FloatArray
+
+
+def strategy_around(
+    mean: FloatArray, batch: int, sigma0: float, *, ribs_parity: bool = False
+) -> Strategy:
+    """A new strategy around `mean` (n,)."""
+    n, ranks = len(mean), np.arange(1.0, batch + 1.0)
+    return Strategy(
+        batch=batch,
+        sigma0=float(sigma0),
+        ribs_parity=bool(ribs_parity),
+        mean=np.array(mean, dtype=np.float64),
+        path_c=np.zeros(n),
+        path_s=np.zeros(n),
+        covariance=np.eye(n),
+        eigenvalues=np.ones(n),
+        eigenvectors=np.eye(n),
+        numbers=np.array([sigma0, 0.0, 0.0, 0.0]),
+        logarithms=np.stack([logs(ranks), logs(ranks + 0.5)]),
+        weights=np.zeros(batch),
+        scratch=np.zeros((2, n)),
+        work=np.zeros((n, n)),
+    )
+
+
+@inner
+def reset(strategy: Strategy) -> None:
+    """Start again around the mean."""
+    n, numbers = len(strategy.mean), strategy.numbers
+    for i in range(n):
+        strategy.path_c[i] = strategy.path_s[i] = 0.0
+        strategy.eigenvalues[i] = 1.0
+        for j in range(n):
+            entry = 1.0 if i == j else 0.0
+            strategy.covariance[i, j] = strategy.eigenvectors[i, j] = entry
+    numbers[SIGMA] = strategy.sigma0
+    numbers[EVALUATIONS] = numbers[DECOMPOSED_AT] = 0.0
+
+
+@inner
+def ask(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
+    """Fill samples (L, n), m + sigma B D z, from standard normal draws z (L, n)."""
+    numbers, mean, vectors = strategy.numbers, strategy.mean, strategy.eigenvectors
+    values, n = strategy.eigenvalues, len(mean)
+    if numbers[EVALUATIONS] == 0.0:
+        numbers[GAP] = _gap(n, strategy.batch, strategy.logarithms, strategy.weights)
+    elif numbers[EVALUATIONS] > numbers[DECOMPOSED_AT] + numbers[GAP]:
+        decompose(strategy.covariance, strategy.work, values, vectors)
+        for e in range(n):
+            values[e] = max(values[e], _SMALLEST_EIGENVALUE)
+        numbers[DECOMPOSED_AT] = numbers[EVALUATIONS]
+    for i in range(len(samples)):
+        for j in range(n):
+            samples[i, j] = mean[j]
+        for e in range(n):
+            along = numbers[SIGMA] * np.sqrt(values[e]) * normals[i, e]
+            for j in range(n):
+                samples[i, j] += along * vectors[j, e]
+
+
+@inner
+def _gap(n: int, batch: int, logarithms: FloatArray, weights: FloatArray) -> float:
+    """Evaluations between decompositions: n L / (2 (c_1 + c_mu) n^2), rates of L / 2 parents."""
+    mueff = _weigh(logarithms, max(batch // 2, 1), weights)
+    _, _, c1, cmu, _ = _learning_rates(n, mueff)
+    return 0.5 * n * batch / ((c1 + cmu) * n * n)
+
+
+@inner
+def _weigh(logarithms: FloatArray, parents: int, weights: FloatArray) -> float:
+    """Fill the weights of ranked parents, ln(mu + 1/2) - ln i, summing to 1; returns mu_eff."""
+    total, squares = 0.0, 0.0
+    for i in range(parents):
+        weights[i] = logarithms[1, parents - 1] - logarithms[0, i]
+        total += weights[i]
+    for i in range(parents):
+        weights[i] /= total
+        squares += weights[i] * weights[i]
+    return 1.0 / squares
+
+
+@inner
+def _learning_rates(n: int, mueff: float) -> tuple[float, float, float, float, float]:
+    """c_c, c_sigma, c_1, c_mu and d_sigma for n dimensions."""
+    cc = (4.0 + mueff / n) / (n + 4.0 + 2.0 * mueff / n)
+    cs = (mueff + 2.0) / (n + mueff + 5.0)
+    c1 = 2.0 / ((n + 1.3) * (n + 1.3) + mueff)
+    cmu = 2.0 * (mueff - 2.0 + 1.0 / mueff) / ((n + 2.0) * (n + 2.0) + mueff)
+    damping = 1.0 + 2.0 * max(0.0, np.sqrt((mueff - 1.0) / (n + 1.0)) - 1.0) + cs
+    return cc, cs, c1, min(1.0 - c1, cmu), damping
+
+
+@inner
+def tell(strategy: Strategy, samples: FloatArray, order: IntArray, parents: int) -> None:
+    """Learn from samples (L, n) with their order (L,), of which the first `parents` succeeded."""
+    numbers, mean, weights = strategy.numbers, strategy.mean, strategy.weights
+    path_c, path_s = strategy.path_c, strategy.path_s
+    numbers[EVALUATIONS] += strategy.batch
+    if parents == 0:
+        return
+    n, sigma = len(mean), numbers[SIGMA]
+    mueff = _weigh(strategy.logarithms, parents, weights)
+    cc, cs, c1, cmu, damping = _learning_rates(n, mueff)
+    step, whitened = strategy.scratch[0], strategy.scratch[1]
+    for j in range(n):
+        step[j] = whitened[j] = 0.0
+    for i in range(parents):
+        for j in range(n):
+            step[j] += weights[i] * (samples[order[i], j] - mean[j])
+    _whiten(strategy.eigenvalues, strategy.eigenvectors, step, whitened)
+    rate = np.sqrt(cs * (2.0 - cs) * mueff) / sigma
+    length = 0.0
+    for j in range(n):
+        path_s[j] = (1.0 - cs) * path_s[j] + rate * whitened[j]
+        length += path_s[j] * path_s[j]
+    length /= n
+    generation = int(numbers[EVALUATIONS]) // strategy.batch
+    steady = length / (1.0 - _power(1.0 - cs, 2 * generation)) < 2.0 + 4.0 / (n + 1.0)
+    rate = np.sqrt(cc * (2.0 - cc) * mueff) if steady else 0.0
+    if not strategy.ribs_parity:
+        rate /= sigma
+    for j in range(n):
+        path_c[j] = (1.0 - cc) * path_c[j] + rate * step[j]
+    c1a = c1 if steady else c1 * (1.0 - cc * (2.0 - cc))
+    kept, one = 1.0 - c1a - cmu, c1 * c1 if strategy.ribs_parity else c1
+    _add_rank_one(strategy.covariance, kept, one, path_c)
+    for i in range(parents):
+        for j in range(n):
+            whitened[j] = samples[order[i], j] - mean[j]
+        _add_rank_one(strategy.covariance, 1.0, cmu * weights[i] / (sigma * sigma), whitened)
+    for j in range(n):
+        mean[j] += step[j]
+    numbers[SIGMA] = sigma * exp(min(1.0, (cs / damping) * (length - 1.0) / 2.0))
+
+
+@inner
+def _whiten(values: FloatArray, vectors: FloatArray, step: FloatArray, out: FloatArray) -> None:
+    """Add C^(-1/2) y to out (n,), of a step y (n,)."""
+    n = len(step)
+    for e in range(n):
+        along = 0.0
+        for j in range(n):
+            along += vectors[j, e] * step[j]
+        along /= np.sqrt(values[e])
+        for j in range(n):
+            out[j] += along * vectors[j, e]
+
+
+@inner
+def _power(base: float, exponent: int) -> float:
+    """base^exponent by repeated squaring."""
+    result = 1.0
+    while exponent > 0:
+        if exponent % 2 == 1:
+            result *= base
+        base *= base
+        exponent //= 2
+    return result
+
+
+@inner
+def _add_rank_one(covariance: FloatArray, kept: float, scale: float, vector: FloatArray) -> None:
+    """C <- kept C + scale v v^T."""
+    for j in range(len(vector)):
+        for k in range(j + 1):
+            entry = kept * covariance[j, k] + scale * (vector[j] * vector[k])
+            covariance[j, k] = covariance[k, j] = entry
+
+
+@inner
+def stopped(strategy: Strategy, order: IntArray, status: IntArray, value: FloatArray) -> bool:
+    """Whether to restart: degenerate covariance, tiny step, or a flat ranking of the batch."""
+    values, last = strategy.eigenvalues, len(order) - 1
+    smallest, largest = values[0], values[len(values) - 1]
+    if largest / smallest > _MAX_CONDITION:
+        return True
+    if strategy.numbers[SIGMA] * np.sqrt(largest) < _SMALLEST_STEP:
+        return True
+    by_status = float(status[order[0]] - status[order[last]])
+    by_value = value[order[0]] - value[order[last]]
+    return last > 0 and np.sqrt(by_status * by_status + by_value * by_value) < _FLAT

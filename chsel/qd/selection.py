@@ -1,0 +1,237 @@
+"""Which estimates size the archive, and which elites become hypotheses (Alg. 1, lines 2-4, 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from chsel.cost.compiled_cost import poses_of
+from chsel.errors import ChselError, require_at_most, require_choice, require_positive
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.search_space import SearchSpace, origin_bounds
+from chsel.problem.subset import evenly, representative
+from chsel.problem.surface import has_surface
+from chsel.qd.archive import GridArchive
+from chsel.qd.measures import MEASURES, Measure
+
+MOST_CELLS = 10_000_000
+_POOL = 400  # elites that are considered
+_MOST_POOL = 1200  # for many hypotheses
+_MOST_REPRESENTATIVE = 300
+
+
+@dataclass(frozen=True)
+class ArchiveSettings:
+    """The grid of the archive: mean +- range_sigmas standard deviations of the measures of E'.
+
+    measure: see chsel.qd.measures. bins: cells per measure. range_sigmas: b_sigma of the paper.
+    least_deviation: floor of the standard deviation (metres or radians).
+    outliers: which of E' are left out of mean and deviation: "ratio" those above
+    ratio x lowest cost + tolerance, "quantile" those above the 80 % quantile, "none".
+    tolerance_per_point: tolerance per known point; tolerance: its floor.
+    """
+
+    measure: str = "position_2"
+    bins: int = 40
+    range_sigmas: float = 3.0
+    least_deviation: float = 0.005
+    outliers: str = "ratio"
+    ratio: float = 5.0
+    tolerance_per_point: float = 1e-3
+    tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        require_choice("outliers", self.outliers, ("ratio", "quantile", "none"))
+        for name in ("bins", "range_sigmas", "least_deviation", "ratio"):
+            require_positive(name, getattr(self, name))
+        for name in ("tolerance_per_point", "tolerance"):
+            require_positive(name, getattr(self, name), zero=True)
+        require_choice("measure", self.measure, MEASURES)
+        require_at_most("bins", self.bins, MOST_CELLS)
+        count = MEASURES[self.measure].count
+        require_at_most(f"bins ** {count}, the number of cells,", self.bins**count, MOST_CELLS)
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """How hypotheses are chosen from the archive.
+
+    choice: "lowest" for the lowest costs, "representative" for those below the limit that all
+    others below it are near to; it is "lowest" where no more than wanted are below.
+    limit: "none" for the cells of lowest cost whatever it is, "ratio" for those below
+    ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
+    and lowest cost + tolerance_per_point x known points + free_tolerance.
+    shortage: what fills a set of too few: "next_best" the next cells, then copies; "resample"
+    copies drawn with replacement; "fewer" nothing.
+    margin: metres by which the object's origin may be beside the workspace, as long as any pose
+    is in there; None: it may be anywhere.
+    """
+
+    choice: str = "lowest"
+    limit: str = "noise"
+    ratio: float = 5.0
+    tolerance: float = 1e-6
+    tolerance_per_point: float = 2e-3
+    free_tolerance: float = 0.2
+    shortage: str = "next_best"
+    margin: float | None = None
+
+    def __post_init__(self) -> None:
+        require_choice("choice", self.choice, ("lowest", "representative"))
+        require_choice("limit", self.limit, ("none", "ratio", "noise"))
+        require_choice("shortage", self.shortage, ("next_best", "resample", "fewer"))
+        require_positive("ratio", self.ratio)
+        for name in ("tolerance", "tolerance_per_point", "free_tolerance"):
+            require_positive(name, getattr(self, name), zero=True)
+        if self.margin is not None:
+            require_positive("margin", self.margin, zero=True)
+
+
+def sized_archive(
+    measure: Measure,
+    measures: FloatArray,
+    costs: FloatArray,
+    settings: ArchiveSettings,
+    known_count: int,
+    dimension: int,
+) -> GridArchive:
+    """The empty archive whose range the measures (B, k) of E' with costs (B,) set."""
+    kept = measures[_inliers(costs, settings, known_count)]
+    mean, deviation = measure.moments(kept if len(kept) >= 2 else measures)
+    half = settings.range_sigmas * np.maximum(deviation, settings.least_deviation)
+    if measure.circular:
+        half = np.minimum(half, np.pi)
+    return GridArchive(measure, mean - half, mean + half, bins=settings.bins, dimension=dimension)
+
+
+def _inliers(costs: FloatArray, settings: ArchiveSettings, known_count: int) -> BoolArray:
+    if settings.outliers == "none":
+        return np.ones(len(costs), dtype=bool)
+    if settings.outliers == "quantile":
+        return costs < np.quantile(costs, 0.8)
+    tolerance = max(settings.tolerance_per_point * known_count, settings.tolerance)
+    return costs < settings.ratio * costs.min() + tolerance
+
+
+def select_elites(
+    costs: FloatArray,
+    elites: FloatArray,
+    problem: RegistrationProblem,
+    space: SearchSpace,
+    settings: OutputSettings,
+    stream: np.random.Generator,
+) -> IntArray:
+    """Indices of as many elites as E_0 has, or fewer if so set, best first.
+
+    Of elites (C, 4, 4) with costs (C,).
+    """
+    count, known_count = len(problem.initial_set), len(problem.points.known)
+    order = np.argsort(costs, kind="stable")
+    order = order[within_workspace(elites[order], problem, space, settings.margin)]
+    good = order[costs[order] <= _limit(costs[order], settings, known_count)]
+    if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
+        return good[_representatives(problem.sdf, poses_of(elites[good]), count)]
+    if len(good) >= count or settings.shortage == "fewer":
+        return good[:count]
+    if settings.shortage == "resample":
+        return good[np.sort((stream.random(count) * len(good)).astype(np.int64))]
+    return order[np.sort(np.resize(np.arange(len(order)), count))]
+
+
+def within_workspace(
+    object_from_world: FloatArray,
+    problem: RegistrationProblem,
+    space: SearchSpace,
+    margin: float | None,
+) -> BoolArray:
+    """True (B,) where the object's origin is in the workspace, widened by a margin in metres.
+
+    Of transforms (B, 4, 4). All True without a margin, or if there is no such pose.
+    """
+    everywhere = np.ones(len(object_from_world), dtype=bool)
+    if margin is None:
+        return everywhere
+    lower, upper = origin_bounds(problem.workspace, space, margin)
+    position = inverse(object_from_world)[:, :3, 3]
+    inside: BoolArray = np.all((position >= lower) & (position <= upper), axis=1)
+    return inside if inside.any() else everywhere
+
+
+def _representatives(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
+    """Places (count,) in ascending order, the first among them, of poses (B, 12) in order of cost.
+
+    Of many, those that are considered, and of many wanted, those beyond, are taken evenly.
+    """
+    pool = evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+    chosen = pool[representative(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
+    others = np.setdiff1d(np.arange(len(poses)), chosen)
+    more = others[evenly(len(others), count - len(chosen))]
+    return np.sort(np.concatenate([chosen, more]))
+
+
+def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:
+    best = float(costs.min())
+    if settings.limit == "none":
+        return float("inf")
+    if settings.limit == "ratio":
+        return settings.ratio * best + settings.tolerance
+    tolerance = settings.tolerance_per_point * known_count + settings.free_tolerance
+    return max(settings.ratio * best, best + tolerance)
+
+
+def repeated(object_from_world: FloatArray) -> BoolArray:
+    """True (B,) for each transform of (B, 4, 4) that equals an earlier one."""
+    _, first = np.unique(object_from_world.reshape(-1, 16), axis=0, return_index=True)
+    flags = np.ones(len(object_from_world), dtype=bool)
+    flags[first] = False
+    return flags
+
+
+class Judge(Protocol):
+    """What gives transforms their costs, by way of its search space."""
+
+    space: SearchSpace
+
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        """Costs (B,) of search vectors (B, d)."""
+
+
+def ranked_hypotheses(
+    objective: Judge,
+    object_from_world: FloatArray,
+    cells: IntArray | None = None,
+    elites: FloatArray | None = None,
+    archive: ArchiveSnapshot | None = None,
+) -> Hypotheses:
+    """Poses (B, 4, 4), costed as they are and put in order of cost; the rest as `ranked` has it."""
+    cost = objective.costs(objective.space.encode(object_from_world))
+    return ranked(object_from_world, cost, cells, elites, archive)
+
+
+def ranked(
+    object_from_world: FloatArray,
+    cost: FloatArray,
+    cells: IntArray | None = None,
+    elites: FloatArray | None = None,
+    archive: ArchiveSnapshot | None = None,
+) -> Hypotheses:
+    """Poses (B, 4, 4) in order of their costs (B,).
+
+    cells (B,): those of the archive that they come from; by default of none. elites (L, 4, 4): all
+    solutions kept; by default the poses in their order.
+    """
+    if not np.isfinite(cost).any():
+        raise ChselError(
+            "no hypothesis has a finite cost; accepted: points, SDF and scales by which the cost "
+            "of some pose is finite"
+        )
+    order = np.argsort(cost, kind="stable")
+    poses = object_from_world[order]
+    cells = np.full(len(poses), -1, dtype=np.int64) if cells is None else cells[order]
+    elites = poses if elites is None else elites
+    return Hypotheses(poses, cost[order], repeated(poses), cells, elites, archive)
