@@ -18,7 +18,7 @@ from chsel.numerics.lattice import MOST_CELLS, NO_LATTICE, cell_centres, lattice
 from chsel.numerics.octree import Tree, octree, rounding_margin
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import stacked
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import field_of
@@ -80,24 +80,17 @@ class CompiledCost:
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
-        return self.costs(poses_of(object_from_world))
+        return self.costs(Poses.of(object_from_world))
 
-    def costs(self, poses: FloatArray) -> FloatArray:
-        """Costs (B,) of poses (B, 12): rotation row by row, then translation."""
+    def costs(self, poses: Poses) -> FloatArray:
+        """Costs (B,) of poses."""
         costs = np.empty(len(poses))
 
         def run(first: int, last: int, work: Any) -> None:
-            costs_of_poses(self.model, poses, costs, first, last, work)
+            costs_of_poses(self.model, poses.numbers, costs, first, last, work)
 
         spread(run, len(poses), lambda: work_for(self.model), least=_POSES_PER_THREAD)
         return costs
-
-
-def poses_of(object_from_world: FloatArray) -> FloatArray:
-    """Poses (B, 12) of transforms (B, 4, 4)."""
-    transforms = stacked(object_from_world)
-    rotations = transforms[:, :3, :3].reshape(-1, 9)
-    return np.concatenate([rotations, transforms[:, :3, 3]], axis=1)
 
 
 def _free_term(

@@ -9,7 +9,6 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective_kernels import Work, costs_and_gradients, descend, work_for
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.pose_tuples import decode_all
 from chsel.numerics.threads import spread
 from chsel.problem.search_space import SearchSpace
 
@@ -29,9 +28,7 @@ class Objective:
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d)."""
-        poses = np.empty((len(vectors), 12))
-        decode_all(self.space_arrays, vectors, poses)
-        return self._cost.costs(poses)
+        return self._cost.costs(self.space.poses(vectors))
 
     def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Costs (B,) and the defined gradients (B, d) at vectors (B, d)."""

@@ -13,13 +13,14 @@ from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space, transforms_of
+from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space
 from chsel.problem.streams import Purpose, normals
 from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
@@ -37,9 +38,9 @@ _BEST = 0.2
 
 
 def resampled_around_best(
-    estimates: FloatArray, costs: FloatArray, space: SearchSpace, stream: np.random.Generator
-) -> FloatArray:
-    """Transforms (B, 4, 4) drawn around the best fifth of estimates (B, 4, 4) with costs (B,).
+    estimates: Poses, costs: FloatArray, space: SearchSpace, stream: np.random.Generator
+) -> Poses:
+    """Poses drawn around the best fifth of B estimates with costs (B,).
 
     Mean and deviation (ddof 1) of each coordinate of the search vectors; the best fifth itself
     comes first, unchanged.
@@ -50,7 +51,7 @@ def resampled_around_best(
     deviation = vectors.std(axis=0, ddof=1) if len(best) > 1 else np.zeros(space.dimension)
     drawn = vectors.mean(axis=0) + deviation * normals(stream, (count, space.dimension))
     drawn[: len(best)] = vectors
-    return transforms_of(space, drawn)
+    return space.poses(drawn)
 
 
 MOST_PASSES = 10_000
@@ -105,13 +106,18 @@ class Chsel:
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
         estimates = self._algorithm_1(
-            problem, objective, problem.initial_set, problem.low_cost_set, 0, observer
+            problem,
+            objective,
+            Poses.of(problem.initial_set),
+            Poses.of(problem.low_cost_set),
+            0,
+            observer,
         )
         for index in range(1, self.settings.passes):
             stream = problem.key.stream(Purpose.REFINEMENT, index)
-            poses = estimates.object_from_world
+            poses = Poses.of(estimates.object_from_world)
             initial_set = resampled_around_best(poses, estimates.cost, space, stream)
-            low_cost_set = estimates.elites
+            low_cost_set = Poses.of(estimates.elites)
             estimates = self._algorithm_1(
                 problem, objective, initial_set, low_cost_set, index, observer
             )
@@ -121,8 +127,8 @@ class Chsel:
         self,
         problem: RegistrationProblem,
         objective: Objective,
-        initial_set: FloatArray,
-        low_cost_set: FloatArray,
+        initial_set: Poses,
+        low_cost_set: Poses,
         index: int,
         observer: Observer,
     ) -> Hypotheses:
@@ -132,7 +138,7 @@ class Chsel:
         starts = initial_set
         if settings.starts is not None:
             more = anchored_starts(problem, space, settings.starts, index)
-            starts = np.concatenate([initial_set, more])
+            starts = Poses.joined([initial_set, more])
         # 1: E' <- SGD on E_0, and on further starts if there are any, with C^
         estimates, costs = descend(objective, starts, settings.descent, observer)
         inside = within_workspace(estimates, problem, space, settings.output.margin)
@@ -156,7 +162,7 @@ class Chsel:
         self._search(objective, archive, start, count, settings.emitter, draws, watch)
         # 7: E <- |E_0| of the cells of M with the lowest costs
         stream = problem.key.stream(Purpose.RESAMPLE, index)
-        elites = transforms_of(space, archive.solutions)
+        elites = space.poses(archive.solutions)
         chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
         snapshot = archive.snapshot(settings.emitter.iterations, index)
         cells = archive.occupied[chosen]

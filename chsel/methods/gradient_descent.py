@@ -11,13 +11,14 @@ from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most, require_positive
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import PlaneSettings, search_space, transforms_of
+from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked_hypotheses
 
@@ -51,15 +52,15 @@ class DescentSettings:
 
 def descend(
     objective: Objective,
-    initial_set: FloatArray,
+    starts: Poses,
     settings: DescentSettings,
     observer: Observer,
-) -> tuple[FloatArray, FloatArray]:
-    """Estimates E' as transforms (B, 4, 4), with their costs (B,), from E_0 (B, 4, 4).
+) -> tuple[Poses, FloatArray]:
+    """Estimates E' with their costs (B,), from B starts: those of E_0, and others.
 
-    Each start runs on its own; the costs are those of the returned transforms.
+    Each start runs on its own; the costs are those of the returned poses.
     """
-    estimates = initial_set
+    estimates = starts
     vectors = objective.space.encode(estimates)
     costs = previous = objective.costs(vectors)
     observer.trace("descent", 0, vectors.copy(), costs.copy())
@@ -67,7 +68,7 @@ def descend(
     for restart in range(settings.restarts):
         vectors = objective.space.encode(estimates)
         vectors = objective.descended(vectors, count, settings.rate, settings.iterations)
-        estimates = transforms_of(objective.space, vectors)
+        estimates = objective.space.poses(vectors)
         vectors = objective.space.encode(estimates)
         costs = objective.costs(vectors)
         done = (restart + 1) * settings.iterations
@@ -77,7 +78,7 @@ def descend(
         if stop_below is not None and _mean_gain(previous, costs) <= stop_below:
             break
         previous = costs
-    return transforms_of(objective.space, objective.space.encode(estimates)), costs
+    return objective.space.poses(objective.space.encode(estimates)), costs
 
 
 def _mean_gain(before: FloatArray, after: FloatArray) -> float:
@@ -114,5 +115,7 @@ class GradientDescent:
         observer = observer or NullObserver()
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
-        estimates, _ = descend(objective, problem.initial_set, self.settings.descent, observer)
+        estimates, _ = descend(
+            objective, Poses.of(problem.initial_set), self.settings.descent, observer
+        )
         return ranked_hypotheses(objective, estimates, elites=estimates)

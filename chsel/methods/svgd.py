@@ -19,13 +19,14 @@ from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.octree import Found
 from chsel.numerics.pose_tuples import decode, pull_back
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import PlaneSettings, search_space, transforms_of
+from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked_hypotheses
 
@@ -273,9 +274,9 @@ class Svgd:
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
         vectors = self._moved(
-            objective, space.encode(problem.initial_set), observer or NullObserver()
+            objective, space.encode(Poses.of(problem.initial_set)), observer or NullObserver()
         )
-        estimates = transforms_of(space, vectors)
+        estimates = space.poses(vectors)
         return ranked_hypotheses(objective, estimates, elites=estimates)
 
     def _moved(self, objective: Objective, vectors: FloatArray, observer: Observer) -> FloatArray:

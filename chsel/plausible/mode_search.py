@@ -20,10 +20,10 @@ from chsel.plausible.plausible_settings import EvaluationCostSettings, ModeSearc
 from chsel.plausible.pose_metrics import EvaluationError
 from chsel.plausible.scan import EvaluationCost
 from chsel.plausible.surface_distance import SQUARE_MILLIMETRES, DistanceSettings, SurfaceDistance
-from chsel.problem.poses import compose, inverse, product, rotation_vector
+from chsel.problem.poses import Poses, compose, inverse, product, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.search_space import SE3Space, transforms_of
+from chsel.problem.search_space import SE3Space
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 from chsel.problem.subset import far_apart
 from chsel.problem.surface import surface_points
@@ -138,11 +138,11 @@ def _descended(
         simplefilter("ignore")  # objects that are too thin to be violated are fine here
         relaxed = CompiledCost.of(problem, smooth)
     objective = Objective(relaxed, SE3Space())
-    poses = inverse(starts)
+    poses = Poses.of(inverse(starts))
     for rate in _RATES:
         vectors = objective.descended(objective.space.encode(poses), 1.0, rate, _ITERATIONS)
-        poses = transforms_of(objective.space, vectors)
-    return inverse(poses)
+        poses = objective.space.poses(vectors)
+    return poses.world_from_object
 
 
 def _drawn(

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.cost.interior_points import VoxelGrid
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Box, Region, box_of, clearance_of
@@ -16,7 +15,7 @@ from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.plausible.plausible_kernels import Blocks, Bounds, Evaluation, costs_below, room_for
 from chsel.plausible.plausible_settings import EvaluationCostSettings
 from chsel.problem.points import KnownPoints, Lattice
-from chsel.problem.poses import compose, inverse, product, rotation_vector
+from chsel.problem.poses import Poses, compose, inverse, product, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import field_of
@@ -63,7 +62,7 @@ class EvaluationCost:
 
     def evaluate(self, object_from_world: FloatArray, *, limit: float = np.inf) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for those not below `limit`."""
-        poses = poses_of(object_from_world)
+        poses = Poses.of(object_from_world).numbers
         costs = np.empty(len(poses))
 
         def run(first: int, last: int, room: Any) -> None:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import PoseError, SettingError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.threads import spread
@@ -23,6 +22,7 @@ from chsel.plausible.surface_kernels import (
     moved_points,
     relative_moves,
 )
+from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import field_of
 from chsel.problem.streams import Purpose, StreamKey, uniforms
@@ -149,7 +149,7 @@ def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatAr
 
 
 def _finite_poses(transforms: FloatArray) -> FloatArray:
-    poses = poses_of(transforms)
+    poses = Poses.of(transforms).numbers
     if not np.isfinite(poses).all():
         row = int(np.argmin(np.isfinite(poses).all(axis=1)))
         raise PoseError(f"pose {row} is not finite; accepted: finite transforms")

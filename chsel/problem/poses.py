@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +19,70 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 RIGID_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """B poses of an object, object_from_world: x_object = R x_world + t (the paper's T).
+
+    Views are computed when they are first asked for, once.
+    """
+
+    numbers: FloatArray  # (B, 12), R row by row, then t in metres, as the kernels read them
+
+    @classmethod
+    def of(cls, object_from_world: Any) -> Poses:
+        """The poses of transforms (B, 4, 4), finite or not; PoseError for another shape."""
+        transforms = stacked(object_from_world)
+        rotations = transforms[:, :3, :3].reshape(-1, 9)
+        return cls(np.concatenate([rotations, transforms[:, :3, 3]], axis=1))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Poses]) -> Poses:
+        """The poses of several parts, at least one, in their order."""
+        return cls(np.concatenate([part.numbers for part in parts]))
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, chosen: Any) -> Poses:
+        """The chosen poses: a slice, flags (B,) or indices (C,)."""
+        return Poses(self.numbers[chosen])
+
+    @property
+    def rotations(self) -> FloatArray:
+        """R (B, 3, 3)."""
+        return self.numbers[:, :9].reshape(-1, 3, 3)
+
+    @property
+    def translations(self) -> FloatArray:
+        """t (B, 3), metres."""
+        return self.numbers[:, 9:]
+
+    @cached_property
+    def matrices(self) -> FloatArray:
+        """Transforms object_from_world (B, 4, 4)."""
+        return compose(self.rotations, self.translations)
+
+    @cached_property
+    def world_from_object(self) -> FloatArray:
+        """The inverse transforms (B, 4, 4)."""
+        return inverse(self.matrices)
+
+    @property
+    def origins(self) -> FloatArray:
+        """Where the object's origin is in the world (B, 3), metres: -R^T t."""
+        return self.world_from_object[:, :3, 3]
+
+    @cached_property
+    def vectors(self) -> FloatArray:
+        """The 9-D vectors (B, 9): the first two rows of R, then t (CHSEL, Sec. IV-B)."""
+        return np.concatenate([self.numbers[:, :6], self.translations], axis=1)
+
+    @cached_property
+    def quaternions(self) -> FloatArray:
+        """Unit quaternions (B, 4) of R, as x y z w."""
+        return quaternions(self.rotations)
 
 
 def stacked(object_from_world: Any) -> FloatArray:
@@ -115,19 +182,20 @@ def rotation_vector(vectors: FloatArray) -> FloatArray:
 
 def random_rotations(stream: np.random.Generator, count: int) -> FloatArray:
     """Rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
-    quaternion = normals(stream, (count, 4))
-    w, x, y, z = (quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
+    drawn = normals(stream, (count, 4))  # w x y z
+    unit = drawn / np.sqrt((drawn**2).sum(axis=1, keepdims=True))
+    return rotations(unit[:, [1, 2, 3, 0]])
 
 
 def rotation_angle(rotation: FloatArray) -> FloatArray:
     """Angle in radians of rotations (..., 3, 3), in [0, pi], exact for small angles too."""
-    skew = np.stack(
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    return arctangents(np.sqrt((twice_sine_axis(rotation) ** 2).sum(axis=-1)), trace - 1.0)
+
+
+def twice_sine_axis(rotation: FloatArray) -> FloatArray:
+    """2 sin(angle) axis (..., 3) of rotations (..., 3, 3): their skew part."""
+    return np.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],
             rotation[..., 0, 2] - rotation[..., 2, 0],
@@ -135,14 +203,6 @@ def rotation_angle(rotation: FloatArray) -> FloatArray:
         ],
         axis=-1,
     )
-    trace = np.trace(rotation, axis1=-2, axis2=-1)
-    return arctangents(np.sqrt((skew**2).sum(axis=-1)), trace - 1.0)
-
-
-def encode_9d(object_from_world: FloatArray) -> FloatArray:
-    """The 9-D vectors (B, 9) of transforms (B, 4, 4): first two rows of R, then t (CHSEL, IV-B)."""
-    rows = object_from_world[:, :2, :3].reshape(-1, 6)
-    return np.concatenate([rows, object_from_world[:, :3, 3]], axis=1)
 
 
 def decode_6d(rows: Tensor) -> Tensor:

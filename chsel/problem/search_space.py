@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,13 +15,13 @@ from chsel.numerics.elementary import arctangents
 from chsel.numerics.pose_tuples import Space, decode_all, matrix_of
 from chsel.problem.points import Workspace
 from chsel.problem.poses import (
+    Poses,
     as_tensor,
-    compose,
     decode_6d,
-    encode_9d,
     product,
     rotated,
     rotation_vector,
+    twice_sine_axis,
 )
 from chsel.problem.sdf_grid import SdfGrid
 
@@ -28,29 +29,36 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class SearchSpace(Protocol):
-    """Vectors x (B, d) that stand for transforms object_from_world."""
+class SearchSpace(ABC):
+    """Vectors x (B, d) that stand for poses."""
 
-    dimension: int
-    arrays: Space
-    """The space as the kernels know it."""
+    dimension: int  # d
+    arrays: Space  # as the kernels take it
 
-    def encode(self, object_from_world: FloatArray) -> FloatArray:
-        """Vectors (B, d) of transforms (B, 4, 4); the nearest ones if the space is smaller."""
+    @abstractmethod
+    def encode(self, poses: Poses) -> FloatArray:
+        """Vectors (B, d) of poses; the nearest ones if the space is smaller."""
 
+    @abstractmethod
     def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Rotations (B, 3, 3) and translations (B, 3) of vectors (B, d), differentiable."""
 
+    def poses(self, vectors: FloatArray) -> Poses:
+        """The poses of vectors (B, d)."""
+        numbers = np.empty((len(vectors), 12))
+        decode_all(self.arrays, np.array(vectors, dtype=np.float64), numbers)
+        return Poses(numbers)
 
-class SE3Space:
+
+class SE3Space(SearchSpace):
     """x = [first row of R, second row of R, t] (CHSEL, Sec. IV-C)."""
 
     dimension = 9
     arrays = Space()
 
-    def encode(self, object_from_world: FloatArray) -> FloatArray:
-        """The 9-D vectors of transforms."""
-        return encode_9d(object_from_world)
+    def encode(self, poses: Poses) -> FloatArray:
+        """The 9-D vectors of poses."""
+        return poses.vectors
 
     def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Gram-Schmidt on the two rows; the translation as it is."""
@@ -80,7 +88,7 @@ class PlaneSettings:
             raise SettingError("a plane needs either plane_height or offset, and not both")
 
 
-class SE2Space:
+class SE2Space(SearchSpace):
     """x = [theta, u, v]: R = Rot(a, theta) R_0, t = o a + u e_u + v e_v."""
 
     dimension = 3
@@ -121,23 +129,13 @@ class SE2Space:
         """The plane's axis in the world (3,): R^T a, the same for every pose."""
         return (self.resting_rotation * self.axis[:, None]).sum(axis=0)
 
-    def encode(self, object_from_world: FloatArray) -> FloatArray:
-        """The plane poses nearest to transforms, by the Frobenius norm of the rotations."""
-        turned = product(object_from_world[:, :3, :3], self.resting_rotation.T)
-        skew = np.stack(
-            [
-                turned[:, 2, 1] - turned[:, 1, 2],
-                turned[:, 0, 2] - turned[:, 2, 0],
-                turned[:, 1, 0] - turned[:, 0, 1],
-            ],
-            axis=1,
-        )
+    def encode(self, poses: Poses) -> FloatArray:
+        """The vectors of the nearest poses on the plane, by the Frobenius norm of rotations."""
+        turned = product(poses.rotations, self.resting_rotation.T)
+        sine = (twice_sine_axis(turned) * self.axis).sum(axis=1)
         along = (rotated(turned, self.axis) * self.axis).sum(axis=1)
-        theta = arctangents(
-            (skew * self.axis).sum(axis=1), np.trace(turned, axis1=1, axis2=2) - along
-        )
-        translation = object_from_world[:, :3, 3]
-        u, v = (translation * self.e_u).sum(axis=1), (translation * self.e_v).sum(axis=1)
+        theta = arctangents(sine, np.trace(turned, axis1=1, axis2=2) - along)
+        u, v = ((poses.translations * axis).sum(axis=1) for axis in (self.e_u, self.e_v))
         return np.stack([theta, u, v], axis=1)
 
     def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -175,14 +173,6 @@ def origin_bounds(
         lowest, highest = (float((corner * upward).sum()) for corner in corners)
         margin += max(lowest + space.offset, -space.offset - highest, 0.0)
     return lower - margin, upper + margin
-
-
-def transforms_of(space: SearchSpace, vectors: FloatArray) -> FloatArray:
-    """The transforms object_from_world (B, 4, 4) of vectors (B, d)."""
-    vectors = np.array(vectors, dtype=np.float64)
-    poses = np.empty((len(vectors), 12))
-    decode_all(space.arrays, vectors, poses)
-    return compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
 
 
 def _lowest_point(sdf: SdfGrid, axis: FloatArray) -> float:

@@ -10,7 +10,7 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled
 from chsel.numerics.pose_tuples import pose_at
 from chsel.numerics.threads import spread
-from chsel.problem.poses import rotated
+from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import distance_at, field_of
 from chsel.problem.streams import Purpose, StreamKey
@@ -81,21 +81,20 @@ def locate_facilities(points: Any, chosen: Any, nearest: Any, apart: Any) -> Any
 _PLACES = 64
 
 
-def outlined(sdf: SdfGrid, poses: FloatArray) -> FloatArray:
+def outlined(sdf: SdfGrid, poses: Poses) -> FloatArray:
     """How far fixed places in the world are from the object's surface, (B, 64), metres.
 
-    Of poses (B, 12). The places lie on the surface in some of these poses, so that poses differ in
+    The places lie on the surface in some of these poses, so that poses differ in
     them as much as their surfaces do: not at all where the object is symmetric.
     """
     surface = sdf.derived("outline", lambda: _points(sdf))
     some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
-    axes = some[:, :9].reshape(-1, 3, 3)  # of the object in the world, row by row
-    places = rotated(np.swapaxes(axes, 1, 2), surface - some[:, 9:])
+    places = rotated(np.swapaxes(some.rotations, 1, 2), surface - some.translations)
     field = field_of(sdf, "trilinear", "surface_point")
     distances = np.empty((len(poses), _PLACES))
 
     def run(first: int, last: int, _: Any) -> None:
-        distances_from_surface(field, poses, places, distances, first, last)
+        distances_from_surface(field, poses.numbers, places, distances, first, last)
 
     spread(run, len(poses), lambda: None, least=100)
     return distances
@@ -105,13 +104,13 @@ def _points(sdf: SdfGrid) -> FloatArray:
     return surface_points(sdf, _PLACES, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
 
 
-def spaced(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
-    """Which of poses (B, 12) to take so that each next one is the farthest from those before."""
+def spaced(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+    """Which poses to take so that each next one is the farthest from those before."""
     return far_apart(outlined(sdf, poses), count)
 
 
-def representative(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
-    """Which of poses (B, 12) to take so that all are near to one of them; the first always is.
+def representative(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+    """Which poses to take so that all are near to one of them; the first always is.
 
     Fewer than count where all others are the same as chosen ones.
     """

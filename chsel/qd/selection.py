@@ -7,10 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import ChselError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.problem.poses import inverse
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SearchSpace, origin_bounds
@@ -120,7 +119,7 @@ def _inliers(costs: FloatArray, settings: ArchiveSettings, known_count: int) -> 
 
 def select_elites(
     costs: FloatArray,
-    elites: FloatArray,
+    elites: Poses,
     problem: RegistrationProblem,
     space: SearchSpace,
     settings: OutputSettings,
@@ -128,14 +127,14 @@ def select_elites(
 ) -> IntArray:
     """Indices of as many elites as E_0 has, or fewer if so set, best first.
 
-    Of elites (C, 4, 4) with costs (C,).
+    Of elites, C poses, with costs (C,).
     """
     count, known_count = len(problem.initial_set), len(problem.points.known)
     order = np.argsort(costs, kind="stable")
     order = order[within_workspace(elites[order], problem, space, settings.margin)]
     good = order[costs[order] <= _limit(costs[order], settings, known_count)]
     if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
-        return good[_representatives(problem.sdf, poses_of(elites[good]), count)]
+        return good[_representatives(problem.sdf, elites[good], count)]
     if len(good) >= count or settings.shortage == "fewer":
         return good[:count]
     if settings.shortage == "resample":
@@ -144,26 +143,25 @@ def select_elites(
 
 
 def within_workspace(
-    object_from_world: FloatArray,
+    poses: Poses,
     problem: RegistrationProblem,
     space: SearchSpace,
     margin: float | None,
 ) -> BoolArray:
     """True (B,) where the object's origin is in the workspace, widened by a margin in metres.
 
-    Of transforms (B, 4, 4). All True without a margin, or if there is no such pose.
+    All True without a margin, or if there is no such pose.
     """
-    everywhere = np.ones(len(object_from_world), dtype=bool)
+    everywhere = np.ones(len(poses), dtype=bool)
     if margin is None:
         return everywhere
     lower, upper = origin_bounds(problem.workspace, space, margin)
-    position = inverse(object_from_world)[:, :3, 3]
-    inside: BoolArray = np.all((position >= lower) & (position <= upper), axis=1)
+    inside: BoolArray = np.all((poses.origins >= lower) & (poses.origins <= upper), axis=1)
     return inside if inside.any() else everywhere
 
 
-def _representatives(sdf: SdfGrid, poses: FloatArray, count: int) -> IntArray:
-    """Places (count,) in ascending order, the first among them, of poses (B, 12) in order of cost.
+def _representatives(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+    """Places (count,) in ascending order, the first among them, of poses in order of cost.
 
     Of many, those that are considered, and of many wanted, those beyond, are taken evenly.
     """
@@ -184,16 +182,16 @@ def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> flo
     return max(settings.ratio * best, best + tolerance)
 
 
-def repeated(object_from_world: FloatArray) -> BoolArray:
-    """True (B,) for each transform of (B, 4, 4) that equals an earlier one."""
-    _, first = np.unique(object_from_world.reshape(-1, 16), axis=0, return_index=True)
-    flags = np.ones(len(object_from_world), dtype=bool)
+def repeated(poses: Poses) -> BoolArray:
+    """True (B,) for each pose that equals an earlier one."""
+    _, first = np.unique(poses.numbers, axis=0, return_index=True)
+    flags = np.ones(len(poses), dtype=bool)
     flags[first] = False
     return flags
 
 
 class Judge(Protocol):
-    """What gives transforms their costs, by way of its search space."""
+    """What gives poses their costs, by way of its search space."""
 
     space: SearchSpace
 
@@ -203,14 +201,15 @@ class Judge(Protocol):
 
 def ranked_hypotheses(
     objective: Judge,
-    object_from_world: FloatArray,
+    poses: Poses,
     cells: IntArray | None = None,
-    elites: FloatArray | None = None,
+    elites: Poses | None = None,
     archive: ArchiveSnapshot | None = None,
 ) -> Hypotheses:
-    """Poses (B, 4, 4), costed as they are and put in order of cost; the rest as `ranked` has it."""
-    cost = objective.costs(objective.space.encode(object_from_world))
-    return ranked(object_from_world, cost, cells, elites, archive)
+    """Poses, costed as they are and put in order of cost; the rest as `ranked` has it."""
+    cost = objective.costs(objective.space.encode(poses))
+    kept = None if elites is None else elites.matrices
+    return ranked(poses.matrices, cost, cells, kept, archive)
 
 
 def ranked(
@@ -234,4 +233,4 @@ def ranked(
     poses = object_from_world[order]
     cells = np.full(len(poses), -1, dtype=np.int64) if cells is None else cells[order]
     elites = poses if elites is None else elites
-    return Hypotheses(poses, cost[order], repeated(poses), cells, elites, archive)
+    return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites, archive)

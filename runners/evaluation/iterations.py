@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.search_space import search_space, transforms_of
+from chsel.problem.search_space import search_space
 from chsel.problem.streams import Purpose
 from chsel.qd.selection import ranked, select_elites
 
@@ -19,6 +19,6 @@ def hypotheses_of(
     """
     space = search_space(settings.plane, problem.sdf)
     stream = problem.key.stream(Purpose.RESAMPLE, snapshot.refinement)
-    costs, poses = -snapshot.objectives, transforms_of(space, snapshot.solutions)
+    costs, poses = -snapshot.objectives, space.poses(snapshot.solutions)
     chosen = select_elites(costs, poses, problem, space, settings.output, stream)
-    return ranked(poses[chosen], costs[chosen], snapshot.cells[chosen], poses)
+    return ranked(poses[chosen].matrices, costs[chosen], snapshot.cells[chosen], poses.matrices)

@@ -14,7 +14,7 @@ import numpy as np
 from chsel.errors import ChselError
 from chsel.numerics.arrays import FloatArray, frozen
 from chsel.problem.file_checks import read_npz
-from chsel.problem.poses import inverse
+from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.qd.selection import repeated
 from replay.file_digest import file_digest
@@ -55,7 +55,7 @@ class OutsideSet:
         order = np.argsort(cost, kind="stable")
         poses = inverse(self.world_from_object)[order]
         cells = np.full(len(poses), -1, dtype=np.int64)
-        return Hypotheses(poses, cost[order], repeated(poses), cells, poses)
+        return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, poses)
 
 
 def outside_folders(given: Mapping[str, Path]) -> dict[str, Path]:

@@ -13,7 +13,7 @@ import trimesh
 from chsel.errors import PoseError
 from chsel.numerics.arrays import FloatArray
 from chsel.presets import ONLINE
-from chsel.problem.poses import inverse, nearest_rigid
+from chsel.problem.poses import Poses, inverse, nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.warm_start import pose_problem
@@ -95,7 +95,7 @@ class PackageSession:
             raise RefusedError("a cost of the package is not finite")
         order = np.argsort(cost, kind="stable")
         poses, cells = poses[order], np.full(len(poses), -1, dtype=np.int64)
-        found = Hypotheses(poses, cost[order], repeated(poses), cells, elites)
+        found = Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites)
         seconds, cpu = float(answer["seconds"]), float(answer["cpu_seconds"])
         return PackageSet(found, seconds, cpu, int(answer["free_points"]))
 

@@ -18,9 +18,9 @@ from chsel.methods.anchored.anchor_sampling import anchored_poses, in_telling_or
 from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings
 from chsel.methods.anchored.energy import Energy
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import apply, compose, inverse
+from chsel.problem.poses import apply, inverse
 from chsel.problem.registration_problem import NullObserver, RegistrationProblem
-from chsel.problem.search_space import origin_bounds, search_space, transforms_of
+from chsel.problem.search_space import origin_bounds, search_space
 from replay.console import print_error
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.panels import drawn, new_figure
@@ -72,11 +72,10 @@ def stages_of(problem: RegistrationProblem, settings: AnchoredSettings) -> list[
     energy = Energy(problem, known, space, settings.penetration_tolerance, bounds)
     traces = _Traces()
     found = Anchored(settings).register(problem, traces)
-    transforms = compose(sampled[:, :9].reshape(-1, 3, 3), sampled[:, 9:])
-    stages = [_sorted("sampled on contacts", transforms, energy.of(sampled))]
+    stages = [_sorted("sampled on contacts", sampled.matrices, energy.of(sampled))]
     for name, title in (("fit", "fitted"), ("spread", "spread below the limit")):
         vectors, energies = traces.told[name]
-        stages.append(_sorted(title, transforms_of(space, vectors), energies))
+        stages.append(_sorted(title, space.poses(vectors).matrices, energies))
     return [*stages, _sorted("chosen", found.object_from_world, found.cost)]
 
 

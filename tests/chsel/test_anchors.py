@@ -41,7 +41,9 @@ def drawn(
     """The best poses (K, 12); all of them where most is as many."""
     problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
     space, known = search_space(plane, GRID), in_telling_order(points)
-    return anchored_poses(problem, known, space, settings, samples=samples, most=most, index=index)
+    return anchored_poses(
+        problem, known, space, settings, samples=samples, most=most, index=index
+    ).numbers
 
 
 def distances(poses: FloatArray, points: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError
-from chsel.problem.poses import compose, random_rotations
+from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import SE3Space
 
 RADIUS = 0.1
@@ -63,7 +63,7 @@ def test_terms_of_a_sphere_have_their_closed_form(
     assert found == pytest.approx(value, abs=1e-9)
     np.testing.assert_allclose(slope, gradient, atol=1e-9)
     objective = Objective(CompiledCost(sphere, points, CostSettings(lookup=lookup)), SE3Space())
-    costs, gradients = objective.costs_and_gradients(SE3Space().encode(np.eye(4)[None]))
+    costs, gradients = objective.costs_and_gradients(SE3Space().encode(Poses.of(np.eye(4)[None])))
     assert costs[0] == pytest.approx(value, abs=1e-9)
     np.testing.assert_allclose(gradients[0, 6:], gradient, atol=1e-9)
 
@@ -109,7 +109,9 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
     cost = RelaxedCost(sphere, points, changes, free_resolution=0.02)
     compiled = CompiledCost(sphere, points, changes, free_resolution=0.02)
     space = SE3Space()
-    vector = space.encode(compose(random_rotations(stream, 1), stream.uniform(-0.02, 0.02, (1, 3))))
+    vector = space.encode(
+        Poses.of(compose(random_rotations(stream, 1), stream.uniform(-0.02, 0.02, (1, 3))))
+    )
     vector[:, :6] *= 1.3  # raw vectors are not orthonormal
     _, gradient = Objective(compiled, space).costs_and_gradients(vector)
     expected = np.zeros(9)

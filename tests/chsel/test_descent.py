@@ -14,7 +14,7 @@ from chsel.cost.objective import Objective
 from chsel.errors import SettingError
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import compose, random_rotations
+from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 
@@ -76,7 +76,7 @@ def test_descent_takes_the_steps_of_torch(free_term: str, lookup: str, plane: bo
     if plane:
         space = SE2Space(PlaneSettings(axis=(0.0, 0.6, 0.8), offset=0.0), BOX)
     changes = CostSettings(free_term=free_term, lookup=lookup)
-    points, vectors = scene(), space.encode(starts(6))
+    points, vectors = scene(), space.encode(Poses.of(starts(6)))
     expected = descended_by_torch(RelaxedCost(BOX, points, changes), space, vectors, 0.001, 30)
     assert np.abs(expected - vectors).max() > 0.01
     objective = Objective(CompiledCost(BOX, points, changes), space)
@@ -85,7 +85,7 @@ def test_descent_takes_the_steps_of_torch(free_term: str, lookup: str, plane: bo
 
 
 def test_no_iteration_moves_nothing_and_one_moves_each_number_by_the_rate() -> None:
-    objective, vectors = contacts(), SE3Space().encode(starts(4))
+    objective, vectors = contacts(), SE3Space().encode(Poses.of(starts(4)))
     np.testing.assert_array_equal(objective.descended(vectors, 4.0, 0.01, 0), vectors)
     _, gradients = objective.costs_and_gradients(vectors)
     step = vectors - objective.descended(vectors, 1.0, 0.01, 1)
@@ -99,11 +99,11 @@ def test_descent_moves_the_surface_onto_the_contacts() -> None:
     objective = Objective(CompiledCost(BOX, KnownPoints(known=middles)), SE3Space())
     turned = starts(5)
     turned[:, :3, :3] = rotations_near_identity(5)
-    before = objective.costs(SE3Space().encode(turned))
+    before = objective.costs(SE3Space().encode(Poses.of(turned)))
     settings = DescentSettings(restarts=20, iterations=50, rate=0.002)
-    poses, costs = descend(objective, turned, settings, NullObserver())
+    poses, costs = descend(objective, Poses.of(turned), settings, NullObserver())
     assert (costs < 0.1 * before).all()
-    np.testing.assert_allclose(poses[:, :3, 3], 0.0, atol=0.006)
+    np.testing.assert_allclose(poses.translations, 0.0, atol=0.006)
     np.testing.assert_array_equal(costs, objective.costs(SE3Space().encode(poses)))
 
 
@@ -116,10 +116,10 @@ def rotations_near_identity(count: int) -> FloatArray:
 def test_descent_reports_every_block_as_it_stands() -> None:
     objective, blocks = contacts(), Blocks()
     settings = DescentSettings(restarts=4, iterations=5, rate=0.001, stop_below=None)
-    poses, costs = descend(objective, starts(3), settings, blocks)
+    poses, costs = descend(objective, Poses.of(starts(3)), settings, blocks)
     assert blocks.iterations == [0, 5, 10, 15, 20]
     assert blocks.total == 20
-    np.testing.assert_array_equal(blocks.traced[0][0], SE3Space().encode(starts(3)))
+    np.testing.assert_array_equal(blocks.traced[0][0], SE3Space().encode(Poses.of(starts(3))))
     for vectors, cost in blocks.traced:
         np.testing.assert_array_equal(cost, objective.costs(vectors))
         rows = vectors[:, :6].reshape(-1, 2, 3)
@@ -133,8 +133,8 @@ def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to() -> None:
     free = KnownPoints(free=[[1.0, 1.0, 1.0]])  # costs nothing anywhere near
     objective = Objective(CompiledCost(BOX, free), SE3Space())
     stopping, going = Blocks(), Blocks()
-    descend(objective, starts(3), DescentSettings(), stopping)
-    descend(objective, starts(3), DescentSettings(stop_below=None), going)
+    descend(objective, Poses.of(starts(3)), DescentSettings(), stopping)
+    descend(objective, Poses.of(starts(3)), DescentSettings(stop_below=None), going)
     assert stopping.iterations == [0, 50]
     assert going.iterations == list(range(0, 501, 50))
 
@@ -144,7 +144,7 @@ def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> 
     blocks = Blocks()
     settings = DescentSettings(restarts=12, iterations=10, rate=0.001, stop_below=0.05)
     initial = starts(4)
-    descend(objective, initial, settings, blocks)
+    descend(objective, Poses.of(initial), settings, blocks)
     costs = [cost for _, cost in blocks.traced]
     gains = [
         np.where(a > 0.0, (a - b) / np.maximum(a, 1e-300), 0.0).mean() for a, b in pairwise(costs)
@@ -156,15 +156,17 @@ def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> 
 
 def test_no_restart_returns_the_starts() -> None:
     objective = contacts()
-    poses, costs = descend(objective, starts(3), DescentSettings(restarts=0), NullObserver())
-    np.testing.assert_allclose(poses, starts(3), atol=1e-15)
+    poses, costs = descend(
+        objective, Poses.of(starts(3)), DescentSettings(restarts=0), NullObserver()
+    )
+    np.testing.assert_allclose(poses.matrices, starts(3), atol=1e-15)
     np.testing.assert_array_equal(costs, objective.costs(SE3Space().encode(poses)))
     assert (costs > 0.0).all()
 
 
 def test_each_start_descends_as_if_it_were_alone() -> None:
     objective = Objective(CompiledCost(BOX, scene()), SE3Space())
-    vectors = SE3Space().encode(starts(4))
+    vectors = SE3Space().encode(Poses.of(starts(4)))
     together = objective.descended(vectors, 4.0, 0.01, 20)
     alone = objective.descended(vectors[2:3], 4.0, 0.01, 20)
     np.testing.assert_array_equal(together[2:3], alone)

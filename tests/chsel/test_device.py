@@ -17,7 +17,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.torch_cost import gpus
 from chsel.errors import EngineError, SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import compose, random_rotations
+from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
 
 needs_gpu = pytest.mark.skipif(gpus() == 0, reason="torch finds no GPU here")
@@ -175,7 +175,7 @@ def test_gradients_stay_on_the_device(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     space = SE2Space(PlaneSettings(offset=0.02), grid) if plane else SE3Space()
-    vectors = space.encode(poses(9, reach=0.05))
+    vectors = space.encode(Poses.of(poses(9, reach=0.05)))
     here = RelaxedCost(grid, points, settings, free_resolution=0.015)
     expected = costs_and_gradients(here, space, vectors)
     monkeypatch.setattr("chsel.cost.torch_cost.device_named", lambda name: PRETENDED)
@@ -262,7 +262,7 @@ def test_no_pairs_at_once_is_an_error(grid: SdfGrid, pairs: int) -> None:
 def test_a_gpu_gives_the_same_bits_again(
     grid: SdfGrid, points: KnownPoints, settings: CostSettings
 ) -> None:
-    vectors = SE3Space().encode(poses(20_000))
+    vectors = SE3Space().encode(Poses.of(poses(20_000)))
 
     def run() -> list[FloatArray]:
         cost = RelaxedCost(grid, points, settings, free_resolution=0.015, device="cuda")
@@ -288,7 +288,7 @@ def test_a_gpu_agrees_with_the_processor(
     there = RelaxedCost(grid, points, settings, free_resolution=0.015, device="cuda")
     expected = here.evaluate(poses(20_000))
     np.testing.assert_allclose(there.evaluate(poses(20_000)), expected, rtol=1e-9, atol=1e-12)
-    vectors = SE3Space().encode(poses(500, reach=0.05))
+    vectors = SE3Space().encode(Poses.of(poses(500, reach=0.05)))
     plain = RelaxedCost(grid, points, settings, free_resolution=0.015)
     slopes = costs_and_gradients(plain, SE3Space(), vectors)[1]
     found = costs_and_gradients(there, SE3Space(), vectors)[1]

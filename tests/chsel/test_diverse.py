@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.plausible.surface_distance import SQUARE_MILLIMETRES, DistanceSettings, SurfaceDistance
-from chsel.problem.poses import axis_angle, compose, inverse
+from chsel.problem.poses import Poses, axis_angle, compose, inverse
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import outlined, representative, spaced
@@ -37,7 +36,7 @@ def test_outlines_differ_about_as_much_as_surfaces_do() -> None:
     surface = surface_points(GRID, 2000, StreamKey(0, 0).stream(Purpose.METRIC_POINTS))
     settings = DistanceSettings(len(surface), "grid", bidirectional=True)
     apart = SurfaceDistance(GRID, None, surface, settings).between(poses, inverse(poses))
-    outlines = outlined(GRID, poses_of(poses))
+    outlines = outlined(GRID, Poses.of(poses))
     squares = ((outlines[:, None] - outlines[None]) ** 2).mean(axis=2) * SQUARE_MILLIMETRES
     near = (apart > 1.0) & (apart < 400.0)
     assert near.sum() > 100
@@ -48,7 +47,7 @@ def test_outlines_differ_about_as_much_as_surfaces_do() -> None:
 def test_poses_that_a_symmetry_makes_alike_stand_for_each_other() -> None:
     turns = axis_angle(np.broadcast_to([0.0, 0.0, 1.0], (30, 3)), np.pi * (np.arange(30) % 2))
     places = np.repeat(0.02 * np.arange(15.0)[:, None] * [1.0, 0.5, 0.0], 2, axis=0)
-    poses = poses_of(inverse(compose(turns, places)))  # a box looks the same after half a turn
+    poses = Poses.of(inverse(compose(turns, places)))  # a box looks the same after half a turn
     outlines = outlined(GRID, poses)
     np.testing.assert_allclose(outlines[::2], outlines[1::2], atol=3e-4)
     chosen = representative(GRID, poses, 15)
@@ -56,7 +55,7 @@ def test_poses_that_a_symmetry_makes_alike_stand_for_each_other() -> None:
 
 
 def test_chosen_poses_stand_for_all_better_than_the_first_ones_do() -> None:
-    poses = poses_of(transforms(200))
+    poses = Poses.of(transforms(200))
     points = outlined(GRID, poses)
     chosen = representative(GRID, poses, 8)
     assert chosen[0] == 0
@@ -68,7 +67,7 @@ def test_chosen_poses_stand_for_all_better_than_the_first_ones_do() -> None:
 
 
 def test_each_choice_is_the_one_that_takes_off_the_most() -> None:
-    poses = poses_of(transforms(40))
+    poses = Poses.of(transforms(40))
     points = outlined(GRID, poses)
     chosen = representative(GRID, poses, 6)
     for n in range(1, 6):
@@ -79,14 +78,14 @@ def test_each_choice_is_the_one_that_takes_off_the_most() -> None:
 
 
 def test_copies_are_chosen_once() -> None:
-    poses = np.repeat(poses_of(transforms(3)), 4, axis=0)
+    poses = Poses.of(np.repeat(transforms(3), 4, axis=0))
     chosen = representative(GRID, poses, 10)
     assert sorted(chosen // 4) == [0, 1, 2]
     assert representative(GRID, poses[:1], 5).tolist() == [0]
 
 
 def test_every_next_pose_is_the_farthest_from_those_before() -> None:
-    poses = poses_of(transforms(60))
+    poses = Poses.of(transforms(60))
     points, order = outlined(GRID, poses), spaced(GRID, poses, 60)
     assert order[0] == 0
     assert sorted(order) == list(range(60))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.methods.anchored.anchor_sampling import in_telling_order
 from chsel.methods.anchored.energy import Energy
 from chsel.methods.anchored.energy_kernels import energies_below, found_around
@@ -14,10 +13,10 @@ from chsel.methods.anchored.walk_kernels import Chains
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import apply, axis_angle, compose, inverse, random_rotations
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, random_rotations
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space, transforms_of
+from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.streams import StreamKey
 
 MESH = trimesh.creation.box((0.2, 0.12, 0.08))
@@ -48,19 +47,18 @@ def energy_of(
     return Energy(problem, in_telling_order(points), space, tolerance, bounds), bounds
 
 
-def around(count: int, shift: float, turn: float) -> FloatArray:
-    """Poses (B, 12) around the truth."""
+def around(count: int, shift: float, turn: float) -> Poses:
+    """Poses around the truth."""
     random = np.random.default_rng(count)
     axes = random.standard_normal((count, 3))
     axes /= np.sqrt((axes**2).sum(axis=1, keepdims=True))
     moves = compose(axis_angle(axes, turn), shift * random.standard_normal((count, 3)))
-    return poses_of(inverse(np.stack([TRUTH @ move for move in moves])))
+    return Poses.of(inverse(np.stack([TRUTH @ move for move in moves])))
 
 
-def plainly(points: KnownPoints, poses: FloatArray, tau: float) -> FloatArray:
+def plainly(points: KnownPoints, poses: Poses, tau: float) -> FloatArray:
     energies = []
-    for pose in poses:
-        transform = compose(pose[:9].reshape(3, 3), pose[9:])
+    for transform in poses.matrices:
         known, free, occupied = (
             GRID.query(apply(transform, part), lookup="trilinear")[0].numpy()
             for part in (points.known, points.free, points.occupied)
@@ -71,20 +69,19 @@ def plainly(points: KnownPoints, poses: FloatArray, tau: float) -> FloatArray:
     return np.array(energies)
 
 
-def squares(points: KnownPoints, poses: FloatArray) -> FloatArray:
+def squares(points: KnownPoints, poses: Poses) -> FloatArray:
     """What a fit lowers, without free points."""
     residuals = []
-    for pose in poses:
-        transform = compose(pose[:9].reshape(3, 3), pose[9:])
+    for transform in poses.matrices:
         known = GRID.query(apply(transform, points.known), lookup="trilinear")[0].numpy()
         residuals.append(((known - points.sdf) ** 2).sum())
     return np.array(residuals)
 
 
-def far_poses() -> FloatArray:
+def far_poses() -> Poses:
     turns = random_rotations(np.random.default_rng(1), 40)
     places = np.random.default_rng(2).uniform(-0.1, 0.5, (40, 3))
-    return poses_of(inverse(compose(turns, places)))
+    return Poses.of(inverse(compose(turns, places)))
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.004])
@@ -92,7 +89,7 @@ def far_poses() -> FloatArray:
     "points", [POINTS, TOUCHED, KnownPoints(free=FREE), KnownPoints(occupied=POINTS.occupied)]
 )
 def test_energy_is_the_plain_formula(points: KnownPoints, tau: float) -> None:
-    poses = np.concatenate([around(12, 0.02, 0.3), far_poses()[:12]])
+    poses = Poses.joined([around(12, 0.02, 0.3), far_poses()[:12]])
     energies = energy_of(points, tau)[0].of(poses)
     np.testing.assert_allclose(energies, plainly(points, poses, tau), rtol=1e-12, atol=1e-9)
 
@@ -102,16 +99,16 @@ def test_energies_that_a_walk_carries_along_are_the_plain_formula() -> None:
     energy, _ = energy_of(POINTS, 0.002)
     chains = walked(energy, around(12, 0.01, 0.1), 0.0, 120)
     assert chains.moved.min() > 0
-    expected = plainly(POINTS, chains.poses, 0.002)
+    expected = plainly(POINTS, Poses(chains.poses), 0.002)
     np.testing.assert_allclose(chains.energies, expected, rtol=1e-12, atol=1e-9)
 
 
 def test_energies_above_a_limit_are_infinite_and_others_as_they_are() -> None:
     energy, _ = energy_of(POINTS)
-    model, poses = energy._model, np.concatenate([around(40, 0.02, 0.3), far_poses()])
+    model, poses = energy._model, Poses.joined([around(40, 0.02, 0.3), far_poses()])
     energies, limited = energy.of(poses), np.empty(len(poses))
     limit = float(np.sort(energies)[30])
-    energies_below(model, poses, limit, limited, 0, len(poses), found_around(model))
+    energies_below(model, poses.numbers, limit, limited, 0, len(poses), found_around(model))
     np.testing.assert_array_equal(limited, np.where(energies <= limit, energies, np.inf))
 
 
@@ -122,10 +119,8 @@ def test_a_fit_recovers_a_pose_that_was_moved_a_little() -> None:
     assert (energy.of(fitted) < 0.0005).all()
     assert (energy.of(poses) > 0.002).all()
     truth = inverse(TRUTH)
-    np.testing.assert_allclose(fitted[:, 9:], np.tile(truth[:3, 3], (20, 1)), atol=0.004)
-    np.testing.assert_allclose(
-        fitted[:, :9], np.tile(truth[:3, :3].reshape(-1), (20, 1)), atol=0.03
-    )
+    np.testing.assert_allclose(fitted.translations, np.tile(truth[:3, 3], (20, 1)), atol=0.004)
+    np.testing.assert_allclose(fitted.rotations, np.tile(truth[:3, :3], (20, 1, 1)), atol=0.03)
 
 
 def test_no_fit_raises_the_sum_of_squares() -> None:
@@ -135,10 +130,10 @@ def test_no_fit_raises_the_sum_of_squares() -> None:
     before, after = squares(points, poses), squares(points, energy.fitted(poses, 10))
     assert (after <= before * (1.0 + 1e-9)).all()
     assert np.median(after / before) < 0.1
-    np.testing.assert_array_equal(energy.fitted(poses, 0), poses)
+    np.testing.assert_array_equal(energy.fitted(poses, 0).numbers, poses.numbers)
 
 
-def walked(energy: Energy, poses: FloatArray, floor: float, moves: int, kept: int = 4) -> Chains:
+def walked(energy: Energy, poses: Poses, floor: float, moves: int, kept: int = 4) -> Chains:
     return energy.walked(poses, energy.of(poses), floor, moves, kept=kept, index=3)
 
 
@@ -146,17 +141,17 @@ def test_walks_stay_below_the_limit_and_within_bounds() -> None:
     energy, (lower, upper) = energy_of(TOUCHED)
     starts = energy.fitted(around(12, 0.01, 0.1), 30)
     chains = walked(energy, starts, 0.01, 200)
-    kept = chains.kept.reshape(-1, 12)
+    kept = Poses(chains.kept.reshape(-1, 12))
     assert np.isfinite(chains.kept_energies).all()
     np.testing.assert_allclose(energy.of(kept), chains.kept_energies.reshape(-1), atol=1e-9)
     assert chains.energies.max() <= 0.01
     assert chains.kept_energies.max() <= 0.01
-    assert np.abs(kept[:, 9:] - np.repeat(starts[:, 9:], 4, axis=0)).max() > 0.002
-    rotations = kept[:, :9].reshape(-1, 3, 3)
-    products = np.einsum("nij,nkj->nik", rotations, rotations)
+    assert np.abs(kept.translations - np.repeat(starts.translations, 4, axis=0)).max() > 0.002
+    products = np.einsum("nij,nkj->nik", kept.rotations, kept.rotations)
     np.testing.assert_allclose(products, np.tile(np.eye(3), (len(kept), 1, 1)), atol=1e-10)
     free = walked(energy_of(KnownPoints(known=CONTACTS[:1]))[0], starts, 10.0, 400)
-    origins = -np.einsum("nij,ni->nj", free.poses[:, :9].reshape(-1, 3, 3), free.poses[:, 9:])
+    reached = Poses(free.poses)
+    origins = -np.einsum("nij,ni->nj", reached.rotations, reached.translations)
     assert (origins >= lower).all()
     assert (origins <= upper).all()
 
@@ -177,7 +172,7 @@ def test_neither_fits_nor_walks_depend_on_threads() -> None:
         with threads(count):
             fitted = energy.fitted(poses, 4)
             chains = walked(energy, fitted, 0.02, 40)
-            results.append([fitted, energy.of(fitted), *chains])
+            results.append([fitted.numbers, energy.of(fitted), *chains])
     for one, two in zip(*results, strict=True):
         np.testing.assert_array_equal(one, two)
 
@@ -187,9 +182,8 @@ def test_on_a_plane_fits_and_walks_stay_on_it() -> None:
     energy, _ = energy_of(TOUCHED, plane=plane)
     space = search_space(plane, GRID)
     near = around(6, 0.01, 0.1)
-    vectors = space.encode(compose(near[:, :9].reshape(-1, 3, 3), near[:, 9:]))
-    poses = poses_of(transforms_of(space, vectors))
+    poses = space.poses(space.encode(near))
     chains = walked(energy, energy.fitted(poses, 10), 0.0, 60)
-    again = space.encode(compose(chains.poses[:, :9].reshape(-1, 3, 3), chains.poses[:, 9:]))
-    np.testing.assert_allclose(poses_of(transforms_of(space, again)), chains.poses, atol=1e-9)
-    assert np.abs(chains.poses - poses).max() > 1e-3
+    again = space.poses(space.encode(Poses(chains.poses)))
+    np.testing.assert_allclose(again.numbers, chains.poses, atol=1e-9)
+    assert np.abs(chains.poses - poses.numbers).max() > 1e-3

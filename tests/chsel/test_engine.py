@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
-from chsel.cost.compiled_cost import CompiledCost, poses_of
+from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.cost.objective_kernels import BETA1, BETA2, EPSILON
 from chsel.errors import EngineError, PointsError, PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
-from chsel.problem.poses import compose, random_rotations
+from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 
 pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
@@ -108,7 +108,7 @@ def cases(draw: st.DrawFn, free_terms: tuple[str, ...] = ("direct", "interior"))
     if draw(st.integers(0, 3)) == 0:
         axis = tuple(stream.standard_normal(3).tolist())
         space = SE2Space(PlaneSettings(axis=axis, offset=0.01), grid_of(shape))
-    vectors = space.encode(compose(random_rotations(stream, count), translations))
+    vectors = space.encode(Poses.of(compose(random_rotations(stream, count), translations)))
     if space.dimension == 9:  # raw vectors are not orthonormal
         vectors[:, :6] += stream.uniform(-0.2, 0.2, (count, 6))
     return Case(shape, points, changes, resolution, vectors, space)
@@ -277,7 +277,7 @@ def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(
     changes = CostSettings(lookup=lookup)
     transforms = compose(random_rotations(stream, 5), stream.uniform(-0.2, 0.2, (5, 3)))
     transforms[0] = np.eye(4)
-    poses = poses_of(transforms)
+    poses = Poses.of(transforms)
     culled, direct = (
         CompiledCost(sdf, KnownPoints(free), changes, free_resolution=0.005, way=way)
         for way in ("tree", "direct")
@@ -285,7 +285,7 @@ def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(
     costs = culled.costs(poses)
     assert costs[0] > 1.0
     assert_same_bits(costs, direct.costs(poses))
-    assert_same_bits(costs, [summed_over_all(culled, sdf, free, pose) for pose in poses])
+    assert_same_bits(costs, [summed_over_all(culled, sdf, free, pose) for pose in poses.numbers])
 
 
 def border_points(sdf: SdfGrid) -> FloatArray:
@@ -314,7 +314,7 @@ def test_points_on_borders_of_voxels_and_of_the_grid_read_what_the_torch_cost_re
         [np.eye(3), [[0, 1, 0], [0, 0, 1], [1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]]
     )
     shifts = np.array([[0, 0, 0], [0.5, -1.0, 2.0], [2.0**-7, 0, 2.0**-6]])
-    vectors = SE3Space().encode(compose(turns, shifts))
+    vectors = SE3Space().encode(Poses.of(compose(turns, shifts)))
     for n in range(len(shifts)):
         world = (at - shifts[n]) @ turns[n]  # exact but for the numbers next to others
         for points in (KnownPoints(world), KnownPoints(occupied=world), KnownPoints(known=world)):
@@ -327,11 +327,17 @@ def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them() ->
     free = np.array([[0.0, 0.0, 0.0], [step, 0.0, 0.0], [0.0, 2 * step, step], [3 * step, 0, 0]])
     changes = CostSettings(free_term="interior", interior_spacing=0.5 * step)
     vectors = SE3Space().encode(
-        compose(
-            np.tile(np.eye(3), (3, 1, 1)),
-            np.array(
-                [[0.0, 0.0, 0.0], [0.5 * step, 0.0, 0.25 * step], [1.5 * step, -step, 2.5 * step]]
-            ),
+        Poses.of(
+            compose(
+                np.tile(np.eye(3), (3, 1, 1)),
+                np.array(
+                    [
+                        [0.0, 0.0, 0.0],
+                        [0.5 * step, 0.0, 0.25 * step],
+                        [1.5 * step, -step, 2.5 * step],
+                    ]
+                ),
+            )
         )
     )
     case = Case("dyadic", KnownPoints(free), changes, step, vectors, SE3Space())
@@ -393,7 +399,7 @@ def test_a_way_that_does_not_fit_is_refused(free_term: str, spacing: float, name
 def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term: str) -> None:
     stream = np.random.default_rng(7)
     transforms = compose(random_rotations(stream, 4), stream.uniform(-0.02, 0.02, (4, 3)))
-    vectors = SE3Space().encode(transforms)
+    vectors = SE3Space().encode(Poses.of(transforms))
     changes = CostSettings(free_term=free_term)
     case = Case("box", edge_points(name), changes, 0.01, vectors, SE3Space())
     assert_equals_torch(case)
@@ -416,7 +422,7 @@ def test_a_scene_far_from_the_origin_is_culled_without_loss(far: float, free_ter
     turns = random_rotations(stream, 6)
     turns[0] = np.eye(3)
     translations = -(turns @ shift) + stream.uniform(-0.03, 0.03, (6, 3))
-    vectors = SE3Space().encode(compose(turns, translations))
+    vectors = SE3Space().encode(Poses.of(compose(turns, translations)))
     points = KnownPoints(free, known=free[:9] + 0.01)
     changes = CostSettings(free_term=free_term)
     case = Case("box", points, changes, 0.01, vectors, SE3Space())
@@ -444,7 +450,7 @@ def test_poses_beyond_all_numbers_cost_infinitely_much_and_harm_no_other(
     assert_same_bits(costs[:13], np.full(13, np.inf))
     assert_same_bits(costs[13:], cost.evaluate(np.eye(4)[None]))
     assert 0.0 < costs[13] < np.inf
-    vectors = SE3Space().encode(transforms)
+    vectors = SE3Space().encode(Poses.of(transforms))
     Objective(cost, SE3Space()).descended(vectors, 1.0, 0.01, 3)
 
 
@@ -532,7 +538,7 @@ def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_not
         cost = CompiledCost(grid_of("box"), KnownPoints(free), changes)
     assert cost.evaluate(np.eye(4)[None])[0] == 0.0
     objective = Objective(cost, SE3Space())
-    vectors = SE3Space().encode(np.eye(4)[None])
+    vectors = SE3Space().encode(Poses.of(np.eye(4)[None]))
     assert_same_bits(objective.descended(vectors, 1.0, 0.01, 5), vectors)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -562,7 +568,7 @@ def test_points_and_poses_are_left_as_they_were() -> None:
     near = stream.uniform(-0.05, 0.05, (40, 3))
     points = KnownPoints(near, near[:3], near[:9])
     objective = Objective(CompiledCost(grid_of("box"), points), SE3Space())
-    vectors = SE3Space().encode(np.tile(np.eye(4), (3, 1, 1)))
+    vectors = SE3Space().encode(Poses.of(np.tile(np.eye(4), (3, 1, 1))))
     before, digest = vectors.copy(), points.digest
     assert (objective.descended(vectors, 3.0, 0.01, 5) != vectors).any()
     objective.costs_and_gradients(vectors)

@@ -5,7 +5,6 @@ import pytest
 import trimesh
 
 from chsel import KnownPoints, SdfGrid
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import SettingError
 from chsel.methods.cvo import rkhs_fields as rkhs_cloud
 from chsel.methods.cvo import rkhs_fields as rkhs_field
@@ -19,6 +18,7 @@ from chsel.methods.cvo.rkhs_fields import (
     surface_field,
 )
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import Poses
 from tests.chsel.dense_cvo import DenseClouds, flows, nearby
 
 SDF = SdfGrid.from_mesh(trimesh.creation.box([0.12, 0.08, 0.06]), 0.01, padding=0.03)
@@ -41,14 +41,14 @@ def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Produ
 
 def values(product: Product, transforms: FloatArray) -> FloatArray:
     out = np.full(len(transforms), np.nan)
-    products(product, poses_of(transforms), out, 0, len(out), scratch())
+    products(product, Poses.of(transforms).numbers, out, 0, len(out), scratch())
     return out
 
 
 def flow(product: Product, transforms: FloatArray) -> FloatArray:
     """Sums (B, 6) over x_i x h_i and h_i."""
     out = np.full((len(transforms), 7), np.nan)
-    flows(product, poses_of(transforms), out, scratch())
+    flows(product, Poses.of(transforms).numbers, out, scratch())
     np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
     return out[:, 1:]
 

@@ -8,7 +8,7 @@ import pytest
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import compose, inverse
+from chsel.problem.poses import Poses, compose, inverse
 from chsel.problem.search_space import search_space
 from chsel.problem.streams import StreamKey
 from chsel.qd.measures import MEASURES
@@ -56,7 +56,7 @@ def selected(
     settings = OutputSettings(**changes)  # type: ignore[arg-type]
     problem, stream = problem_of(count, sdf), np.random.default_rng(0)
     space = search_space(None, problem.sdf)
-    return select_elites(costs, at(x), problem, space, settings, stream).tolist()
+    return select_elites(costs, Poses.of(at(x)), problem, space, settings, stream).tolist()
 
 
 def chosen(count: int, **changes: Any) -> list[int]:
@@ -110,8 +110,8 @@ def test_equal_estimates_still_make_an_archive_of_some_width() -> None:
 
 def test_repetitions_are_flagged_after_the_first() -> None:
     poses = np.stack([np.eye(4), 2 * np.eye(4), np.eye(4), 2 * np.eye(4), 3 * np.eye(4)])
-    assert repeated(poses).tolist() == [False, False, True, True, False]
-    assert repeated(poses[:0]).tolist() == []
+    assert repeated(Poses.of(poses)).tolist() == [False, False, True, True, False]
+    assert repeated(Poses.of(poses[:0])).tolist() == []
 
 
 GROUPS = np.array([0.1, 0.101, 0.102, 0.103, 0.5, 0.501, 0.502, 0.503, 0.9, 0.901, 0.902, 0.903])

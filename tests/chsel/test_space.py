@@ -11,6 +11,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError
 from chsel.problem.poses import (
+    Poses,
     apply,
     axis_angle,
     compose,
@@ -18,7 +19,7 @@ from chsel.problem.poses import (
     random_rotations,
     rotation_vector,
 )
-from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace, transforms_of
+from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 from chsel.qd.measures import MEASURES, Measure, measure_named
 
 BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
@@ -31,16 +32,16 @@ def random_transforms(count: int) -> np.ndarray:
 
 def test_nine_numbers_and_transforms_are_inverse_to_each_other() -> None:
     transforms = random_transforms(50)
-    vectors = SE3Space().encode(transforms)
-    np.testing.assert_allclose(transforms_of(SE3Space(), vectors), transforms, atol=1e-14)
+    vectors = SE3Space().encode(Poses.of(transforms))
+    np.testing.assert_allclose(SE3Space().poses(vectors).matrices, transforms, atol=1e-14)
 
 
 def test_raw_rows_decode_to_the_rotation_of_gram_schmidt() -> None:
     transforms = random_transforms(20)
-    vectors = SE3Space().encode(transforms)
+    vectors = SE3Space().encode(Poses.of(transforms))
     vectors[:, 3:6] = 1.7 * vectors[:, 3:6] - 0.4 * vectors[:, 0:3]  # same span, same halves
     vectors[:, 0:3] *= 0.2
-    np.testing.assert_allclose(transforms_of(SE3Space(), vectors), transforms, atol=1e-12)
+    np.testing.assert_allclose(SE3Space().poses(vectors).matrices, transforms, atol=1e-12)
 
 
 def test_degenerate_rows_decode_to_finite_numbers() -> None:
@@ -56,7 +57,7 @@ def test_plane_pose_of_a_tilted_rotation_is_the_nearest_by_frobenius() -> None:
     for theta in np.linspace(-3.0, 3.0, 9):
         tilt = axis_angle(np.array([0.8, 0.0, 0.6]), np.deg2rad(10.0))
         rotation = axis_angle(axis, theta) @ tilt
-        found = space.encode(compose(rotation, np.zeros(3))[None])[0, 0]
+        found = space.encode(Poses.of(compose(rotation, np.zeros(3))[None]))[0, 0]
 
         def distance(angle: float, rotation: np.ndarray = rotation) -> float:
             return float(((axis_angle(axis, angle) - rotation) ** 2).sum())
@@ -70,8 +71,8 @@ def test_plane_poses_survive_encoding_and_stay_on_the_plane() -> None:
     settings = PlaneSettings(axis=(0, 0, 2.0), offset=-0.1, resting_rotation=(np.pi / 2, 0, 0))
     space = SE2Space(settings, BOX)
     vectors = STREAM.uniform(-1.0, 1.0, (30, 3))
-    transforms = transforms_of(space, vectors)
-    np.testing.assert_allclose(space.encode(transforms), vectors, atol=1e-12)
+    transforms = space.poses(vectors).matrices
+    np.testing.assert_allclose(space.encode(Poses.of(transforms)), vectors, atol=1e-12)
     np.testing.assert_allclose(transforms[:, 2, 3], -0.1, atol=1e-15)
     rest = rotation_vector(np.array([np.pi / 2, 0, 0]))
     np.testing.assert_allclose(transforms[:, 2, :3], np.tile(rest[2], (30, 1)), atol=1e-12)
@@ -88,7 +89,7 @@ def test_plane_height_puts_the_object_onto_the_plane(
     world_axis = np.array([0.0, 0.0, 1.0])
     axis = rotation_vector(np.array(resting)) @ world_axis
     settings = PlaneSettings(axis=tuple(axis), plane_height=0.4, resting_rotation=resting)
-    transforms = transforms_of(SE2Space(settings, BOX), STREAM.uniform(-1.0, 1.0, (5, 3)))
+    transforms = SE2Space(settings, BOX).poses(STREAM.uniform(-1.0, 1.0, (5, 3))).matrices
     corners = trimesh.creation.box((0.2, 0.1, 0.06)).vertices
     for transform in transforms:
         heights = apply(inverse(transform), corners)[:, 2]
@@ -148,13 +149,13 @@ def test_measures_of_vectors_and_translations_are_their_entries() -> None:
         MEASURES["plane_angle"].values(on_plane.space, poses), poses[:, :1]
     )
     np.testing.assert_array_equal(
-        MEASURES["position_3"].values(on_plane.space, poses), transforms_of(plane, poses)[:, :3, 3]
+        MEASURES["position_3"].values(on_plane.space, poses), plane.poses(poses).matrices[:, :3, 3]
     )
 
 
 def test_object_measures_are_of_world_from_object() -> None:
     transforms = random_transforms(10)
-    vectors = SE3Space().encode(transforms)
+    vectors = SE3Space().encode(Poses.of(transforms))
     world, objective = inverse(transforms), objective_in(SE3Space())
     xy = MEASURES["object_xy"].values(objective.space, vectors)
     np.testing.assert_allclose(xy, world[:, :2, 3], atol=1e-14)
@@ -165,7 +166,7 @@ def test_object_measures_are_of_world_from_object() -> None:
 def test_an_object_that_points_straight_up_has_a_yaw_and_no_gradient_of_it() -> None:
     """The object's x axis along the world's z: the heading is not defined."""
     rotation = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    vector = SE3Space().encode(compose(rotation[None], np.zeros((1, 3))))
+    vector = SE3Space().encode(Poses.of(compose(rotation[None], np.zeros((1, 3)))))
     objective, yaw = objective_in(SE3Space()), MEASURES["object_yaw"]
     assert np.isfinite(yaw.values(objective.space, vector)).all()
     np.testing.assert_array_equal(yaw.gradients(objective.space, vector[0]), np.zeros((1, 9)))
@@ -180,7 +181,7 @@ def test_compiled_decoding_is_that_of_torch(planar: bool) -> None:
     vectors = STREAM.uniform(-3.0, 3.0, (50, space.dimension))
     rotation, translation = space.decode(torch.tensor(vectors))
     expected = compose(rotation.numpy(), translation.numpy())
-    np.testing.assert_allclose(transforms_of(space, vectors), expected, rtol=0.0, atol=3e-15)
+    np.testing.assert_allclose(space.poses(vectors).matrices, expected, rtol=0.0, atol=3e-15)
 
 
 def test_a_measure_of_the_other_space_names_those_that_fit() -> None:

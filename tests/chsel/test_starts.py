@@ -39,7 +39,7 @@ def starts_of(
     problem: RegistrationProblem, index: int = 0, plane: PlaneSettings | None = None
 ) -> FloatArray:
     space = search_space(plane, problem.sdf)
-    return anchored_starts(problem, space, STARTS, index)
+    return anchored_starts(problem, space, STARTS, index).matrices
 
 
 class Descents(NullObserver):

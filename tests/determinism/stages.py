@@ -12,6 +12,7 @@ from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     ArchiveSnapshot,
     Hypotheses,
@@ -117,7 +118,7 @@ def _keep_start(stages: Stages, method: Method, problem: RegistrationProblem, st
         return  # the kernels of its cost show in its own stages
     space = search_space(settings.plane, problem.sdf)
     objective = Objective(CompiledCost.of(problem, settings.cost), space)
-    vectors = space.encode(problem.initial_set)
+    vectors = space.encode(Poses.of(problem.initial_set))
     keep(stages, f"step {step}: search vectors of E_0", {"vectors": vectors})
     keep(stages, f"step {step}: costs of E_0", {"costs": objective.costs(vectors)})
     _, gradients = objective.costs_and_gradients(vectors)

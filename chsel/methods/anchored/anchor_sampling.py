@@ -15,10 +15,10 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import box_of
 from chsel.numerics.threads import spread
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import compose
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.search_space import SE2Space, SearchSpace, origin_bounds, transforms_of
+from chsel.problem.search_space import SE2Space, SearchSpace, origin_bounds
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import far_apart
 from chsel.problem.surface import has_surface, surface_points
@@ -120,8 +120,8 @@ def anchored_poses(
     samples: int,
     most: int,
     index: int = 0,
-) -> FloatArray:
-    """The best of so many random poses by their coarse score: poses (K, 12), best first.
+) -> Poses:
+    """The best of so many random poses by their coarse score: K poses, best first.
 
     known: the problem's points, see `in_telling_order`. most: K at most; less where the object
     is out of its bounds too often. index: of the stream.
@@ -147,7 +147,7 @@ def anchored_poses(
     scores = np.concatenate([best.scores[:count] for best, count in parts])
     numbers = np.concatenate([best.numbers[:count] for best, count in parts])
     poses = np.concatenate([best.poses[:count] for best, count in parts])
-    return poses[np.lexsort([numbers, scores])[:most]]
+    return Poses(poses[np.lexsort([numbers, scores])[:most]])
 
 
 def in_telling_order(points: KnownPoints) -> KnownPoints:
@@ -250,13 +250,13 @@ class AnchoredStarts:
 
 def anchored_starts(
     problem: RegistrationProblem, space: SearchSpace, settings: AnchoredStarts, index: int
-) -> FloatArray:
-    """Transforms (K, 4, 4), best first; none of an object too thin to have a surface on its grid.
+) -> Poses:
+    """K poses, best first; none of an object too thin to have a surface on its grid.
 
     index: of the pass, each of which draws its own.
     """
     if not has_surface(problem.sdf):
-        return np.zeros((0, 4, 4))
+        return Poses(np.zeros((0, 12)))
     poses = anchored_poses(
         problem,
         in_telling_order(problem.points),
@@ -266,5 +266,4 @@ def anchored_starts(
         most=settings.kept,
         index=index,
     )
-    transforms = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
-    return transforms_of(space, space.encode(transforms))
+    return space.poses(space.encode(poses))

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.anchored.anchor_sampling import (
     AnchorSettings,
@@ -15,14 +14,14 @@ from chsel.methods.anchored.anchor_sampling import (
 )
 from chsel.methods.anchored.energy import Energy
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import compose
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space, transforms_of
+from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.subset import evenly, representative, spaced
 from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import update_cells
@@ -159,7 +158,7 @@ class Anchored:
 
 
 class _Search:
-    """The stages of one registration. Poses are (B, 12): rotation row by row, then translation."""
+    """The stages of one registration."""
 
     def __init__(
         self, problem: RegistrationProblem, settings: AnchoredSettings, observer: Observer
@@ -172,27 +171,24 @@ class _Search:
         tolerance = settings.penetration_tolerance
         self._energy = Energy(problem, self._known, self._space, tolerance, bounds)
 
-    def found(self) -> tuple[FloatArray, FloatArray]:
+    def found(self) -> tuple[Poses, FloatArray]:
         """Poses near minima with their energies, the lowest first, from as many rounds as it takes.
 
         The best of E_0 and E_l join the first round.
         """
         effort, problem = self._effort, self._problem
-        given_set = np.concatenate([problem.initial_set, problem.low_cost_set])
+        given = Poses.of(np.concatenate([problem.initial_set, problem.low_cost_set]))
         if self._settings.plane is not None:  # moves keep to the plane, but do not lead onto it
-            given_set = transforms_of(self._space, self._space.encode(given_set))
-        given = poses_of(given_set)
+            given = self._space.poses(self._space.encode(given))
         given = given[np.argsort(self._energy.of(given), kind="stable")[:_MOST_GIVEN]]
         poses, energies = given[:0], np.zeros(0)
         spent = index = 0
         while True:
             drawn = self._drawn(index)
-            joined = drawn if index else np.concatenate([drawn, given])
+            joined = drawn if index else Poses.joined([drawn, given])
             more, more_energies = self._descended(*self._fitted(joined), index)
-            poses, energies = (
-                np.concatenate([poses, more]),
-                np.concatenate([energies, more_energies]),
-            )
+            poses = Poses.joined([poses, more])
+            energies = np.concatenate([energies, more_energies])
             spent += effort.samples + effort.kept * effort.first_steps
             spent += effort.refined * effort.steps + effort.descents * effort.descent_moves
             index += 1
@@ -203,7 +199,7 @@ class _Search:
         order = np.argsort(energies, kind="stable")
         return poses[order], energies[order]
 
-    def _drawn(self, index: int) -> FloatArray:
+    def _drawn(self, index: int) -> Poses:
         effort, settings = self._effort, self._settings
         poses = anchored_poses(
             self._problem,
@@ -217,23 +213,23 @@ class _Search:
         self._observer.progress("sample", effort.samples, effort.samples)
         return poses
 
-    def _fitted(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _fitted(self, poses: Poses) -> tuple[Poses, FloatArray]:
         """All fitted a little, and the better part of them some more; the lowest first."""
         effort = self._effort
         poses, _ = self._ordered(self._energy.fitted(poses, effort.first_steps))
         better = self._energy.fitted(poses[: effort.refined], effort.steps)
-        poses, energies = self._ordered(np.concatenate([better, poses[effort.refined :]]))
+        poses, energies = self._ordered(Poses.joined([better, poses[effort.refined :]]))
         self._tell("fit", poses, energies)
         return poses, energies
 
-    def _ordered(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _ordered(self, poses: Poses) -> tuple[Poses, FloatArray]:
         energies = self._energy.of(poses)
         order = np.argsort(energies, kind="stable")
         return poses[order], energies[order]
 
     def _descended(
-        self, poses: FloatArray, energies: FloatArray, index: int
-    ) -> tuple[FloatArray, FloatArray]:
+        self, poses: Poses, energies: FloatArray, index: int
+    ) -> tuple[Poses, FloatArray]:
         """The lowest walk down to the limit that holds so far, and the lowest of all further."""
         effort, limit = self._effort, self._limit(energies)
         amount = effort.descents, effort.descent_moves
@@ -245,19 +241,19 @@ class _Search:
 
     def _walked_down(
         self,
-        poses: FloatArray,
+        poses: Poses,
         energies: FloatArray,
         floor: float,
         count: int,
         moves: int,
         index: int,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[Poses, FloatArray]:
         """Poses in order of their energies before the `count` lowest walked down to a floor."""
         order = np.argsort(energies, kind="stable")
         poses, energies = poses[order], energies[order]
         first = poses[:count], energies[:count]
         chains = self._energy.walked(*first, floor, moves, kept=0, index=index)
-        poses = np.concatenate([chains.poses, poses[count:]])
+        poses = Poses.joined([Poses(chains.poses), poses[count:]])
         return poses, np.concatenate([chains.energies, energies[count:]])
 
     def _limit(self, energies: FloatArray) -> float:
@@ -266,7 +262,7 @@ class _Search:
         relative = settings.limit_ratio * least + settings.limit_slack * settings.noise
         return max(settings.limit_noise * settings.noise, relative, least)
 
-    def spread(self, poses: FloatArray, energies: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def spread(self, poses: Poses, energies: FloatArray) -> tuple[Poses, FloatArray]:
         """Candidates with their energies: poses below the limit, and walks there from these.
 
         And walks below a higher one: which energies the contacts allow is not known that well.
@@ -278,14 +274,14 @@ class _Search:
         inner = self._wandered(poses, energies, limit, wanted - outer, 0)
         further = self._wandered(poses, energies, outer_limit, outer, 1)
         below = energies <= limit
-        poses = np.concatenate([poses[below], inner[0], further[0]])
+        poses = Poses.joined([poses[below], inner[0], further[0]])
         energies = np.concatenate([energies[below], inner[1], further[1]])
         self._tell("spread", poses, energies)
         return poses, energies
 
     def _wandered(
-        self, poses: FloatArray, energies: FloatArray, limit: float, chains: int, index: int
-    ) -> tuple[FloatArray, FloatArray]:
+        self, poses: Poses, energies: FloatArray, limit: float, chains: int, index: int
+    ) -> tuple[Poses, FloatArray]:
         """States of chains below a limit, with their energies, from poses that are far apart."""
         below = energies <= limit
         poses, energies = poses[below], energies[below]
@@ -294,22 +290,21 @@ class _Search:
             poses[starts], energies[starts], limit, self._effort.moves, kept=_KEPT, index=index
         )
         kept = walked.kept_energies.reshape(-1) <= limit
-        return walked.kept.reshape(-1, 12)[kept], walked.kept_energies.reshape(-1)[kept]
+        return Poses(walked.kept.reshape(-1, 12)[kept]), walked.kept_energies.reshape(-1)[kept]
 
-    def chosen(self, poses: FloatArray, energies: FloatArray) -> Hypotheses:
+    def chosen(self, poses: Poses, energies: FloatArray) -> Hypotheses:
         """As many hypotheses as E_0 has poses, of candidates; all of these go into the archive."""
         problem, space, settings = self._problem, self._space, self._settings
         count = len(problem.initial_set)
         pool = evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
         chosen = pool[representative(problem.sdf, poses[pool], min(count, _MOST_CHOSEN))]
-        transforms = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
         if len(chosen) < count:
             others = np.setdiff1d(np.arange(len(poses)), chosen)
-            new = ~repeated(transforms[np.concatenate([chosen, others])])
+            new = ~repeated(poses[np.concatenate([chosen, others])])
             others = others[new[len(chosen) :]]
             more = others[evenly(len(others), count - len(chosen))]
             chosen = np.resize(np.concatenate([chosen, more]), count)
-        vectors, objective = space.encode(transforms), self._energy.objective
+        vectors, objective = space.encode(poses), self._energy.objective
         measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
         measures = measure.values(space, vectors)
         archive = sized_archive(
@@ -322,12 +317,12 @@ class _Search:
         )
         update_cells(archive, objective, vectors, energies)
         self._observer.snapshot(archive.snapshot(0, 0))
-        elites = transforms_of(space, archive.solutions)
+        elites = space.poses(archive.solutions)
         cells = archive.cells_of(measures[chosen])
-        hypotheses = transforms_of(space, vectors[chosen])
+        hypotheses = space.poses(vectors[chosen])
         return ranked_hypotheses(objective, hypotheses, cells, elites, archive.snapshot(0, 0))
 
-    def _tell(self, stage: str, poses: FloatArray, energies: FloatArray) -> None:
-        vectors = self._space.encode(compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]))
-        self._observer.trace(stage, 0, vectors, energies.copy())
+    def _tell(self, stage: str, poses: Poses, energies: FloatArray) -> None:
+        vectors = self._space.encode(poses)
+        self._observer.trace(stage, 0, vectors.copy(), energies.copy())
         self._observer.progress(stage, 1, 1)

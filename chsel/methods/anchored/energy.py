@@ -23,6 +23,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import triple
 from chsel.numerics.threads import spread
 from chsel.problem.points import KnownPoints
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.search_space import SE2Space, SearchSpace
 from chsel.problem.streams import Purpose
@@ -81,30 +82,30 @@ class Energy:
             upper=triple(bounds[1]),
         )
 
-    def of(self, poses: FloatArray) -> FloatArray:
-        """Energies (B,) of poses (B, 12)."""
+    def of(self, poses: Poses) -> FloatArray:
+        """Energies (B,) of poses."""
         energies = np.empty(len(poses))
 
         def run(first: int, last: int, found: Any) -> None:
-            energies_below(self._model, poses, np.inf, energies, first, last, found)
+            energies_below(self._model, poses.numbers, np.inf, energies, first, last, found)
 
         spread(run, len(poses), lambda: found_around(self._model), least=50)
         return energies
 
-    def fitted(self, poses: FloatArray, steps: int) -> FloatArray:
-        """Poses (B, 12) after at most so many Levenberg-Marquardt steps."""
-        moved = np.array(poses)
+    def fitted(self, poses: Poses, steps: int) -> Poses:
+        """Poses after at most so many Levenberg-Marquardt steps."""
+        moved = np.array(poses.numbers)
 
         def run(first: int, last: int, fit: Any) -> None:
             fit_poses(self._fitting, self._twists, moved, steps, first, last, fit)
 
         dimension = len(self._twists.basis)
         spread(run, len(moved), lambda: fit_for(self._fitting, dimension), least=8)
-        return moved
+        return Poses(moved)
 
     def walked(
         self,
-        poses: FloatArray,
+        poses: Poses,
         energies: FloatArray,
         floor: float,
         moves: int,
@@ -112,12 +113,13 @@ class Energy:
         kept: int,
         index: int,
     ) -> Chains:
-        """Chains from poses (C, 12) with energies (C,), after so many moves.
+        """Chains from C poses with energies (C,), after so many moves.
 
         floor: the limit that they stay below, or come down to. kept: states to keep on the way.
         index: of the stream.
         """
-        chains, stream = chains_from(poses, energies, kept), self._key.stream(Purpose.WALKS, index)
+        chains = chains_from(poses.numbers, energies, kept)
+        stream = self._key.stream(Purpose.WALKS, index)
 
         def run(first: int, last: int, steps: Any) -> None:
             stride, model = self._stride, self._model

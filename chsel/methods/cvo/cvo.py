@@ -12,7 +12,6 @@ from itertools import pairwise
 import numpy as np
 
 from chsel import presets
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.methods.cvo.cvo_kernels import (
     DONE,
@@ -36,7 +35,7 @@ from chsel.methods.cvo.rkhs_fields import (
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import require_ieee_arithmetic, spread
-from chsel.problem.poses import compose, encode_9d, rotated
+from chsel.problem.poses import Poses, rotated
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
@@ -170,12 +169,12 @@ class _Clouds:
     product: Product
     norm: float
 
-    def values(self, poses: FloatArray) -> FloatArray:
-        """F (B,) at poses (B, 12)."""
+    def values(self, poses: Poses) -> FloatArray:
+        """F (B,) at poses."""
         out = np.empty(len(poses))
 
         def run(first: int, last: int, work: object) -> None:
-            products(self.product, poses, out, first, last, work)
+            products(self.product, poses.numbers, out, first, last, work)
 
         spread(run, len(poses), scratch)
         return out
@@ -212,42 +211,41 @@ class Cvo:
         require_ieee_arithmetic()
         observer = observer or NullObserver()
         settings, points = self.settings, problem.points
-        estimates = problem.initial_set
+        initial = estimates = Poses.of(problem.initial_set)
         if len(points.contacts) == 0 and not (settings.free_space and len(points.free)):
             costs = np.ones(len(estimates))
-            observer.trace("ascent", 0, encode_9d(estimates), costs.copy())
-            return ranked(estimates, costs)
+            observer.trace("ascent", 0, estimates.vectors, costs.copy())
+            return ranked(estimates.matrices, costs)
         centre = np.zeros(3)
         if settings.origin == "workspace":
             centre = (problem.workspace.bounds[0] + problem.workspace.bounds[1]) / 2.0
-        shifted = _seen_from(centre, estimates)
-        poses, moved = poses_of(shifted), np.zeros(len(estimates), dtype=bool)
+        poses, moved = _seen_from(centre, estimates), np.zeros(len(estimates), dtype=bool)
         done, total = 0, settings.max_iterations * len(settings.levels)
         for level, ell in enumerate(settings.levels):
             clouds = self._clouds(problem, ell, centre)
             states = np.zeros((len(poses), 5))
             states[:, VALUE] = clouds.values(poses)
             if level == 0:
-                observer.trace("ascent", 0, encode_9d(estimates), clouds.costs(states[:, VALUE]))
+                observer.trace("ascent", 0, estimates.vectors, clouds.costs(states[:, VALUE]))
             for count in self._blocks():
                 self._climb(clouds.product, poses, states, count)
                 moved |= states[:, MOVED] > 0.0
                 done += count
-                estimates = _placed(poses, moved, centre, problem.initial_set)
-                observer.trace("ascent", done, encode_9d(estimates), clouds.costs(states[:, VALUE]))
+                estimates = _placed(poses, moved, centre, initial)
+                observer.trace("ascent", done, estimates.vectors, clouds.costs(states[:, VALUE]))
                 observer.progress("ascent", done, total)
                 if (states[:, DONE] > 0.0).all():
                     break
             done = (level + 1) * settings.max_iterations
-        return ranked(estimates, clouds.costs(states[:, VALUE]))
+        return ranked(estimates.matrices, clouds.costs(states[:, VALUE]))
 
     def _blocks(self) -> list[int]:
         """How many iterations each block has."""
         ends = [*range(0, self.settings.max_iterations, _BLOCK), self.settings.max_iterations]
         return [last - first for first, last in pairwise(ends)]
 
-    def _climb(self, product: Product, poses: FloatArray, states: FloatArray, count: int) -> None:
-        """Take poses (B, 12) some iterations uphill, each on its own."""
+    def _climb(self, product: Product, poses: Poses, states: FloatArray, count: int) -> None:
+        """Take poses some iterations uphill in place, each on its own."""
         settings = self.settings
         growth = log(settings.max_step / settings.min_step) / (STEPS - 1)
         steps = np.array([settings.min_step * exp(growth * k) for k in range(STEPS)])
@@ -255,7 +253,7 @@ class Cvo:
         ascent = Ascent(np.minimum(steps, settings.max_step), settings.c, settings.d, below)
 
         def run(first: int, last: int, work: object) -> None:
-            climb(product, ascent, poses, states, count, first, last, work)
+            climb(product, ascent, poses.numbers, states, count, first, last, work)
 
         spread(run, len(poses), scratch)
 
@@ -290,15 +288,13 @@ class Cvo:
         return _Clouds(product, float(np.sqrt(observed * of_object)))
 
 
-def _seen_from(centre: FloatArray, object_from_world: FloatArray) -> FloatArray:
-    """Transforms (B, 4, 4) from a world whose origin is at `centre` (3,)."""
-    rotation = object_from_world[:, :3, :3]
-    return compose(rotation, object_from_world[:, :3, 3] + rotated(rotation, centre))
+def _seen_from(centre: FloatArray, poses: Poses) -> Poses:
+    """The same poses in a world whose origin is at `centre` (3,)."""
+    shifted = poses.translations + rotated(poses.rotations, centre)
+    return Poses(np.concatenate([poses.numbers[:, :9], shifted], axis=1))
 
 
-def _placed(
-    poses: FloatArray, moved: np.ndarray, centre: FloatArray, initial_set: FloatArray
-) -> FloatArray:
-    """Transforms (B, 4, 4) of poses (B, 12) seen from `centre`; of E_0 those that never moved."""
-    seen = compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])
-    return np.where(moved[:, None, None], _seen_from(-centre, seen), initial_set)
+def _placed(poses: Poses, moved: np.ndarray, centre: FloatArray, initial: Poses) -> Poses:
+    """Poses seen from `centre` (3,), back in the world; of E_0 those that never moved."""
+    back = _seen_from(-centre, poses)
+    return Poses(np.where(moved[:, None], back.numbers, initial.numbers))

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from chsel import presets
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import (
     SettingError,
     require_at_most,
@@ -18,7 +17,7 @@ from chsel.errors import (
 from chsel.methods.icp.icp_kernels import Matches, iterate, matches_for, rms_distances
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.threads import require_ieee_arithmetic, spread
-from chsel.problem.poses import compose, encode_9d
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
@@ -97,13 +96,13 @@ class Icp:
         """Hypotheses for the contacts of a problem, best first."""
         require_ieee_arithmetic()
         observer = observer or NullObserver()
-        contacts, poses = problem.points.contacts, poses_of(problem.initial_set)
+        contacts, poses = problem.points.contacts, Poses.of(problem.initial_set)
         if len(contacts) == 0:
             return ranked(problem.initial_set, np.zeros(len(poses)))
         cloud = _Cloud(contacts, self.surface(problem))
-        observer.trace("icp", 0, encode_9d(_transforms(poses)), cloud.distances(poses))
+        observer.trace("icp", 0, poses.vectors, cloud.distances(poses))
         poses = self._iterated(cloud, poses, observer)
-        return ranked(_transforms(poses), cloud.distances(poses))
+        return ranked(poses.matrices, cloud.distances(poses))
 
     def surface(self, problem: RegistrationProblem) -> FloatArray:
         """The points (Q, 3) of the object, in its frame, that a registration goes by."""
@@ -113,16 +112,16 @@ class Icp:
         key = StreamKey(key.seed, 0)
         return problem.sdf.derived(("icp", count, key), lambda: _drawn(problem.sdf, count, key))
 
-    def _iterated(self, cloud: _Cloud, poses: FloatArray, observer: Observer) -> FloatArray:
-        """Poses (B, 12) after as many iterations as the stop rule lets happen."""
+    def _iterated(self, cloud: _Cloud, poses: Poses, observer: Observer) -> Poses:
+        """Poses after as many iterations as the stop rule lets happen."""
         total = self.settings.iterations
         errors = np.full(len(poses), np.inf)
         for first in range(0, total, _BLOCK):
             history, after = cloud.iterated(poses, min(_BLOCK, total - first))
             still = self._gaining(np.concatenate([errors[None], after]))
             count = len(still) if still.all() else int(np.argmin(still)) + 1
-            poses, errors = history[count - 1], after[count - 1]
-            observer.trace("icp", first + count, encode_9d(_transforms(poses)), errors.copy())
+            poses, errors = Poses(history[count - 1]), after[count - 1]
+            observer.trace("icp", first + count, poses.vectors, errors.copy())
             observer.progress("icp", first + count, total)
             if not still.all():
                 break
@@ -143,22 +142,24 @@ class _Cloud:
     def __init__(self, contacts: FloatArray, model: FloatArray) -> None:
         self._contacts, self._model = contacts.T.copy(), model.T.copy()
 
-    def iterated(self, poses: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    def iterated(self, poses: Poses, count: int) -> tuple[FloatArray, FloatArray]:
         """Poses (K, B, 12) after each of K iterations, and errors (K, B); see iterate."""
-        history, errors = np.empty((count, *poses.shape)), np.empty((count, len(poses)))
+        history, errors = np.empty((count, len(poses), 12)), np.empty((count, len(poses)))
 
         def run(first: int, last: int, matches: Any) -> None:
-            iterate(self._contacts, self._model, poses, history, errors, first, last, matches)
+            iterate(
+                self._contacts, self._model, poses.numbers, history, errors, first, last, matches
+            )
 
         spread(run, len(poses), self._matches)
         return history, errors
 
-    def distances(self, poses: FloatArray) -> FloatArray:
-        """The rms distances (B,) of the contacts to the model under poses (B, 12)."""
+    def distances(self, poses: Poses) -> FloatArray:
+        """The rms distances (B,) of the contacts to the model under poses."""
         out = np.empty(len(poses))
 
         def run(first: int, last: int, matches: Any) -> None:
-            rms_distances(self._contacts, self._model, poses, out, first, last, matches)
+            rms_distances(self._contacts, self._model, poses.numbers, out, first, last, matches)
 
         spread(run, len(poses), self._matches)
         return out
@@ -169,8 +170,3 @@ class _Cloud:
 
 def _drawn(sdf: SdfGrid, count: int, key: StreamKey) -> FloatArray:
     return surface_points(sdf, count, key.stream(Purpose.ICP_SURFACE))
-
-
-def _transforms(poses: FloatArray) -> FloatArray:
-    """Transforms (B, 4, 4) of poses (B, 12)."""
-    return compose(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:])

@@ -23,6 +23,7 @@ from chsel.methods.medial_constraint.medial_cost import MedialObjective
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.elementary import logs
 from chsel.numerics.threads import spread
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Observer
 from chsel.problem.streams import Purpose, StreamKey, normals
 
@@ -96,12 +97,12 @@ class CmaEsSettings:
 
 def evolved(
     objective: MedialObjective,
-    initial_set: FloatArray,
+    initial_set: Poses,
     settings: CmaEsSettings,
     key: StreamKey,
     observer: Observer,
 ) -> FloatArray:
-    """Search vectors (B, d) of the estimates that CMA-ES finds from E_0 (B, 4, 4)."""
+    """Search vectors (B, d) of the estimates that CMA-ES finds from E_0."""
     vectors = objective.space.encode(initial_set)
     count = len(vectors)
     starts = vectors[:1] if settings.starts == "single" else vectors

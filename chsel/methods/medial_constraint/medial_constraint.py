@@ -13,13 +13,14 @@ from chsel.methods.medial_constraint.medial_cost import (
 )
 from chsel.methods.medial_constraint.medial_kernels import medial_cma_me
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import PlaneSettings, search_space, transforms_of
+from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.streams import Purpose
 from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.archive import GridArchive
@@ -81,9 +82,9 @@ class MedialConstraint:
         space = search_space(self.settings.plane, problem.sdf)
         objective = MedialObjective(MedialCost(problem, self.settings.cost), space)
         vectors = evolved(
-            objective, problem.initial_set, self.settings.cma_es, problem.key, observer
+            objective, Poses.of(problem.initial_set), self.settings.cma_es, problem.key, observer
         )
-        estimates = transforms_of(space, vectors)
+        estimates = space.poses(vectors)
         return ranked_hypotheses(objective, estimates, elites=estimates)
 
 
@@ -149,17 +150,18 @@ class MedialConstraintCmaMe:
         objective = MedialObjective(MedialCost(problem, settings.cost), space)
         key, count = problem.key, len(problem.initial_set)
         # E' <- CMA-ES on E_0; as poses, so that it holds what hypotheses can be
-        found = evolved(objective, problem.initial_set, settings.cma_es, key, observer)
-        vectors = space.encode(transforms_of(space, found))
+        initial_set = Poses.of(problem.initial_set)
+        found = evolved(objective, initial_set, settings.cma_es, key, observer)
+        vectors = space.encode(space.poses(found))
         archive = self._seeded_archive(problem, objective, vectors)
         # M <- CMA-ME(M, C_M, n_o)
-        first, best = space.encode(problem.initial_set[:1])[0], archive.best_solution
+        first, best = space.encode(initial_set[:1])[0], archive.best_solution
         start = first if settings.emitter.start == "initial" else best
         draws, watch = Draws(key), ArchiveWatch(observer, 0, "cma_me")
         watch.start(archive)
         cma_me(objective, archive, start, count, settings.emitter, draws, watch, medial_cma_me)
         # E <- cells of M with the |E_0| lowest costs
-        stream, elites = key.stream(Purpose.RESAMPLE), transforms_of(space, archive.solutions)
+        stream, elites = key.stream(Purpose.RESAMPLE), space.poses(archive.solutions)
         chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
         snapshot = archive.snapshot(settings.emitter.iterations, 0)
         cells = archive.occupied[chosen]
@@ -174,5 +176,5 @@ class MedialConstraintCmaMe:
         known_count = len(problem.points.known)
         archive = sized_archive(measure, measures, costs, settings, known_count, space.dimension)
         update_cells(archive, objective, vectors, costs)
-        update_cells(archive, objective, space.encode(problem.low_cost_set))
+        update_cells(archive, objective, space.encode(Poses.of(problem.low_cost_set)))
         return archive

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import SettingError, require_choice, require_positive
 from chsel.methods.medial_constraint.medial_kernels import (
     MedialModel,
@@ -20,9 +19,9 @@ from chsel.methods.medial_constraint.medial_kernels import (
 )
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Places
-from chsel.numerics.pose_tuples import decode_all
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.points import Lattice, Workspace
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
 from chsel.problem.sdf_lookup import field_of
@@ -164,14 +163,14 @@ class MedialCost:
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
-        return self.costs(poses_of(object_from_world))
+        return self.costs(Poses.of(object_from_world))
 
-    def costs(self, poses: FloatArray) -> FloatArray:
-        """Costs (B,) of poses (B, 12): rotation row by row, then translation."""
+    def costs(self, poses: Poses) -> FloatArray:
+        """Costs (B,) of poses."""
         costs = np.empty(len(poses))
 
         def run(first: int, last: int, work: Any) -> None:
-            medial_costs_of_poses(self.model, poses, costs, first, last, work)
+            medial_costs_of_poses(self.model, poses.numbers, costs, first, last, work)
 
         spread(run, len(poses), lambda: medial_places(self.model), least=_POSES_PER_THREAD)
         return costs
@@ -214,6 +213,4 @@ class MedialObjective:
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d)."""
-        poses = np.empty((len(vectors), 12))
-        decode_all(self.space_arrays, vectors, poses)
-        return self._cost.costs(poses)
+        return self._cost.costs(self.space.poses(vectors))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import ChselError, SettingError
 from chsel.methods.anchored.anchor_sampling import in_telling_order
 from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Effort
@@ -19,10 +18,10 @@ from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import apply, check_rigid, inverse
+from chsel.problem.poses import Poses, apply, check_rigid, inverse
 from chsel.problem.registration_problem import Hypotheses, NullObserver, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space, transforms_of
+from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from chsel.problem.warm_start import pose_problem
@@ -60,7 +59,7 @@ def energies_of(
     space = search_space(settings.plane, problem.sdf)
     bounds = origin_bounds(problem.workspace, space, settings.anchors.margin)
     known, tolerance = in_telling_order(problem.points), settings.penetration_tolerance
-    return Energy(problem, known, space, tolerance, bounds).of(poses_of(object_from_world))
+    return Energy(problem, known, space, tolerance, bounds).of(Poses.of(object_from_world))
 
 
 def registered(method: Anchored, problem: RegistrationProblem) -> Hypotheses:
@@ -146,7 +145,7 @@ def test_the_archive_leads_on_to_the_next_step() -> None:
     first = method.register(posed(method, FEW))
     assert first.archive is not None
     space = search_space(None, GRID)
-    np.testing.assert_array_equal(first.elites, transforms_of(space, first.archive.solutions))
+    np.testing.assert_array_equal(first.elites, space.poses(first.archive.solutions).matrices)
     problem = posed(method, previous=first)
     np.testing.assert_array_equal(problem.low_cost_set, first.elites)
     np.testing.assert_array_equal(problem.initial_set, first.object_from_world)
@@ -226,7 +225,7 @@ def test_on_a_plane_every_hypothesis_stands_on_it() -> None:
     method = anchored(plane=plane)
     found = registered(method, posed(method, known_points(STANDING, 40)))
     space = search_space(plane, GRID)
-    again = transforms_of(space, space.encode(found.object_from_world))
+    again = space.poses(space.encode(Poses.of(found.object_from_world))).matrices
     np.testing.assert_allclose(again, found.object_from_world, atol=1e-12)
     np.testing.assert_allclose(inverse(found.object_from_world)[:, 2, 3], 0.3, atol=1e-3)
     position, rotation = pose_errors(found.object_from_world[:1], STANDING, ObjectSymmetry())

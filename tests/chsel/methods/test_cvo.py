@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.cost.compiled_cost import poses_of
 from chsel.errors import SettingError
 from chsel.methods.cvo import cvo_kernels as kernels
 from chsel.methods.cvo.cvo import Cvo, CvoSettings, preset_cvo, preset_cvo_no_free_space
@@ -20,7 +19,7 @@ from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
@@ -54,14 +53,14 @@ def product_of(points: KnownPoints) -> Product:
 
 def value(product: Product, object_from_world: FloatArray) -> float:
     out = np.empty(1)
-    products(product, poses_of(object_from_world[None]), out, 0, 1, scratch())
+    products(product, Poses.of(object_from_world[None]).numbers, out, 0, 1, scratch())
     return float(out[0])
 
 
 def direction(product: Product, object_from_world: FloatArray) -> tuple[FloatArray, float]:
     """The unit flow (6,), and the slope of F along it."""
     out = np.empty((1, 7))
-    flows(product, poses_of(object_from_world[None]), out, scratch())
+    flows(product, Poses.of(object_from_world[None]).numbers, out, scratch())
     xi = out[0, 1:] / 7.0
     xi = xi / np.sqrt((xi**2).sum())
     return xi, float((xi * out[0, 1:]).sum())
@@ -78,9 +77,9 @@ def test_a_step_is_the_exponential_of_the_flow(tau: float) -> None:
     turning = stream.normal(size=6)
     for xi in (turning / np.sqrt((turning**2).sum()), np.array([0.0, 0, 0, 0.6, 0, 0.8])):
         start = nearby(1, 3)[0]
-        found = np.array(gone(tuple(poses_of(start[None])[0]), tuple(xi), tau))
+        found = np.array(gone(tuple(Poses.of(start[None]).numbers[0]), tuple(xi), tau))
         expected = along(start, xi, tau)
-        np.testing.assert_allclose(found, poses_of(expected[None])[0], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(found, Poses.of(expected[None]).numbers[0], rtol=0, atol=1e-15)
 
 
 def test_the_expansion_along_the_flow_is_that_of_the_sum_over_all_pairs() -> None:
@@ -112,7 +111,7 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
     dense, product = DenseClouds.of(SDF, points, 0.01), product_of(points)
     gains = []
     for start in nearby(8, 6):
-        poses, states = poses_of(start[None]), np.zeros((1, 5))
+        poses, states = Poses.of(start[None]).numbers, np.zeros((1, 5))
         before = states[0, VALUE] = value(product, start)
         climb(product, ASCENT, poses, states, 1, 0, 1, scratch())
         xi, _ = direction(product, start)
@@ -129,7 +128,7 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
 
 def test_the_inner_product_never_falls_and_is_that_of_the_pose() -> None:
     product, starts = product_of(scene()), nearby(5, 7, 0.2)
-    poses, states = poses_of(starts), np.zeros((5, 5))
+    poses, states = Poses.of(starts).numbers, np.zeros((5, 5))
     products(product, poses, states[:, VALUE], 0, 5, scratch())
     for _ in range(30):
         before = states[:, VALUE].copy()

@@ -19,7 +19,7 @@ from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.problem.poses import apply, axis_angle, compose, encode_9d, inverse, product
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, product
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE3Space
 from chsel.problem.streams import StreamKey
@@ -167,7 +167,7 @@ def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
     kept = Traces()
     Svgd(settings).register(problem, kept)
     cost, space = RelaxedCost.of(problem, settings.cost), SE3Space()
-    vectors = torch.from_numpy(encode_9d(problem.initial_set).copy()).requires_grad_()
+    vectors = torch.from_numpy(Poses.of(problem.initial_set).vectors.copy()).requires_grad_()
     adam = torch.optim.Adam([vectors], **ADAM)  # type: ignore[arg-type]
     for iteration in range(60):
         if iteration == 50:
@@ -213,7 +213,7 @@ def test_an_observer_sees_every_fifty_iterations_and_changes_nothing() -> None:
     assert method.register(problem, kept).digest == method.register(problem).digest
     assert list(kept.traced) == [0, 50, 100, 120]
     assert kept.progressed == [(50, 120), (100, 120), (120, 120)]
-    np.testing.assert_array_equal(kept.traced[0][0], encode_9d(problem.initial_set))
+    np.testing.assert_array_equal(kept.traced[0][0], Poses.of(problem.initial_set).vectors)
     means = [float(cost.mean()) for _, cost in kept.traced.values()]
     assert means[-1] < 0.5 * means[0]
     with threads(2):
