@@ -12,7 +12,7 @@ from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, preset_a
 from chsel.methods.chsel import Chsel, ChselSettings
 from chsel.methods.cvo.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
-from chsel.methods.icp.icp import Icp, preset_icp
+from chsel.methods.icp import Icp, preset_icp
 from chsel.methods.installed import installed_method, installed_names, offering_packages
 from chsel.methods.medial_constraint.medial_constraint import (
     MedialConstraint,

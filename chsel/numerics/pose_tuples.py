@@ -173,6 +173,16 @@ def pose_at(poses, n):
 
 
 @leaf
+def moved(pose, x, y, z):
+    """R p + t of a point p = x, y, z."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
+        pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
+        pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
+    )
+
+
+@leaf
 def origin_within(pose, low, high):
     """Whether a pose has the object's origin, -R^T t in the world, in a box."""
     x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])

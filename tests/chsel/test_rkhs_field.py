@@ -6,15 +6,14 @@ import trimesh
 
 from chsel import KnownPoints, SdfGrid
 from chsel.errors import SettingError
-from chsel.methods.cvo import rkhs_fields as rkhs_cloud
-from chsel.methods.cvo import rkhs_fields as rkhs_field
+from chsel.methods.cvo import rkhs_fields
 from chsel.methods.cvo.cvo_kernels import Product, products, scratch
+from chsel.methods.cvo.gaussian_blur import Kernel
 from chsel.methods.cvo.rkhs_fields import (
-    Kernel,
-    blocks_of,
     cloud_norm,
+    cube_kernel,
     free_field,
-    of_block,
+    full_cubes,
     surface_field,
 )
 from chsel.numerics.arrays import FloatArray
@@ -118,7 +117,7 @@ def test_a_field_is_made_once_for_a_grid() -> None:
 
 
 def test_a_field_too_large_for_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rkhs_field, "MOST_NODES", 1000)
+    monkeypatch.setattr(rkhs_fields, "MOST_NODES", 1000)
     with pytest.raises(SettingError, match="a smaller ell"):
         surface_field(SDF, Kernel(0.02, 1.0), 0.0123)
     with pytest.raises(SettingError, match="at most 100_000"):
@@ -156,7 +155,7 @@ def test_points_all_over_the_world_are_summed_one_by_one(monkeypatch: pytest.Mon
     for scale in (1.0, 1e300):
         points[0] = scale * 1e6
         assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points, KERNEL), 1e-9)
-    monkeypatch.setattr(rkhs_cloud, "_MANY", 2050)
+    monkeypatch.setattr(rkhs_fields, "_MANY", 2050)
     with pytest.raises(SettingError, match="2100 points of one class are far apart"):
         cloud_norm(points, KERNEL, 0.01)
 
@@ -165,11 +164,11 @@ def test_points_all_over_the_world_are_summed_one_by_one(monkeypatch: pytest.Mon
 def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
     lattice = (np.indices((20, 20, 20)).reshape(3, -1).T - 10.0) * spacing
     points = lattice[~(np.abs(lattice) < 4.5 * spacing).all(axis=1)]
-    alone, centres, side = blocks_of(points, KERNEL.ell, spacing)
+    alone, centres, side = full_cubes(points, KERNEL.ell, spacing)
     assert side == (5 if spacing == 0.01 else 2)
     assert len(alone) + side**3 * len(centres) == len(points)
     assert len(alone) < 0.6 * len(points)
-    field, wide = free_field(SDF, KERNEL, 0.01), of_block(KERNEL, spacing, side)
+    field, wide = free_field(SDF, KERNEL, 0.01), cube_kernel(KERNEL, spacing, side)
     nothing = field.term(np.zeros((0, 3)), 1.0)
     all_alone = Product(field.term(points, 1.0), nothing, nothing)
     cubes = free_field(SDF, wide, 0.01).term(centres, 1.0)
@@ -184,9 +183,9 @@ def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
 def test_cubes_are_made_of_full_lattices_alone() -> None:
     off = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
     for points in (off, off[:5], np.zeros((0, 3))):
-        alone, centres, _ = blocks_of(points, 0.1, 0.01)
+        alone, centres, _ = full_cubes(points, 0.1, 0.01)
         np.testing.assert_array_equal(alone, points)
         assert len(centres) == 0
     twice = np.tile(np.indices((20, 20, 4)).reshape(3, -1).T * 0.02, (2, 1))
-    alone, centres, side = blocks_of(twice, 0.1, 0.02)
+    alone, centres, side = full_cubes(twice, 0.1, 0.02)
     assert len(alone) + side**3 * len(centres) == len(twice)

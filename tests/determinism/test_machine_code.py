@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from numba.core.registry import CPUDispatcher
 
-from chsel.methods.cvo.blur_kernels import splat
+from chsel.methods.cvo.gaussian_blur import splat
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, kernel_sources
 from chsel.plausible.plausible_set import plausible_set

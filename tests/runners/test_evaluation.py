@@ -14,7 +14,7 @@ import pyarrow.parquet
 import pytest
 
 from chsel.errors import ChselError, RecordingError
-from chsel.methods.icp.icp import Icp
+from chsel.methods.icp import Icp
 from chsel.plausible.plausible_file import read_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import pose_errors

@@ -1,1 +1,5 @@
 """CVO."""
+
+from chsel.methods.cvo.cvo import Cvo, CvoSettings
+
+__all__ = ["Cvo", "CvoSettings"]

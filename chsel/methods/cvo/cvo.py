@@ -7,6 +7,7 @@ space and surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -14,25 +15,23 @@ import numpy as np
 from chsel import presets
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.methods.cvo.cvo_kernels import (
-    DONE,
-    MOVED,
     STEPS,
-    VALUE,
     Ascent,
     Product,
     climb,
+    climbers_at,
     products,
     scratch,
 )
+from chsel.methods.cvo.gaussian_blur import Kernel
 from chsel.methods.cvo.rkhs_fields import (
-    Kernel,
-    blocks_of,
     cloud_norm,
+    cube_kernel,
     free_field,
-    of_block,
+    full_cubes,
     surface_field,
 )
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.poses import Poses, rotated
@@ -53,38 +52,38 @@ _BLOCK = 10  # iterations between two traces
 
 @dataclass(frozen=True)
 class CvoSettings:
-    """All settings of CVO; names as in the authors' parameter file.
+    """All settings of CVO; names as in the authors' parameter file."""
 
-    free_space: use free points; else contacts and the object's surface alone. balanced: weigh
-    contacts by the number of free points per contact. ell: length scale of the kernel, metres.
-    ell_min, ell_decay: after an ascent, ell is multiplied by ell_decay and the ascent goes on, as
-    long as ell is above ell_min. sigma, s_sigma: amplitudes of the kernels of places and of equal
-    labels; unequal labels have a kernel of 0. sp_thres: a product of the kernels that is not above
-    it counts as 0; 0 keeps all of them. surface_band: nodes of the SDF this near to the surface
-    make the object's surface, those farther outside its free space, metres; null: the SDF's
-    resolution (r_t). c, d: what the rotational and the translational part of the flow are divided
-    by, so that a turn by 1 rad counts as a shift by sqrt(c / d) m. origin: about which the flow
-    turns, "world" as published, or the "workspace" centre. max_iterations: of an ascent. min_step,
-    max_step: the least and the greatest length of a step that is tried first. stop_below: a start
-    ends when its inner product grew by no more than this fraction in 5 iterations in a row; null:
-    never.
-    """
-
+    # Use free points; else contacts and the object's surface alone.
     free_space: bool = True
+    # Weigh contacts by the number of free points per contact.
     balanced: bool = False
+    # Length scale of the kernel, metres. After an ascent it is multiplied by ell_decay and another
+    # ascent follows, as long as it is above ell_min.
     ell: float = 0.1
     ell_min: float = 0.1
     ell_decay: float = 0.5
+    # Amplitudes of the kernels of places and of equal labels; unequal labels have a kernel of 0.
     sigma: float = 0.1
     s_sigma: float = 0.8
+    # A product of the kernels that is not above it counts as 0; 0 keeps all of them.
     sp_thres: float = 0.0
+    # Nodes of the SDF within it of the surface make the object's surface, those farther outside its
+    # free space, metres; null: the SDF's resolution (r_t).
     surface_band: float | None = None
+    # Divisors of the rotational and the translational part of the flow, so that a turn by 1 rad
+    # counts as a shift by sqrt(c / d) m.
     c: float = 7.0
     d: float = 7.0
+    # About which the flow turns, "world" as published, or the "workspace" centre.
     origin: str = "world"
+    # Of an ascent.
     max_iterations: int = 100
+    # Least and greatest length of a step that is tried first.
     min_step: float = 1e-4
     max_step: float = 0.8
+    # A start ends when its inner product grew by no more than this fraction in 5 iterations in a
+    # row; null: never.
     stop_below: float | None = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
@@ -164,19 +163,15 @@ def preset_cvo_no_free_space(preset: str) -> CvoSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Clouds:
-    """The clouds of a problem at one length scale. norm: |f_x| |f_z|."""
+    """The clouds of a problem at one length scale."""
 
     product: Product
-    norm: float
+    norm: float  # |f_x| |f_z|
 
-    def values(self, poses: Poses) -> FloatArray:
-        """F (B,) at poses."""
+    def values(self, poses: FloatArray) -> FloatArray:
+        """F (B,) at poses (B, 12)."""
         out = np.empty(len(poses))
-
-        def run(first: int, last: int, work: object) -> None:
-            products(self.product, poses.numbers, out, first, last, work)
-
-        spread(run, len(poses), scratch)
+        spread(partial(products, self.product, poses, out), len(poses), scratch)
         return out
 
     def costs(self, values: FloatArray) -> FloatArray:
@@ -219,71 +214,62 @@ class Cvo:
         centre = np.zeros(3)
         if settings.origin == "workspace":
             centre = (problem.workspace.bounds[0] + problem.workspace.bounds[1]) / 2.0
-        poses, moved = _seen_from(centre, estimates), np.zeros(len(estimates), dtype=bool)
-        done, total = 0, settings.max_iterations * len(settings.levels)
+        poses, ascent = _seen_from(centre, initial).numbers, self._ascent()
+        moved = np.zeros(len(poses), dtype=bool)
+        total = settings.max_iterations * len(settings.levels)
+        ends = [*range(0, settings.max_iterations, _BLOCK), settings.max_iterations]
         for level, ell in enumerate(settings.levels):
             clouds = self._clouds(problem, ell, centre)
-            states = np.zeros((len(poses), 5))
-            states[:, VALUE] = clouds.values(poses)
+            climbers = climbers_at(poses, clouds.values(poses))
             if level == 0:
-                observer.trace("ascent", 0, estimates.vectors, clouds.costs(states[:, VALUE]))
-            for count in self._blocks():
-                self._climb(clouds.product, poses, states, count)
-                moved |= states[:, MOVED] > 0.0
-                done += count
-                estimates = _placed(poses, moved, centre, initial)
-                observer.trace("ascent", done, estimates.vectors, clouds.costs(states[:, VALUE]))
+                observer.trace("ascent", 0, estimates.vectors, clouds.costs(climbers.value))
+            for first, last in pairwise(ends):
+                run = partial(climb, clouds.product, ascent, climbers, last - first)
+                spread(run, len(poses), scratch)
+                moved |= climbers.moved
+                estimates = _in_world(climbers.poses, moved, centre, initial)
+                done = level * settings.max_iterations + last
+                observer.trace("ascent", done, estimates.vectors, clouds.costs(climbers.value))
                 observer.progress("ascent", done, total)
-                if (states[:, DONE] > 0.0).all():
+                if climbers.done.all():
                     break
-            done = (level + 1) * settings.max_iterations
-        return ranked(estimates.matrices, clouds.costs(states[:, VALUE]))
+            poses = climbers.poses
+        return ranked(estimates.matrices, clouds.costs(climbers.value))
 
-    def _blocks(self) -> list[int]:
-        """How many iterations each block has."""
-        ends = [*range(0, self.settings.max_iterations, _BLOCK), self.settings.max_iterations]
-        return [last - first for first, last in pairwise(ends)]
-
-    def _climb(self, product: Product, poses: Poses, states: FloatArray, count: int) -> None:
-        """Take poses some iterations uphill in place, each on its own."""
+    def _ascent(self) -> Ascent:
+        """The settings of `climb`; steps grow by a fixed factor."""
         settings = self.settings
         growth = log(settings.max_step / settings.min_step) / (STEPS - 1)
         steps = np.array([settings.min_step * exp(growth * k) for k in range(STEPS)])
-        below = -1.0 if settings.stop_below is None else settings.stop_below
-        ascent = Ascent(np.minimum(steps, settings.max_step), settings.c, settings.d, below)
-
-        def run(first: int, last: int, work: object) -> None:
-            climb(product, ascent, poses.numbers, states, count, first, last, work)
-
-        spread(run, len(poses), scratch)
+        stop_below = -1.0 if settings.stop_below is None else settings.stop_below
+        return Ascent(np.minimum(steps, settings.max_step), settings.c, settings.d, stop_below)
 
     def _clouds(self, problem: RegistrationProblem, ell: float, centre: FloatArray) -> _Clouds:
         """Both clouds; the observed one as seen from `centre` (3,)."""
-        settings, sdf = self.settings, problem.sdf
+        settings, sdf, lattice = self.settings, problem.sdf, problem.free_resolution
         kernel = Kernel.above(ell, 1.0, settings.sp_thres / settings.amplitude)
         band = sdf.resolution if settings.surface_band is None else settings.surface_band
         contacts = problem.points.contacts
         free = problem.points.free if settings.free_space else np.zeros((0, 3))
         surface_z = surface_field(sdf, kernel, band)
         free_z = free_field(sdf, kernel, band) if settings.free_space else surface_z
-        weight = len(free) / len(contacts) if settings.balanced and len(contacts) else 1.0
-        weight = weight if len(free) else 1.0
-        lattice = problem.free_resolution
+        weight = 1.0
+        if settings.balanced and len(contacts) and len(free):
+            weight = len(free) / len(contacts)
         observed = weight * cloud_norm(contacts, kernel, lattice)
         of_object = weight * surface_z.norm
         if settings.free_space:
             observed += cloud_norm(free, kernel, lattice)
             of_object += free_z.norm
-        alone, cubes, side = free, np.zeros((0, 3)), 1
+        alone, cubes, cube_z = free, np.zeros((0, 3)), free_z
         if settings.sp_thres == 0.0:
-            alone, cubes, side = blocks_of(free, ell, lattice)
-        block_z = free_z
-        if side > 1:
-            block_z = free_field(sdf, of_block(kernel, lattice, side), band)
+            alone, cubes, side = full_cubes(free, ell, lattice)
+            if side > 1:
+                cube_z = free_field(sdf, cube_kernel(kernel, lattice, side), band)
         product = Product(
-            free_z.term(alone - centre, 1.0),
-            block_z.term(cubes - centre, 1.0),
-            surface_z.term(contacts - centre, weight),
+            free=free_z.term(alone - centre, 1.0),
+            cubes=cube_z.term(cubes - centre, 1.0),
+            surface=surface_z.term(contacts - centre, weight),
         )
         return _Clouds(product, float(np.sqrt(observed * of_object)))
 
@@ -294,7 +280,7 @@ def _seen_from(centre: FloatArray, poses: Poses) -> Poses:
     return Poses(np.concatenate([poses.numbers[:, :9], shifted], axis=1))
 
 
-def _placed(poses: Poses, moved: np.ndarray, centre: FloatArray, initial: Poses) -> Poses:
-    """Poses seen from `centre` (3,), back in the world; of E_0 those that never moved."""
-    back = _seen_from(-centre, poses)
+def _in_world(poses: FloatArray, moved: BoolArray, centre: FloatArray, initial: Poses) -> Poses:
+    """Poses (B, 12) seen from `centre` (3,) back in the world; of E_0 those that never moved."""
+    back = _seen_from(-centre, Poses(poses))
     return Poses(np.where(moved[:, None], back.numbers, initial.numbers))

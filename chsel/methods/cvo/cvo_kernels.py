@@ -9,51 +9,62 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Box, Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import sine_cosine
-from chsel.numerics.pose_tuples import pose_at
+from chsel.numerics.pose_tuples import moved, pose_at
+from chsel.problem.sdf_lookup import interpolated
 
 BLOCK = 512  # points that are located at once
 STEPS = 16
-VALUE, STEP, STALLED, DONE, MOVED = range(5)  # what the state of a start holds there
 _PATIENCE = 5
 _REFINEMENTS = 3
-_NEAR = 0.05  # lengths of steps that differ by less are not told apart
+_NEAR = 0.05  # steps count as equally long if they differ by less than this fraction
 
 
 class ClassTerm(NamedTuple):
-    """One class of points and its field.
+    """One class of points and its field."""
 
-    points (3, N): of the world, metres. table (nodes, 4): f at the nodes of the box, its gradient.
-    weight: W of the class.
-    """
-
-    points: FloatArray
+    points: FloatArray  # (3, N), world, metres
     box: Box
-    table: Any
-    weight: float
+    table: Any  # (nodes, 4), f and its gradient at the nodes of the box
+    weight: float  # W of the class
 
 
 class Product(NamedTuple):
-    """F(X) = sum over classes of W sum_i f(R x_i + t). blocks: of cubes of free points."""
+    """F(X) = sum over classes of W sum_i f(R x_i + t)."""
 
     free: ClassTerm
-    blocks: ClassTerm
+    cubes: ClassTerm  # centres of cubes of free points
     surface: ClassTerm
 
 
 class Ascent(NamedTuple):
-    """How to climb. steps (16,): tau, ascending. c, d: scales of the flow's parts.
+    """How to climb."""
 
-    stop_below: relative gain of F that does not count as one; negative: every gain counts.
-    """
+    steps: FloatArray  # (16,), tau, ascending
+    c: float  # scale of the flow's rotation
+    d: float  # and of its translation
+    stop_below: float  # relative gain of F that counts as none; negative: every gain counts
 
-    steps: FloatArray
-    c: float
-    d: float
-    stop_below: float
+
+class Climbers(NamedTuple):
+    """The starts of an ascent and how far they are; `climb` changes them in place."""
+
+    poses: FloatArray  # (B, 12)
+    value: FloatArray  # (B,), F
+    step: IntArray  # (B,), index of the last step's length
+    stalled: IntArray  # (B,), iterations in a row that gained nothing
+    done: BoolArray  # (B,)
+    moved: BoolArray  # (B,)
+
+
+def climbers_at(poses: FloatArray, value: FloatArray) -> Climbers:
+    """Climbers at copies of poses (B, 12) with their F (B,), before the first step."""
+    counts = np.zeros((2, len(poses)), dtype=np.int64)
+    flags = np.zeros((2, len(poses)), dtype=np.bool_)
+    return Climbers(poses.copy(), value.copy(), *counts, *flags)
 
 
 def scratch() -> Places:
@@ -69,22 +80,17 @@ def products(product, poses, out, first, last, places):
 
 
 @compiled
-def climb(product, ascent, poses, states, iterations, first, last, places):
-    """Take poses (B, 12) some iterations uphill, from `first` to before `last`.
-
-    states (B, 5): F, index of the last step's length, iterations in a row that gained nothing,
-    whether the start is done, whether it has moved.
-    """
+def climb(product, ascent, climbers, iterations, first, last, places):
+    """Move climbers uphill for some iterations, those from `first` to before `last`."""
     for n in range(first, last):
-        state = states[n]
         for _ in range(iterations):
-            if state[DONE] == 0.0:
-                pose = pose_at(poses, n)
+            if not climbers.done[n]:
+                pose = pose_at(climbers.poses, n)
                 xi, slope = _direction(product, ascent, pose, places)
                 if slope > 0.0:
-                    _step(product, ascent, pose, xi, slope, poses[n], state, places)
+                    _step(product, ascent, pose, xi, slope, climbers, n, places)
                 else:
-                    state[DONE] = 1.0
+                    climbers.done[n] = True
 
 
 @inner
@@ -107,15 +113,15 @@ def _direction(product, ascent, pose, places):
 
 
 @inner
-def _step(product, ascent, pose, xi, slope, moved, state, places):
-    """The best step found along the flow, if any is uphill.
+def _step(product, ascent, pose, xi, slope, climbers, n, places):
+    """Move climber n by the best step found along the flow, if any is uphill.
 
     From the last step's length on: longer while F rises, or shorter until it has risen; then where
     polynomials are highest that have F and its slope at 0, and F at the lengths tried.
     """
-    steps, before = ascent.steps, state[VALUE]
+    steps, before = ascent.steps, climbers.value[n]
     least, most = steps[0] / 1024.0, steps[STEPS - 1]
-    k = int(state[STEP])
+    k = climbers.step[n]
     tau, other, at_other = steps[k], 0.0, 0.0
     value = _product_at(product, _gone(pose, xi, tau), places)
     vertex = _vertex(tau, value - before, slope)
@@ -133,7 +139,7 @@ def _step(product, ascent, pose, xi, slope, moved, state, places):
         value = _product_at(product, _gone(pose, xi, tau), places)
         vertex = _vertex(tau, value - before, slope)
     if value <= before:
-        state[DONE] = 1.0
+        climbers.done[n] = True
         return
     ahead = vertex
     if other > 0.0:
@@ -149,14 +155,13 @@ def _step(product, ascent, pose, xi, slope, moved, state, places):
         ahead = _crest(tau, value - before, other, at_other - before, slope)
     reached = _gone(pose, xi, tau)
     for i in range(12):
-        moved[i] = reached[i]
+        climbers.poses[n, i] = reached[i]
     while k > 0 and steps[k] > tau:
         k -= 1
     small = value - before <= ascent.stop_below * before
-    state[VALUE], state[STEP], state[MOVED] = value, float(k), 1.0
-    state[STALLED] = state[STALLED] + 1.0 if small else 0.0
-    if state[STALLED] >= _PATIENCE:
-        state[DONE] = 1.0
+    climbers.value[n], climbers.step[n], climbers.moved[n] = value, k, True
+    climbers.stalled[n] = climbers.stalled[n] + 1 if small else 0
+    climbers.done[n] = climbers.stalled[n] >= _PATIENCE
 
 
 @leaf
@@ -220,9 +225,7 @@ def _gone(pose, xi, tau):
         pose[6] * turn[0] + pose[7] * turn[3] + pose[8] * turn[6],
         pose[6] * turn[1] + pose[7] * turn[4] + pose[8] * turn[7],
         pose[6] * turn[2] + pose[7] * turn[5] + pose[8] * turn[8],
-        pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
-        pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
-        pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
+        *moved(pose, x, y, z),
     )
 
 
@@ -238,17 +241,20 @@ def _rest_of_sine(angle, sine):
 @inner
 def _product_at(product, pose, places):
     """F at a pose."""
-    total = _sum_at(product.free, pose, places)
-    total += _sum_at(product.blocks, pose, places)
-    return total + _sum_at(product.surface, pose, places)
+    total = 0.0
+    for term in product:
+        total += _sum_at(term, pose, places)
+    return total
 
 
 @inner
 def flow_at(product, pose, places):
     """F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), in the world."""
-    sums = _moments_at(product.free, pose, places)
-    sums = _added(sums, _moments_at(product.blocks, pose, places))
-    value, x, y, z, p, q, r = _added(sums, _moments_at(product.surface, pose, places))
+    value = x = y = z = p = q = r = 0.0
+    for term in product:
+        f, by_x, by_y, by_z, a, b, c = _moments_at(term, pose, places)
+        value, x, y, z = value + f, x + by_x, y + by_y, z + by_z
+        p, q, r = p + a, q + b, r + c
     # R (x_i x h_i) = (p_i - t) x grad f(p_i)
     p -= pose[10] * z - pose[11] * y
     q -= pose[11] * x - pose[9] * z
@@ -261,19 +267,6 @@ def flow_at(product, pose, places):
         pose[0] * x + pose[3] * y + pose[6] * z,
         pose[1] * x + pose[4] * y + pose[7] * z,
         pose[2] * x + pose[5] * y + pose[8] * z,
-    )
-
-
-@leaf
-def _added(a, b):
-    return (
-        a[0] + b[0],
-        a[1] + b[1],
-        a[2] + b[2],
-        a[3] + b[3],
-        a[4] + b[4],
-        a[5] + b[5],
-        a[6] + b[6],
     )
 
 
@@ -312,29 +305,17 @@ def _between(near, far, share):
 @inner
 def _moments_at(term, pose, places):
     """W times sums of f, grad f and p x grad f at p_i = R x_i + t, in the object frame."""
-    box, table, points = term.box, term.table, term.points
-    across, along = int(box.across), int(box.along)
-    beyond, cell = places.beyond, places.cell
+    box, points, u, v, w = term.box, term.points, places.u, places.v, places.w
     value = gx = gy = gz = p = q = r = 0.0
     for start in range(0, points.shape[1], BLOCK):
         end = min(start + BLOCK, points.shape[1])
         xs, ys, zs = points[0, start:end], points[1, start:end], points[2, start:end]
         locate(pose, box, xs, ys, zs, places, end - start)
         for n in range(end - start):
-            if beyond[n] == 0.0:
-                u, v, w = places.u[n], places.v[n], places.w[n]
-                s = nx = ny = nz = 0.0
-                for corner in range(8):
-                    i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
-                    weight = (u if i else 1.0 - u) * (v if j else 1.0 - v) * (w if k else 1.0 - w)
-                    at = cell[n] + i * across + j * along + k
-                    s += weight * table[at, 0]
-                    nx += weight * table[at, 1]
-                    ny += weight * table[at, 2]
-                    nz += weight * table[at, 3]
-                a = pose[0] * xs[n] + pose[1] * ys[n] + pose[2] * zs[n] + pose[9]
-                b = pose[3] * xs[n] + pose[4] * ys[n] + pose[5] * zs[n] + pose[10]
-                c = pose[6] * xs[n] + pose[7] * ys[n] + pose[8] * zs[n] + pose[11]
+            if places.beyond[n] == 0.0:
+                at = places.cell[n]
+                s, nx, ny, nz = interpolated(box, term.table, at, u[n], v[n], w[n])
+                a, b, c = moved(pose, xs[n], ys[n], zs[n])
                 value += s
                 gx, gy, gz = gx + nx, gy + ny, gz + nz
                 p += b * nz - c * ny

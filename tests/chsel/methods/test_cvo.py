@@ -11,8 +11,16 @@ from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.errors import SettingError
 from chsel.methods.cvo import cvo_kernels as kernels
 from chsel.methods.cvo.cvo import Cvo, CvoSettings, preset_cvo, preset_cvo_no_free_space
-from chsel.methods.cvo.cvo_kernels import DONE, VALUE, Ascent, Product, climb, products, scratch
-from chsel.methods.cvo.rkhs_fields import Kernel, free_field, surface_field
+from chsel.methods.cvo.cvo_kernels import (
+    Ascent,
+    Product,
+    climb,
+    climbers_at,
+    products,
+    scratch,
+)
+from chsel.methods.cvo.gaussian_blur import Kernel
+from chsel.methods.cvo.rkhs_fields import free_field, surface_field
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
@@ -111,15 +119,15 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
     dense, product = DenseClouds.of(SDF, points, 0.01), product_of(points)
     gains = []
     for start in nearby(8, 6):
-        poses, states = Poses.of(start[None]).numbers, np.zeros((1, 5))
-        before = states[0, VALUE] = value(product, start)
-        climb(product, ASCENT, poses, states, 1, 0, 1, scratch())
+        before = value(product, start)
+        climbers = climbers_at(Poses.of(start[None]).numbers, np.array([before]))
+        climb(product, ASCENT, climbers, 1, 0, 1, scratch())
         xi, _ = direction(product, start)
         b, c, d, e = dense.quartic(start, xi)
         roots = np.roots([4 * e, 3 * d, 2 * c, b])
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
         tau = np.clip(real.min(initial=0.8), 1e-4, 0.8)
-        gains.append((states[0, VALUE] - before, value(product, along(start, xi, tau)) - before))
+        gains.append((climbers.value[0] - before, value(product, along(start, xi, tau)) - before))
     ours, theirs = np.array(gains).T
     assert (ours >= 0.99 * theirs).all()
     assert ours.sum() >= theirs.sum()
@@ -128,16 +136,16 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
 
 def test_the_inner_product_never_falls_and_is_that_of_the_pose() -> None:
     product, starts = product_of(scene()), nearby(5, 7, 0.2)
-    poses, states = Poses.of(starts).numbers, np.zeros((5, 5))
-    products(product, poses, states[:, VALUE], 0, 5, scratch())
+    poses, now = Poses.of(starts).numbers, np.empty(5)
+    products(product, poses, now, 0, 5, scratch())
+    climbers = climbers_at(poses, now)
     for _ in range(30):
-        before = states[:, VALUE].copy()
-        climb(product, ASCENT, poses, states, 1, 0, 5, scratch())
-        assert (states[:, VALUE] >= before).all()
-        assert ((states[:, VALUE] > before) | (states[:, DONE] > 0.0)).all()
-        now = np.empty(5)
-        products(product, poses, now, 0, 5, scratch())
-        np.testing.assert_array_equal(now, states[:, VALUE])
+        before = climbers.value.copy()
+        climb(product, ASCENT, climbers, 1, 0, 5, scratch())
+        assert (climbers.value >= before).all()
+        assert ((climbers.value > before) | climbers.done).all()
+        products(product, climbers.poses, now, 0, 5, scratch())
+        np.testing.assert_array_equal(now, climbers.value)
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "reference"])

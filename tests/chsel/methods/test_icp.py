@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.errors import ChselError, SettingError
-from chsel.methods.icp.icp import Icp, IcpSettings, preset_icp
+from chsel.methods.icp import Icp, IcpSettings, preset_icp
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors

@@ -1,0 +1,339 @@
+"""ICP of the contacts against points of the object's surface: the paper's weak baseline.
+
+Iterative closest point, point to point (Besl and McKay, 1992), from each start by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel import presets
+from chsel.errors import SettingError, require_at_most, require_choice, require_positive
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.eigen import decompose
+from chsel.numerics.pose_tuples import finite, moved, pose_at
+from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.problem.poses import Poses
+from chsel.problem.registration_problem import (
+    Hypotheses,
+    NullObserver,
+    Observer,
+    RegistrationProblem,
+)
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.surface import surface_points
+from chsel.problem.warm_start import OnlineSettings
+from chsel.qd.selection import ranked
+
+MOST_ITERATIONS = 1_000_000
+MOST_POINTS = 1_000_000
+_BLOCK = 10  # iterations between two traces
+_NO_GAP = 1e-9  # eigenvalues this much apart, as a part of the largest, count as equal,
+_NO_SPREAD = 1e-20  # and so do those this much apart, m^2: points that differ by rounding alone
+
+
+@dataclass(frozen=True)
+class IcpSettings:
+    """All settings of ICP."""
+
+    surface_points: int = 500  # Q, how many points stand for the object's surface
+    redraw: str = "session"  # new points for every "registration", or the same for a session
+    iterations: int = 100  # at most
+    # End when the rms distance of no start falls by more than this fraction; None: never early.
+    stop_below: float | None = 1e-6
+    online: OnlineSettings = field(default_factory=OnlineSettings)
+
+    def __post_init__(self) -> None:
+        require_positive("surface_points", self.surface_points)
+        require_at_most("surface_points", self.surface_points, MOST_POINTS)
+        require_choice("redraw", self.redraw, ("registration", "session"))
+        require_positive("iterations", self.iterations, zero=True)
+        require_at_most("iterations", self.iterations, MOST_ITERATIONS)
+        if self.stop_below is not None and not 0.0 <= self.stop_below < 1.0:
+            raise SettingError(
+                f"stop_below is {self.stop_below}; accepted: from 0 to less than 1, or null"
+            )
+
+
+def preset_icp(preset: str) -> IcpSettings:
+    """The settings of ICP in a preset.
+
+    The paper's surface points are redrawn, those of its authors' code are not. Ours stay for a
+    session, so that a change of the result comes from a new contact and not from new points; on
+    51 simulated sessions neither choice came out ahead.
+    """
+    redraw = "registration" if preset == "paper" else "session"
+    return IcpSettings(redraw=redraw, online=presets.ONLINE[preset])
+
+
+class Icp:
+    """Registers the contacts by point-to-point ICP from every pose of E_0; E_l is not used.
+
+    Free and occupied points, and those of a known distance that is not 0, are not used. Costs are
+    rms distances in metres of the contacts to the surface points nearest to them: not to be
+    compared with those of the relaxed cost. Without any contact E_0 is returned, at cost 0.
+    """
+
+    def __init__(self, settings: IcpSettings | None = None) -> None:
+        self.settings = settings or IcpSettings()
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem."""
+        return self.settings.online
+
+    def register(
+        self, problem: RegistrationProblem, observer: Observer | None = None
+    ) -> Hypotheses:
+        """Hypotheses for the contacts of a problem, best first."""
+        require_ieee_arithmetic()
+        observer = observer or NullObserver()
+        contacts, poses = problem.points.contacts, Poses.of(problem.initial_set)
+        if len(contacts) == 0:
+            return ranked(problem.initial_set, np.zeros(len(poses)))
+        clouds = _Clouds(contacts.T.copy(), self.surface(problem).T.copy())
+        observer.trace("icp", 0, poses.vectors, _distances(clouds, poses))
+        poses = self._iterated(clouds, poses, observer)
+        return ranked(poses.matrices, _distances(clouds, poses))
+
+    def surface(self, problem: RegistrationProblem) -> FloatArray:
+        """The points (Q, 3) of the object's surface that stand for it, in its frame, metres."""
+        sdf, key, count = problem.sdf, problem.key, self.settings.surface_points
+        if self.settings.redraw == "registration":
+            return surface_points(sdf, count, key.stream(Purpose.ICP_SURFACE))
+        key = StreamKey(key.seed, 0)
+        stream = key.stream(Purpose.ICP_SURFACE)
+        return sdf.derived(("icp", count, key), lambda: surface_points(sdf, count, stream))
+
+    def _iterated(self, clouds: _Clouds, poses: Poses, observer: Observer) -> Poses:
+        """Poses after as many iterations as the stop rule allows."""
+        total, scratch = self.settings.iterations, partial(_scratch, clouds)
+        errors = np.full(len(poses), np.inf)
+        for first in range(0, total, _BLOCK):
+            count = min(_BLOCK, total - first)
+            history, after = np.empty((count, len(poses), 12)), np.empty((count, len(poses)))
+            spread(partial(_iterate, clouds, poses.numbers, history, after), len(poses), scratch)
+            falling = self._falling(np.concatenate([errors[None], after]))
+            count = count if falling.all() else int(np.argmin(falling)) + 1
+            poses, errors = Poses(history[count - 1]), after[count - 1]
+            observer.trace("icp", first + count, poses.vectors, errors.copy())
+            observer.progress("icp", first + count, total)
+            if not falling.all():
+                break
+        return poses
+
+    def _falling(self, errors: FloatArray) -> BoolArray:
+        """Whether the error of any start falls enough in each of K iterations; errors (K + 1, B)."""
+        if self.settings.stop_below is None:
+            return np.ones(len(errors) - 1, dtype=bool)
+        falls: BoolArray = errors[1:] < (1.0 - self.settings.stop_below) * errors[:-1]
+        return np.logical_or.reduce(falls, axis=1)
+
+
+class _Clouds(NamedTuple):
+    """What is aligned."""
+
+    contacts: FloatArray  # (3, N), world, metres
+    surface: FloatArray  # (3, Q), object frame, metres
+
+
+def _distances(clouds: _Clouds, poses: Poses) -> FloatArray:
+    """The rms distances (B,) of the contacts to their nearest surface points, metres."""
+    out = np.empty(len(poses))
+    run = partial(_fill_distances, clouds, poses.numbers, out)
+    spread(run, len(poses), partial(_scratch, clouds))
+    return out
+
+
+class _Scratch(NamedTuple):
+    """Scratch of one thread."""
+
+    points: FloatArray  # (3, N), the contacts in the object frame
+    squares: FloatArray  # (N,), their squared distances to the nearest surface points
+    nearest: IntArray  # (N,), which those are
+    matched: FloatArray  # (3, N), and where
+    form: FloatArray  # (4, 4), a quadratic form of quaternions
+    work: FloatArray  # (4, 4)
+    values: FloatArray  # (4,), its eigenvalues
+    vectors: FloatArray  # (4, 4), its eigenvectors, in columns
+    last_values: FloatArray  # (4,), the same of the form of the rotation so far
+    last_vectors: FloatArray  # (4, 4)
+
+
+def _scratch(clouds: _Clouds) -> _Scratch:
+    count = clouds.contacts.shape[1]
+    points, matched, squares = np.empty((3, count)), np.empty((3, count)), np.empty(count)
+    form, work, vectors, last_vectors = np.empty((4, 4, 4))
+    values, last_values = np.empty((2, 4))
+    nearest = np.empty(count, dtype=np.int64)
+    return _Scratch(
+        points, squares, nearest, matched, form, work, values, vectors, last_values, last_vectors
+    )
+
+
+@compiled
+def _iterate(clouds, poses, history, errors, first, last, scratch):
+    """Run K iterations from poses (B, 12), those from `first` to before `last`.
+
+    Fills history (K, B, 12), the pose after each iteration, and errors (K, B): the rms distance of
+    the contacts to the points matched with them, infinite once a sum is not finite; the pose stays
+    then.
+    """
+    for n in range(first, last):
+        pose = pose_at(poses, n)
+        error, settled = np.inf, False
+        for k in range(len(history)):
+            if not settled:  # a pose that stays as it is will always do so
+                before = pose
+                _match(clouds, pose, scratch)
+                pose = _aligned(clouds.contacts, pose, scratch)
+                error = _rms(clouds.contacts, pose, scratch.matched)
+                settled = pose == before
+            for i in range(12):
+                history[k, n, i] = pose[i]
+            errors[k, n] = error
+
+
+@compiled
+def _fill_distances(clouds, poses, out, first, last, scratch):
+    """Fill out (B,) with the rms distances under poses (B, 12), from `first` to before `last`."""
+    for n in range(first, last):
+        pose = pose_at(poses, n)
+        _match(clouds, pose, scratch)
+        out[n] = _rms(clouds.contacts, pose, scratch.matched)
+
+
+@inner
+def _match(clouds, pose, scratch):
+    """Fill matched (3, N) with the surface point nearest to each contact, the first of equals.
+
+    The inner loop is over contacts, so that it can be vectorised.
+    """
+    contacts, surface = clouds.contacts, clouds.surface
+    squares, nearest = scratch.squares, scratch.nearest
+    xs, ys, zs = scratch.points[0], scratch.points[1], scratch.points[2]
+    for n in range(len(squares)):
+        xs[n], ys[n], zs[n] = moved(pose, contacts[0, n], contacts[1, n], contacts[2, n])
+        squares[n], nearest[n] = np.inf, 0
+    for q in range(surface.shape[1]):
+        x, y, z = surface[0, q], surface[1, q], surface[2, q]
+        for n in range(len(squares)):
+            dx, dy, dz = xs[n] - x, ys[n] - y, zs[n] - z
+            square = dx * dx + dy * dy + dz * dz
+            nearer = square < squares[n]
+            squares[n] = square if nearer else squares[n]
+            nearest[n] = q if nearer else nearest[n]
+    for n in range(len(squares)):
+        for axis in range(3):
+            scratch.matched[axis, n] = surface[axis, nearest[n]]
+
+
+@inner
+def _aligned(points, pose, scratch):
+    """The pose that brings points (3, N) nearest to those matched (Horn, 1987, Sec. 4).
+
+    Its rotation is the unit quaternion of largest q^T M q. Where that leaves some freedom, as with
+    one point or with points in a line, it is the one nearest to the rotation of `pose`.
+    """
+    matched = scratch.matched
+    x, y, z = _centre(points)
+    u, v, w = _centre(matched)
+    a = b = c = d = e = f = g = h = i = 0.0
+    for n in range(points.shape[1]):
+        dx, dy, dz = points[0, n] - x, points[1, n] - y, points[2, n] - z
+        du, dv, dw = matched[0, n] - u, matched[1, n] - v, matched[2, n] - w
+        a, b, c = a + dx * du, b + dx * dv, c + dx * dw
+        d, e, f = d + dy * du, e + dy * dv, f + dy * dw
+        g, h, i = g + dz * du, h + dz * dv, i + dz * dw
+    if not finite((a, b, c, d, e, f, g, h, i, x, y, z)):
+        return pose
+    _fill_form((a, b, c, d, e, f, g, h, i), scratch.form)
+    decompose(scratch.form, scratch.work, scratch.values, scratch.vectors)
+    r = _rotation(_best_quaternion(pose, scratch))
+    return (
+        *r,
+        u - (r[0] * x + r[1] * y + r[2] * z),
+        v - (r[3] * x + r[4] * y + r[5] * z),
+        w - (r[6] * x + r[7] * y + r[8] * z),
+    )
+
+
+@leaf
+def _centre(points):
+    """The mean of points (3, N)."""
+    x = y = z = 0.0
+    count = points.shape[1]
+    for n in range(count):
+        x, y, z = x + points[0, n], y + points[1, n], z + points[2, n]
+    return x / count, y / count, z / count
+
+
+@inner
+def _fill_form(s, form):
+    """Fill M (4, 4) from s = sum x y^T: q^T M q = sum y . R(q) x, of quaternions w, x, y, z."""
+    form[0, 0] = s[0] + s[4] + s[8]
+    form[1, 1] = s[0] - s[4] - s[8]
+    form[2, 2] = s[4] - s[0] - s[8]
+    form[3, 3] = s[8] - s[0] - s[4]
+    form[0, 1] = form[1, 0] = s[5] - s[7]
+    form[0, 2] = form[2, 0] = s[6] - s[2]
+    form[0, 3] = form[3, 0] = s[1] - s[3]
+    form[1, 2] = form[2, 1] = s[1] + s[3]
+    form[1, 3] = form[3, 1] = s[2] + s[6]
+    form[2, 3] = form[3, 2] = s[5] + s[7]
+
+
+@inner
+def _best_quaternion(pose, scratch):
+    """The eigenvector of the largest eigenvalue; of several, the unit vector nearest to `pose`."""
+    values, vectors = scratch.values, scratch.vectors
+    best = vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3]
+    least = values[3] - max(_NO_GAP * values[3], _NO_SPREAD)
+    if values[2] < least:
+        return best
+    r = pose  # brings the axes onto its columns, so sum x y^T is its transpose
+    _fill_form((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]), scratch.form)
+    decompose(scratch.form, scratch.work, scratch.last_values, scratch.last_vectors)
+    w = x = y = z = 0.0
+    for k in range(4):
+        if values[k] >= least:
+            along = 0.0
+            for j in range(4):
+                along += vectors[j, k] * scratch.last_vectors[j, 3]
+            w, x = w + along * vectors[0, k], x + along * vectors[1, k]
+            y, z = y + along * vectors[2, k], z + along * vectors[3, k]
+    size = np.sqrt(w * w + x * x + y * y + z * z)
+    return best if size < 1e-6 else (w / size, x / size, y / size, z / size)
+
+
+@leaf
+def _rotation(quaternion):
+    """The rotation of a unit quaternion w, x, y, z."""
+    w, x, y, z = quaternion
+    return (
+        w * w + x * x - y * y - z * z,
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        w * w - x * x + y * y - z * z,
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        w * w - x * x - y * y + z * z,
+    )
+
+
+@inner
+def _rms(points, pose, matched):
+    """sqrt(mean |R x + t - y|^2) over points x (3, N) and those matched, y; infinite, never NaN."""
+    total, count = 0.0, points.shape[1]
+    for n in range(count):
+        x, y, z = moved(pose, points[0, n], points[1, n], points[2, n])
+        dx, dy, dz = matched[0, n] - x, matched[1, n] - y, matched[2, n] - z
+        total += dx * dx + dy * dy + dz * dz
+    return np.sqrt(total / count) if total < np.inf else np.inf
