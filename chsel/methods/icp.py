@@ -16,7 +16,7 @@ from chsel.errors import SettingError, require_at_most, require_choice, require_
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
-from chsel.numerics.pose_tuples import finite, moved, pose_at
+from chsel.numerics.pose_tuples import finite, pose_at, rotate, transform
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
@@ -128,7 +128,7 @@ class Icp:
         return poses
 
     def _falling(self, errors: FloatArray) -> BoolArray:
-        """Whether the error of any start falls enough in each of K iterations; errors (K + 1, B)."""
+        """Whether any start's error falls enough in each of K iterations; errors (K + 1, B)."""
         if self.settings.stop_below is None:
             return np.ones(len(errors) - 1, dtype=bool)
         falls: BoolArray = errors[1:] < (1.0 - self.settings.stop_below) * errors[:-1]
@@ -218,7 +218,7 @@ def _match(clouds, pose, scratch):
     squares, nearest = scratch.squares, scratch.nearest
     xs, ys, zs = scratch.points[0], scratch.points[1], scratch.points[2]
     for n in range(len(squares)):
-        xs[n], ys[n], zs[n] = moved(pose, contacts[0, n], contacts[1, n], contacts[2, n])
+        xs[n], ys[n], zs[n] = transform(pose, contacts[0, n], contacts[1, n], contacts[2, n])
         squares[n], nearest[n] = np.inf, 0
     for q in range(surface.shape[1]):
         x, y, z = surface[0, q], surface[1, q], surface[2, q]
@@ -255,12 +255,8 @@ def _aligned(points, pose, scratch):
     _fill_form((a, b, c, d, e, f, g, h, i), scratch.form)
     decompose(scratch.form, scratch.work, scratch.values, scratch.vectors)
     r = _rotation(_best_quaternion(pose, scratch))
-    return (
-        *r,
-        u - (r[0] * x + r[1] * y + r[2] * z),
-        v - (r[3] * x + r[4] * y + r[5] * z),
-        w - (r[6] * x + r[7] * y + r[8] * z),
-    )
+    a, b, c = rotate(r, x, y, z)
+    return *r, u - a, v - b, w - c
 
 
 @leaf
@@ -333,7 +329,7 @@ def _rms(points, pose, matched):
     """sqrt(mean |R x + t - y|^2) over points x (3, N) and those matched, y; infinite, never NaN."""
     total, count = 0.0, points.shape[1]
     for n in range(count):
-        x, y, z = moved(pose, points[0, n], points[1, n], points[2, n])
+        x, y, z = transform(pose, points[0, n], points[1, n], points[2, n])
         dx, dy, dz = matched[0, n] - x, matched[1, n] - y, matched[2, n] - z
         total += dx * dx + dy * dy + dz * dz
     return np.sqrt(total / count) if total < np.inf else np.inf

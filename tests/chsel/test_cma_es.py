@@ -11,11 +11,9 @@ import numba
 import numpy as np
 import pytest
 
-import chsel.methods.medial_constraint.cma_es
 from chsel.errors import SettingError
-from chsel.methods.medial_constraint import cma_es_kernels as kernels
-from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved, run_all
-from chsel.methods.medial_constraint.cma_es_kernels import BEST, GENERATIONS, STOPPED, Run
+from chsel.methods.medial_constraint import cma_es
+from chsel.methods.medial_constraint.cma_es import CmaEsSettings, Run, evolved, run_all
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.streams import StreamKey
@@ -50,13 +48,9 @@ def cost_of(model, space, vector, work):  # type: ignore[no-untyped-def]
 def _on_landscapes() -> Iterator[None]:
     """Compiles the runs, as they are, around other functions instead of the cost."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "cost_of", cost_of)
-        loop: Any = kernels.evolve
-        patch.setattr(
-            chsel.methods.medial_constraint.cma_es,
-            "evolve",
-            numba.njit(error_model="numpy")(loop.py_func),
-        )
+        patch.setattr(cma_es, "cost_of", cost_of)
+        loop: Any = cma_es.evolve
+        patch.setattr(cma_es, "evolve", numba.njit(error_model="numpy")(loop.py_func))
         yield
 
 
@@ -89,18 +83,18 @@ def test_it_needs_about_as_many_evaluations_as_the_cma_package(
 ) -> None:
     settings = replace(UNENDING, sigma0=sigma0, generations=900)
     runs = runs_on(kind, settings, np.full((21, D), start))
-    assert all(run.numbers[BEST] <= 1e-9 for run in runs)
+    assert all(run.cost[0] <= 1e-9 for run in runs)
     evaluations = [10 * (1 + np.argmax(run.history[0] <= 1e-9)) for run in runs]
     assert 0.8 * theirs < np.median(evaluations) < 1.25 * theirs
 
 
 def test_the_best_is_the_lowest_cost_met_and_the_start_counts() -> None:
     (run,) = runs_on(SPHERE, replace(UNENDING, generations=30), np.ones((1, D)))
-    assert run.numbers[BEST] == min(run.history[0, :30])
-    assert run.numbers[BEST] == cost_of(Landscape(SPHERE), 0, run.best, 0)
+    assert run.cost[0] == min(run.history[0, :30])
+    assert run.cost[0] == cost_of(Landscape(SPHERE), 0, run.best, 0)
     (run,) = runs_on(SPHERE, replace(UNENDING, generations=3), np.zeros((1, D)))
     np.testing.assert_array_equal(run.best, 0.0)
-    assert run.numbers[BEST] == 0.0
+    assert run.cost[0] == 0.0
 
 
 def test_every_start_draws_from_a_stream_of_its_own() -> None:
@@ -114,7 +108,7 @@ def test_every_start_draws_from_a_stream_of_its_own() -> None:
 def test_blocks_of_any_length_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(UNENDING, generations=60)
     expected = runs_on(SPHERE, settings, np.ones((1, D)))[0]
-    monkeypatch.setattr(chsel.methods.medial_constraint.cma_es, "_BLOCK", 7)
+    monkeypatch.setattr(cma_es, "_BLOCK", 7)
     found = runs_on(SPHERE, settings, np.ones((1, D)))[0]
     np.testing.assert_array_equal(found.best, expected.best)
     np.testing.assert_array_equal(found.strategy.covariance, expected.strategy.covariance)
@@ -122,8 +116,8 @@ def test_blocks_of_any_length_give_the_same_bits(monkeypatch: pytest.MonkeyPatch
 
 def stopped_at(kind: int, **changes: Any) -> tuple[int, Run]:
     (run,) = runs_on(kind, replace(UNENDING, **changes), np.ones((1, D)))
-    assert run.numbers[STOPPED] == 1.0
-    return int(run.numbers[GENERATIONS]), run
+    assert run.stopped[0]
+    return int(run.generations[0]), run
 
 
 def test_tolfun_ends_a_run_when_generation_and_recent_best_costs_are_level() -> None:

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from chsel.errors import SettingError
-from chsel.methods.medial_constraint.medial_cost import Balls, MedialCost, MedialCostSettings
+from chsel.methods.medial_constraint.medial_balls import Balls
+from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply, compose, random_rotations

@@ -13,7 +13,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Box, Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import sine_cosine
-from chsel.numerics.pose_tuples import moved, pose_at
+from chsel.numerics.pose_tuples import composed, pose_at, rotate_back, transform
 from chsel.problem.sdf_lookup import interpolated
 
 BLOCK = 512  # points that are located at once
@@ -123,10 +123,10 @@ def _step(product, ascent, pose, xi, slope, climbers, n, places):
     least, most = steps[0] / 1024.0, steps[STEPS - 1]
     k = climbers.step[n]
     tau, other, at_other = steps[k], 0.0, 0.0
-    value = _product_at(product, _gone(pose, xi, tau), places)
+    value = _product_at(product, _moved_along(pose, xi, tau), places)
     vertex = _vertex(tau, value - before, slope)
     while value > before and vertex > tau and k + 1 < STEPS:
-        beyond = _product_at(product, _gone(pose, xi, steps[k + 1]), places)
+        beyond = _product_at(product, _moved_along(pose, xi, steps[k + 1]), places)
         if not beyond > value:
             other, at_other = steps[k + 1], beyond
             break
@@ -136,7 +136,7 @@ def _step(product, ascent, pose, xi, slope, climbers, n, places):
     while value <= before and tau > least:
         other, at_other = tau, value
         tau = max(min(vertex, 0.5 * tau), 0.1 * tau)
-        value = _product_at(product, _gone(pose, xi, tau), places)
+        value = _product_at(product, _moved_along(pose, xi, tau), places)
         vertex = _vertex(tau, value - before, slope)
     if value <= before:
         climbers.done[n] = True
@@ -147,13 +147,13 @@ def _step(product, ascent, pose, xi, slope, climbers, n, places):
     for _ in range(_REFINEMENTS):
         if not (ahead <= most and abs(ahead - tau) > _NEAR * tau):
             break
-        at_ahead = _product_at(product, _gone(pose, xi, ahead), places)
+        at_ahead = _product_at(product, _moved_along(pose, xi, ahead), places)
         if at_ahead > value:
             tau, value, other, at_other = ahead, at_ahead, tau, value
         else:
             other, at_other = ahead, at_ahead
         ahead = _crest(tau, value - before, other, at_other - before, slope)
-    reached = _gone(pose, xi, tau)
+    reached = _moved_along(pose, xi, tau)
     for i in range(12):
         climbers.poses[n, i] = reached[i]
     while k > 0 and steps[k] > tau:
@@ -183,7 +183,7 @@ def _crest(tau, gain, other, other_gain, slope):
 
 
 @leaf
-def _gone(pose, xi, tau):
+def _moved_along(pose, xi, tau):
     """G Exp(tau xi) of a pose G = (R, t) and a unit vector xi = (omega, u).
 
     Exp has the rotation I + sin(a) W + (1 - cos(a)) W^2, a = tau |omega|, W the hat of omega /
@@ -201,10 +201,7 @@ def _gone(pose, xi, tau):
     i, j, k = b * r - c * q, c * p - a * r, a * q - b * p
     first = back / angle if angle > 0.0 else 0.0
     second = _rest_of_sine(angle, sine)
-    x = tau * (u + first * p + second * i)
-    y = tau * (v + first * q + second * j)
-    z = tau * (w + first * r + second * k)
-    turn = (
+    exponential = (
         cosine + back * a * a,
         back * a * b - sine * c,
         back * a * c + sine * b,
@@ -214,19 +211,11 @@ def _gone(pose, xi, tau):
         back * a * c - sine * b,
         back * b * c + sine * a,
         cosine + back * c * c,
+        tau * (u + first * p + second * i),
+        tau * (v + first * q + second * j),
+        tau * (w + first * r + second * k),
     )
-    return (
-        pose[0] * turn[0] + pose[1] * turn[3] + pose[2] * turn[6],
-        pose[0] * turn[1] + pose[1] * turn[4] + pose[2] * turn[7],
-        pose[0] * turn[2] + pose[1] * turn[5] + pose[2] * turn[8],
-        pose[3] * turn[0] + pose[4] * turn[3] + pose[5] * turn[6],
-        pose[3] * turn[1] + pose[4] * turn[4] + pose[5] * turn[7],
-        pose[3] * turn[2] + pose[4] * turn[5] + pose[5] * turn[8],
-        pose[6] * turn[0] + pose[7] * turn[3] + pose[8] * turn[6],
-        pose[6] * turn[1] + pose[7] * turn[4] + pose[8] * turn[7],
-        pose[6] * turn[2] + pose[7] * turn[5] + pose[8] * turn[8],
-        *moved(pose, x, y, z),
-    )
+    return composed(pose, exponential)
 
 
 @leaf
@@ -252,22 +241,14 @@ def flow_at(product, pose, places):
     """F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), in the world."""
     value = x = y = z = p = q = r = 0.0
     for term in product:
-        f, by_x, by_y, by_z, a, b, c = _moments_at(term, pose, places)
-        value, x, y, z = value + f, x + by_x, y + by_y, z + by_z
+        f, gx, gy, gz, a, b, c = _moments_at(term, pose, places)
+        value, x, y, z = value + f, x + gx, y + gy, z + gz
         p, q, r = p + a, q + b, r + c
     # R (x_i x h_i) = (p_i - t) x grad f(p_i)
     p -= pose[10] * z - pose[11] * y
     q -= pose[11] * x - pose[9] * z
     r -= pose[9] * y - pose[10] * x
-    return (
-        value,
-        pose[0] * p + pose[3] * q + pose[6] * r,
-        pose[1] * p + pose[4] * q + pose[7] * r,
-        pose[2] * p + pose[5] * q + pose[8] * r,
-        pose[0] * x + pose[3] * y + pose[6] * z,
-        pose[1] * x + pose[4] * y + pose[7] * z,
-        pose[2] * x + pose[5] * y + pose[8] * z,
-    )
+    return (value, *rotate_back(pose, p, q, r), *rotate_back(pose, x, y, z))
 
 
 @inner
@@ -315,7 +296,7 @@ def _moments_at(term, pose, places):
             if places.beyond[n] == 0.0:
                 at = places.cell[n]
                 s, nx, ny, nz = interpolated(box, term.table, at, u[n], v[n], w[n])
-                a, b, c = moved(pose, xs[n], ys[n], zs[n])
+                a, b, c = transform(pose, xs[n], ys[n], zs[n])
                 value += s
                 gx, gy, gz = gx + nx, gy + ny, gz + nz
                 p += b * nz - c * ny

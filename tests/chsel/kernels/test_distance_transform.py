@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.methods.medial_constraint.medial_kernels import squared_clearances
+from chsel.methods.medial_constraint.medial_balls import squared_clearances
 from chsel.numerics.arrays import BoolArray, IntArray
 
 

@@ -75,8 +75,8 @@ def direction(product: Product, object_from_world: FloatArray) -> tuple[FloatArr
 
 
 @numba.njit
-def gone(pose, xi, tau):  # type: ignore[no-untyped-def]
-    return kernels._gone(pose, xi, tau)
+def moved_along(pose, xi, tau):  # type: ignore[no-untyped-def]
+    return kernels._moved_along(pose, xi, tau)
 
 
 @pytest.mark.parametrize("tau", [1e-9, 1e-3, 0.019, 0.021, 0.8])
@@ -85,7 +85,7 @@ def test_a_step_is_the_exponential_of_the_flow(tau: float) -> None:
     turning = stream.normal(size=6)
     for xi in (turning / np.sqrt((turning**2).sum()), np.array([0.0, 0, 0, 0.6, 0, 0.8])):
         start = nearby(1, 3)[0]
-        found = np.array(gone(tuple(Poses.of(start[None]).numbers[0]), tuple(xi), tau))
+        found = np.array(moved_along(tuple(Poses.of(start[None]).numbers[0]), tuple(xi), tau))
         expected = along(start, xi, tau)
         np.testing.assert_allclose(found, Poses.of(expected[None]).numbers[0], rtol=0, atol=1e-15)
 
