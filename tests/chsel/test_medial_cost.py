@@ -13,13 +13,13 @@ from chsel.methods.medial_constraint.medial_balls import Balls
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import apply, compose, random_rotations
+from chsel.problem.poses import Poses, apply, compose, random_rotations
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
 from chsel.problem.streams import StreamKey
 
 RADIUS = 0.1
-IDENTITY = np.eye(4)[None]
+IDENTITY = Poses.of(np.eye(4)[None])
 
 
 def sphere() -> SdfGrid:
@@ -35,7 +35,7 @@ GRID = sphere()
 
 def problem(points: KnownPoints) -> RegistrationProblem:
     workspace = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    return RegistrationProblem(GRID, points, IDENTITY, workspace, 0.025, StreamKey(0, 0))
+    return RegistrationProblem(GRID, points, IDENTITY.matrices, workspace, 0.025, StreamKey(0, 0))
 
 
 def contacts(count: int = 7) -> KnownPoints:
@@ -72,9 +72,9 @@ def test_costs_are_means_of_squares_in_square_metres() -> None:
 
 def test_a_missing_set_costs_nothing() -> None:
     alone = MedialCost(problem(KnownPoints(occupied=np.zeros((1, 3)))))
-    np.testing.assert_array_equal(alone.evaluate(poses()), 0.0)
+    np.testing.assert_array_equal(alone.evaluate(Poses.of(poses())), 0.0)
     no_balls = MedialCost(problem(contacts()), MedialCostSettings(known_scale=0.0))
-    np.testing.assert_array_equal(no_balls.evaluate(poses()), 0.0)
+    np.testing.assert_array_equal(no_balls.evaluate(Poses.of(poses())), 0.0)
 
 
 @pytest.mark.parametrize("outside", OUTSIDE)
@@ -94,7 +94,7 @@ def test_costs_are_those_of_the_equation(lookup: str, outside: str) -> None:
     expected = (depth**2).mean(axis=1) + (distances(points.known) ** 2).mean(axis=1)
     assert (depth > 0.0).any()
     assert (depth == 0.0).any()
-    np.testing.assert_allclose(cost.evaluate(poses()), expected, rtol=1e-9)
+    np.testing.assert_allclose(cost.evaluate(Poses.of(poses())), expected, rtol=1e-9)
 
 
 def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() -> None:
@@ -104,9 +104,9 @@ def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() 
     assert len(cost.balls) > 100
     away = compose(np.eye(3)[None], np.array([[0.05, 0.0, 0.0]]))
     assert cost.evaluate(IDENTITY)[0] < 1e-7
-    assert cost.evaluate(away)[0] > 1e-4
+    assert cost.evaluate(Poses.of(away))[0] > 1e-4
     ignored = MedialCost(cost_problem(free), MedialCostSettings(ball_scale=0.0))
-    np.testing.assert_allclose(ignored.evaluate(away), 0.05**2, rtol=1e-9)
+    np.testing.assert_allclose(ignored.evaluate(Poses.of(away)), 0.05**2, rtol=1e-9)
 
 
 def cost_problem(free: FloatArray) -> RegistrationProblem:
@@ -116,21 +116,21 @@ def cost_problem(free: FloatArray) -> RegistrationProblem:
 def test_poses_that_are_not_finite_cost_infinitely_much() -> None:
     bad = poses(3)
     bad[0, 0, 3], bad[1, 1, 1] = np.inf, np.nan
-    cost = MedialCost(problem(contacts()), balls=some_balls()).evaluate(bad)
+    cost = MedialCost(problem(contacts()), balls=some_balls()).evaluate(Poses.of(bad))
     np.testing.assert_array_equal(np.isinf(cost), [True, True, False])
 
 
 def test_costs_do_not_depend_on_threads_or_on_the_batch() -> None:
     cost = MedialCost(problem(contacts()), balls=some_balls())
     many = poses(700)
-    together = cost.evaluate(many)
+    together = cost.evaluate(Poses.of(many))
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        np.testing.assert_array_equal(cost.evaluate(many), together)
+        np.testing.assert_array_equal(cost.evaluate(Poses.of(many)), together)
     finally:
         torch.set_num_threads(threads)
-    np.testing.assert_array_equal(cost.evaluate(many[41:42]), together[41:42])
+    np.testing.assert_array_equal(cost.evaluate(Poses.of(many[41:42])), together[41:42])
 
 
 @pytest.mark.parametrize("name", ["inflation", "ball_scale", "known_scale"])

@@ -20,7 +20,7 @@ from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.presets import PRESETS
-from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import ArchiveSnapshot
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
@@ -66,7 +66,7 @@ def judged(method: Method, problem: RegistrationProblem, poses: np.ndarray) -> n
     if isinstance(cost, CostSettings):
         return RelaxedCost.of(problem, cost).evaluate(poses)
     if isinstance(cost, MedialCostSettings):
-        return MedialCost(problem, cost).evaluate(poses)
+        return MedialCost(problem, cost).evaluate(Poses.of(poses))
     return None
 
 

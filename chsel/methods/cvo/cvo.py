@@ -88,9 +88,8 @@ class CvoSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
     def __post_init__(self) -> None:
-        for name in ("ell", "ell_min", "ell_decay", "sigma", "s_sigma", "c", "d"):
-            require_positive(name, getattr(self, name))
-        for name in ("max_iterations", "min_step", "max_step"):
+        scales = "ell", "ell_min", "ell_decay", "sigma", "s_sigma", "c", "d"
+        for name in (*scales, "max_iterations", "min_step", "max_step"):
             require_positive(name, getattr(self, name))
         for name in ("ell", "ell_min"):
             if not FINEST <= getattr(self, name) <= COARSEST:

@@ -61,9 +61,10 @@ class Kernel:
                 f"ell {self.ell} m reaches over {reach:.1e} nodes of {spacing} m; "
                 f"accepted: at most {_MOST_REACH:_}, so a smaller ell"
             )
-        values, slopes = np.empty((2, 2 * (-(-math.ceil(reach) // stride) * stride) + 1))
-        _fill_gaussian(spacing, self.ell, values, slopes)
-        return Weights(values, slopes, spacing, radius if self.radius < math.inf else math.inf)
+        most = -(-math.ceil(reach) // stride) * stride
+        x = np.arange(-most, most + 1) * spacing
+        values = np.array([exp(e) for e in (-0.5 * (x / self.ell) * (x / self.ell)).tolist()])
+        return Weights(values, -x * values, spacing, radius if self.radius < math.inf else math.inf)
 
 
 def blurred_with_gradient(
@@ -88,8 +89,8 @@ def blurred(source: FloatArray, weights: Weights) -> FloatArray:
         inside = tuple(slice(reach, reach + side) for side in source.shape)
         return _blurred_in_ball(source, weights, shape, 1)[0][inside].copy()
     for axis in (2, 1, 0):
-        inside = np.arange(reach, reach + source.shape[axis])
-        source = _along(axis, source, weights.values, shape, 1).take(inside, axis)
+        nodes = np.arange(reach, reach + source.shape[axis])
+        source = _along(axis, source, weights.values, shape, 1).take(nodes, axis)
     return source
 
 
@@ -144,16 +145,6 @@ def _blurred_in_ball(
 
 
 @compiled
-def _fill_gaussian(spacing, ell, weights, slopes):
-    """Fill weights (2 K + 1,) with exp(-x^2 / (2 ell^2)) at -K .. K spacings, and -x times it."""
-    reach = (len(weights) - 1) // 2
-    for i in range(len(weights)):
-        x = (i - reach) * spacing
-        weights[i] = exp(-0.5 * (x / ell) * (x / ell))
-        slopes[i] = -x * weights[i]
-
-
-@compiled
 def _blur_rows(source, weights, stride, out, first, last, _):
     """Fill out (A, m, C), from row `first` to before `last`, with source (A, n, C) blurred.
 
@@ -199,13 +190,13 @@ def _add_columns(columns, out, first, last, _):
 
 
 @compiled
-def sum_of_pairs(points: FloatArray, ell: float, radius: float, first: int, last: int) -> float:
+def sum_of_pairs(points: FloatArray, ell: float, radius: float) -> float:
     """Sum over pairs of points (N, 3) closer than `radius` of exp(-|x - y|^2 / (2 ell^2)).
 
-    Of every point from `first` to before `last` with itself and, twice, with those after it.
+    Of every point with itself and, twice, with those after it.
     """
     total = 0.0
-    for i in range(first, last):
+    for i in range(len(points)):
         total += 1.0
         for j in range(i + 1, len(points)):
             x, y = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]
@@ -239,12 +230,3 @@ def splat(points, origin, inverse, weights):
 def _below(g, count):
     """The lower of the two nodes around a grid coordinate."""
     return min(max(np.int64(np.floor(g)), 0), count - 2)
-
-
-@compiled
-def sum_of_products(left: FloatArray, right: FloatArray) -> float:
-    """Sum of left (N,) times right (N,), in their order."""
-    total = 0.0
-    for n in range(len(left)):
-        total += left[n] * right[n]
-    return total

@@ -20,7 +20,6 @@ from chsel.methods.cvo.gaussian_blur import (
     blurred_with_gradient,
     splat,
     sum_of_pairs,
-    sum_of_products,
 )
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Box, box_of
@@ -112,8 +111,8 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
         splat(points, first, 1.0 / spacing, grid)
     else:
         np.add.at(grid, tuple(nodes.T), 1.0)
-    inside = blurred(grid, weights)
-    return narrow.amplitude * sum_of_products(grid.reshape(-1), inside.reshape(-1))
+    products_in_order = (grid * blurred(grid, weights)).reshape(-1)
+    return narrow.amplitude * float(np.cumsum(products_in_order)[-1])
 
 
 def _pair_by_pair(points: FloatArray, kernel: Kernel) -> float:
@@ -123,7 +122,7 @@ def _pair_by_pair(points: FloatArray, kernel: Kernel) -> float:
             "points within a box that is small beside ell"
         )
     radius = min(kernel.radius, _FAR * kernel.ell)
-    return kernel.amplitude * sum_of_pairs(points, kernel.ell, radius, 0, len(points))
+    return kernel.amplitude * sum_of_pairs(points, kernel.ell, radius)
 
 
 def _narrowed(kernel: Kernel, spacing: float) -> Kernel:

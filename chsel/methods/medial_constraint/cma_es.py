@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.errors import require_at_most, require_choice, require_positive
-from chsel.methods.medial_constraint.medial_cost import MedialObjective
+from chsel.methods.medial_constraint.medial_cost import MedialCost
 from chsel.methods.medial_constraint.medial_kernels import cost_of
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
@@ -142,7 +142,7 @@ def run_from(start: FloatArray, cost: float, batch: int, sigma0: float, generati
 
 
 def evolved(
-    objective: MedialObjective,
+    objective: MedialCost,
     initial_set: Poses,
     settings: CmaEsSettings,
     key: StreamKey,
@@ -161,7 +161,7 @@ def evolved(
 
 
 def run_all(
-    objective: MedialObjective,
+    objective: MedialCost,
     starts: FloatArray,
     count: int,
     settings: CmaEsSettings,
@@ -268,21 +268,16 @@ def _ended(run: Run, rules: StopRules) -> bool:
     if not values[len(values) - 1] <= _MAX_CONDITION * values[0]:
         return True
     spread = run.values[run.order[0]] - run.values[run.order[len(run.order) - 1]]
-    recent = _spread(run.history[0], max(count - rules.recent, 0), count)
+    costs = run.history[0]
+    lowest = highest = costs[count - 1]
+    for i in range(max(count - rules.recent, 0), count):
+        lowest, highest = min(lowest, costs[i]), max(highest, costs[i])
+    recent = highest - lowest
     if spread < rules.tolfun and recent < rules.tolfun:
         return True
     if count > _SHORTEST_HISTORY and recent < rules.tolfunhist:
         return True
     return _step_ends(run.strategy, rules) or _stagnates(run, rules, count)
-
-
-@inner
-def _spread(costs: FloatArray, first: int, last: int) -> float:
-    """Highest less lowest of costs from `first` to before `last`."""
-    lowest = highest = costs[first]
-    for i in range(first, last):
-        lowest, highest = min(lowest, costs[i]), max(highest, costs[i])
-    return highest - lowest
 
 
 @inner

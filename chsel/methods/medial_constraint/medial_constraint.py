@@ -6,11 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from chsel import presets
 from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved
-from chsel.methods.medial_constraint.medial_cost import (
-    MedialCost,
-    MedialCostSettings,
-    MedialObjective,
-)
+from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods.medial_constraint.medial_kernels import medial_cma_me
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses
@@ -80,7 +76,7 @@ class MedialConstraint:
         """Hypotheses for the known points of a problem, best first."""
         observer = observer or NullObserver()
         space = search_space(self.settings.plane, problem.sdf)
-        objective = MedialObjective(MedialCost(problem, self.settings.cost), space)
+        objective = MedialCost(problem, self.settings.cost, space=space)
         vectors = evolved(
             objective, Poses.of(problem.initial_set), self.settings.cma_es, problem.key, observer
         )
@@ -147,7 +143,7 @@ class MedialConstraintCmaMe:
         """Hypotheses for the known points of a problem, best first."""
         observer, settings = observer or NullObserver(), self.settings
         space = search_space(settings.plane, problem.sdf)
-        objective = MedialObjective(MedialCost(problem, settings.cost), space)
+        objective = MedialCost(problem, settings.cost, space=space)
         key, count = problem.key, len(problem.initial_set)
         # E' <- CMA-ES on E_0; as poses, so that it holds what hypotheses can be
         initial_set = Poses.of(problem.initial_set)
@@ -168,7 +164,7 @@ class MedialConstraintCmaMe:
         return ranked_hypotheses(objective, elites[chosen], cells, elites, snapshot)
 
     def _seeded_archive(
-        self, problem: RegistrationProblem, objective: MedialObjective, vectors: FloatArray
+        self, problem: RegistrationProblem, objective: MedialCost, vectors: FloatArray
     ) -> GridArchive:
         """The archive that measures of E', vectors (B, d), size, holding E' and E_l."""
         settings, measure, space = self.settings.archive, self._measure, objective.space

@@ -21,7 +21,7 @@ from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
 from chsel.problem.sdf_lookup import field_of
-from chsel.problem.search_space import SearchSpace
+from chsel.problem.search_space import SE3Space, SearchSpace
 
 _POSES_PER_THREAD = 100  # fewer are costed faster than a thread wakes up
 
@@ -50,8 +50,8 @@ class MedialCost:
     """C_M(X) = mean_b max(0, r_b - s(R c_b + t))^2 + mean_k (s(R x_k + t) - v_k)^2, in m^2.
 
     Over the balls (c_b, r_b) of the free voxels in the workspace, and the points x_k of known
-    signed distance v_k. Occupied points have no term. A mean over nothing is 0. balls: others than
-    those of the problem's free points.
+    signed distance v_k. Occupied points have no term. A mean over nothing is 0. space: of the
+    vectors whose costs are asked for. balls: others than those of the problem's free points.
     """
 
     def __init__(
@@ -59,10 +59,13 @@ class MedialCost:
         problem: RegistrationProblem,
         settings: MedialCostSettings | None = None,
         *,
+        space: SearchSpace | None = None,
         balls: Balls | None = None,
     ) -> None:
         require_ieee_arithmetic()
         settings = settings or MedialCostSettings()
+        self.space = space or SE3Space()
+        self.space_arrays = self.space.arrays
         self.balls = _balls_of(problem, settings) if balls is None else balls
         self.model = MedialModel(
             field=field_of(problem.sdf, settings.lookup, settings.outside),
@@ -75,12 +78,12 @@ class MedialCost:
             known_scale=settings.known_scale,
         )
 
-    def evaluate(self, object_from_world: FloatArray) -> FloatArray:
-        """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
-        return self.costs(Poses.of(object_from_world))
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        """Costs (B,) of vectors (B, d) of the search space."""
+        return self.evaluate(self.space.poses(vectors))
 
-    def costs(self, poses: Poses) -> FloatArray:
-        """Costs (B,) of poses."""
+    def evaluate(self, poses: Poses) -> FloatArray:
+        """Costs (B,) of poses; infinite for one that is not finite."""
         costs = np.empty(len(poses))
         run = partial(medial_costs_of_poses, self.model, poses.numbers, costs)
         spread(run, len(poses), self.work, least=_POSES_PER_THREAD)
@@ -110,15 +113,3 @@ def _least_values(sdf: SdfGrid, lookup: str) -> FloatArray:
         return (least - 1e-9 * (1.0 + np.abs(least))).reshape(-1)
 
     return sdf.derived(("least values", lookup), least_values)
-
-
-class MedialObjective:
-    """The Medial Constraint cost over the vectors of a search space."""
-
-    def __init__(self, cost: MedialCost, space: SearchSpace) -> None:
-        self._cost, self.space = cost, space
-        self.model, self.space_arrays, self.work = cost.model, space.arrays, cost.work
-
-    def costs(self, vectors: FloatArray) -> FloatArray:
-        """Costs (B,) of vectors (B, d)."""
-        return self._cost.costs(self.space.poses(vectors))
