@@ -54,10 +54,8 @@ _BLOCK = 10  # iterations between two traces
 class CvoSettings:
     """All settings of CVO; names as in the authors' parameter file."""
 
-    # Use free points; else contacts and the object's surface alone.
-    free_space: bool = True
-    # Weigh contacts by the number of free points per contact.
-    balanced: bool = False
+    free_space: bool = True  # use free points; else contacts and the object's surface alone
+    balanced: bool = False  # weigh contacts by the number of free points per contact
     # Length scale of the kernel, metres. After an ascent it is multiplied by ell_decay and another
     # ascent follows, as long as it is above ell_min.
     ell: float = 0.1
@@ -66,8 +64,7 @@ class CvoSettings:
     # Amplitudes of the kernels of places and of equal labels; unequal labels have a kernel of 0.
     sigma: float = 0.1
     s_sigma: float = 0.8
-    # A product of the kernels that is not above it counts as 0; 0 keeps all of them.
-    sp_thres: float = 0.0
+    sp_thres: float = 0.0  # a product of the kernels that is not above it counts as 0; 0: none does
     # Nodes of the SDF within it of the surface make the object's surface, those farther outside its
     # free space, metres; null: the SDF's resolution (r_t).
     surface_band: float | None = None
@@ -75,13 +72,10 @@ class CvoSettings:
     # counts as a shift by sqrt(c / d) m.
     c: float = 7.0
     d: float = 7.0
-    # About which the flow turns, "world" as published, or the "workspace" centre.
-    origin: str = "world"
-    # Of an ascent.
-    max_iterations: int = 100
-    # Least and greatest length of a step that is tried first.
-    min_step: float = 1e-4
-    max_step: float = 0.8
+    origin: str = "world"  # about which the flow turns: as published, or the "workspace" centre
+    max_iterations: int = 100  # of an ascent
+    min_step: float = 1e-4  # the least and
+    max_step: float = 0.8  # the greatest length of a step that is tried first
     # A start ends when its inner product grew by no more than this fraction in 5 iterations in a
     # row; null: never.
     stop_below: float | None = 1e-6

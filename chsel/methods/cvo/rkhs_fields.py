@@ -111,8 +111,8 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
         splat(points, first, 1.0 / spacing, grid)
     else:
         np.add.at(grid, tuple(nodes.T), 1.0)
-    products_in_order = (grid * blurred(grid, weights)).reshape(-1)
-    return narrow.amplitude * float(np.cumsum(products_in_order)[-1])
+    terms = (grid * blurred(grid, weights)).reshape(-1)
+    return narrow.amplitude * float(np.cumsum(terms)[-1])  # added in their order
 
 
 def _pair_by_pair(points: FloatArray, kernel: Kernel) -> float:
@@ -128,7 +128,7 @@ def _pair_by_pair(points: FloatArray, kernel: Kernel) -> float:
 def _narrowed(kernel: Kernel, spacing: float) -> Kernel:
     """The kernel that is widened to this one by sharing out points among nodes.
 
-    Either point of a pair is spread with a variance of spacing^2 / 6 along an axis, in the mean.
+    Either point of a pair is spread with a variance of spacing^2 / 6 along an axis, on average.
     """
     ell = math.sqrt(kernel.ell * kernel.ell - spacing * spacing / 3.0)
     widening = kernel.ell / ell

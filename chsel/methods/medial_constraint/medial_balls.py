@@ -36,8 +36,8 @@ def medial_balls(
     Largest first. Each is the largest that touches no voxel that is not free, around a centre that
     no ball covers so far; of equals, the first in row-major order.
 
-    free (N, 3): centres of free voxels of side `resolution`, metres, or any points, each of which
-    makes the voxel free that it falls into. All else is not free, beyond the workspace, too.
+    free (N, 3): centres of free voxels of side `resolution`, metres, or any points, which make the
+    voxels free that hold them. All else is not free, nor is anything beyond the workspace.
     inflation: metres by which a ball may be inflated to cover another.
     Raises SettingError where the free points span too many voxels.
     """
@@ -73,7 +73,7 @@ def _free_voxels(points: FloatArray, lattice: Lattice) -> BoolArray:
 
 
 def _row_starts(medial: BoolArray) -> IntArray:
-    """Where each row along the last axis starts among the voxels (nx, ny + 1), see `_covering`."""
+    """Where each row of voxels along the last axis starts (nx, ny + 1); the next entry ends it."""
     in_row = np.count_nonzero(medial, axis=2)
     ends = np.cumsum(in_row).reshape(in_row.shape)
     return np.concatenate([ends[:, :1] - in_row[:, :1], ends], axis=1)
@@ -84,8 +84,8 @@ def squared_clearances(inside: BoolArray, out: IntArray) -> None:
     """Fill out (nx, ny, nz) with squared distances from the centres of voxels to the set's border.
 
     In half sides of a voxel: the least over all voxels w that are not inside, taken as cubes, of
-    the sum over the axes of max(2 |v - w| - 1, 0)^2. As it is a sum over the axes, one axis after
-    the other finds it (Felzenszwalb and Huttenlocher, 2012). At least one voxel must be outside.
+    the sum over the axes of max(2 |v - w| - 1, 0)^2, computed axis by axis (Felzenszwalb and
+    Huttenlocher, 2012). At least one voxel must be outside.
     """
     flat, flags = out.reshape(-1), inside.reshape(-1)
     for n in range(len(flat)):
@@ -113,13 +113,13 @@ def _nearest(line: IntArray, count: int, k: int) -> int:
     """The least of line[j] + max(2 |k - j| - 1, 0)^2, going outwards while that can be less."""
     least, reach = line[k], max(k, count - 1 - k)
     for step in range(1, reach + 1):
-        more = (2 * step - 1) * (2 * step - 1)
-        if more >= least:
+        along = (2 * step - 1) * (2 * step - 1)
+        if along >= least:
             break
         if step <= k:
-            least = min(least, line[k - step] + more)
+            least = min(least, line[k - step] + along)
         if k + step < count:
-            least = min(least, line[k + step] + more)
+            least = min(least, line[k + step] + along)
     return least
 
 
@@ -139,13 +139,12 @@ def _mark_medial(squared: IntArray, out: BoolArray) -> None:
 @inner
 def _held(squared: IntArray, i: int, j: int, k: int) -> bool:
     """Whether |c_u - c_v| + r_v <= r_u for any of the 26 neighbours u of a voxel v."""
-    own = squared[i, j, k]
-    radius = np.sqrt(float(own))
+    radius = np.sqrt(float(squared[i, j, k]))
     for a in range(-1, 2):
         for b in range(-1, 2):
             for c in range(-1, 2):
                 other = squared[i + a, j + b, k + c]
-                if other > own:
+                if other > squared[i, j, k]:
                     apart = 2.0 * np.sqrt(float(a * a + b * b + c * c))
                     if apart + radius <= np.sqrt(float(other)) + _TOLERANCE:
                         return True
@@ -156,11 +155,10 @@ def _held(squared: IntArray, i: int, j: int, k: int) -> bool:
 def _covering(
     voxels: IntArray, radii: FloatArray, rows: IntArray, order: IntArray, inflation: float
 ) -> IntArray:
-    """Indices of balls that, once inflated, cover all others; each the next that none does so far.
+    """Indices of balls that, inflated, cover all others: each the next that is not yet covered.
 
-    voxels (P, 3), ascending in row-major order, with radii (P,). rows (nx, ny + 1): of every row of
-    voxels along the last axis, where it starts in `voxels`; the next entry is its end. order (P,):
-    in which balls are taken. Ball i covers ball j if |c_i - c_j| + r_j <= r_i + inflation.
+    voxels (P, 3), ascending in row-major order, with radii (P,). rows: see `_row_starts`. order
+    (P,): in which balls are taken. Ball i covers ball j if |c_i - c_j| + r_j <= r_i + inflation.
     """
     covered, chosen = np.zeros(len(order), dtype=np.bool_), np.empty(len(order), dtype=np.int64)
     count = 0

@@ -44,12 +44,12 @@ CMA_ES = {
 
 @dataclass(frozen=True)
 class MedialConstraintSettings:
-    """All settings of Medial Constraint; plane restricts the poses to SE(2)."""
+    """All settings of Medial Constraint."""
 
     cost: MedialCostSettings = field(default_factory=MedialCostSettings)
     cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    plane: PlaneSettings | None = None
+    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
 
 def preset_medial_constraint(preset: str) -> MedialConstraintSettings:
@@ -77,9 +77,8 @@ class MedialConstraint:
         observer = observer or NullObserver()
         space = search_space(self.settings.plane, problem.sdf)
         objective = MedialCost(problem, self.settings.cost, space=space)
-        vectors = evolved(
-            objective, Poses.of(problem.initial_set), self.settings.cma_es, problem.key, observer
-        )
+        initial_set, settings = Poses.of(problem.initial_set), self.settings.cma_es
+        vectors = evolved(objective, initial_set, settings, problem.key, observer)
         estimates = space.poses(vectors)
         return ranked_hypotheses(objective, estimates, elites=estimates)
 
@@ -94,18 +93,15 @@ _OUTPUT = OutputSettings(tolerance_per_point=0.0, free_tolerance=TOLERANCE)
 
 @dataclass(frozen=True)
 class MedialConstraintCmaMeSettings:
-    """All settings of Medial Constraint with CMA-ME; plane restricts the poses to SE(2).
-
-    Tolerances of archive and output are in m^2, as the cost is.
-    """
+    """All settings of Medial Constraint with CMA-ME."""
 
     cost: MedialCostSettings = field(default_factory=MedialCostSettings)
     cma_es: CmaEsSettings = field(default_factory=CmaEsSettings)
-    archive: ArchiveSettings = _ARCHIVE
+    archive: ArchiveSettings = _ARCHIVE  # tolerances in m^2, as the cost is
     emitter: EmitterSettings = _EMITTER
-    output: OutputSettings = _OUTPUT
+    output: OutputSettings = _OUTPUT  # tolerances in m^2
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    plane: PlaneSettings | None = None
+    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
     def __post_init__(self) -> None:
         measure_named(self.archive.measure, planar=self.plane is not None)
@@ -147,8 +143,8 @@ class MedialConstraintCmaMe:
         key, count = problem.key, len(problem.initial_set)
         # E' <- CMA-ES on E_0; as poses, so that it holds what hypotheses can be
         initial_set = Poses.of(problem.initial_set)
-        found = evolved(objective, initial_set, settings.cma_es, key, observer)
-        vectors = space.encode(space.poses(found))
+        vectors = evolved(objective, initial_set, settings.cma_es, key, observer)
+        vectors = space.encode(space.poses(vectors))
         archive = self._seeded_archive(problem, objective, vectors)
         # M <- CMA-ME(M, C_M, n_o)
         first, best = space.encode(initial_set[:1])[0], archive.best_solution

@@ -31,7 +31,7 @@ from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
-from tests.chsel.dense_cvo import DenseClouds, along, flows, nearby
+from tests.chsel.methods.dense_cvo import DenseClouds, along, flows, nearby
 
 MESH = trimesh.creation.box([0.12, 0.08, 0.06])
 SDF = SdfGrid.from_mesh(MESH, 0.01, padding=0.03)

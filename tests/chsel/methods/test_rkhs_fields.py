@@ -18,7 +18,7 @@ from chsel.methods.cvo.rkhs_fields import (
 )
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses
-from tests.chsel.dense_cvo import DenseClouds, flows, nearby
+from tests.chsel.methods.dense_cvo import DenseClouds, flows, nearby
 
 SDF = SdfGrid.from_mesh(trimesh.creation.box([0.12, 0.08, 0.06]), 0.01, padding=0.03)
 KERNEL = Kernel(0.1, 0.0064)
