@@ -20,7 +20,7 @@ from chsel.problem.mesh import clean_mesh
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.settings import settings_mapping
+from chsel.problem.settings import changed_settings
 from chsel.problem.streams import StreamKey
 from chsel.problem.warm_start import pose_problem
 
@@ -132,22 +132,15 @@ def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGri
     return SdfGrid.from_mesh(mesh, resolution)
 
 
-def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> dict[str, Any]:
-    """The preset's settings with changes laid over them, as a mapping."""
-    settings = settings_mapping(preset_settings(method, preset))
+def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> Any:
+    """The preset's settings with changes laid over them."""
+    chosen = preset_settings(method, preset)
     if dataclasses.is_dataclass(changes) and not isinstance(changes, type):
-        settings = settings_mapping(changes)
+        chosen = changes
     elif changes is not None:
         require_instance("settings", changes, Mapping, "a mapping, or the settings of the method")
-        settings = _merged(settings, changes)
+        chosen = changed_settings(chosen, changes, "method")
     if hypotheses is not None:
-        settings = _merged(settings, {"online": {"hypotheses": hypotheses}})
-    return settings
-
-
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for name, value in changes.items():
-        both = isinstance(value, Mapping) and isinstance(base.get(name), Mapping)
-        merged[name] = _merged(base[name], value) if both else value
-    return merged
+        online = {"online": {"hypotheses": hypotheses}}
+        chosen = changed_settings(chosen, online, "method")
+    return chosen

@@ -65,7 +65,10 @@ class PresetName:
 
 @dataclass(frozen=True)
 class ProbeConfig:
-    """conf/probe.yaml, checked. session and method: checked by whoever they name."""
+    """conf/probe.yaml, which has all defaults, checked.
+
+    session and method: checked by whoever they name.
+    """
 
     object: ObjectConfig
     session: Any
@@ -74,9 +77,9 @@ class ProbeConfig:
     recording: RecordingConfig
     assets: AssetsConfig
     logs: str
-    seed: int = 0
-    threads: int = 1
-    configuration: str | None = None
+    seed: int
+    threads: int
+    configuration: str | None
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)

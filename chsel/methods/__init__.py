@@ -3,89 +3,65 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
-from chsel import presets
 from chsel.errors import SettingError, require_choice, require_instance
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, preset_anchored
+from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.methods.chsel import Chsel, ChselSettings
-from chsel.methods.cvo.cvo import Cvo, preset_cvo, preset_cvo_no_free_space
+from chsel.methods.cvo.cvo import Cvo, CvoSettings
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
-from chsel.methods.icp.icp import Icp, preset_icp
+from chsel.methods.icp.icp import Icp, IcpSettings
 from chsel.methods.installed import installed_method, installed_names, offering_packages
 from chsel.methods.medial_constraint.medial_constraint import (
     MedialConstraint,
     MedialConstraintCmaMe,
-    preset_medial_constraint,
-    preset_medial_constraint_cma_me,
+    MedialConstraintCmaMeSettings,
+    MedialConstraintSettings,
 )
 from chsel.methods.method import Method
-from chsel.methods.svgd import Svgd, preset_svgd
-from chsel.problem.settings import build_settings
+from chsel.methods.svgd import Svgd, SvgdSettings
+from chsel.problem.settings import PRESETS, changed_settings, in_preset
 
-
-def _chsel(preset: str) -> ChselSettings:
-    return ChselSettings(
-        cost=presets.COST[preset],
-        descent=presets.DESCENT[preset],
-        archive=presets.ARCHIVE[preset],
-        emitter=presets.EMITTER[preset],
-        output=presets.OUTPUT[preset],
-        online=presets.ONLINE[preset],
-        starts=presets.STARTS[preset],
-    )
-
-
-def _chsel_cma_me(preset: str) -> ChselSettings:
-    return replace(_chsel(preset), search="cma_me")
-
-
-def _gradient_descent(preset: str) -> GradientDescentSettings:
-    return GradientDescentSettings(
-        cost=presets.COST[preset], descent=presets.DESCENT[preset], online=presets.ONLINE[preset]
-    )
-
-
-_OURS: dict[str, tuple[Callable[[Any], Method], Callable[[str], Any]]] = {
-    "chsel": (Chsel, _chsel),
-    "chsel_cma_me": (Chsel, _chsel_cma_me),
-    "gradient_descent": (GradientDescent, _gradient_descent),
-    "icp": (Icp, preset_icp),
-    "svgd": (Svgd, preset_svgd),
-    "cvo": (Cvo, preset_cvo),
-    "cvo_no_free_space": (Cvo, preset_cvo_no_free_space),
-    "medial_constraint": (MedialConstraint, preset_medial_constraint),
-    "medial_constraint_cma_me": (MedialConstraintCmaMe, preset_medial_constraint_cma_me),
-    "anchored": (Anchored, preset_anchored),
+_OURS: dict[str, tuple[Callable[[Any], Method], Any]] = {
+    "chsel": (Chsel, ChselSettings()),
+    "chsel_cma_me": (Chsel, ChselSettings(search="cma_me")),
+    "gradient_descent": (GradientDescent, GradientDescentSettings()),
+    "icp": (Icp, IcpSettings()),
+    "svgd": (Svgd, SvgdSettings()),
+    "cvo": (Cvo, CvoSettings()),
+    "cvo_no_free_space": (Cvo, CvoSettings(free_space=False)),
+    "medial_constraint": (MedialConstraint, MedialConstraintSettings()),
+    "medial_constraint_cma_me": (MedialConstraintCmaMe, MedialConstraintCmaMeSettings()),
+    "anchored": (Anchored, AnchoredSettings()),
 }
 OURS = tuple(_OURS)
 METHODS = (*OURS, *(name for name in installed_names() if name not in OURS))
 
 
 def preset_settings(name: str, preset: str = "default") -> Any:
-    """The settings of a method by name, as a preset has them."""
-    _, of_preset = _entry(name)
-    require_choice("preset", preset, presets.PRESETS)
-    return of_preset(preset)
+    """The settings of a method by name in a preset, one of PRESETS."""
+    make, default = _entry(name)
+    require_choice("preset", preset, PRESETS)
+    own = getattr(make, "preset", None)  # of an installed method
+    return own(preset) if own else in_preset(default, preset)
 
 
 def build_method(name: str, settings: Any = None) -> Method:
     """A method by name.
 
-    settings: its settings, a mapping of them (unnamed ones keep their default), or None for the
-    default preset. Raises SettingError for names and values that do not exist, and for a name of
-    ours that an installed package gives to a method, too.
+    settings: its settings, or a mapping of changes to those of the preset `default`. Raises
+    SettingError for names and values that do not exist, and for a name of ours that an installed
+    package gives to a method, too.
     """
-    make, preset = _entry(name)
+    make, _ = _entry(name)
     if name in OURS and (offering := offering_packages(name)):
         raise SettingError(f"method {name} is of package {offering[0]}, too; accepted: one of them")
-    default = preset("default")
+    default = preset_settings(name)
+    kind = type(default)
     if settings is None:
         settings = default
     elif isinstance(settings, Mapping):
-        settings = build_settings(type(default), settings, "method")
-    kind = type(default)
+        settings = changed_settings(default, settings, "method")
     require_instance("settings", settings, kind, f"a mapping, or a {kind.__name__}")
     return make(settings)
 
@@ -95,7 +71,7 @@ def noise_of(method: Method) -> float | None:
     return method.settings.noise if isinstance(method.settings, AnchoredSettings) else None
 
 
-def _entry(name: str) -> tuple[Callable[[Any], Method], Callable[[str], Any]]:
-    """What makes a method of its settings, and its settings by preset."""
+def _entry(name: str) -> tuple[Callable[[Any], Method], Any]:
+    """What makes a method of its settings, and its settings by default."""
     require_choice("method", name, METHODS)
     return _OURS[name] if name in OURS else installed_method(name)

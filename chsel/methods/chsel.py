@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space
+from chsel.problem.settings import PRESETS, Presets
 from chsel.problem.streams import Purpose, normals
 from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
@@ -74,8 +76,21 @@ class ChselSettings:
     emitter: EmitterSettings = field(default_factory=EmitterSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    starts: AnchoredStarts | None = None
+    starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)
     plane: PlaneSettings | None = None
+
+    presets: ClassVar[Presets] = {
+        preset: {
+            "cost": CostSettings.presets[preset],
+            "descent": DescentSettings.presets[preset],
+            "archive": ArchiveSettings.presets[preset],
+            "emitter": EmitterSettings.presets[preset],
+            "output": OutputSettings.presets[preset],
+            "online": OnlineSettings.presets[preset],
+            "starts": None,
+        }
+        for preset in PRESETS[1:]
+    }
 
     def __post_init__(self) -> None:
         require_choice("search", self.search, SEARCHES)

@@ -30,11 +30,10 @@ def offering_packages(name: str) -> tuple[str, ...]:
 
 
 @cache
-def installed_method(name: str) -> tuple[Callable[[Any], Method], Callable[[str], Any]]:
-    """What makes an installed method of its settings, and its settings by preset.
+def installed_method(name: str) -> tuple[Callable[[Any], Method], Any]:
+    """What makes an installed method of its settings, and its settings by default.
 
-    A class without `preset(name)` has the settings of its constructor in all presets. Raises
-    SettingError for one that cannot be imported, is no method, or is offered by two packages.
+    Raises SettingError for one that cannot be imported, is no method, or is of two packages.
     """
     point, *others = _offers()[name]
     package = offering_packages(name)
@@ -51,7 +50,7 @@ def installed_method(name: str) -> tuple[Callable[[Any], Method], Callable[[str]
         ) from error
     if lacks := _lacks(default):
         raise SettingError(f"{who} has {lacks}; see {_IMPLEMENTED}")
-    return offered, getattr(offered, "preset", lambda _: offered().settings)
+    return offered, default.settings
 
 
 def _lacks(method: Any) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from chsel.problem.poses import (
 )
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 
 MOST_HYPOTHESES = 1_000_000
@@ -46,6 +48,11 @@ class OnlineSettings:
     keep_best: bool = True
     low_cost_set: str = "elites"
     update: str = "noise"
+
+    presets: ClassVar[Presets] = {
+        "paper": {"rotation_law": "axis_gauss", "keep_best": False},
+        "reference": {"initial": "upright"},
+    }
 
     def __post_init__(self) -> None:
         require_positive("hypotheses", self.hypotheses)

@@ -12,16 +12,16 @@ import trimesh
 
 from chsel.errors import PoseError
 from chsel.numerics.arrays import FloatArray
-from chsel.presets import ONLINE
 from chsel.problem.poses import Poses, inverse, nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.settings import in_preset
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.warm_start import pose_problem
+from chsel.problem.warm_start import OnlineSettings, pose_problem
 from chsel.qd.selection import repeated
 from runners.benchmarks.published import PublishedPackage, RefusedError
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
-HOW = replace(ONLINE["reference"], initial="so3")
+HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")
 """E_0 and E_l as the package's authors make them, but first from the starts that all others get."""
 
 
