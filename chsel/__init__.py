@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from chsel.cost.cost_settings import CostSettings
     from chsel.cost.torch_cost import RelaxedCost
     from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
+    from chsel.online_registration import OnlineRegistration
     from chsel.problem.mesh import load_mesh
     from chsel.problem.points import KnownPoints, Workspace
     from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
@@ -35,6 +36,7 @@ __all__ = [
     "InputWarning",
     "KnownPoints",
     "MeshWarning",
+    "OnlineRegistration",
     "PointsWarning",
     "RegistrationProblem",
     "RelaxedCost",
@@ -53,6 +55,7 @@ _PLACES = {
     "InputWarning": "errors",
     "KnownPoints": "problem.points",
     "MeshWarning": "errors",
+    "OnlineRegistration": "online_registration",
     "PointsWarning": "errors",
     "RegistrationProblem": "problem.registration_problem",
     "RelaxedCost": "cost.torch_cost",

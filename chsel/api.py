@@ -15,6 +15,7 @@ import trimesh
 from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
 from chsel.methods import build_method, noise_of, preset_settings
 from chsel.numerics.arrays import frozen
+from chsel.online_registration import OnlineRegistration
 from chsel.problem.input_checks import check_contacts, check_fit, check_points
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.points import KnownPoints, Workspace
@@ -23,6 +24,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import changed_settings
 from chsel.problem.streams import StreamKey
 from chsel.problem.warm_start import pose_problem
+from chsel.problem.settings import settings_mapping
 
 _VOXELS_PER_EXTENT = 20
 
@@ -77,8 +79,16 @@ def register(
     sdf = _grid(target, resolution)
     _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
     workspace = workspace or Workspace.around(points.all_points(), sdf.diameter)
-    key = StreamKey(seed, step)
-    problem = pose_problem(sdf, points, workspace, free_resolution, key, solver.online, previous)
+    online = OnlineRegistration(
+        sdf,
+        workspace,
+        free_resolution,
+        solver.online,
+        seed=seed,
+        points=points,
+        previous=previous,
+    )
+    problem = online.pose(step)
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
     result = solver.register(problem, observer)

@@ -13,6 +13,7 @@ from chsel.errors import RecordingError, SettingError
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
+from chsel.online_registration import OnlineRegistration
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
 from chsel.problem.registration_problem import Hypotheses
@@ -85,6 +86,19 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
                 value = {part: value}
             settings = changed_settings(settings, value, "method")
     return _named(name or recorded, settings)
+
+
+def recorded_online(recording: Recording, method: Method) -> OnlineRegistration:
+    """The loop that a recorded session walks with a method, before its first step."""
+    start = recording.start
+    return OnlineRegistration(
+        start.sdf,
+        start.workspace,
+        start.free_resolution,
+        method.online,
+        seed=recording.seed,
+        points=start.initial_points,
+    )
 
 
 def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:

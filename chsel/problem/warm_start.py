@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from chsel.errors import require_at_most, require_choice, require_positive
+from chsel.errors import PoseError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import (
@@ -116,8 +116,10 @@ def updated_initial_set(
     """E_0 around the best previous hypothesis: object_from_world (B, 4, 4).
 
     The noise acts on world_from_object: added to the position, multiplied from the left onto
-    the rotation.
+    the rotation. Raises PoseError if there is no previous hypothesis.
     """
+    if len(previous.cost) == 0:
+        raise PoseError("the previous result has no hypotheses; accepted: at least one")
     best = previous.object_from_world[int(np.argmin(previous.cost))]
     world_from_best = inverse(best)
     stream = key.stream(Purpose.UPDATE_NOISE)

@@ -18,6 +18,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import EngineError, RecordingError, SettingError
 from chsel.methods import build_method
+from chsel.online_registration import OnlineRegistration
 from chsel.plausible.plausible_file import save_plausible
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import plausible_settings
@@ -26,7 +27,6 @@ from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, 
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from replay.__main__ import main
 from replay.comparing.columns import COLUMNS
 from replay.comparing.comparison import common_cost, compared, medians, recorded_label
@@ -84,41 +84,27 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     recorder = McapRecorder(path)
     recorder.record(start)
-    points, previous = KnownPoints(), None
-    for step in range(3):
-        contacts = np.asarray(trimesh.sample.sample_surface(mesh, 4, seed=step)[0]) + OFFSET
-        free = random.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.11), (30, 3))
-        new = KnownPoints(free=free, known=contacts, known_sdf=np.zeros(4))
-        points = points.merged(new)
-        recorder.record(Probe(step, "contact", new))
-        problem = pose_problem(
-            start.sdf,
-            points,
-            start.workspace,
-            start.free_resolution,
-            StreamKey(start.seed, step),
-            method.online,
-            previous,
-        )
-        found = _Last(recorder)
-        posed, truth = ProblemPosed(step, problem), start.world_from_object
-        register_recorded(posed, method, found, truth, symmetry_for_errors(start))
-        previous = found.last.hypotheses
+    online = OnlineRegistration(
+        start.sdf, start.workspace, start.free_resolution, method.online, seed=start.seed
+    )
+
+    def probes():
+        for step in range(3):
+            contacts = np.asarray(trimesh.sample.sample_surface(mesh, 4, seed=step)[0]) + OFFSET
+            free = random.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.11), (30, 3))
+            new = KnownPoints(free=free, known=contacts, known_sdf=np.zeros(4))
+            recorder.record(Probe(step, "contact", new))
+            yield step, new
+
+    def register(problem):
+        posed, truth = ProblemPosed(problem.key.step, problem), start.world_from_object
+        symmetry = symmetry_for_errors(start)
+        return register_recorded(posed, method, recorder, truth, symmetry).hypotheses
+
+    assert len([*online.steps(probes(), register)]) == 3
     recorder.record(SessionEnded(2, "finished"))
     recorder.close()
     return path
-
-
-class _Last:
-    """Hands events on and keeps the last one with hypotheses."""
-
-    def __init__(self, recorder) -> None:
-        self._recorder = recorder
-
-    def record(self, event) -> None:
-        self._recorder.record(event)
-        if hasattr(event, "hypotheses"):
-            self.last = event
 
 
 def rows_of(text: str) -> dict[str, list[str]]:

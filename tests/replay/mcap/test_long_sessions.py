@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from chsel.online_registration import OnlineRegistration, Start
 from chsel.problem import points as points_module
 from chsel.problem.points import GrowingPoints, KnownPoints
+from chsel.problem.warm_start import OnlineSettings
 from replay.events import Event, Logged, Probe, SessionEnded, SessionStarted
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import recover
@@ -110,13 +112,19 @@ def test_a_run_touches_every_point_once(long_session: list[Event], costs: Simple
         probes=lambda: iter(event for event in long_session if isinstance(event, Probe)),
     )
     never: Any = None
+    online = OnlineRegistration(
+        start.sdf,
+        start.workspace,
+        start.free_resolution,
+        OnlineSettings(),
+        points=start.initial_points,
+        start=Start(step=STEPS),
+    )
     run = SessionRun(
         session,
+        online,
         never,
-        start.sdf,
         ListRecorder(),
-        seed=0,
-        start=(0, STEPS),
         recording=RecordingConfig(),
         symmetry=None,
         show=lambda *_: None,
