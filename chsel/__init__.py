@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from chsel.cost.cost_settings import CostSettings
     from chsel.cost.torch_cost import RelaxedCost
     from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
-    from chsel.online_registration import OnlineRegistration
     from chsel.problem.mesh import load_mesh
+    from chsel.problem.online_registration import OnlineRegistration
     from chsel.problem.points import KnownPoints, Workspace
     from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
     from chsel.problem.sdf_grid import SdfGrid
@@ -55,7 +55,7 @@ _PLACES = {
     "InputWarning": "errors",
     "KnownPoints": "problem.points",
     "MeshWarning": "errors",
-    "OnlineRegistration": "online_registration",
+    "OnlineRegistration": "problem.online_registration",
     "PointsWarning": "errors",
     "RegistrationProblem": "problem.registration_problem",
     "RelaxedCost": "cost.torch_cost",

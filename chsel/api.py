@@ -15,16 +15,13 @@ import trimesh
 from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
 from chsel.methods import build_method, noise_of, preset_settings
 from chsel.numerics.arrays import frozen
-from chsel.online_registration import OnlineRegistration
 from chsel.problem.input_checks import check_contacts, check_fit, check_points
 from chsel.problem.mesh import clean_mesh
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import changed_settings
-from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
-from chsel.problem.settings import settings_mapping
 
 _VOXELS_PER_EXTENT = 20
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from chsel.methods.method import Method
-from chsel.online_registration import OnlineRegistration
 from chsel.plausible.pose_metrics import result_numbers
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges

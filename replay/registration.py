@@ -13,9 +13,9 @@ from chsel.errors import RecordingError, SettingError
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
-from chsel.online_registration import OnlineRegistration
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.settings import PRESETS, changed_settings, settings_mapping
 from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder, SessionStarted

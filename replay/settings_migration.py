@@ -12,7 +12,7 @@ from typing import Any
 
 from chsel.methods.anchored.anchored import AnchoredSettings
 from chsel.methods.chsel import ChselSettings
-from chsel.problem.warm_start import OnlineSettings
+from chsel.problem.online_registration import OnlineSettings
 from chsel.qd.selection import OutputSettings
 
 LEFT_OUT: Mapping[type, Mapping[str, Any]] = {

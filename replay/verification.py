@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chsel.errors import ChselError, RecordingError
-from chsel.online_registration import OnlineStep
+from chsel.problem.online_registration import OnlineStep
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.differences import apart, difference

@@ -18,11 +18,10 @@ from chsel.errors import InputWarning, RecordingError
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.numerics.threads import require_threads
-from chsel.online_registration import OnlineRegistration, Start
+from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.recording_info import recording_digest

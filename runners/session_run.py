@@ -9,9 +9,9 @@ from typing import Any
 from chsel.errors import ChselError, InputWarning
 from chsel.methods import noise_of
 from chsel.methods.method import Method
-from chsel.online_registration import OnlineRegistration, OnlineStep
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.input_checks import check_contacts, check_fit, check_points
+from chsel.problem.online_registration import OnlineRegistration, OnlineStep
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.events import Logged, Probe, ProblemPosed, Recorder, Timed

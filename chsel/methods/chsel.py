@@ -14,6 +14,7 @@ from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -24,7 +25,6 @@ from chsel.problem.registration_problem import (
 from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space
 from chsel.problem.settings import PRESETS, Presets
 from chsel.problem.streams import Purpose, normals
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (

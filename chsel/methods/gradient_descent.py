@@ -12,6 +12,7 @@ from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most, require_positive
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -21,7 +22,6 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import PRESETS, Presets
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked_hypotheses
 
 MOST_ITERATIONS = 1_000_000

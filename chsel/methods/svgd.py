@@ -18,6 +18,7 @@ from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.octree import Found
 from chsel.numerics.pose_tuples import decode, pull_back
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -27,7 +28,6 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import PRESETS, Presets
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked_hypotheses
 
 _LEAST = 1e-8  # of 2 h^2, which keeps gamma finite

@@ -16,9 +16,9 @@ from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads as use_threads
+from chsel.problem.online_registration import OnlineSettings, first_initial_set
 from chsel.problem.settings import in_preset
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from runners.benchmarks.depth_images import depth_images
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
 from runners.benchmarks.methods import methods

@@ -12,11 +12,10 @@ import trimesh
 
 from chsel.errors import PoseError
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, inverse, nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import in_preset
-from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.warm_start import OnlineSettings, pose_problem
 from chsel.problem.streams import Purpose
 from chsel.qd.selection import repeated
 from runners.benchmarks.published import PublishedPackage, RefusedError

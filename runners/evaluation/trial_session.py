@@ -13,8 +13,8 @@ from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.pose_metrics import EvaluationError
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.warm_start import OnlineSettings
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.session_recording import TRUTH, record_session

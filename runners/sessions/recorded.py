@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from functools import reduce
 
 from chsel.errors import PointsError, SettingError
-from chsel.online_registration import OnlineRegistration, Start
 from chsel.problem.input_checks import check_points
+from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.points import KnownPoints
-from chsel.problem.warm_start import OnlineSettings
 from replay.events import Probe
 from replay.mcap.reader import read_recording
 

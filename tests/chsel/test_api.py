@@ -14,10 +14,10 @@ import chsel
 from chsel.methods import build_method, preset_settings
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.4)), np.array([0.3, 0.1, 0.2]))

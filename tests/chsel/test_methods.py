@@ -23,11 +23,11 @@ from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSe
 from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import ArchiveSnapshot
 from chsel.problem.settings import PRESETS, settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, MESH, TRUTH
 
 WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
@@ -327,8 +327,10 @@ def test_an_installed_class_may_give_the_settings_of_each_preset(
         def preset(name: str) -> IcpSettings:
             return IcpSettings(iterations=PRESETS.index(name) + 7)
 
-    monkeypatch.setattr("chsel.methods.METHODS", (*METHODS, "theirs"))
-    monkeypatch.setattr("chsel.methods.installed_method", lambda _: (Theirs, IcpSettings()))
+    monkeypatch.setattr("chsel.methods.registry.METHODS", (*METHODS, "theirs"))
+    monkeypatch.setattr(
+        "chsel.methods.registry.installed_method", lambda _: (Theirs, IcpSettings())
+    )
     assert [preset_settings("theirs", name).iterations for name in PRESETS] == [7, 8, 9]
     changed = build_method("theirs", {"redraw": "registration"}).settings
     assert changed == IcpSettings(iterations=7, redraw="registration")

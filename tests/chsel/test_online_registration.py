@@ -6,10 +6,9 @@ import trimesh
 
 from chsel import Hypotheses, KnownPoints, OnlineRegistration, SdfGrid, Workspace
 from chsel.errors import ChselError, PoseError
-from chsel.online_registration import Start
+from chsel.problem.online_registration import OnlineSettings, Start, pose_problem
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings, pose_problem
 
 GRID = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.06, 0.04)), 0.02)
 WORKSPACE = Workspace((-0.1, -0.3, 0.0), (0.5, 0.3, 0.6))

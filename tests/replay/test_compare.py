@@ -18,12 +18,12 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import EngineError, RecordingError, SettingError
 from chsel.methods import build_method
-from chsel.online_registration import OnlineRegistration
 from chsel.plausible.plausible_file import save_plausible
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import plausible_diversity
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey

@@ -14,6 +14,7 @@ from chsel.methods.anchored.anchor_sampling import (
 )
 from chsel.methods.anchored.energy import Energy
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -23,7 +24,6 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.subset import evenly, representative, spaced
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import update_cells
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import ArchiveSettings, ranked_hypotheses, repeated, sized_archive

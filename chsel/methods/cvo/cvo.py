@@ -35,6 +35,7 @@ from chsel.methods.cvo.rkhs_fields import (
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -44,7 +45,6 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.sdf_grid import COARSEST, FINEST
 from chsel.problem.settings import Presets
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000

@@ -16,6 +16,7 @@ from chsel.errors import (
 from chsel.methods.icp.icp_kernels import Matches, iterate, matches_for, rms_distances
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -27,7 +28,6 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000

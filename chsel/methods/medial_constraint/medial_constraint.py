@@ -13,6 +13,7 @@ from chsel.methods.medial_constraint.medial_cost import (
 )
 from chsel.methods.medial_constraint.medial_kernels import medial_cma_me
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -23,7 +24,6 @@ from chsel.problem.registration_problem import (
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import PRESETS, Presets
 from chsel.problem.streams import Purpose
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.archive import GridArchive
 from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me, update_cells
 from chsel.qd.measures import measure_named

@@ -18,13 +18,13 @@ from chsel.methods.medial_constraint.medial_constraint import (
 )
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings
 from chsel.problem.settings import PRESETS, build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
 Maker = Callable[[str], Any]

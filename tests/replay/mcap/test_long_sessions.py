@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chsel.online_registration import OnlineRegistration, Start
 from chsel.problem import points as points_module
+from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.points import GrowingPoints, KnownPoints
-from chsel.problem.warm_start import OnlineSettings
 from replay.events import Event, Logged, Probe, SessionEnded, SessionStarted
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import recover

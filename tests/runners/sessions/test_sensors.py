@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
 from chsel.methods import build_method
-from chsel.online_registration import OnlineRegistration, Start
+from chsel.problem.online_registration import OnlineRegistration, Start
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from chsel.problem.settings import build_settings, settings_mapping
