@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel import presets
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
 from chsel.numerics.pose_tuples import finite, pose_at, rotate, transform
 from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -25,9 +25,9 @@ from chsel.problem.registration_problem import (
     Observer,
     RegistrationProblem,
 )
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000
@@ -39,7 +39,12 @@ _NO_SPREAD = 1e-20  # and so do those this much apart, m^2: points that differ b
 
 @dataclass(frozen=True)
 class IcpSettings:
-    """All settings of ICP."""
+    """All settings of ICP.
+
+    The paper's surface points are redrawn, those of its authors' code are not. Ours stay for a
+    session, so that a change of the result comes from a new contact and not from new points; on
+    51 simulated sessions neither choice came out ahead.
+    """
 
     surface_points: int = 500  # Q, how many points stand for the object's surface
     redraw: str = "session"  # new points for every "registration", or the same for a session
@@ -47,6 +52,11 @@ class IcpSettings:
     # End when the rms distance of no start falls by more than this fraction; None: never early.
     stop_below: float | None = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
+
+    presets: ClassVar[Presets] = {
+        "paper": {"redraw": "registration", "online": OnlineSettings.presets["paper"]},
+        "reference": {"online": OnlineSettings.presets["reference"]},
+    }
 
     def __post_init__(self) -> None:
         require_positive("surface_points", self.surface_points)
@@ -58,17 +68,6 @@ class IcpSettings:
             raise SettingError(
                 f"stop_below is {self.stop_below}; accepted: from 0 to less than 1, or null"
             )
-
-
-def preset_icp(preset: str) -> IcpSettings:
-    """The settings of ICP in a preset.
-
-    The paper's surface points are redrawn, those of its authors' code are not. Ours stay for a
-    session, so that a change of the result comes from a new contact and not from new points; on
-    51 simulated sessions neither choice came out ahead.
-    """
-    redraw = "registration" if preset == "paper" else "session"
-    return IcpSettings(redraw=redraw, online=presets.ONLINE[preset])
 
 
 class Icp:

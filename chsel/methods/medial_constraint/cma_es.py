@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from chsel.numerics.elementary import logs
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Observer
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import all_finite, rank
 from chsel.qd.evolution_kernels import SIGMA, Strategy, ask, strategy_around, tell
@@ -67,6 +68,11 @@ class CmaEsSettings:
     tolfun: float = 1e-8
     tolfunhist: float = 1e-9
     tolx: float = 1e-11
+
+    presets: ClassVar[Presets] = {
+        "paper": {"tolfun": 1e-5, "tolfunhist": 1e-6},
+        "reference": {"starts": "single", "tolfun": 1e-5, "tolfunhist": 1e-6},
+    }
 
     def __post_init__(self) -> None:
         require_choice("starts", self.starts, ("per_start", "single"))

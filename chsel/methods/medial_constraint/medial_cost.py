@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
 from chsel.problem.sdf_lookup import field_of
 from chsel.problem.search_space import SE3Space, SearchSpace
+from chsel.problem.settings import Presets
 
 _POSES_PER_THREAD = 100  # fewer are costed faster than a thread wakes up
 
@@ -38,6 +40,11 @@ class MedialCostSettings:
     # How the SDF grid is read, see SdfGrid.query.
     lookup: str = "trilinear"
     outside: str = "surface_point"
+
+    presets: ClassVar[Presets] = {
+        "paper": {"lookup": "nearest"},
+        "reference": {"ball_scale": 0.0, "lookup": "nearest", "outside": "bounding_box"},
+    }
 
     def __post_init__(self) -> None:
         for name in ("inflation", "ball_scale", "known_scale"):
