@@ -1,7 +1,4 @@
-"""ICP of the contacts against points of the object's surface: the paper's weak baseline.
-
-Iterative closest point, point to point (Besl and McKay, 1992), from each start by itself.
-"""
+"""ICP of contacts and points of the object's surface (Besl and McKay, 1992), a weak baseline."""
 
 from __future__ import annotations
 
@@ -209,10 +206,7 @@ def _fill_distances(clouds, poses, out, first, last, scratch):
 
 @inner
 def _match(clouds, pose, scratch):
-    """Fill matched (3, N) with the surface point nearest to each contact, the first of equals.
-
-    The inner loop is over contacts, so that it can be vectorised.
-    """
+    """Fill matched (3, N) with the surface point nearest to each contact, the first of equals."""
     contacts, surface = clouds.contacts, clouds.surface
     squares, nearest = scratch.squares, scratch.nearest
     xs, ys, zs = scratch.points[0], scratch.points[1], scratch.points[2]
@@ -221,7 +215,7 @@ def _match(clouds, pose, scratch):
         squares[n], nearest[n] = np.inf, 0
     for q in range(surface.shape[1]):
         x, y, z = surface[0, q], surface[1, q], surface[2, q]
-        for n in range(len(squares)):
+        for n in range(len(squares)):  # can be vectorised
             dx, dy, dz = xs[n] - x, ys[n] - y, zs[n] - z
             square = dx * dx + dy * dy + dz * dz
             nearer = square < squares[n]

@@ -11,10 +11,10 @@ from typing import Any
 from chsel.errors import SettingError, require_choice, require_instance
 from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
 from chsel.methods.chsel import Chsel, ChselSettings
-from chsel.methods.cvo.cvo import Cvo, CvoSettings
+from chsel.methods.cvo import Cvo, CvoSettings
 from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
 from chsel.methods.icp import Icp, IcpSettings
-from chsel.methods.medial_constraint.medial_constraint import (
+from chsel.methods.medial_constraint import (
     MedialConstraint,
     MedialConstraintCmaMe,
     MedialConstraintCmaMeSettings,

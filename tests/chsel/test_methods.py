@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from chsel.methods.icp import Icp, IcpSettings
 
 from chsel import Hypotheses, KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
 from chsel.methods import METHODS, OURS, build_method, preset_settings
+from chsel.methods.icp import Icp, IcpSettings
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import pose_errors
