@@ -273,13 +273,13 @@ def _ended(run: Run, rules: StopRules) -> bool:
         return True
     if not values[len(values) - 1] <= _MAX_CONDITION * values[0]:
         return True
-    spread = run.values[run.order[0]] - run.values[run.order[len(run.order) - 1]]
+    latest = run.values[run.order[0]] - run.values[run.order[len(run.order) - 1]]
     costs = run.history[0]
     lowest = highest = costs[count - 1]
     for i in range(max(count - rules.recent, 0), count):
         lowest, highest = min(lowest, costs[i]), max(highest, costs[i])
     recent = highest - lowest
-    if spread < rules.tolfun and recent < rules.tolfun:
+    if latest < rules.tolfun and recent < rules.tolfun:
         return True
     if count > _SHORTEST_HISTORY and recent < rules.tolfunhist:
         return True
