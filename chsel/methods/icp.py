@@ -12,7 +12,7 @@ from chsel.errors import SettingError, require_at_most, require_choice, require_
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
-from chsel.numerics.pose_tuples import finite, pose_at, rotate, transform
+from chsel.numerics.pose_tuples import finite, moved, pose_at, turned
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
@@ -208,7 +208,7 @@ def _match(clouds, pose, scratch):
     squares, nearest = scratch.squares, scratch.nearest
     xs, ys, zs = scratch.points[0], scratch.points[1], scratch.points[2]
     for n in range(len(squares)):
-        xs[n], ys[n], zs[n] = transform(pose, contacts[0, n], contacts[1, n], contacts[2, n])
+        xs[n], ys[n], zs[n] = moved(pose, contacts[0, n], contacts[1, n], contacts[2, n])
         squares[n], nearest[n] = np.inf, 0
     for q in range(surface.shape[1]):
         x, y, z = surface[0, q], surface[1, q], surface[2, q]
@@ -245,7 +245,7 @@ def _aligned(points, pose, scratch):
     _fill_form((a, b, c, d, e, f, g, h, i), scratch.form)
     decompose(scratch.form, scratch.work, scratch.values, scratch.vectors)
     r = _rotation(_best_quaternion(pose, scratch))
-    a, b, c = rotate(r, x, y, z)
+    a, b, c = turned(r, x, y, z)
     return *r, u - a, v - b, w - c
 
 
@@ -319,7 +319,7 @@ def _rms(points, pose, matched):
     """sqrt(mean |R x + t - y|^2) over points x (3, N) and those matched, y; infinite, never NaN."""
     total, count = 0.0, points.shape[1]
     for n in range(count):
-        x, y, z = transform(pose, points[0, n], points[1, n], points[2, n])
+        x, y, z = moved(pose, points[0, n], points[1, n], points[2, n])
         dx, dy, dz = matched[0, n] - x, matched[1, n] - y, matched[2, n] - z
         total += dx * dx + dy * dy + dz * dz
     return np.sqrt(total / count) if total < np.inf else np.inf

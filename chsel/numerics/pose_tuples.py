@@ -173,45 +173,6 @@ def pose_at(poses, n):
 
 
 @leaf
-def transform(pose, x, y, z):
-    """A point moved by a pose: R x + t."""
-    return (
-        pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
-        pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
-        pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
-    )
-
-
-@leaf
-def rotate(pose, x, y, z):
-    """A vector turned by a pose: R x."""
-    return (
-        pose[0] * x + pose[1] * y + pose[2] * z,
-        pose[3] * x + pose[4] * y + pose[5] * z,
-        pose[6] * x + pose[7] * y + pose[8] * z,
-    )
-
-
-@leaf
-def rotate_back(pose, x, y, z):
-    """A vector turned by the transpose of a pose's rotation: R^T x."""
-    return (
-        pose[0] * x + pose[3] * y + pose[6] * z,
-        pose[1] * x + pose[4] * y + pose[7] * z,
-        pose[2] * x + pose[5] * y + pose[8] * z,
-    )
-
-
-@leaf
-def composed(left, right):
-    """The pose that moves points by `right`, then by `left`."""
-    a, d, g = rotate(left, right[0], right[3], right[6])
-    b, e, h = rotate(left, right[1], right[4], right[7])
-    c, f, i = rotate(left, right[2], right[5], right[8])
-    return a, b, c, d, e, f, g, h, i, *transform(left, right[9], right[10], right[11])
-
-
-@leaf
 def origin_within(pose, low, high):
     """Whether a pose has the object's origin, -R^T t in the world, in a box."""
     x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])

@@ -13,7 +13,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Box, Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import sine_cosine
-from chsel.numerics.pose_tuples import composed, pose_at, rotate_back, transform
+from chsel.numerics.pose_tuples import composed, moved, pose_at, turned_back
 from chsel.problem.sdf_lookup import interpolated
 
 BLOCK = 512  # points that are located at once
@@ -248,7 +248,7 @@ def flow_at(product, pose, places):
     p -= pose[10] * z - pose[11] * y
     q -= pose[11] * x - pose[9] * z
     r -= pose[9] * y - pose[10] * x
-    return (value, *rotate_back(pose, p, q, r), *rotate_back(pose, x, y, z))
+    return (value, *turned_back(pose, p, q, r), *turned_back(pose, x, y, z))
 
 
 @inner
@@ -296,7 +296,7 @@ def _moments_at(term, pose, places):
             if places.beyond[n] == 0.0:
                 at = places.cell[n]
                 s, nx, ny, nz = interpolated(box, term.table, at, u[n], v[n], w[n])
-                a, b, c = transform(pose, xs[n], ys[n], zs[n])
+                a, b, c = moved(pose, xs[n], ys[n], zs[n])
                 value += s
                 gx, gy, gz = gx + nx, gy + ny, gz + nz
                 p += b * nz - c * ny

@@ -9,7 +9,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, spliced
-from chsel.numerics.pose_tuples import decode, finite, pose_at, transform
+from chsel.numerics.pose_tuples import decode, finite, moved, pose_at
 from chsel.problem.sdf_lookup import Field, continued, sample
 from chsel.qd.archive import Batch, Cells, all_finite, insert, rank
 from chsel.qd.emitter_kernels import MeSearch, move_to_elite
@@ -87,7 +87,7 @@ def _distance(field, pose, x, y, z, places, n):
     """Signed distance at the n-th of the places, that of a world point x, y, z."""
     if places.beyond[n] > 0.0:
         inside = sample(field.trilinear, field.box, field.table, places, n)
-        return continued(field.box_distance, field.box, inside, *transform(pose, x, y, z))[0]
+        return continued(field.box_distance, field.box, inside, *moved(pose, x, y, z))[0]
     return sample(field.trilinear, field.box, field.table, places, n)[0]
 
 
