@@ -45,8 +45,7 @@ def cache_directory() -> Path:
         wrong = _unusable(place, fingerprint)
         if wrong is None:
             return place / fingerprint
-        text = "%s is %s, %s. They are kept where they are without it"
-        _log.warning(text, CACHE_VARIABLE, named, wrong)
+        _log.warning("%s is %s, %s. The default folder is used", CACHE_VARIABLE, named, wrong)
     temporary = Path(tempfile.gettempdir()) / f"chsel-{_user()}"
     for place in (_user_cache() / "chsel" / "kernels", temporary):
         _make_private(place)

@@ -95,13 +95,13 @@ def look_up(lattice, tree, region, move, back, candidates):
     spheres, nodes = tree.spheres, len(tree.starts) - 1
     centres, cells, point_at = lattice.centres, lattice.cells, lattice.point_at
     count = len(cells)
-    places, numbers, asked = candidates.places, candidates.kept, candidates.nodes
+    places, numbers, wanted = candidates.places, candidates.kept, candidates.nodes
     x, y, z = candidates.x, candidates.y, candidates.z
     locate(back, lattice.box, centres[0], centres[1], centres[2], places, count)
     total = 0
     for n in range(count):
         point = point_at[places.cell[n]]
-        asked[total], numbers[total] = cells[n], point
+        wanted[total], numbers[total] = cells[n], point
         total += 1 if point >= 0 else 0
     for n in range(total):
         copy_centre(spheres, nodes + numbers[n], candidates, n)
@@ -109,7 +109,7 @@ def look_up(lattice, tree, region, move, back, candidates):
     count = 0
     for n in range(total):  # a point beside the cell that it was looked up for is left out
         numbers[count] = numbers[n]
-        count += 1 if places.cell[n] == asked[n] else 0
+        count += 1 if places.cell[n] == wanted[n] else 0
     _sort(numbers, count)
     for n in range(count):
         copy_centre(spheres, nodes + numbers[n], candidates, n)
