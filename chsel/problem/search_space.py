@@ -12,7 +12,7 @@ from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray, frozen
 from chsel.numerics.cell_set import triple
 from chsel.numerics.elementary import arctangents
-from chsel.numerics.pose_tuples import Space, decode_all, matrix_of
+from chsel.numerics.pose_tuples import SpaceConstants, decode_all, matrix_of
 from chsel.problem.points import Workspace
 from chsel.problem.poses import (
     Poses,
@@ -33,7 +33,7 @@ class SearchSpace(ABC):
     """Vectors x (B, d) that stand for poses."""
 
     dimension: int  # d
-    arrays: Space  # as the kernels take it
+    arrays: SpaceConstants  # as the kernels take it
 
     @abstractmethod
     def encode(self, poses: Poses) -> FloatArray:
@@ -54,7 +54,7 @@ class SE3Space(SearchSpace):
     """x = [first row of R, second row of R, t] (CHSEL, Sec. IV-C)."""
 
     dimension = 9
-    arrays = Space()
+    arrays = SpaceConstants()
 
     def encode(self, poses: Poses) -> FloatArray:
         """The 9-D vectors of poses."""
@@ -113,7 +113,7 @@ class SE2Space(SearchSpace):
         self._hat_squared = as_tensor(np.outer(axis, axis) - np.eye(3))
         turning = product(self._hat.numpy(), self.resting_rotation)
         turning_squared = product(self._hat_squared.numpy(), self.resting_rotation)
-        self.arrays = Space(
+        self.arrays = SpaceConstants(
             planar=True,
             axis=triple(axis),
             e_u=triple(e_u),
