@@ -89,10 +89,10 @@ class Icp:
         contacts, poses = problem.points.contacts, Poses.of(problem.initial_set)
         if len(contacts) == 0:
             return ranked(problem.initial_set, np.zeros(len(poses)))
-        clouds = _Clouds(contacts.T.copy(), self.surface(problem).T.copy())
-        observer.trace("icp", 0, poses.vectors, _distances(clouds, poses))
-        poses = self._iterated(clouds, poses, observer)
-        return ranked(poses.matrices, _distances(clouds, poses))
+        sets = _PointSets(contacts.T.copy(), self.surface(problem).T.copy())
+        observer.trace("icp", 0, poses.vectors, _distances(sets, poses))
+        poses = self._iterated(sets, poses, observer)
+        return ranked(poses.matrices, _distances(sets, poses))
 
     def surface(self, problem: RegistrationProblem) -> FloatArray:
         """The points (Q, 3) of the object's surface that stand for it, in its frame, metres."""
@@ -103,14 +103,14 @@ class Icp:
         stream = key.stream(Purpose.ICP_SURFACE)
         return sdf.derived(("icp", count, key), lambda: surface_points(sdf, count, stream))
 
-    def _iterated(self, clouds: _Clouds, poses: Poses, observer: Observer) -> Poses:
+    def _iterated(self, sets: _PointSets, poses: Poses, observer: Observer) -> Poses:
         """Poses after as many iterations as the stop rule allows."""
-        total, scratch = self.settings.iterations, partial(_scratch, clouds)
+        total, scratch = self.settings.iterations, partial(_scratch, sets)
         errors = np.full(len(poses), np.inf)
         for first in range(0, total, _BLOCK):
             count = min(_BLOCK, total - first)
             history, after = np.empty((count, len(poses), 12)), np.empty((count, len(poses)))
-            spread(partial(_iterate, clouds, poses.numbers, history, after), len(poses), scratch)
+            spread(partial(_iterate, sets, poses.numbers, history, after), len(poses), scratch)
             falling = self._falling(np.concatenate([errors[None], after]))
             count = count if falling.all() else int(np.argmin(falling)) + 1
             poses, errors = Poses(history[count - 1]), after[count - 1]
@@ -128,18 +128,18 @@ class Icp:
         return np.logical_or.reduce(falls, axis=1)
 
 
-class _Clouds(NamedTuple):
-    """What is aligned."""
+class _PointSets(NamedTuple):
+    """The points that are aligned."""
 
     contacts: FloatArray  # (3, N), world, metres
     surface: FloatArray  # (3, Q), object frame, metres
 
 
-def _distances(clouds: _Clouds, poses: Poses) -> FloatArray:
+def _distances(sets: _PointSets, poses: Poses) -> FloatArray:
     """The rms distances (B,) of the contacts to their nearest surface points, metres."""
     out = np.empty(len(poses))
-    run = partial(_fill_distances, clouds, poses.numbers, out)
-    spread(run, len(poses), partial(_scratch, clouds))
+    run = partial(_fill_distances, sets, poses.numbers, out)
+    spread(run, len(poses), partial(_scratch, sets))
     return out
 
 
@@ -158,8 +158,8 @@ class _Scratch(NamedTuple):
     last_vectors: FloatArray  # (4, 4)
 
 
-def _scratch(clouds: _Clouds) -> _Scratch:
-    count = clouds.contacts.shape[1]
+def _scratch(sets: _PointSets) -> _Scratch:
+    count = sets.contacts.shape[1]
     points, matched, squares = np.empty((3, count)), np.empty((3, count)), np.empty(count)
     form, work, vectors, last_vectors = np.empty((4, 4, 4))
     values, last_values = np.empty((2, 4))
@@ -170,7 +170,7 @@ def _scratch(clouds: _Clouds) -> _Scratch:
 
 
 @compiled
-def _iterate(clouds, poses, history, errors, first, last, scratch):
+def _iterate(sets, poses, history, errors, first, last, scratch):
     """Run K iterations from poses (B, 12), those from `first` to before `last`.
 
     Fills history (K, B, 12), the pose after each iteration, and errors (K, B): the rms distance of
@@ -183,9 +183,9 @@ def _iterate(clouds, poses, history, errors, first, last, scratch):
         for k in range(len(history)):
             if not settled:  # a pose that stays as it is will always do so
                 before = pose
-                _match(clouds, pose, scratch)
-                pose = _aligned(clouds.contacts, pose, scratch)
-                error = _rms(clouds.contacts, pose, scratch.matched)
+                _match(sets, pose, scratch)
+                pose = _aligned(sets.contacts, pose, scratch)
+                error = _rms(sets.contacts, pose, scratch.matched)
                 settled = pose == before
             for i in range(12):
                 history[k, n, i] = pose[i]
@@ -193,18 +193,18 @@ def _iterate(clouds, poses, history, errors, first, last, scratch):
 
 
 @compiled
-def _fill_distances(clouds, poses, out, first, last, scratch):
+def _fill_distances(sets, poses, out, first, last, scratch):
     """Fill out (B,) with the rms distances under poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
         pose = pose_at(poses, n)
-        _match(clouds, pose, scratch)
-        out[n] = _rms(clouds.contacts, pose, scratch.matched)
+        _match(sets, pose, scratch)
+        out[n] = _rms(sets.contacts, pose, scratch.matched)
 
 
 @inner
-def _match(clouds, pose, scratch):
+def _match(sets, pose, scratch):
     """Fill matched (3, N) with the surface point nearest to each contact, the first of equals."""
-    contacts, surface = clouds.contacts, clouds.surface
+    contacts, surface = sets.contacts, sets.surface
     squares, nearest = scratch.squares, scratch.nearest
     xs, ys, zs = scratch.points[0], scratch.points[1], scratch.points[2]
     for n in range(len(squares)):
