@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -129,6 +130,17 @@ def test_a_package_imports_only_what_it_may(package: str) -> None:
     assert len(files) > 5
     tops = {file: {name.split(".")[0] for name in imported(file, REPOSITORY)} for file in files}
     assert not {file: names for file, names in tops.items() if names & FORBIDDEN[package]}
+
+
+def test_the_page_for_maintainers_has_these_rules() -> None:
+    for header, rules in {
+        "package | never imports": FORBIDDEN,
+        "folder of `chsel` | may import": MAY_IMPORT,
+        "method | is built of": BUILT_OF,
+    }.items():
+        _, _, rest = PAGE.read_text().partition(f"| {header} |\n|---|---|\n")
+        rows = [re.findall(r"`(\w+)`", row) for row in rest.partition("\n\n")[0].splitlines()]
+        assert {name: set(others) for name, *others in rows} == rules
 
 
 def test_every_folder_of_chsel_has_its_layer() -> None:
