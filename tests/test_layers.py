@@ -35,7 +35,7 @@ MAY_IMPORT = {
 BUILT_OF = {"chsel": {"gradient_descent", "anchored"}}
 """Methods, each a file or a folder of chsel/methods, and those that are parts of them."""
 EVERY_METHOD = {"method"}  # the protocol that they implement
-ALL_METHODS = {"", "installed"}  # chsel/methods/__init__.py, and methods of other packages
+ALL_METHODS = {"", "registry"}  # chsel/methods/__init__.py, and the table of all methods
 
 
 def module_name(file: Path, root: Path) -> str:

@@ -30,21 +30,9 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for title in RECIPES:
         recipe = section(PAGE, title)
         assert take_over(recipe, folder)
-        before_presets_follow_from_the_code(folder)
         for command in commands_in(recipe):
             run(command, folder)
     return folder
-
-
-def before_presets_follow_from_the_code(folder: Path) -> None:
-    """What a method needs as long as conf/method/ has a file for each."""
-    if (folder / "conf" / "method" / "gradient_descent.yaml").exists():
-        text = (folder / "conf" / "method" / "gradient_descent.yaml").read_text()
-        renamed = text.replace("gradient_descent", "annealing")
-        (folder / "conf" / "method" / "annealing.yaml").write_text(renamed)
-        table = folder / "chsel" / "methods" / "__init__.py"
-        entry = "(Annealing, lambda preset: AnnealingSettings())"
-        table.write_text(table.read_text().replace("(Annealing, AnnealingSettings())", entry))
 
 
 def run(command: str, folder: Path) -> str:
