@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from chsel import CompiledCost
 from replay.mcap.reader import Recording, read_recording
-from tests.docs.page import commands_in, section, shell, take_over
+from tests.docs.page import commands_in, named_blocks, section, shell, take_over
 
 PAGE = "architecture.md"
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -113,3 +114,20 @@ def test_an_event_is_written_read_listed_and_exported(copy: Path) -> None:
 def test_recordings_of_before_the_event_stay_readable(copy: Path) -> None:
     stored = REPOSITORY / "tests" / "replays" / "spam_can_gradient_descent.mcap"
     run(f"python -m replay verify {stored}", copy)
+
+
+def test_files_and_classes_that_the_page_names_exist() -> None:
+    prose = re.sub(r"^```.*?^```$", "", (REPOSITORY / "docs" / PAGE).read_text(), flags=re.M | re.S)
+    words = set(re.findall(r"`([\w./-]+)`", prose))
+    files = [file for package in PACKAGES for file in (REPOSITORY / package).rglob("*.*")]
+    files += (REPOSITORY / "tests").rglob("*.*")
+    recipes = "".join(section(PAGE, title) for title in RECIPES)
+    paths = {"/" + name for name, _, _ in named_blocks(recipes)}
+    paths |= {"/" + file.relative_to(REPOSITORY).as_posix() for file in files}
+    named = {word for word in words if word.endswith((".py", ".yaml", ".json"))}
+    assert len(named) > 30
+    assert {word for word in named if not any(path.endswith("/" + word) for path in paths)} == set()
+    text = "".join(file.read_text() for file in files if file.suffix == ".py")
+    classes = {word for word in words if re.fullmatch(r"(?:[A-Z][a-z0-9]+){2,}", word)}
+    assert len(classes) > 8
+    assert {word for word in classes if not re.search(rf"\b{word}\b", text)} == set()
