@@ -27,7 +27,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import PRESETS, Presets
+from chsel.problem.settings import Presets
 from chsel.qd.selection import ranked_hypotheses
 
 _LEAST = 1e-8  # of 2 h^2, which keeps gamma finite
@@ -238,10 +238,7 @@ class SvgdSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None
 
-    presets: ClassVar[Presets] = {
-        preset: {"cost": CostSettings.presets[preset], "online": OnlineSettings.presets[preset]}
-        for preset in PRESETS[1:]
-    }
+    presets: ClassVar[Presets] = {}  # those of its groups
 
     def __post_init__(self) -> None:
         require_choice("kernel", self.kernel, ("reference", "median"))

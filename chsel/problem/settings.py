@@ -40,10 +40,19 @@ def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str)
 
 
 def in_preset(settings: Settings, preset: str) -> Settings:
-    """Settings of the preset `default` with what differs in another one, see `PRESETS`."""
+    """Settings of the preset `default` as another one of `PRESETS` has them.
+
+    Each group of settings changes as its own class says, then what `presets` of this class names.
+    A class without `presets` is the same in all of them, with its groups.
+    """
     require_choice("preset", preset, PRESETS)
-    changes = getattr(settings, "presets", {}).get(preset, {})
-    return changed_settings(settings, changes, f"preset {preset}")
+    presets = getattr(settings, "presets", None)
+    if presets is None:
+        return settings
+    values = vars(settings).items()
+    groups = {n: in_preset(v, preset) for n, v in values if dataclasses.is_dataclass(v)}
+    settings = dataclasses.replace(settings, **groups)  # type: ignore[type-var]
+    return changed_settings(settings, presets.get(preset, {}), f"preset {preset}")
 
 
 def settings_mapping(settings: Any) -> dict[str, Any]:
