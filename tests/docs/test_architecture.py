@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from chsel import CompiledCost
 from replay.mcap.reader import Recording, read_recording
@@ -63,6 +64,13 @@ def test_a_method_anneals_every_start(copy: Path) -> None:
         before = np.sort(CompiledCost.of(problem).evaluate(problem.initial_set))
         assert (found.cost <= before).all()
         assert found.cost.sum() < before.sum()
+
+
+def test_a_method_has_the_presets_of_its_groups(copy: Path) -> None:
+    shown = run("python -m runners.probe method=annealing preset=paper --cfg job --resolve", copy)
+    method = yaml.safe_load(shown)["method"]
+    assert (method["name"], method["rounds"]) == ("annealing", 200)
+    assert method["cost"]["lookup"] == "nearest"
 
 
 def test_its_kernel_is_checked_as_all_are(copy: Path) -> None:
