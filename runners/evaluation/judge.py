@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from chsel.errors import ChselError
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet
 from chsel.plausible.pose_metrics import EvaluationError, pose_errors
-from chsel.plausible.scan import EvaluationCost
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
