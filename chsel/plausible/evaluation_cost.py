@@ -170,7 +170,7 @@ def cost_below(model: EvaluationModel, pose: Pose, limit: float, scratch: Found)
     occupied = _occupied_count(model, pose, scratch)
     if not _cost(model, 0, occupied, total) < limit:
         return np.inf
-    if rigid(pose) and not _few_violations(model, pose, occupied, total, limit, scratch):
+    if rigid(pose) and not _may_be_below(model, pose, occupied, total, limit, scratch):
         return np.inf
     cost = _cost(model, _free_count(model, pose, scratch), occupied, total)
     return cost if cost < limit else np.inf
@@ -218,10 +218,10 @@ def _distance(
 
 
 @spliced
-def _few_violations(
+def _may_be_below(
     model: EvaluationModel, pose: Pose, occupied: int, total: float, limit: float, scratch: Found
 ) -> bool:
-    """False if the free points near some points inside of the object are too many violations."""
+    """False if the free points near some points inside of the object violate too often."""
     spheres, nodes = model.tree.spheres, len(model.tree.starts) - 1
     voxels, inside, hits = model.voxels, model.inside, 0
     for n in range(inside.shape[1]):

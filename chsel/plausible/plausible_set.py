@@ -45,11 +45,6 @@ class PlausibleSet:
         return self.world_from_object[0]
 
     @property
-    def filled(self) -> bool:
-        """Whether members off the grid were added."""
-        return bool(self.local.any())
-
-    @property
     def digest(self) -> str:
         """Digest of the members and their costs."""
         parts = self.world_from_object, self.cost, self.local, self.index, self.index_cost

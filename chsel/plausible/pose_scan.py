@@ -1,7 +1,7 @@
-"""All poses of a grid that cost less than a limit, by brute force but for what cannot be.
+"""A grid of poses around the true one, and all its poses that cost less than a limit.
 
-A block of positions is passed over if the least that the known points can cost anywhere in it is
-too much already; the bounds allow for rounding, and what remains is costed as if alone.
+A block of positions is skipped if a lower bound of what the known points cost anywhere in it is
+too high. Bounds allow for rounding, and every pose that remains gets its exact cost.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class Scan(NamedTuple):
 
 
 class ScanBuffer(NamedTuple):
-    """Scratch of one thread, and C poses that it has found."""
+    """Scratch of one thread, and the poses below the limit that it collects."""
 
     cost_scratch: Found
     turned: FloatArray  # (3, M)
@@ -186,10 +186,10 @@ class ScanBuffer(NamedTuple):
 
 @compiled
 def scan_rotations(scan: Scan, first: int, last: int, buffer: ScanBuffer) -> tuple[int, int]:
-    """Find the poses below the limit with rotations from `first` to before `last`.
+    """Collect the poses below the limit, of rotations from `first` to before `last`.
 
-    Returns the rotation to go on with, and how many poses are in the buffer; it ends before `last`
-    where the buffer may not do for another rotation.
+    Returns the rotation to go on with, which is less than `last` where the buffer may be too small
+    for it, and the number of poses in the buffer.
     """
     positions, blocks, known = scan.positions, scan.blocks, scan.known
     centres, stack, count = blocks.centres, buffer.stack, 0
@@ -239,14 +239,14 @@ def _rotation_at(rotations: FloatArray, n: int) -> Any:
 def _may_hold(
     scan: Scan, layer: int, rotated_points: FloatArray, x: float, y: float, z: float
 ) -> bool:
-    """Whether known points, turned and moved to a block's centre, leave it below the limit."""
+    """Whether a block with its centre at x, y, z, turned, can hold a pose below the limit."""
     bounds = scan.bounds.layers[layer]
     table, reach, inverse, low = scan.bounds.table, scan.bounds.reach, bounds.inverse, bounds.low
-    high_x, high_y, high_z = bounds.high[0], bounds.high[1], bounds.high[2]
-    most_x, most_y, most_z = bounds.most[0], bounds.most[1], bounds.most[2]
+    high_x, high_y, high_z = bounds.high_x, bounds.high_y, bounds.high_z
+    most_x, most_y, most_z = bounds.most_x, bounds.most_y, bounds.most_z
     across, along, row = bounds.across, bounds.along, bounds.row
     radius, unsure, total = bounds.radius, bounds.unsure, 0.0
-    x, y, z = x + bounds.corner[0], y + bounds.corner[1], z + bounds.corner[2]
+    x, y, z = x + bounds.corner_x, y + bounds.corner_y, z + bounds.corner_z
     for m in range(rotated_points.shape[1]):
         u = (rotated_points[0, m] - x) * inverse
         v = (rotated_points[1, m] - y) * inverse

@@ -77,18 +77,16 @@ def _centre_and_radius(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 BOUNDS_LAYER = np.dtype(
-    [
-        ("corner", np.float64, 3),  # of the first cell, in the object frame, m
-        ("inverse", np.float64),  # cells per metre
-        ("low", np.float64),  # the box of the SDF grid, in cells: its lower side on all axes,
-        ("high", np.float64, 3),  # and its upper sides
-        ("most", np.float64, 3),  # the greatest index of a cell per axis
-        ("across", np.float64),  # steps in the table to the next cell on the first axis,
-        ("along", np.float64),  # and on the second
-        ("row", np.float64),  # of the first cell in the table
-        ("radius", np.float64),  # m
-        ("unsure", np.float64),  # cells: nearer to the border of a cell, its bounds do not hold
-    ]
+    [(f"corner_{axis}", np.float64) for axis in "xyz"]  # of the first cell, object frame, m
+    + [("inverse", np.float64)]  # cells per metre
+    + [("low", np.float64)]  # the box of the SDF grid, in cells: its lower side on all axes,
+    + [(f"high_{axis}", np.float64) for axis in "xyz"]  # and its upper sides
+    + [(f"most_{axis}", np.float64) for axis in "xyz"]  # the greatest index of a cell
+    + [("across", np.float64)]  # steps in the table to the next cell on the first axis,
+    + [("along", np.float64)]  # and on the second
+    + [("row", np.float64)]  # of the first cell in the table
+    + [("radius", np.float64)]  # m
+    + [("unsure", np.float64)]  # cells: nearer to the border of a cell, its bounds do not hold
 )
 
 
@@ -130,11 +128,11 @@ def _bounds(sdf: SdfGrid, lookup: str, outside: str, radii: FloatArray) -> Dista
             _open_border(low, size, radius)
         _, ny, nz = low.shape
         layers[n] = (
-            corner,
+            *corner,
             1.0 / size,
             (sdf.bounds[0] - corner)[0] / size,
-            (sdf.bounds[1] - corner) / size,
-            np.array(low.shape) - 1,
+            *(sdf.bounds[1] - corner) / size,
+            *(np.array(low.shape) - 1),
             ny * nz,
             nz,
             row,
@@ -173,27 +171,18 @@ def _least_around(values: FloatArray, size: float, radius: float) -> FloatArray:
     """The least value of all cells that have a point within a radius of a point of each cell."""
     reach = int(np.floor(radius / size)) + 1
     gap = np.maximum(np.abs(np.arange(-reach, reach + 1)) - 1, 0) * size
+    left = radius**2 - gap[:, None] ** 2 - gap**2
+    nx, ny, _ = values.shape
     columns: dict[int, FloatArray] = {}
     out = np.full(values.shape, np.inf)
-    for i in range(-reach, reach + 1):
-        for j in range(-reach, reach + 1):
-            left = radius**2 - gap[i + reach] ** 2 - gap[j + reach] ** 2
-            if left < 0.0:
-                continue
-            length = int(np.floor(np.sqrt(left) / size)) + 1
-            if length not in columns:
-                columns[length] = minimum_filter1d(values, 2 * length + 1, axis=2, mode="nearest")
-            to_x, from_x = _shifted(i, values.shape[0])
-            to_y, from_y = _shifted(j, values.shape[1])
-            target = out[to_x, to_y]
-            np.minimum(target, columns[length][from_x, from_y], out=target)
+    for i, j in np.argwhere(left >= 0.0):
+        length = int(np.floor(np.sqrt(left[i, j]) / size)) + 1
+        if length not in columns:
+            column = minimum_filter1d(values, 2 * length + 1, axis=2, mode="nearest")
+            pad = (reach, reach), (reach, reach), (0, 0)
+            columns[length] = np.pad(column, pad, constant_values=np.inf)
+        np.minimum(out, columns[length][i : i + nx, j : j + ny], out=out)
     return out
-
-
-def _shifted(step: int, count: int) -> tuple[slice, slice]:
-    """Cells that have another one `step` cells further on, and those other cells."""
-    step = max(-count, min(step, count))
-    return slice(max(-step, 0), count - max(step, 0)), slice(max(step, 0), count + min(step, 0))
 
 
 def _open_border(low: FloatArray, size: float, radius: float) -> None:
