@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -21,8 +23,8 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, normals
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
@@ -74,8 +76,10 @@ class ChselSettings:
     emitter: EmitterSettings = field(default_factory=EmitterSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    starts: AnchoredStarts | None = None
+    starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)
     plane: PlaneSettings | None = None
+
+    presets: ClassVar[Presets] = {"paper": {"starts": None}, "reference": {"starts": None}}
 
     def __post_init__(self) -> None:
         require_choice("search", self.search, SEARCHES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.registration_problem import Observer
 from chsel.problem.search_space import SearchSpace
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd import emitter_kernels as kernels
 from chsel.qd.archive import GridArchive
@@ -33,10 +34,15 @@ class EmitterSettings:
     """
 
     iterations: int = 100
-    sigma0: float = 1.0
-    rate: float = 0.05
+    sigma0: float = 0.005
+    rate: float = 0.01
     start: str = "best"
     ribs_parity: bool = False
+
+    presets: ClassVar[Presets] = {
+        "paper": {"sigma0": 1.0, "rate": 0.05, "start": "initial"},
+        "reference": {"sigma0": 1.0, "rate": 0.05, "start": "initial", "ribs_parity": True},
+    }
 
     def __post_init__(self) -> None:
         require_positive("iterations", self.iterations, zero=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SearchSpace, origin_bounds
+from chsel.problem.settings import Presets
 from chsel.problem.subset import evenly, representative
 from chsel.problem.surface import has_surface
 from chsel.qd.archive import GridArchive
@@ -35,14 +36,30 @@ class ArchiveSettings:
     tolerance_per_point: tolerance per known point; tolerance: its floor.
     """
 
-    measure: str = "position_2"
-    bins: int = 40
+    measure: str = "object_xy"
+    bins: int = 56
     range_sigmas: float = 3.0
     least_deviation: float = 0.005
     outliers: str = "ratio"
     ratio: float = 5.0
     tolerance_per_point: float = 1e-3
     tolerance: float = 1e-6
+
+    presets: ClassVar[Presets] = {
+        "paper": {
+            "measure": "position_2",
+            "bins": 40,
+            "least_deviation": 1e-4,
+            "outliers": "none",
+        },
+        "reference": {
+            "measure": "position_2",
+            "bins": 40,
+            "least_deviation": 1e-4,
+            "tolerance_per_point": 0.0,
+            "tolerance": 0.1,
+        },
+    }
 
     def __post_init__(self) -> None:
         require_choice("outliers", self.outliers, ("ratio", "quantile", "none"))
@@ -71,14 +88,26 @@ class OutputSettings:
     is in there; None: it may be anywhere.
     """
 
-    choice: str = "lowest"
+    choice: str = "representative"
     limit: str = "noise"
-    ratio: float = 5.0
+    ratio: float = 1.3
     tolerance: float = 1e-6
-    tolerance_per_point: float = 2e-3
-    free_tolerance: float = 0.2
+    tolerance_per_point: float = 5e-4
+    free_tolerance: float = 0.01
     shortage: str = "next_best"
-    margin: float | None = None
+    margin: float | None = 0.15
+
+    _OTHERS: ClassVar = {  # of both other presets
+        "choice": "lowest",
+        "ratio": 5.0,
+        "tolerance_per_point": 2e-3,
+        "free_tolerance": 0.2,
+        "margin": None,
+    }
+    presets: ClassVar[Presets] = {
+        "paper": _OTHERS | {"limit": "none", "shortage": "fewer"},
+        "reference": _OTHERS | {"limit": "ratio", "shortage": "resample"},
+    }
 
     def __post_init__(self) -> None:
         require_choice("choice", self.choice, ("lowest", "representative"))

@@ -12,9 +12,9 @@ from chsel.numerics.threads import threads as use_threads
 from chsel.plausible.plausible_set import plausible_set, rotation_seed
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_scan import grid_around
+from chsel.problem.online_registration import OnlineSettings, first_initial_set
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from replay.events import Probe
 from runners.benchmarks.problems import PROBLEMS, drill, pose
 from runners.benchmarks.scope import Scope

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from chsel.errors import ChselError
+from chsel.errors import EvaluationError
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet
-from chsel.plausible.pose_metrics import EvaluationError, pose_errors
+from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
@@ -18,6 +18,7 @@ from runners.evaluation.measure import Measure
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.table import Row
 from runners.evaluation.trial_session import load_members, plausible_settings_of, read_session
+from runners.session_run import one_line
 from runners.sessions.recorded import RecordedSession
 
 
@@ -135,9 +136,3 @@ class Judge:
                 "qd_score": snapshot.qd_score,
                 **metrics,
             }
-
-
-def one_line(error: BaseException) -> str:
-    """What an error says, with its kind if it is none of ours."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"

@@ -14,6 +14,7 @@ from chsel.methods.anchored.anchor_sampling import (
 )
 from chsel.methods.anchored.energy import Energy
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -23,7 +24,6 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.subset import evenly, representative, spaced
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import update_cells
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import ArchiveSettings, ranked_hypotheses, repeated, sized_archive
@@ -37,7 +37,7 @@ _POOL = 400  # candidates to choose from
 _MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
 _MOST_CHOSEN = 300  # by facility location; more of them are taken evenly
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
-_ARCHIVE = ArchiveSettings(measure="object_xy", outliers="none")
+_ARCHIVE = ArchiveSettings(bins=40, outliers="none")
 _ONLINE = OnlineSettings(update="own")
 
 
@@ -101,6 +101,8 @@ class AnchoredSettings:
     limit_noise noise levels, and limit_ratio x lowest energy + limit_slack noise levels.
     outer_share, outer_noise: that share of the chains may be so many noise levels above it.
     plane: restricts the poses to SE(2).
+
+    They are the same in all presets: the method is neither in the paper nor in its authors' code.
     """
 
     size: str = "medium"
@@ -131,11 +133,6 @@ class AnchoredSettings:
             require_positive(name, getattr(self, name), zero=True)
         require_at_most("outer_share", self.outer_share, 1.0)
         measure_named(self.archive.measure, planar=self.plane is not None)
-
-
-def preset_anchored(preset: str) -> AnchoredSettings:
-    """The settings of any preset: the method is neither in the paper nor in its code."""
-    return AnchoredSettings()
 
 
 class Anchored:

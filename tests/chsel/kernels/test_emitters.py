@@ -108,7 +108,7 @@ def found(name: str, kind: int, interval: int = 0, count: int = COUNT) -> GridAr
     """The archive after a search."""
     archive = empty_archive()
     draws, watch = Draws(StreamKey(4, 0)), ArchiveWatch(Watcher(interval), 0, "search")
-    settings = EmitterSettings(iterations=ITERATIONS, sigma0=0.2)
+    settings = EmitterSettings(iterations=ITERATIONS, sigma0=0.2, rate=0.05)
     SEARCHES[name](LandscapeObjective(kind), archive, START, count, settings, draws, watch)  # type: ignore[arg-type]
     return archive
 
