@@ -31,6 +31,10 @@ class PoseError(ChselError):
     """A pose is not a rigid transform."""
 
 
+class EvaluationError(ChselError):
+    """A plausible set cannot be made, written or read, or does not belong to a problem."""
+
+
 class EngineError(ChselError):
     """The compiled kernels cannot run here, or a device does not exist."""
 

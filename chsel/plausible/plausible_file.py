@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from chsel.errors import ChselError
+from chsel.errors import ChselError, EvaluationError
 from chsel.numerics.arrays import FloatArray, digest, frozen
 from chsel.plausible.plausible_set import PlausibleSet, rotation_seed
 from chsel.plausible.plausible_settings import PlausibleSettings
-from chsel.plausible.pose_metrics import EvaluationError
 from chsel.problem.file_checks import read_npz
 from chsel.problem.poses import check_rigid
 from chsel.problem.registration_problem import RegistrationProblem
@@ -31,25 +30,26 @@ def plausible_path(folder: Path, problem: RegistrationProblem, settings: Plausib
     return folder / _name(problem.points.digest, settings, seed, problem.sdf.digest)
 
 
-def save_plausible(folder: Path, found: PlausibleSet) -> Path:
+def save_plausible(folder: Path, members: PlausibleSet) -> Path:
     """Write a set into a folder, under the name by which `load_plausible` finds it."""
-    name = _name(found.points_digest, found.settings, found.seed, found.sdf_digest)
+    settings = members.settings
+    name = _name(members.points_digest, settings, members.seed, members.sdf_digest)
     path, beside = folder / name, folder / f".{name}.{os.urandom(4).hex()}"
     arrays: dict[str, Any] = {
         "format": np.array(FORMAT),
-        "world_from_object": found.world_from_object,
-        "cost": found.cost,
-        "local": found.local,
-        "index": found.index,
-        "index_cost": found.index_cost,
-        "true_pose": found.truth,
-        "true_cost": np.array(found.true_cost),
-        "epsilon": np.array(found.settings.epsilon),
-        "settings": np.array(found.settings.text),
-        "seed": np.array(found.seed, dtype=np.uint64),
-        "points_digest": np.array(found.points_digest),
-        "sdf_digest": np.array(found.sdf_digest),
-        "digest": np.array(found.digest),
+        "world_from_object": members.world_from_object,
+        "cost": members.cost,
+        "local": members.local,
+        "index": members.index,
+        "index_cost": members.index_cost,
+        "true_pose": members.truth,
+        "true_cost": np.array(members.true_cost),
+        "epsilon": np.array(settings.epsilon),
+        "settings": np.array(settings.text),
+        "seed": np.array(members.seed, dtype=np.uint64),
+        "points_digest": np.array(members.points_digest),
+        "sdf_digest": np.array(members.sdf_digest),
+        "digest": np.array(members.digest),
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -81,42 +81,42 @@ def load_plausible(
     path = plausible_path(folder, problem, settings)
     if not path.exists():
         return None
-    found = read_plausible(path)
+    members = read_plausible(path)
     expected = {
-        "known points": (found.points_digest, problem.points.digest),
-        "SDF grid": (found.sdf_digest, problem.sdf.digest),
-        "definition": (found.settings.digest, settings.digest),
-        "seed": (found.seed, rotation_seed(problem, settings)),
+        "known points": (members.points_digest, problem.points.digest),
+        "SDF grid": (members.sdf_digest, problem.sdf.digest),
+        "definition": (members.settings.digest, settings.digest),
+        "seed": (members.seed, rotation_seed(problem, settings)),
     }
     if world_from_object is not None:
         given = frozen("world_from_object", world_from_object, (4, 4))
-        expected["true pose"] = digest(found.truth), digest(given)
-    for what, (have, want) in expected.items():
+        expected["true pose"] = digest(members.truth), digest(given)
+    for part, (have, want) in expected.items():
         if have != want:
             raise EvaluationError(
-                f"plausible set {path} belongs to another {what} ({have}); accepted: {want}, so "
-                "remove the file to have it made again"
+                f"plausible set {path} belongs to another {part} ({have}); accepted: {want}, so "
+                "remove the file to have it computed again"
             )
-    return found
+    return members
 
 
 def read_plausible(path: Path) -> PlausibleSet:
     """The set in a file, its digest checked. Raises EvaluationError if it is damaged."""
     try:
         arrays = read_npz(path, most_bytes=MOST_BYTES, error=EvaluationError)
-        found = _set_of(arrays)
+        members = _set_of(arrays)
     except _UNREADABLE as error:
         text = " ".join(str(error).split())
         raise EvaluationError(
-            f"plausible set {path} is damaged or no plausible set ({text}); accepted: a file that "
-            "runners.plausible has written"
+            f"plausible set {path} is damaged or not a plausible set ({text}); accepted: a file "
+            "that runners.plausible has written"
         ) from None
-    if str(arrays["digest"]) != found.digest:
+    if str(arrays["digest"]) != members.digest:
         raise EvaluationError(
-            f"plausible set {path} does not hold what was written (digest {found.digest}); "
+            f"plausible set {path} does not hold what was written (digest {members.digest}); "
             f"accepted: {arrays['digest']}"
         )
-    return found
+    return members
 
 
 def _set_of(arrays: dict[str, Any]) -> PlausibleSet:
@@ -127,18 +127,18 @@ def _set_of(arrays: dict[str, Any]) -> PlausibleSet:
     count, on_grid = len(members), len(arrays["index"])
     if count == 0:
         raise EvaluationError("it has no member")
-    settings = build_settings(PlausibleSettings, json.loads(str(arrays["settings"])), "settings")
+    settings = json.loads(str(arrays["settings"]))
     return PlausibleSet(
-        members,
-        frozen("cost", arrays["cost"], (count,)),
-        frozen("local", arrays["local"], (count,), dtype=np.bool_),
-        frozen("index", arrays["index"], (on_grid,), dtype=np.int64),
-        frozen("index_cost", arrays["index_cost"], (on_grid,)),
-        float(arrays["true_cost"]),
-        settings,
-        int(arrays["seed"]),
-        str(arrays["points_digest"]),
-        str(arrays["sdf_digest"]),
+        world_from_object=members,
+        cost=frozen("cost", arrays["cost"], (count,)),
+        local=frozen("local", arrays["local"], (count,), dtype=np.bool_),
+        index=frozen("index", arrays["index"], (on_grid,), dtype=np.int64),
+        index_cost=frozen("index_cost", arrays["index_cost"], (on_grid,)),
+        true_cost=float(arrays["true_cost"]),
+        settings=build_settings(PlausibleSettings, settings, "settings"),
+        seed=int(arrays["seed"]),
+        points_digest=str(arrays["points_digest"]),
+        sdf_digest=str(arrays["sdf_digest"]),
     )
 
 

@@ -1,4 +1,4 @@
-"""What the plausible set is: the cost that defines it, and the poses that are looked at."""
+"""What the plausible set is: the cost that defines it, and the grid of poses that is scanned."""
 
 from __future__ import annotations
 
@@ -23,19 +23,13 @@ Axis = tuple[tuple[float, float, int], ...]
 
 @dataclass(frozen=True)
 class EvaluationCostSettings:
-    """Settings of the cost C that only evaluation uses (CHSEL, Eq. 2).
+    """Settings of the cost C that only evaluation uses (CHSEL, Eq. 2)."""
 
-    combine: "sums" over points as the paper writes it, "means" over each class of points as the
-    authors' experiments took them. violation: c_max, of a free or occupied point on the wrong
-    side. tolerance: metres that a point may be on the wrong side (0 in the paper). occupied:
-    whether occupied points count. lookup, outside: how the SDF grid is read, see SdfGrid.query.
-    """
-
-    combine: str = "means"
-    violation: float = 1e5
-    tolerance: float = 0.01
-    occupied: bool = True
-    lookup: str = "nearest"
+    combine: str = "means"  # "sums" over points (the paper), "means" over each class (its code)
+    violation: float = 1e5  # c_max, of a free or occupied point on the wrong side
+    tolerance: float = 0.01  # metres that a point may be on the wrong side; 0 in the paper
+    occupied: bool = True  # whether occupied points count
+    lookup: str = "nearest"  # how the SDF grid is read, see SdfGrid.query
     outside: str = "surface_point"
 
     def __post_init__(self) -> None:
@@ -80,19 +74,13 @@ class Offsets:
 
 @dataclass(frozen=True)
 class PoseGridSettings:
-    """The poses that are looked at: positions around the true one, each with every rotation.
+    """The poses that are scanned: positions around the true one, each with every rotation."""
 
-    offsets: of the positions. rotations: how many, uniform on SO(3), absolute. upright: yaws of
-    the object's frame on the world's, evenly spaced. extra: "added" looks at the upright ones and
-    at the true rotation besides, "replaced" puts them in place of the first, as the reference
-    does. seed: of the rotations; by default that of the session.
-    """
-
-    offsets: Offsets = field(default_factory=Offsets)
-    rotations: int = 10_000
-    upright: int = 100
-    extra: str = "added"
-    seed: int | None = None
+    offsets: Offsets = field(default_factory=Offsets)  # of the positions
+    rotations: int = 10_000  # uniform on SO(3), absolute
+    upright: int = 100  # yaws of the object's frame on the world's, evenly spaced
+    extra: str = "added"  # upright and true rotation besides, or "replaced": in place of the first
+    seed: int | None = None  # of the rotations; by default that of the session
 
     def __post_init__(self) -> None:
         require_positive("rotations", self.rotations)
@@ -111,18 +99,16 @@ class PoseGridSettings:
 
 @dataclass(frozen=True)
 class ModeSearchSettings:
-    """How members are sought in modes that the grid passes by, see chsel.plausible.mode_search.
+    """How members are sought in modes between the poses of the grid, see chsel.plausible.off_grid.
 
-    starts: how many poses climb, at most. They are poses of the grid whose mean over known points
-    is less than `distance` above the true pose's, and that violate few points by more than
-    `depth`, metres both. separation: how far the surface of a new mode is from that of all other
-    members, metres, root mean square.
+    Poses of the grid climb if their mean over known points is less than `distance` above the true
+    pose's, and few points are deeper than `depth` on the wrong side, metres both.
     """
 
-    starts: int = 1000
+    starts: int = 1000  # poses that climb, at most
     distance: float = 0.01
     depth: float = 0.02
-    separation: float = 0.01
+    separation: float = 0.01  # m, root mean square, of a new mode's surface from all other members'
 
     def __post_init__(self) -> None:
         require_positive("starts", self.starts)
@@ -135,21 +121,17 @@ class ModeSearchSettings:
 class PlausibleSettings:
     """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V).
 
-    epsilon: eps, metres. cost, grid: what C is, and which X are looked at. members: how many are
-    kept for evaluation at most, a random subset. fill_to: where the grid has fewer members than
-    this, others are sought around them, off the grid, see chsel.plausible.scan; 0: never.
-    modes: how to look for members far from all on the grid; None: not at all.
-    rescan: look at all poses at every step; False: after the first step only at the members of the
-    one before, which is exact only where C cannot fall as points are added, as with sums.
+    Without rescan, steps after the first look only at the members of the one before, which is
+    exact only where C cannot fall as points are added, as with sums.
     """
 
-    epsilon: float = 0.001
-    cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
-    grid: PoseGridSettings = field(default_factory=PoseGridSettings)
-    members: int = 1000
-    fill_to: int = 30
-    rescan: bool = True
-    modes: ModeSearchSettings | None = None
+    epsilon: float = 0.001  # eps, metres
+    cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)  # C
+    grid: PoseGridSettings = field(default_factory=PoseGridSettings)  # of poses X
+    members: int = 1000  # kept for evaluation at most, a random subset
+    fill_to: int = 30  # with fewer members on the grid, others are sought around them; 0: never
+    rescan: bool = True  # look at all poses at every step
+    modes: ModeSearchSettings | None = None  # how to look for members far from all on the grid
 
     def __post_init__(self) -> None:
         require_positive("epsilon", self.epsilon)
@@ -160,7 +142,7 @@ class PlausibleSettings:
 
     @property
     def text(self) -> str:
-        """All settings as JSON; without modes as it was before there was a search for them."""
+        """All settings as JSON; without modes as before they existed, so that digests stay."""
         mapping = settings_mapping(self)
         if self.modes is None:
             del mapping["modes"]

@@ -1,4 +1,4 @@
-"""How far hypotheses are from the true pose and from the plausible set, and from each other."""
+"""How far hypotheses are from the true pose, from each other, and from the plausible set."""
 
 from __future__ import annotations
 
@@ -8,16 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.errors import ChselError, SettingError
-from chsel.numerics.arrays import FloatArray
+from chsel.errors import EvaluationError, SettingError
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
 from chsel.problem.poses import apply, inverse, product, rotated, rotation_angle
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
-
-
-class EvaluationError(ChselError):
-    """A plausible set cannot be made, written or read, or does not belong to a problem."""
 
 
 def pose_errors(
@@ -35,73 +31,6 @@ def pose_errors(
     relative = product(object_from_world[:, :3, :3], world_from_object[:3, :3])
     distance = np.sqrt(((centres - centre) ** 2).sum(axis=1))
     return distance, symmetry.rotation_errors(relative)
-
-
-@dataclass(frozen=True)
-class PlausibleDiversity:
-    """coverage: the mean over plausible poses of the distance to the nearest hypothesis;
-    plausibility: the mean over hypotheses of that to the nearest plausible pose; mm^2.
-    """
-
-    coverage: float
-    plausibility: float
-
-    @property
-    def diversity(self) -> float:
-        """PD = coverage + plausibility, mm^2; 0 is best."""
-        return self.coverage + self.plausibility
-
-    @property
-    def root(self) -> float:
-        """The square root of PD, mm, which compares with lengths."""
-        return math.sqrt(self.diversity)
-
-
-def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
-    """The metrics of distances d (B, P) in mm^2, of hypotheses and plausible poses.
-
-    Raises EvaluationError if there is none of either.
-    """
-    if distances.ndim != 2 or 0 in distances.shape:
-        raise EvaluationError(
-            f"distances have shape {distances.shape}; accepted: (B, P), at least one hypothesis "
-            "and one plausible pose"
-        )
-    nearest_hypothesis, nearest_member = distances.min(axis=0), distances.min(axis=1)
-    return PlausibleDiversity(float(nearest_hypothesis.mean()), float(nearest_member.mean()))
-
-
-def cheapest(costs: FloatArray, quantile: float) -> np.ndarray:
-    """Flags (B,) of hypotheses whose cost is at most this quantile of costs (B,); 1: all."""
-    if not 0.0 < quantile <= 1.0:
-        raise SettingError(f"quantile is {quantile}; accepted: above 0, at most 1")
-    return np.asarray(costs <= np.quantile(costs, quantile, method="higher"))
-
-
-class Spread(NamedTuple):
-    """position: metres. rotation: radians."""
-
-    position: float
-    rotation: float
-
-
-def spread(hypotheses: Hypotheses, centre: FloatArray) -> Spread | None:
-    """Spread of the hypotheses that repeat no other; None if there is none.
-
-    position: the root mean square distance of the object's centres from their mean; `centre` (3,)
-    is in the object's frame, metres. rotation: the mean angle between the orientation of the best
-    hypothesis, the first, and those of the others, symmetries of the object not considered; 0
-    without others.
-    """
-    object_from_world = hypotheses.object_from_world[~hypotheses.duplicate]  # (B, 4, 4)
-    if len(object_from_world) == 0:
-        return None
-    centres = np.stack([apply(pose, centre[None])[0] for pose in inverse(object_from_world)])
-    distances = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
-    rotations = object_from_world[:, :3, :3]
-    angles = rotation_angle(rotations[1:] @ rotations[0].T)
-    rotation = float(angles.mean()) if len(angles) else 0.0
-    return Spread(float(np.sqrt(np.mean(distances**2))), rotation)
 
 
 def result_numbers(
@@ -133,18 +62,77 @@ def result_numbers(
     return values
 
 
+class Spread(NamedTuple):
+    """How far hypotheses are from each other."""
+
+    position: float  # m, root mean square distance of the object's centres from their mean
+    rotation: float  # radians, mean angle between the best hypothesis, the first, and the others
+
+
+def spread(hypotheses: Hypotheses, centre: FloatArray) -> Spread | None:
+    """Spread of the hypotheses that repeat no other; None if there is none.
+
+    centre (3,): of the object, in its frame, metres. Symmetries of the object are not considered;
+    the rotation is 0 for a single hypothesis.
+    """
+    object_from_world = hypotheses.object_from_world[~hypotheses.duplicate]  # (B, 4, 4)
+    if len(object_from_world) == 0:
+        return None
+    centres = np.stack([apply(pose, centre[None])[0] for pose in inverse(object_from_world)])
+    distances = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
+    rotations = object_from_world[:, :3, :3]
+    angles = rotation_angle(rotations[1:] @ rotations[0].T)
+    rotation = float(angles.mean()) if len(angles) else 0.0
+    return Spread(float(np.sqrt(np.mean(distances**2))), rotation)
+
+
+def cheapest(costs: FloatArray, quantile: float) -> BoolArray:
+    """Flags (B,) of hypotheses whose cost is at most this quantile of costs (B,); 1: all."""
+    if not 0.0 < quantile <= 1.0:
+        raise SettingError(f"quantile is {quantile}; accepted: above 0, at most 1")
+    return np.asarray(costs <= np.quantile(costs, quantile, method="higher"))
+
+
+@dataclass(frozen=True)
+class PlausibleDiversity:
+    """How far hypotheses are from the plausible set (CHSEL, Sec. V), mm^2; 0 is best."""
+
+    coverage: float  # mean over plausible poses of the distance to the nearest hypothesis
+    plausibility: float  # mean over hypotheses of the distance to the nearest plausible pose
+
+    @property
+    def diversity(self) -> float:
+        """PD = coverage + plausibility, mm^2."""
+        return self.coverage + self.plausibility
+
+    @property
+    def root(self) -> float:
+        """The square root of PD, mm, which compares with lengths."""
+        return math.sqrt(self.diversity)
+
+
+def plausible_diversity(distances: FloatArray) -> PlausibleDiversity:
+    """The metrics of distances d (B, P) in mm^2, of hypotheses and plausible poses.
+
+    Raises EvaluationError if there is none of either.
+    """
+    if distances.ndim != 2 or 0 in distances.shape:
+        raise EvaluationError(
+            f"distances have shape {distances.shape}; accepted: (B, P), at least one hypothesis "
+            "and one plausible pose"
+        )
+    nearest_hypothesis, nearest_member = distances.min(axis=0), distances.min(axis=1)
+    return PlausibleDiversity(float(nearest_hypothesis.mean()), float(nearest_member.mean()))
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """rank: share of the B + 1 poses that are at least as far out as the true one, in (0, 1].
+    """Whether the true pose could be one of B hypotheses."""
 
-    Uniform over many registrations if calibrated; small ones say that the truth lies outside of
-    the spread, as of a set too narrow or off. spread, error: root mean squared surface distances,
-    mm, between hypotheses, and from them to the truth.
-    """
-
-    rank: float
-    spread: float
-    error: float
+    rank: float  # share in (0, 1] of the B + 1 poses that are at least as far out as the true one;
+    # uniform over many registrations if calibrated, small if the set is too narrow, or off
+    spread: float  # mm, root mean squared surface distance between hypotheses
+    error: float  # mm, root mean squared surface distance from hypotheses to the truth
 
     def within(self, level: float = 0.05) -> bool:
         """Whether the truth is within the set's spread: not among the outermost `level`."""
@@ -167,6 +155,5 @@ def calibration(
     # Rounding must not rank equal poses.
     rank = (outwards >= outwards[-1] * (1.0 - 1e-9)).mean()
     between = distances[:-1, :-1].sum() / (count * (count - 1))
-    return Calibration(
-        float(rank), float(np.sqrt(between)), float(np.sqrt(distances[-1, :-1].mean()))
-    )
+    error = np.sqrt(distances[-1, :-1].mean())
+    return Calibration(float(rank), float(np.sqrt(between)), float(error))

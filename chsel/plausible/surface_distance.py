@@ -9,27 +9,23 @@ surface; one-directional, s the distance to the mesh (CHSEL, Sec. V).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from chsel.errors import PoseError, SettingError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.cell_set import Places, locate, places_for
+from chsel.numerics.compiler import compiled
+from chsel.numerics.pose_tuples import composed, inverted, moved, pose_at
 from chsel.numerics.threads import spread
-from chsel.plausible.surface_kernels import (
-    mean_squares,
-    moved_for,
-    moved_points,
-    relative_moves,
-)
-from chsel.problem.poses import Poses
+from chsel.problem.poses import Poses, compose, inverse, product, rotated, stacked
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import field_of
+from chsel.problem.sdf_lookup import Field, continued, field_of, sample
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 
 if TYPE_CHECKING:
     import trimesh
-
 
 METHODS = ("nearest", "exact", "grid")
 SQUARE_MILLIMETRES = 1e6  # in a square metre
@@ -40,15 +36,16 @@ _MOST_POINTS = 1_000_000
 
 @dataclass(frozen=True)
 class DistanceSettings:
-    """points: Q, 200 in the paper. method: "exact" measures to the mesh for every pair of poses;
-    "nearest" only for the few pairs that the interpolated SDF grid says are the nearest, which
-    are all that the metrics read, and is 10 to 100 times faster; "grid" never. bidirectional: the
-    mean of d and the same with the roles of the two poses swapped.
+    """How distances are measured.
+
+    "exact" measures to the mesh for every pair of poses; "nearest" only for the few pairs that the
+    interpolated SDF grid says are the nearest, which are all that the metrics read, and is 10 to
+    100 times faster; "grid" never.
     """
 
-    points: int = 500
+    points: int = 500  # Q, 200 in the paper
     method: str = "nearest"
-    bidirectional: bool = False
+    bidirectional: bool = False  # the mean of d and of d with the roles of the poses swapped
 
     def __post_init__(self) -> None:
         require_positive("points", self.points)
@@ -57,7 +54,7 @@ class DistanceSettings:
 
 
 class SurfaceDistance:
-    """Distances between poses of one object. mesh: in metres; may be None for method "grid"."""
+    """Distances between poses of one object."""
 
     def __init__(
         self,
@@ -66,7 +63,10 @@ class SurfaceDistance:
         points: FloatArray,
         settings: DistanceSettings | None = None,
     ) -> None:
-        """points (Q, 3): on the surface, in the object's frame, see surface_points."""
+        """points (Q, 3): on the surface, in the object's frame, see surface_points.
+
+        mesh: in metres; may be None for method "grid".
+        """
         import igl
 
         self.settings = settings = settings or DistanceSettings()
@@ -85,52 +85,58 @@ class SurfaceDistance:
 
         With method "nearest", the least of every row and column are exact, others are the grid's.
         """
-        to_object, to_world = _finite_poses(object_from_world), _finite_poses(world_from_object)
-        count, other = len(to_object), len(to_world)
+        to_object, to_world = _finite(object_from_world), _finite(world_from_object)
         if self.settings.method == "exact":
+            count, other = len(to_object), len(to_world)
             rows, columns = np.indices((count, other)).reshape(2, -1)
             return self._exact(to_object, to_world, rows, columns).reshape(count, other)
-        distances = self._grid(to_object, to_world)
+        distances = self._by_grid(Poses.of(to_object).numbers, Poses.of(to_world).numbers)
         if self.settings.method == "nearest" and distances.size:
             rows, columns = _nearest(distances)
             distances[rows, columns] = self._exact(to_object, to_world, rows, columns)
         return distances
 
-    def _grid(self, to_object: FloatArray, to_world: FloatArray) -> FloatArray:
-        """All distances (B, P) by the grid."""
+    @property
+    def _directions(self) -> tuple[bool, ...]:
+        return (False, True) if self.settings.bidirectional else (False,)
+
+    def _by_grid(self, to_object: FloatArray, to_world: FloatArray) -> FloatArray:
+        """All distances (B, P) by the grid, of poses (B, 12) and (P, 12)."""
         total = np.zeros((len(to_object), len(to_world)))
-        ways = (False, True) if self.settings.bidirectional else (False,)
-        for back in ways:
-            out = np.empty_like(total)
+        for back in self._directions:
+            total += self._mean_squares(PosePairs(to_object, to_world, back))
+        return total * (SQUARE_MILLIMETRES / len(self._directions))
 
-            def run(first: int, last: int, scratch: Any, back: bool = back, out: Any = out) -> None:
-                field, points = self._field, self._points
-                mean_squares(field, points, to_object, to_world, back, out, first, last, scratch)
+    def _mean_squares(self, pairs: PosePairs) -> FloatArray:
+        out = np.empty((len(pairs.to_object), len(pairs.to_world)))
 
-            spread(run, len(to_object), lambda: moved_for(self._points.shape[1]))
-            total += out
-        return total * (SQUARE_MILLIMETRES / len(ways))
+        def run(first: int, last: int, places: Places) -> None:
+            mean_squares(self._field, self._points, pairs, out, first, last, places)
+
+        spread(run, len(out), lambda: places_for(self._points.shape[1]))
+        return out
 
     def _exact(
         self, to_object: FloatArray, to_world: FloatArray, rows: IntArray, columns: IntArray
     ) -> FloatArray:
-        """Distances (N,) to the mesh of pairs of poses."""
+        """Distances (N,) to the mesh of pairs of poses (B, 4, 4) and (P, 4, 4)."""
         total = np.zeros(len(rows))
-        ways = (False, True) if self.settings.bidirectional else (False,)
         count = self._points.shape[1]
-        piece = max(1, _POINTS_AT_ONCE // count)
-        for back in ways:
-            for first in range(0, len(rows), piece):
-                some = slice(first, first + piece)
-                moves = np.empty((len(rows[some]), 12))
-                relative_moves(to_object[rows[some]], to_world[columns[some]], back, moves)
-                points = np.empty((len(moves), count, 3))
-                moved_points(self._points, moves, points)
+        size = max(1, _POINTS_AT_ONCE // count)
+        for back in self._directions:
+            for first in range(0, len(rows), size):
+                some = slice(first, first + size)
+                left, right = to_object[rows[some]], to_world[columns[some]]
+                turn = product(left[:, :3, :3], right[:, :3, :3])
+                shift = rotated(left[:, :3, :3], right[:, :3, 3]) + left[:, :3, 3]
+                moves = compose(turn, shift)
+                moves = (inverse(moves) if back else moves)[:, None]
+                points = rotated(moves[..., :3, :3], self._points.T) + moves[..., :3, 3]
                 squared = self._tree.squared_distance(
                     self._vertices, self._faces, points.reshape(-1, 3)
                 )[0]
-                total[some] += squared.reshape(len(moves), count).mean(axis=1)
-        return total * (SQUARE_MILLIMETRES / len(ways))
+                total[some] += squared.reshape(-1, count).mean(axis=1)
+        return total * (SQUARE_MILLIMETRES / len(self._directions))
 
 
 def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatArray:
@@ -138,8 +144,7 @@ def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatAr
     corners = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     areas = np.sqrt((np.cross(b - a, c - a) ** 2).sum(axis=1))
-    stream = key.stream(Purpose.METRIC_POINTS)
-    drawn = uniforms(stream, 0.0, 1.0, (count, 3))
+    drawn = uniforms(key.stream(Purpose.METRIC_POINTS), 0.0, 1.0, (count, 3))
     until = np.cumsum(areas)
     face = np.searchsorted(until, drawn[:, 0] * until[-1], side="right")
     face = np.minimum(face, len(areas) - 1)
@@ -148,12 +153,13 @@ def surface_points(mesh: trimesh.Trimesh, count: int, key: StreamKey) -> FloatAr
     return u * a[face] + (1.0 - u - v) * b[face] + v * c[face]
 
 
-def _finite_poses(transforms: FloatArray) -> FloatArray:
-    poses = Poses.of(transforms).numbers
-    if not np.isfinite(poses).all():
-        row = int(np.argmin(np.isfinite(poses).all(axis=1)))
-        raise PoseError(f"pose {row} is not finite; accepted: finite transforms")
-    return poses
+def _finite(transforms: FloatArray) -> FloatArray:
+    """Transforms (B, 4, 4) as numbers; PoseError for another shape, or one that is not finite."""
+    transforms = stacked(transforms)
+    finite = np.isfinite(transforms[:, :3]).all(axis=(1, 2))
+    if not finite.all():
+        raise PoseError(f"pose {int(np.argmin(finite))} is not finite; accepted: finite transforms")
+    return transforms
 
 
 def _nearest(distances: FloatArray) -> tuple[IntArray, IntArray]:
@@ -165,3 +171,39 @@ def _nearest(distances: FloatArray) -> tuple[IntArray, IntArray]:
         np.put_along_axis(near, least, True, axis=axis)
     rows, columns = np.nonzero(near)
     return rows, columns
+
+
+class PosePairs(NamedTuple):
+    """Every estimate with every plausible pose: how they move points of the object."""
+
+    to_object: FloatArray  # (B, 12), object_from_world
+    to_world: FloatArray  # (P, 12), world_from_object
+    back: bool  # by the inverse of both instead
+
+
+@compiled
+def mean_squares(
+    field: Field,
+    points: FloatArray,
+    pairs: PosePairs,
+    out: FloatArray,
+    first: int,
+    last: int,
+    places: Places,
+) -> None:
+    """Fill out (B, P) with the mean of s^2 over moved points (3, Q), m^2, in rows first to last."""
+    xs, ys, zs = points[0], points[1], points[2]
+    for b in range(first, last):
+        for p in range(len(pairs.to_world)):
+            move = composed(pose_at(pairs.to_object, b), pose_at(pairs.to_world, p))
+            if pairs.back:
+                move = inverted(move)
+            locate(move, field.box, xs, ys, zs, places, len(xs))
+            total = 0.0
+            for n in range(len(xs)):
+                inside = sample(field.trilinear, field.box, field.table, places, n)
+                if places.beyond[n] > 0.0:
+                    x, y, z = moved(move, xs[n], ys[n], zs[n])
+                    inside = continued(field.box_distance, field.box, inside, x, y, z)
+                total += inside[0] * inside[0]
+            out[b, p] = total / len(xs)

@@ -12,29 +12,29 @@ import numpy as np
 
 from chsel.errors import PoseError, SettingError, require_at_most, require_positive
 from chsel.numerics.arrays import FloatArray, frozen
-from chsel.plausible.plausible_set import PoseGrid, scan
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import MOST_ROTATIONS, EvaluationCostSettings, Offsets
-from chsel.plausible.scan import EvaluationCost
+from chsel.plausible.pose_scan import PoseGrid, scan_grid
 from chsel.problem.poses import inverse, nearest_rigid, product, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import Purpose, normals
 
-_FIRST_LOOK = 4000  # poses that tell which costs are worth looking for
+_FIRST_LOOK = 4000  # poses that show which costs are worth looking for
 _STREAM = 100  # of the plausible rotations' streams, and those after it
 
 
 @dataclass(frozen=True)
 class TruePoseSettings:
-    """reach: metres to either side of the guess, along each axis; spacing: of the positions
-    looked at. rotations: how many, turned from the guess by normal rotation vectors of deviation
-    `angle` (radians), the guess's own besides. passes: each after the first looks around the best
-    pose so far, with a reach of one spacing, and spacing and angle scaled alike.
+    """The poses to look at around the guess.
+
+    Each pass after the first looks around the best pose so far, with a reach of one spacing, and
+    spacing and angle scaled alike.
     """
 
-    reach: float = 0.08
-    spacing: float = 0.01
-    rotations: int = 2000
-    angle: float = 0.02
+    reach: float = 0.08  # metres to either side of the guess, along each axis
+    spacing: float = 0.01  # metres between positions
+    rotations: int = 2000  # turned from the guess at random, the guess's own besides
+    angle: float = 0.02  # radians, standard deviation of their rotation vectors
     passes: int = 2
     cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
 
@@ -52,9 +52,9 @@ class TruePoseSettings:
 
 @dataclass(frozen=True, eq=False)
 class TruePose:
-    """world_from_object (4, 4), its evaluation cost, and that of the guess."""
+    """The pose of least evaluation cost near a guess."""
 
-    world_from_object: FloatArray
+    world_from_object: FloatArray  # (4, 4)
     cost: float
     guess_cost: float
 
@@ -70,35 +70,30 @@ def find_true_pose(
     guess = frozen("guess", guess, (4, 4), error=PoseError)
     best = nearest_rigid("guess", guess[None])[0]
     cost = EvaluationCost(problem, settings.cost)
-    least = guess_cost = float(cost.evaluate(inverse(best)[None])[0])
+    least = guess_cost = cost.at(best)
     reach, spacing, angle = settings.reach, settings.spacing, settings.angle
     for n in range(settings.passes):
         half = round(reach / spacing)
         axis = ((-half * spacing, half * spacing, 2 * half + 1),)
         stream = problem.key.stream(Purpose.PLAUSIBLE_ROTATIONS, _STREAM + n)
         turns = rotation_vector(angle * normals(stream, (settings.rotations, 3)))
-        turned = np.concatenate([best[None, :3, :3], product(turns, best[:3, :3])])
-        grid = PoseGrid(best[:3, 3], Offsets(axis, axis, axis), turned)
-        best, least = _best(cost, problem, grid, best, least)
+        rotations = np.concatenate([best[None, :3, :3], product(turns, best[:3, :3])])
+        grid = PoseGrid(best[:3, 3], Offsets(axis, axis, axis), rotations)
+        best, least = _best(cost, grid, best, least)
         reach, spacing, angle = spacing, spacing * spacing / reach, angle * spacing / reach
     return TruePose(best, least, guess_cost)
 
 
 def _best(
-    cost: EvaluationCost,
-    problem: RegistrationProblem,
-    grid: PoseGrid,
-    best: FloatArray,
-    least: float,
+    cost: EvaluationCost, grid: PoseGrid, best: FloatArray, least: float
 ) -> tuple[FloatArray, float]:
-    """The cheapest pose of a grid and its cost; what was best before if none is cheaper."""
+    """The cheapest pose of a grid and its cost; the best one before if none is cheaper."""
     look = np.arange(0, len(grid), max(1, len(grid) // _FIRST_LOOK))
-    costs = cost.evaluate(inverse(grid.poses(look)))
-    if costs.min() < least:
-        first = int(np.argmin(costs))
-        best, least = grid.poses(look[first : first + 1])[0], float(costs[first])
-    index, costs = scan(cost, problem, grid, least)
-    if len(index) == 0:
+    look_costs = cost.evaluate(inverse(grid.poses(look)))
+    index, costs = scan_grid(cost, grid, min(least, float(look_costs.min())))
+    if len(index) == 0:  # none is cheaper than those
+        index, costs = look, look_costs
+    cheapest = int(np.argmin(costs))
+    if not costs[cheapest] < least:
         return best, least
-    first = int(np.argmin(costs))
-    return grid.poses(index[first : first + 1])[0], float(costs[first])
+    return grid.poses(index[cheapest : cheapest + 1])[0], float(costs[cheapest])

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads as use_threads
-from chsel.plausible.plausible_set import grid_around, plausible_set, rotation_seed
+from chsel.plausible.plausible_set import plausible_set, rotation_seed
 from chsel.plausible.plausible_settings import plausible_settings
+from chsel.plausible.pose_scan import grid_around
 from chsel.problem.online_registration import OnlineSettings, first_initial_set
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey

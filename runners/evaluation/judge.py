@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+from chsel.errors import EvaluationError
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet
-from chsel.plausible.pose_metrics import EvaluationError, pose_errors
-from chsel.plausible.scan import EvaluationCost
+from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey

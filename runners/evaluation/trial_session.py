@@ -8,11 +8,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from chsel.errors import RecordingError
+from chsel.errors import EvaluationError, RecordingError
 from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings
-from chsel.plausible.pose_metrics import EvaluationError
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.writer import McapRecorder

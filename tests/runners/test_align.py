@@ -10,8 +10,8 @@ import pytest
 import trimesh
 import yaml
 
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import EvaluationCostSettings
-from chsel.plausible.scan import EvaluationCost
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.poses import apply, axis_angle, compose, inverse, roll_pitch_yaw

@@ -11,8 +11,8 @@ import pyarrow.parquet
 import pytest
 
 from chsel.errors import RecordingError, SettingError
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import DEFINITIONS, definition_name, plausible_settings
-from chsel.plausible.scan import EvaluationCost
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import settings_mapping
@@ -28,7 +28,7 @@ from runners.evaluation.table import (
     write_table,
 )
 from runners.reporting.evaluation_folder import ReportError, open_evaluation
-from tests.chsel.evaluation.scenes import WORKSPACE, ball
+from tests.chsel.plausible.scenes import WORKSPACE, ball
 from tests.runners.in_process import run
 from tests.runners.made_up_evaluations import made_up_iterations, row, write_evaluation
 

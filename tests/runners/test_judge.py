@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from chsel.numerics.arrays import FloatArray
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet
-from chsel.plausible.scan import EvaluationCost
 from chsel.problem.poses import compose, inverse, product, rotation_vector
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey

@@ -1,22 +1,28 @@
-"""How well a surface, rotated about its centroid, matches itself."""
+"""The search for rotations that map an object's surface onto itself.
+
+First for axes of revolution, then for a finite group of rotations.
+"""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.plausible.surface_distance import surface_points
-from chsel.problem.poses import rotations
+from chsel.problem.poses import axis_angle, rotations
 from chsel.problem.streams import StreamKey
 
 if TYPE_CHECKING:
     import trimesh
 
+LARGEST_GROUP = 60  # the icosahedron's; a larger one cannot be distinguished from revolution
 TOLERANCE = 0.0085  # of the diameter
-_TESTED = 1000  # points by which a rotation is judged
+_TESTED = 1000  # points by which a rotation is tested
 _POINTS = 20_000  # points that mark the cells of the coarse grid
 _CELLS = 48  # of the coarse grid, along each axis
 _AT_ONCE = 2000  # rotations
@@ -24,6 +30,14 @@ _MOST_FACES = 100_000  # above this, vertices are merged
 _MERGED = 128  # cells along the longest side
 _ON_SURFACE = 1e-6  # of the radius: nearer, the face's normal is the better direction
 _DAMPING = 1e-4
+
+_ANGLES = np.arange(1.0, 17.0) * np.pi * (3.0 - np.sqrt(5.0))  # golden: of no n-fold symmetry
+_SPREAD = 12_000  # rotations, about 9 degrees apart
+_NEIGHBOURS = 16
+_COARSE = 0.05  # of the diameter: coarse errors of rotations within 9 degrees of a symmetry
+_MOST_CANDIDATES, _MOST_ALIGNED = 400, 50
+_SAME = np.deg2rad(10.0)  # between two approximations of one element
+_IMPROVEMENTS = 5
 
 
 class RotatedSurface:
@@ -40,7 +54,7 @@ class RotatedSurface:
     radius: float  # from the centroid to the farthest vertex, m; 0 for a mesh without an area
     corners: FloatArray  # (F, 3, 3), of each face
     normals: FloatArray  # (F, 3), unit
-    areas: FloatArray  # (F,), shares of the whole
+    areas: FloatArray  # (F,), shares of the total
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         """Only centre and radius are set for a mesh without an area."""
@@ -144,3 +158,125 @@ def _merged(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray
     faces = index[faces]
     a, b, c = faces.T
     return np.stack(sums, axis=1) / count[:, None], faces[(a != b) & (b != c) & (c != a)]
+
+
+def axes_of_revolution(surface: RotatedSurface) -> FloatArray:
+    """Unit axes (A, 3) about which every rotation matches: none, one, or two of a sphere's.
+
+    Candidates are the axes of inertia and those of slippage. The normals of a surface of revolution
+    meet its axis: rotations about u move points p within the surface where n . (u x p) = 0 (Gelfand
+    and Guibas, 2004, "Shape segmentation using local slippage analysis"). Slippage finds the axis
+    where moments of inertia are equal by chance, inertia where the normals of a scan are noise.
+    """
+    middles = (surface.corners + np.roll(surface.corners, 1, axis=1)) / 2.0  # exact for squares
+    slips = np.cross(middles, surface.normals[:, None])
+    moments = [np.einsum("f,fki,fkj->ij", surface.areas, v, v) for v in (slips, middles)]
+    axes = np.concatenate([np.linalg.eigh(moment)[1].T for moment in moments])
+    errors = np.array([_largest_error_about(surface, axis) for axis in axes])
+    best = axes[errors.argmin()]
+    if errors.min() > 1.0:
+        return np.zeros((0, 3))
+    across = (np.abs(axes @ best) < 0.5) & (errors <= 1.0)
+    return np.concatenate([best[None], axes[across][:1]])
+
+
+def _largest_error_about(surface: RotatedSurface, axis: FloatArray) -> float:
+    """Of rotations about an axis; few points are enough to see a large one."""
+    turns = axis_angle(np.tile(axis, (len(_ANGLES), 1)), _ANGLES)
+    error = surface.errors(turns, count=100).max()
+    return float(error if error > 2.0 else surface.errors(turns).max())
+
+
+def half_turn_across(surface: RotatedSurface, axis: FloatArray) -> FloatArray:
+    """The identity, and a half turn that swaps the ends of an axis if it matches (1 or 2, 3, 3)."""
+    across = np.linalg.svd(axis[None])[2][1]  # unit, at a right angle to the axis
+    turns = np.array([np.eye(3), 2.0 * np.outer(across, across) - np.eye(3)])
+    return turns[surface.errors(turns) <= 1.0]
+
+
+def finite_group(surface: RotatedSurface) -> FloatArray:
+    """The symmetries (S, 3, 3) of a surface without an axis of revolution, the identity first.
+
+    Of rotations spread over SO(3), those that match better than their neighbours on a coarse grid
+    are aligned with the surface. Each, the best first, joins the group if all products match.
+    """
+    spread, neighbours = _spread()
+    coarse = surface.coarse_errors(spread)
+    least = np.flatnonzero((coarse <= coarse[neighbours].min(axis=1)) & (coarse <= _COARSE))
+    least = least[np.argsort(coarse[least], kind="stable")][:_MOST_CANDIDATES]
+    turns = surface.aligned(spread[least], steps=4, count=64)
+    turns = _distinct(_best_first(turns, surface.errors(turns, count=200), 3.0), _MOST_ALIGNED)
+    turns = surface.aligned(turns, steps=12, count=500)
+    group = np.eye(3)[None]
+    for turn in _best_first(turns, surface.errors(turns), 1.0):
+        if _angles_between(turn[None], group).min() > _SAME:
+            larger = generated(np.array([*group, turn]))
+            if larger is not None and surface.errors(larger).max() <= 1.0:
+                group = larger
+    improved = generated(surface.aligned(group, steps=12, count=500))
+    return group if improved is None else improved
+
+
+def _best_first(turns: FloatArray, errors: FloatArray, most: float) -> FloatArray:
+    """Rotations (T, 3, 3) with errors (T,) of at most so much, in the order of the errors."""
+    order = np.argsort(errors, kind="stable")
+    return turns[order[errors[order] <= most]]
+
+
+@cache
+def _spread() -> tuple[FloatArray, IntArray]:
+    """Rotations (N, 3, 3) spread evenly, and the indices (N, K) of each and its neighbours.
+
+    Alexa, 2022, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)".
+    """
+    place = np.arange(_SPREAD) + 0.5
+    inner, outer = np.sqrt(place / _SPREAD), np.sqrt(1.0 - place / _SPREAD)
+    first, second = 2.0 * np.pi * place / np.sqrt(2.0), 2.0 * np.pi * place / 1.533751168755204288
+    pairs = [(inner, np.sin(first)), (inner, np.cos(first))]
+    pairs += [(outer, np.sin(second)), (outer, np.cos(second))]
+    quaternion = np.array([radius * share for radius, share in pairs]).T
+    _, index = cKDTree(np.concatenate([quaternion, -quaternion])).query(quaternion, k=_NEIGHBOURS)
+    return rotations(quaternion), index % _SPREAD
+
+
+def _angles_between(turns: FloatArray, others: FloatArray) -> FloatArray:
+    """Angles (T, O), radians, between rotations (T, 3, 3) and (O, 3, 3)."""
+    trace = turns.reshape(-1, 9) @ others.reshape(-1, 9).T
+    return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+
+
+def _distinct(turns: FloatArray, most: int) -> FloatArray:
+    """Rotations (T, 3, 3) without those near an earlier one, at most so many."""
+    kept: list[FloatArray] = []
+    while len(turns) and len(kept) < most:
+        kept.append(turns[0])
+        turns = turns[_angles_between(turns, turns[:1])[:, 0] > _SAME]
+    return np.array(kept).reshape(-1, 3, 3)
+
+
+def generated(turns: FloatArray) -> FloatArray | None:
+    """The group (S, 3, 3) of all products of approximate rotations (T, 3, 3), the identity first.
+
+    None if it has more than 60 elements, or is not a group. Every element is replaced by the mean
+    of what the table of products says it is, which converges to an exact group (Grove, Karcher and
+    Ruh, 1974, "Group actions and curvature").
+    """
+    turns = _distinct(np.concatenate([np.eye(3)[None], turns]), LARGEST_GROUP + 1)
+    while True:
+        products = np.einsum("iab,jbc->ijac", turns, turns).reshape(-1, 3, 3)
+        angles = _angles_between(products, turns)
+        new = products[angles.min(axis=1) > _SAME]
+        if len(new) == 0:
+            break
+        turns = np.concatenate([turns, _distinct(new, LARGEST_GROUP + 1)])
+        if len(turns) > LARGEST_GROUP:
+            return None
+    table = angles.argmin(axis=1).reshape(len(turns), len(turns))
+    if (np.sort(table, axis=1) != np.arange(len(turns))).any():
+        return None
+    for _ in range(_IMPROVEMENTS):
+        means = np.einsum("jba,jkbc->kac", turns, turns[table])
+        left, _, right = np.linalg.svd(means)
+        turns = left @ right
+    turns[0] = np.eye(3)  # without the rounding
+    return turns

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from chsel.errors import EvaluationError
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.plausible_file import load_plausible, plausible_path, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import Offsets, PlausibleSettings, PoseGridSettings
-from chsel.plausible.pose_metrics import EvaluationError
 from chsel.problem.poses import apply
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
-from tests.chsel.evaluation.scenes import ball, scene
+from tests.chsel.plausible.scenes import ball, scene
 
 SETTINGS = PlausibleSettings(
     epsilon=0.02,

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.errors import PoseError, SettingError
+from chsel.errors import EvaluationError, PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
-from chsel.plausible import plausible_set as module
-from chsel.plausible import scan as position_blocks
-from chsel.plausible.plausible_set import grid_around, plausible_set, scan
+from chsel.plausible import pose_scan, position_blocks
+from chsel.plausible.evaluation_cost import EvaluationCost
+from chsel.plausible.plausible_set import plausible_set, rotation_seed
 from chsel.plausible.plausible_settings import (
     EvaluationCostSettings,
     Offsets,
@@ -22,14 +22,13 @@ from chsel.plausible.plausible_settings import (
     PoseGridSettings,
     plausible_settings,
 )
-from chsel.plausible.pose_metrics import EvaluationError
-from chsel.plausible.scan import EvaluationCost
+from chsel.plausible.pose_scan import grid_around, scan_grid
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, compose, inverse, rotation_angle
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
 from chsel.problem.subset import far_apart
-from tests.chsel.evaluation.scenes import OBJECTS, WORKSPACE, ball, box, scene
+from tests.chsel.plausible.scenes import OBJECTS, WORKSPACE, ball, box, scene
 
 SMALL = PoseGridSettings(
     Offsets(((-0.06, 0.06, 5),), ((-0.1, 0.0, 2), (0.02, 0.05, 3)), ((0.0, 0.0, 1),)),
@@ -113,8 +112,8 @@ def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
     limit = float(np.quantile(every, share))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(position_blocks, "_TOPS", tops)
-        module._blocks.cache_clear()
-        index, found = scan(cost, problem, grid, limit)
+        pose_scan._blocks.cache_clear()
+        index, found = scan_grid(cost, grid, limit)
     np.testing.assert_array_equal(index, np.flatnonzero(every < limit))
     np.testing.assert_array_equal(found, every[index])
     below = cost.evaluate(inverse(poses), limit=limit)
@@ -145,7 +144,7 @@ def test_the_set_holds_the_true_pose_and_nothing_that_costs_more_than_epsilon_ab
     np.testing.assert_allclose(found.cost, exact, atol=1e-12)
     assert (found.cost < found.true_cost + BOX.epsilon).all()
     assert len(found.cost) == BOX.fill_to
-    assert found.filled
+    assert found.local.any()
     assert len(found.index) == (~found.local).sum()  # the true pose itself is on this grid
 
 
@@ -235,7 +234,7 @@ def test_the_rotations_are_the_same_at_every_step_of_a_session() -> None:
 
 
 def test_too_many_members_are_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MOST_MEMBERS", 10)
+    monkeypatch.setattr(pose_scan, "MOST_MEMBERS", 10)
     problem, truth = touched_box()
     with pytest.raises(EvaluationError, match="more than 10 poses cost less than"):
         plausible_set(problem, truth, replace(BOX, epsilon=0.05))
@@ -292,7 +291,7 @@ def plausible_rotation(by: PlausibleSettings, seed: int) -> FloatArray:
     """The first random rotation that a problem of that seed looks at."""
     problem, truth = touched_box()
     problem = replace(problem, key=StreamKey(seed, 0))
-    grid = grid_around(truth, by.grid, module.rotation_seed(problem, by))
+    grid = grid_around(truth, by.grid, rotation_seed(problem, by))
     return grid.rotations[200]
 
 

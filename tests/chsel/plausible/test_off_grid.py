@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chsel.errors import SettingError
+from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import (
@@ -22,15 +23,13 @@ from chsel.plausible.plausible_settings import (
     PoseGridSettings,
     plausible_settings,
 )
-from chsel.plausible.pose_metrics import EvaluationError
-from chsel.plausible.scan import EvaluationCost
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
-from tests.chsel.evaluation.scenes import WORKSPACE, ball
+from tests.chsel.plausible.scenes import WORKSPACE, ball
 
 OTHER = np.array([0.0, 0.0, -0.16])  # where the ball may be as well
 # The positions nearest to it are 8 mm off, along z.
@@ -165,7 +164,7 @@ def test_an_object_without_a_surface_is_one_clear_error() -> None:
     sdf, known = problem.sdf, problem.points.known
     lifted = SdfGrid(sdf.origin, sdf.resolution, sdf.values + 0.15, sdf.gradients)
     points = KnownPoints(known=known, known_sdf=np.full(len(known), 0.15))
-    with pytest.raises(EvaluationError, match="modes cannot be told apart: no node"):
+    with pytest.raises(EvaluationError, match="modes cannot be distinguished: no node"):
         plausible_set(replace(problem, sdf=lifted, points=points), np.eye(4), SEARCH)
 
 

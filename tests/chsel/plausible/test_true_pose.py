@@ -10,13 +10,13 @@ import pytest
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible import true_pose
-from chsel.plausible.plausible_set import PoseGrid
+from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import EvaluationCostSettings, Offsets
-from chsel.plausible.scan import EvaluationCost
+from chsel.plausible.pose_scan import PoseGrid
 from chsel.plausible.true_pose import TruePoseSettings, find_true_pose
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, compose, inverse, rotation_angle, rotation_vector
-from tests.chsel.evaluation.scenes import box, scene
+from tests.chsel.plausible.scenes import box, scene
 
 HALF = np.array([0.06, 0.09, 0.12])
 QUICK = TruePoseSettings(

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.errors import PoseError, SettingError
+from chsel.errors import EvaluationError, PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
-from chsel.plausible.pose_metrics import EvaluationError, calibration, cheapest, plausible_diversity
+from chsel.plausible.pose_metrics import calibration, cheapest, plausible_diversity
 from chsel.plausible.surface_distance import (
     METHODS,
     DistanceSettings,

@@ -11,8 +11,8 @@ import trimesh
 from scipy.optimize import brentq
 
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible.rotated_surface import RotatedSurface
-from chsel.plausible.symmetry import ObjectSymmetry, generated, grid_symmetry, object_symmetry
+from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
+from chsel.plausible.symmetry_search import RotatedSurface, generated
 from chsel.problem.mesh import load_mesh
 from chsel.problem.poses import axis_angle, compose, rotation_vector
 from chsel.problem.sdf_grid import SdfGrid
@@ -250,7 +250,7 @@ def test_the_same_mesh_gives_the_same_bits() -> None:
     from chsel.plausible import symmetry
 
     first = object_symmetry(MODELS["spam_can"]())
-    symmetry._found.cache_clear()
+    symmetry._symmetry.cache_clear()
     second = object_symmetry(MODELS["spam_can"]())
     assert second is not first
     np.testing.assert_array_equal(first.rotations, second.rotations)

@@ -1,0 +1,279 @@
+"""The evaluation cost, which defines the plausible set and is exact (CHSEL, Eq. 2)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from chsel.cost.interior_points import VoxelGrid
+from chsel.numerics.arrays import FloatArray
+from chsel.numerics.cell_set import Box, Places, Region, box_of, clearance_of, locate
+from chsel.numerics.compiler import compiled, inner, leaf, spliced
+from chsel.numerics.octree import Candidates, Tree, candidates_for, octree, walk
+from chsel.numerics.pose_tuples import finite, moved, pose_at, rigid, turned_back
+from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.plausible.plausible_settings import EvaluationCostSettings
+from chsel.problem.points import KnownPoints, Lattice
+from chsel.problem.poses import Poses, inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_lookup import Field, continued, field_of, sample
+from chsel.problem.subset import far_apart
+
+_POSES_PER_THREAD = 500
+_MOST_DISTINCT = 32  # violated free points that are counted one by one at first
+_MOST_INSIDE = 128  # points inside of the object that are looked up among free voxels
+_MOST_CANDIDATES = 20_000
+_MOST_VOXELS = 20_000_000
+_LEVEL_ROUNDING = 1e-12  # metres: what interpolation may lie below all of its corners
+Pose = tuple[float, ...]
+
+
+class Divisors(NamedTuple):
+    """What the sums over each class of points are divided by."""
+
+    free: float
+    occupied: float
+    known: float
+
+
+class EvaluationModel(NamedTuple):
+    """All that the evaluation cost of a pose depends on."""
+
+    field: Field
+    tree: Tree  # of the free points
+    region: Region  # cells of the object in which a free point can violate
+    occupied: FloatArray  # (3, K), world
+    known: FloatArray  # (3, M), world
+    known_sdf: FloatArray  # (M,), m
+    level: float  # free points violate at s <= level, occupied ones at s >= -level
+    violation: float  # c_max
+    divisors: Divisors
+    inside: FloatArray  # (3, I) points in the object, by which most violations are found early
+    voxels: Box  # around the free points
+    point_in: Any  # (voxels,) number of a free point in each, -1 for none; int32
+
+
+class EvaluationCost:
+    """C(X) = c_max violated free + c_max violated occupied + |s - v| of known points.
+
+    Sums over points, or the means over each class. A free point at x is violated if
+    s(X x) <= -tolerance, an occupied one if s(X x) >= tolerance.
+    """
+
+    def __init__(self, problem: RegistrationProblem, settings: EvaluationCostSettings) -> None:
+        require_ieee_arithmetic()
+        self.problem, self.settings = problem, settings
+        points, sdf, level = problem.points, problem.sdf, -settings.tolerance
+        tree = octree(points.free, problem.free_resolution)
+        voxels, point_in = _voxels(tree, problem.free_resolution)
+        occupied = points.occupied if settings.occupied else np.zeros((0, 3))
+        self.model = EvaluationModel(
+            field=field_of(sdf, settings.lookup, settings.outside),
+            tree=tree,
+            region=_region(sdf, level, settings.lookup),
+            occupied=occupied.T.copy(),
+            known=points.known.T.copy(),
+            known_sdf=points.sdf.copy(),
+            level=level,
+            violation=settings.violation,
+            divisors=_divisors(points, settings),
+            inside=sdf.derived(("inside", level), lambda: _inside(sdf, level)),
+            voxels=voxels,
+            point_in=point_in,
+        )
+
+    def evaluate(self, object_from_world: FloatArray, *, limit: float = np.inf) -> FloatArray:
+        """Costs (B,) of transforms (B, 4, 4); infinite for those not below `limit`."""
+        poses = Poses.of(object_from_world).numbers
+        costs = np.empty(len(poses))
+
+        def run(first: int, last: int, scratch: Candidates) -> None:
+            costs_below(self.model, poses, limit, costs, first, last, scratch)
+
+        spread(run, len(poses), lambda: scratch_for(self.model), least=_POSES_PER_THREAD)
+        return costs
+
+    def at(self, world_from_object: FloatArray) -> float:
+        """The cost of one pose (4, 4)."""
+        return float(self.evaluate(inverse(world_from_object)[None])[0])
+
+
+def _divisors(points: KnownPoints, settings: EvaluationCostSettings) -> Divisors:
+    if settings.combine == "sums":
+        return Divisors(1.0, 1.0, 1.0)
+    classes = points.free, points.occupied, points.known
+    return Divisors(*(float(max(len(part), 1)) for part in classes))
+
+
+def _region(sdf: SdfGrid, level: float, lookup: str) -> Region:
+    """The cells that read any value of `level` or less."""
+
+    def make() -> Region:
+        box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
+        active = sdf.active_cells(level + _LEVEL_ROUNDING, lookup).numpy().reshape(sdf.shape)
+        return Region(box, clearance_of(active, sdf.resolution))
+
+    return sdf.derived(("evaluation region", level, lookup), make)
+
+
+def _inside(sdf: SdfGrid, level: float) -> FloatArray:
+    """Points (3, I) inside of the object, far apart from each other."""
+    nodes = np.argwhere(sdf.values <= level)
+    nodes = nodes[:: max(1, len(nodes) // _MOST_CANDIDATES)]
+    points = sdf.origin + nodes * sdf.resolution
+    return points[far_apart(points, _MOST_INSIDE)].T.copy()
+
+
+def _voxels(tree: Tree, resolution: float) -> tuple[Box, Any]:
+    """The voxels of free points with an empty layer around them, and a free point of each."""
+    free = tree.spheres[:3, len(tree.starts) - 1 :].T
+    if len(free) == 0 or np.prod(np.ptp(free, axis=0) / resolution + 3.0) > _MOST_VOXELS:
+        return box_of(np.zeros(3), 1.0, (1, 1, 1)), np.full(1, -1, dtype=np.int32)
+    grid = VoxelGrid.around(free, resolution)
+    point_in = np.full(grid.flags.shape, -1, dtype=np.int32)
+    voxels = Lattice(tuple(grid.origin.tolist()), resolution).voxels(free)
+    point_in[tuple(np.clip(voxels, 0, np.array(grid.flags.shape) - 1).T)] = np.arange(len(free))
+    return box_of(grid.origin, resolution, grid.flags.shape), point_in.reshape(-1)
+
+
+def scratch_for(model: EvaluationModel) -> Candidates:
+    """Scratch for one thread."""
+    points = model.tree.spheres, model.occupied, model.known
+    return candidates_for(max(_MOST_DISTINCT + 1, *(array.shape[1] for array in points)))
+
+
+@compiled
+def costs_below(
+    model: EvaluationModel,
+    poses: FloatArray,
+    limit: float,
+    out: FloatArray,
+    first: int,
+    last: int,
+    scratch: Candidates,
+) -> None:
+    """Fill out (B,) with the costs below a limit, else inf, of poses (B, 12) from first to last."""
+    for n in range(first, last):
+        out[n] = cost_below(model, pose_at(poses, n), limit, scratch)
+
+
+@inner
+def cost_below(model: EvaluationModel, pose: Pose, limit: float, scratch: Candidates) -> float:
+    """The evaluation cost of a pose; infinite if it is not below the limit."""
+    if not finite(pose):
+        return np.inf
+    total = _known_sum(model, pose, scratch)
+    if not _cost(model, 0, 0, total) < limit:
+        return np.inf
+    occupied = _occupied_count(model, pose, scratch)
+    if not _cost(model, 0, occupied, total) < limit:
+        return np.inf
+    if rigid(pose) and not _may_be_below(model, pose, occupied, total, limit, scratch):
+        return np.inf
+    cost = _cost(model, _free_count(model, pose, scratch), occupied, total)
+    return cost if cost < limit else np.inf
+
+
+@leaf
+def _cost(model: EvaluationModel, free: int, occupied: int, total: float) -> float:
+    cost = model.violation * (free / model.divisors.free)
+    cost += model.violation * (occupied / model.divisors.occupied)
+    return cost + total / model.divisors.known
+
+
+@spliced
+def _known_sum(model: EvaluationModel, pose: Pose, scratch: Candidates) -> float:
+    """sum |s - v| over the points of known signed distance, in their order."""
+    known, total = model.known, 0.0
+    locate(pose, model.field.box, known[0], known[1], known[2], scratch.places, known.shape[1])
+    for n in range(known.shape[1]):
+        s = _distance(model.field, pose, known[0, n], known[1, n], known[2, n], scratch.places, n)
+        total += abs(s - model.known_sdf[n])
+    return total
+
+
+@spliced
+def _occupied_count(model: EvaluationModel, pose: Pose, scratch: Candidates) -> int:
+    occupied, count = model.occupied, 0
+    places, number = scratch.places, occupied.shape[1]
+    locate(pose, model.field.box, occupied[0], occupied[1], occupied[2], places, number)
+    for n in range(number):
+        x, y, z = occupied[0, n], occupied[1, n], occupied[2, n]
+        count += 1 if _distance(model.field, pose, x, y, z, places, n) >= -model.level else 0
+    return count
+
+
+@leaf
+def _distance(
+    field: Field, pose: Pose, x: float, y: float, z: float, places: Places, n: int
+) -> float:
+    """Signed distance of a world point, whose place in the grid is the n-th of the places."""
+    inside = sample(field.trilinear, field.box, field.table, places, n)
+    if places.beyond[n] > 0.0:
+        a, b, c = moved(pose, x, y, z)
+        inside = continued(field.box_distance, field.box, inside, a, b, c)
+    return inside[0]
+
+
+@spliced
+def _may_be_below(
+    model: EvaluationModel,
+    pose: Pose,
+    occupied: int,
+    total: float,
+    limit: float,
+    scratch: Candidates,
+) -> bool:
+    """False if the free points near some points inside of the object violate too often."""
+    spheres, nodes = model.tree.spheres, len(model.tree.starts) - 1
+    voxels, inside, hits = model.voxels, model.inside, 0
+    for n in range(inside.shape[1]):
+        x, y, z = inside[0, n] - pose[9], inside[1, n] - pose[10], inside[2, n] - pose[11]
+        x, y, z = turned_back(pose, x, y, z)
+        i = min(max(np.rint((x - voxels.first[0]) * voxels.inverse), 0.0), voxels.most[0])
+        j = min(max(np.rint((y - voxels.first[1]) * voxels.inverse), 0.0), voxels.most[1])
+        k = min(max(np.rint((z - voxels.first[2]) * voxels.inverse), 0.0), voxels.most[2])
+        point = model.point_in[int(i * voxels.across + j * voxels.along + k)]
+        if point >= 0 and hits < _MOST_DISTINCT and _is_new(scratch.kept, hits, point):
+            node = nodes + point
+            scratch.x[0] = spheres[0, node]
+            scratch.y[0] = spheres[1, node]
+            scratch.z[0] = spheres[2, node]
+            locate(pose, model.region.box, scratch.x, scratch.y, scratch.z, scratch.places, 1)
+            if _violates(model, scratch.places, 0):
+                scratch.kept[hits] = point
+                hits += 1
+                if not _cost(model, hits, occupied, total) < limit:
+                    return False
+    return True
+
+
+@leaf
+def _is_new(kept: Any, count: int, point: int) -> bool:
+    new = True
+    for n in range(count):
+        new &= kept[n] != point
+    return new
+
+
+@leaf
+def _violates(model: EvaluationModel, places: Places, n: int) -> bool:
+    """Whether a free point at the n-th of the places is inside; nothing beyond the grid is."""
+    if model.region.clearance[places.cell[n]] >= 0.0 or places.beyond[n] > 0.0:
+        return False
+    field = model.field
+    inside = sample(field.trilinear, field.box, field.table, places, n)
+    return inside[0] <= model.level
+
+
+@spliced
+def _free_count(model: EvaluationModel, pose: Pose, scratch: Candidates) -> int:
+    slack = 0.0 if rigid(pose) else np.inf
+    count = walk(model.tree, model.region, pose, slack, scratch)
+    locate(pose, model.region.box, scratch.x, scratch.y, scratch.z, scratch.places, count)
+    violations = 0
+    for n in range(count):
+        violations += 1 if _violates(model, scratch.places, n) else 0
+    return violations
