@@ -21,7 +21,7 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import field_of
+from chsel.problem.sdf_lookup import distance_field
 
 _POSES_PER_THREAD = 200  # fewer are costed faster than a thread wakes up
 WAYS = ("fastest", "direct", "tree", "lattice")
@@ -49,7 +49,7 @@ class CompiledCost:
         require_choice("way", way, WAYS)
         self.settings = settings = settings or CostSettings()
         self.model = Model(
-            field_of(sdf, settings.lookup, settings.outside),
+            distance_field(sdf, settings.lookup, settings.outside),
             _free_term(sdf, points.free, settings, free_resolution, way),
             points.occupied.T.copy(),
             points.known.T.copy(),

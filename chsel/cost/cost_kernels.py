@@ -16,7 +16,7 @@ from chsel.numerics.compiler import inner, leaf, spliced
 from chsel.numerics.lattice import Lattice, look_up
 from chsel.numerics.octree import Found, Tree, found_for, walk
 from chsel.numerics.pose_tuples import finite, rigid
-from chsel.problem.sdf_lookup import Field, continued, sample
+from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 
 MOST_SLACK = 0.03  # metres
 STEPS_AHEAD = 3.0  # that a list of neighbours should last
@@ -53,7 +53,7 @@ class Model(NamedTuple):
     occupied (3, K), known (3, M): points of the world. known_sdf (M,).
     """
 
-    field: Field
+    field: DistanceField
     free: FreeTerm
     occupied: FloatArray
     known: FloatArray
@@ -148,7 +148,7 @@ def _free_sums(model, found, count):
     sums = _NOTHING
     for n in range(count):
         if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
-            s, nx, ny, nz = sample(trilinear, box, table, places, n)
+            s, nx, ny, nz = distance_in_box(trilinear, box, table, places, n)
             violation = max(model.alpha - s, 0.0)
             size = -model.free_scale * _slope(model, violation)
             value = model.free_scale * violation
@@ -213,10 +213,10 @@ def _with_known(sums, model, pose, places):
 @spliced
 def _distance_at(field, table, places, n, pose, x, y, z):
     """Signed distance and gradient at the n-th of the places, that of a world point x, y, z."""
-    inside = sample(field.trilinear, field.box, table, places, n)
+    inside = distance_in_box(field.trilinear, field.box, table, places, n)
     if places.beyond[n] > 0.0:
         a, b, c = _moved(pose, x, y, z)
-        return continued(field.box_distance, field.box, inside, a, b, c)
+        return distance_beyond_box(field.box_distance, field.box, inside, a, b, c)
     return inside
 
 

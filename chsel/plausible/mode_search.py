@@ -25,7 +25,7 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE3Space
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
-from chsel.problem.subset import far_apart
+from chsel.problem.subset import farthest_points
 from chsel.problem.surface import surface_points
 
 _STREAM = 200  # of the plausible rotations' streams, and those after it
@@ -164,7 +164,7 @@ def _spread_out(poses: FloatArray, most: int, lever: float, seed: int) -> FloatA
         drawn = uniforms(stream, 0.0, 1.0, len(poses))
         poses = poses[np.sort(np.argsort(drawn, kind="stable")[:CANDIDATES])]
     places = np.concatenate([poses[:, :3, 3], lever * poses[:, :3, :3].reshape(-1, 9)], axis=1)
-    return poses[far_apart(places, most)]
+    return poses[farthest_points(places, most)]
 
 
 def _distance(sdf: SdfGrid, seed: int) -> SurfaceDistance:

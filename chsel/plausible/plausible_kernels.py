@@ -15,7 +15,7 @@ from chsel.numerics.cell_set import Box, Region, locate
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
 from chsel.numerics.octree import Found, Tree, found_for, walk
 from chsel.numerics.pose_tuples import finite, pose_at, rigid
-from chsel.problem.sdf_lookup import Field, continued, sample
+from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 
 _MOST_DISTINCT = 32  # violations that are told apart one by one
 
@@ -30,7 +30,7 @@ class Evaluation(NamedTuple):
     of one free point in each (-1: none), by which most violating poses are found fast.
     """
 
-    field: Field
+    field: DistanceField
     tree: Tree
     region: Region
     occupied: FloatArray
@@ -159,12 +159,12 @@ def _occupied_count(model, pose, found):
 @leaf
 def _distance(field, pose, x, y, z, places, n):
     """Signed distance at the n-th of the places, that of a world point."""
-    inside = sample(field.trilinear, field.box, field.table, places, n)
+    inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
     if places.beyond[n] > 0.0:
         a = pose[0] * x + pose[1] * y + pose[2] * z + pose[9]
         b = pose[3] * x + pose[4] * y + pose[5] * z + pose[10]
         c = pose[6] * x + pose[7] * y + pose[8] * z + pose[11]
-        inside = continued(field.box_distance, field.box, inside, a, b, c)
+        inside = distance_beyond_box(field.box_distance, field.box, inside, a, b, c)
     return inside[0]
 
 
@@ -212,7 +212,7 @@ def _violates(model, places, n):
     if model.region.clearance[places.cell[n]] >= 0.0 or places.beyond[n] > 0.0:
         return False
     field = model.field
-    return sample(field.trilinear, field.box, field.table, places, n)[0] <= model.level
+    return distance_in_box(field.trilinear, field.box, field.table, places, n)[0] <= model.level
 
 
 @spliced

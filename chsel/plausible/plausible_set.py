@@ -25,7 +25,7 @@ from chsel.plausible.scan import EvaluationCost, blocks_of, bounds_of, local_mem
 from chsel.problem.poses import axis_angle, check_rigid, compose, inverse, random_rotations
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import Purpose, StreamKey, uniforms
-from chsel.problem.subset import far_apart
+from chsel.problem.subset import farthest_points
 
 MOST_MEMBERS = 2_000_000
 _CAPACITY = 50_000  # poses that a thread finds before it hands them over, at least
@@ -254,7 +254,7 @@ def _check_survivors(
 
 def _telling_order(known: FloatArray) -> IntArray:
     """Known points, each far from those before it, then at random: to reject poses early."""
-    first = far_apart(known, _MOST_TELLING)
+    first = farthest_points(known, _MOST_TELLING)
     stream = StreamKey(0, 0).stream(Purpose.PLAUSIBLE_ROTATIONS)
     rest = np.argsort(uniforms(stream, 0.0, 1.0, len(known)), kind="stable")
     return np.concatenate([first, rest[~np.isin(rest, first)]])

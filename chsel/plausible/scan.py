@@ -18,9 +18,9 @@ from chsel.problem.points import KnownPoints, Lattice
 from chsel.problem.poses import Poses, compose, inverse, product, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import field_of
+from chsel.problem.sdf_lookup import distance_field
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
-from chsel.problem.subset import far_apart
+from chsel.problem.subset import farthest_points
 
 _POSES_PER_THREAD = 500
 _MOST_INSIDE = 128  # points inside of the object that are asked whether they are in free space
@@ -46,7 +46,7 @@ class EvaluationCost:
         voxels, point_in = _voxels(tree, problem.free_resolution)
         occupied = points.occupied if settings.occupied else np.zeros((0, 3))
         self.model = Evaluation(
-            field_of(sdf, settings.lookup, settings.outside),
+            distance_field(sdf, settings.lookup, settings.outside),
             tree,
             region,
             occupied.T.copy(),
@@ -100,7 +100,7 @@ def _inside(sdf: SdfGrid, level: float) -> FloatArray:
     nodes = np.argwhere(sdf.values <= level)
     nodes = nodes[:: max(1, len(nodes) // _MOST_CANDIDATES)]
     points = sdf.origin + nodes * sdf.resolution
-    return points[far_apart(points, _MOST_INSIDE)].T.copy()
+    return points[farthest_points(points, _MOST_INSIDE)].T.copy()
 
 
 def _voxels(tree: Tree, resolution: float) -> tuple[Box, Any]:
@@ -340,5 +340,5 @@ def local_members(
         if n >= _ROUNDS // 2 and len(costs) >= _ENOUGH * wanted:
             break
     places = np.concatenate([pool[:, :3, 3], lever * pool[:, :3, :3].reshape(-1, 9)], axis=1)
-    chosen = np.sort(far_apart(places, known + wanted, given=known))[known:]
+    chosen = np.sort(farthest_points(places, known + wanted, given=known))[known:]
     return pool[chosen], costs[chosen - known]

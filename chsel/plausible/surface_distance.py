@@ -24,7 +24,7 @@ from chsel.plausible.surface_kernels import (
 )
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import field_of
+from chsel.problem.sdf_lookup import distance_field
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class SurfaceDistance:
         if mesh is None and settings.method != "grid":
             raise SettingError(f"method {settings.method} needs a mesh; accepted without: grid")
         self._points = np.ascontiguousarray(points.T)
-        self._field = field_of(sdf, "trilinear", "surface_point")
+        self._field = distance_field(sdf, "trilinear", "surface_point")
         if mesh is not None:
             self._vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
             self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)

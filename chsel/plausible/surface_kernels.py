@@ -7,7 +7,7 @@ from typing import NamedTuple
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled, leaf
-from chsel.problem.sdf_lookup import Field, continued, sample
+from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 
 
 class Moved(NamedTuple):
@@ -71,7 +71,9 @@ def _inverse(move):
 
 
 @compiled
-def mean_squares(field: Field, points, to_object, to_world, back, out, first, last, scratch):
+def mean_squares(
+    field: DistanceField, points, to_object, to_world, back, out, first, last, scratch
+):
     """Fill out (B, P) with the mean of s^2 over points (3, Q), metres^2, of rows first to last.
 
     Points are moved by world_from_object, to_world (P, 12), then by object_from_world, to_object
@@ -87,13 +89,13 @@ def mean_squares(field: Field, points, to_object, to_world, back, out, first, la
             locate(move, field.box, xs, ys, zs, places, len(xs))
             total = 0.0
             for n in range(len(xs)):
-                inside = sample(field.trilinear, field.box, field.table, places, n)
+                inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
                 if places.beyond[n] > 0.0:
                     x, y, z = xs[n], ys[n], zs[n]
                     u = move[0] * x + move[1] * y + move[2] * z + move[9]
                     v = move[3] * x + move[4] * y + move[5] * z + move[10]
                     w = move[6] * x + move[7] * y + move[8] * z + move[11]
-                    inside = continued(field.box_distance, field.box, inside, u, v, w)
+                    inside = distance_beyond_box(field.box_distance, field.box, inside, u, v, w)
                 total += inside[0] * inside[0]
             out[b, p] = total / len(xs)
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 RIGID_TOLERANCE = 1e-6
+SENSOR_TOLERANCE = 1e-3  # of poses from files and sensors, which are often rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ def nearest_rigid(name: str, transforms: FloatArray) -> FloatArray:
 
     Raises PoseError unless they are rigid within 1e-3.
     """
-    check_rigid(name, transforms, 1e-3)
+    check_rigid(name, transforms, SENSOR_TOLERANCE)
     left, _, right = np.linalg.svd(transforms[:, :3, :3])
     return compose(left @ right, transforms[:, :3, 3])
 

@@ -24,7 +24,7 @@ from chsel.problem.points import Lattice, Workspace
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
-from chsel.problem.sdf_lookup import field_of
+from chsel.problem.sdf_lookup import distance_field
 from chsel.problem.search_space import SearchSpace
 from chsel.problem.settings import Presets
 
@@ -157,7 +157,7 @@ class MedialCost:
         self.settings = settings = settings or MedialCostSettings()
         self.balls = _balls_of(problem, settings) if balls is None else balls
         self.model = MedialModel(
-            field_of(problem.sdf, settings.lookup, settings.outside),
+            distance_field(problem.sdf, settings.lookup, settings.outside),
             _least_values(problem.sdf, settings.lookup),
             self.balls.centres.T.copy(),
             self.balls.radii,

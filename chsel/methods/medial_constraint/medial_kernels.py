@@ -10,7 +10,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.pose_tuples import decode, finite, pose_at
-from chsel.problem.sdf_lookup import Field, continued, sample
+from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 from chsel.qd.archive import Batch, Cells, all_finite, insert, rank
 from chsel.qd.emitter_kernels import MeSearch, move_to_elite
 from chsel.qd.evolution_kernels import ask, reset, stopped, tell
@@ -147,7 +147,7 @@ class MedialModel(NamedTuple):
     (3, N_b) and radii (N_b,) of the balls. known (3, N_k) and known_sdf (N_k,).
     """
 
-    field: Field
+    field: DistanceField
     least: FloatArray
     centres: FloatArray
     radii: FloatArray
@@ -213,12 +213,12 @@ def _known_mean(model, pose, places):
 def _distance(field, pose, x, y, z, places, n):
     """Signed distance at the n-th of the places, that of a world point x, y, z."""
     if places.beyond[n] > 0.0:
-        inside = sample(field.trilinear, field.box, field.table, places, n)
+        inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
         a = pose[0] * x + pose[1] * y + pose[2] * z + pose[9]
         b = pose[3] * x + pose[4] * y + pose[5] * z + pose[10]
         c = pose[6] * x + pose[7] * y + pose[8] * z + pose[11]
-        return continued(field.box_distance, field.box, inside, a, b, c)[0]
-    return sample(field.trilinear, field.box, field.table, places, n)[0]
+        return distance_beyond_box(field.box_distance, field.box, inside, a, b, c)[0]
+    return distance_in_box(field.trilinear, field.box, field.table, places, n)[0]
 
 
 @spliced
