@@ -8,8 +8,8 @@ from torch import Tensor
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import clearance_of
 from chsel.numerics.octree import octree
-from chsel.problem.poses import as_tensor, moved
-from chsel.problem.sdf_grid import SdfGrid, squared_length
+from chsel.problem.poses import as_tensor, moved, squared_length
+from chsel.problem.sdf_grid import SdfGrid
 
 
 class FreeTree:

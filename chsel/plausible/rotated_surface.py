@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.plausible.surface_distance import surface_points
-from chsel.problem.poses import rotations
+from chsel.problem.poses import rotation_matrices
 from chsel.problem.streams import StreamKey
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class RotatedSurface:
             half = -0.5 * np.linalg.solve(hessian, gradient[..., None])[..., 0]
             quaternion = np.concatenate([half, np.ones((len(half), 1))], axis=1)
             quaternion /= np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
-            turns = rotations(quaternion) @ turns
+            turns = rotation_matrices(quaternion) @ turns
         return turns
 
     def coarse_errors(self, turns: FloatArray, count: int = 128) -> FloatArray:

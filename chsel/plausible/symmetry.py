@@ -13,7 +13,7 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.elementary import arctangents
 from chsel.plausible.rotated_surface import RotatedSurface
 from chsel.problem.mesh import mesh_digest
-from chsel.problem.poses import axis_angle, product, rotated, rotation_angle, rotations
+from chsel.problem.poses import axis_angle, product, rotated, rotation_angle, rotation_matrices
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.surface import has_surface, object_centre
 
@@ -160,7 +160,7 @@ def _spread() -> tuple[FloatArray, IntArray]:
         ]
     ).T
     _, index = cKDTree(np.concatenate([quaternion, -quaternion])).query(quaternion, k=_NEIGHBOURS)
-    return rotations(quaternion), index % _SPREAD
+    return rotation_matrices(quaternion), index % _SPREAD
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 class SearchSpace(ABC):
-    """Vectors x (B, d) that stand for poses."""
+    """Vectors x (B, d) that represent poses."""
 
     dimension: int  # d
-    arrays: Space  # as the kernels take it
+    arrays: Space  # for kernels
 
     @abstractmethod
     def encode(self, poses: Poses) -> FloatArray:
-        """Vectors (B, d) of poses; the nearest ones if the space is smaller."""
+        """Vectors (B, d) of poses, or of the nearest poses in the space."""
 
     @abstractmethod
     def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,16 +69,15 @@ class SE3Space(SearchSpace):
 class PlaneSettings:
     """An object that stands on a plane and only turns and slides on it.
 
-    axis: normal of the plane in the object's frame when the object rests (unit vector after
-    normalisation). resting_rotation: rotation vector of object_from_world at rest, radians,
-    for an object that lies on its side. plane_height: of the plane above the world's origin along
-    its normal, metres; or offset: axis . t of object_from_world, metres. Give one of the two.
+    Either plane_height or offset is required, and not both.
     """
 
+    # Normal of the plane in the frame of the resting object; it is normalised.
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    # R_0 of an object that does not stand upright: rotation vector of object_from_world, radians.
     resting_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    plane_height: float | None = None
-    offset: float | None = None
+    plane_height: float | None = None  # above the world's origin along the normal, metres
+    offset: float | None = None  # o = axis . t of object_from_world, metres
 
     def __post_init__(self) -> None:
         axis = frozen("plane.axis", self.axis, (3,), error=SettingError)
@@ -126,7 +125,7 @@ class SE2Space(SearchSpace):
 
     @property
     def upward(self) -> FloatArray:
-        """The plane's axis in the world (3,): R^T a, the same for every pose."""
+        """The plane's normal in the world (3,): R^T a, the same for every pose."""
         return (self.resting_rotation * self.axis[:, None]).sum(axis=0)
 
     def encode(self, poses: Poses) -> FloatArray:
@@ -162,9 +161,9 @@ def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:
 def origin_bounds(
     workspace: Workspace, space: SearchSpace, margin: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the object's origin may be (3,): the workspace, widened by a margin in metres.
+    """Bounds (3,) of the object's origin: the workspace plus a margin in metres.
 
-    For an object on a plane, it is widened further until it meets the plane.
+    For an object on a plane, the margin grows until the bounds meet the plane.
     """
     lower, upper = workspace.bounds
     if isinstance(space, SE2Space):
@@ -176,7 +175,7 @@ def origin_bounds(
 
 
 def _lowest_point(sdf: SdfGrid, axis: FloatArray) -> float:
-    """The least a . x over the object's surface, read off the grid's nodes near the surface."""
+    """The least a . x on the object's surface, from the grid's nodes near the surface."""
     near = np.abs(sdf.values) < 2.0 * sdf.resolution
     nodes = sdf.origin + np.argwhere(near) * sdf.resolution
     surface = nodes - sdf.values[near][:, None] * sdf.gradients[near]

@@ -12,7 +12,7 @@ from chsel.problem.poses import (
     interpolated,
     quaternions,
     random_rotations,
-    rotations,
+    rotation_matrices,
 )
 
 
@@ -20,7 +20,7 @@ def test_quaternions_and_rotations_are_each_others_inverse() -> None:
     r = random_rotations(np.random.default_rng(0), 100)
     axes = np.eye(3)
     r = np.concatenate([r, np.eye(3)[None], axis_angle(axes, np.full(3, np.pi))])
-    np.testing.assert_allclose(rotations(quaternions(r)), r, atol=1e-14)
+    np.testing.assert_allclose(rotation_matrices(quaternions(r)), r, atol=1e-14)
 
 
 def test_turns_are_those_of_scipy_and_positions_on_a_line() -> None:
