@@ -121,9 +121,10 @@ class FreeGrid:
         """Mark the voxels that points (N, 3) are in when moved by each of poses (P, 4, 4).
 
         These are free whatever the number of views. Returns the number of voxels that became free.
+        Raises PoseError for poses that are not finite.
         """
-        poses = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
-        self._mark_points(_rows("points", points), poses)
+        poses = frozen("poses", np.reshape(poses, (-1, 4, 4)), (None, 4, 4), error=PoseError)
+        self._mark_points(_rows("points", points), np.array(poses))
         return self._settle(self._views)
 
     def new(self) -> FloatArray:

@@ -17,7 +17,6 @@ from chsel.problem.poses import (
     rotation_angle,
 )
 from chsel.problem.sdf_grid import mesh_sdf
-from chsel.sensing.free_space import FreeGrid
 
 if TYPE_CHECKING:
     import trimesh
@@ -75,14 +74,6 @@ def between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
     fraction = (part / np.repeat(pieces, pieces))[between]
     path[between] = interpolated(kept[start[between]], kept[start[between] + 1], fraction)
     return np.concatenate([path, kept[-1:]])
-
-
-def sweep(grid: FreeGrid, interior: FloatArray, poses: FloatArray) -> int:
-    """Mark the voxels of interior points (M, 3) at poses (Q, 4, 4), world from their frame.
-
-    Returns the number of voxels that became free.
-    """
-    return grid.at(interior, poses=frozen("poses", poses, (None, 4, 4), error=PoseError))
 
 
 def _inside(mesh: trimesh.Trimesh, spacing: float) -> FloatArray:
