@@ -81,19 +81,20 @@ class KnownPoints:
 
 
 class GrowingPoints:
-    """The known points of a session so far: copied only when all are asked for.
-
-    free, occupied, known, contacts: how many there are, without a copy.
-    """
+    """The known points of a session so far, joined only when all are asked for."""
 
     def __init__(self, initial: KnownPoints) -> None:
-        self._parts = [initial]
-        self._counts = _counts(initial)
+        self.free = self.occupied = self.known = self.contacts = 0  # numbers of points
+        self._parts: list[KnownPoints] = []
+        self.add(initial)
 
     def add(self, new: KnownPoints) -> None:
-        """New points follow those so far."""
+        """Append new points."""
         self._parts.append(new)
-        self._counts = self._counts + _counts(new)
+        self.free += len(new.free)
+        self.occupied += len(new.occupied)
+        self.known += len(new.known)
+        self.contacts += len(new.contacts)
 
     def all(self) -> KnownPoints:
         """All points so far; the same value until more are added."""
@@ -102,32 +103,9 @@ class GrowingPoints:
         return self._parts[0]
 
     @property
-    def free(self) -> int:
-        return int(self._counts[0])
-
-    @property
-    def occupied(self) -> int:
-        return int(self._counts[1])
-
-    @property
-    def known(self) -> int:
-        return int(self._counts[2])
-
-    @property
-    def contacts(self) -> int:
-        return int(self._counts[3])
-
-    @property
     def count(self) -> int:
-        """How many points there are in all classes."""
+        """Number of points in all classes."""
         return self.free + self.occupied + self.known
-
-
-def _counts(points: KnownPoints) -> np.ndarray:
-    """Numbers of points (4,): free, occupied, known, contacts."""
-    return np.array(
-        [len(points.free), len(points.occupied), len(points.known), len(points.contacts)]
-    )
 
 
 @dataclass(frozen=True)

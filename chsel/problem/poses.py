@@ -168,12 +168,17 @@ def rotated(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
 def axis_angle(axis: FloatArray, angle: FloatArray | float) -> FloatArray:
     """Rotations (..., 3, 3) about unit axes (..., 3) by angles (...) in radians (Rodrigues)."""
     sine, cosine = (values[..., None, None] for values in sines_cosines(angle))
-    hat = np.zeros((*axis.shape[:-1], 3, 3))
-    hat[..., 0, 1], hat[..., 0, 2] = -axis[..., 2], axis[..., 1]
-    hat[..., 1, 0], hat[..., 1, 2] = axis[..., 2], -axis[..., 0]
-    hat[..., 2, 0], hat[..., 2, 1] = -axis[..., 1], axis[..., 0]
     outer = axis[..., :, None] * axis[..., None, :]
-    return cosine * np.eye(3) + sine * hat + (1.0 - cosine) * outer
+    return cosine * np.eye(3) + sine * hat(axis) + (1.0 - cosine) * outer
+
+
+def hat(vectors: FloatArray) -> FloatArray:
+    """The matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    matrices = np.zeros((*vectors.shape, 3))
+    matrices[..., 0, 1], matrices[..., 0, 2] = -vectors[..., 2], vectors[..., 1]
+    matrices[..., 1, 0], matrices[..., 1, 2] = vectors[..., 2], -vectors[..., 0]
+    matrices[..., 2, 0], matrices[..., 2, 1] = -vectors[..., 1], vectors[..., 0]
+    return matrices
 
 
 def roll_pitch_yaw(angles: FloatArray) -> FloatArray:

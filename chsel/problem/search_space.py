@@ -18,6 +18,7 @@ from chsel.problem.poses import (
     Poses,
     as_tensor,
     decode_6d,
+    hat,
     product,
     rotated,
     rotation_vector,
@@ -93,7 +94,8 @@ class SE2Space(SearchSpace):
     dimension = 3
 
     def __init__(self, settings: PlaneSettings, sdf: SdfGrid) -> None:
-        axis = np.array(settings.axis) / np.sqrt((np.array(settings.axis) ** 2).sum())
+        axis = np.array(settings.axis)
+        axis = axis / np.sqrt((axis**2).sum())
         along_z = abs(abs(axis[2]) - 1.0) < 1e-9
         other = np.array([0.0, -1.0, 0.0]) if along_z else np.array([0.0, 0.0, -1.0])
         e_u = np.cross(axis, other)
@@ -105,21 +107,17 @@ class SE2Space(SearchSpace):
         self.axis, self.e_u, self.e_v = axis, e_u, np.cross(axis, e_u)
         self.offset = offset
         self.resting_rotation = rotation_vector(np.array(settings.resting_rotation))
-        self._axis, self._rest = as_tensor(axis), as_tensor(self.resting_rotation)
-        self._e_u, self._e_v = as_tensor(e_u), as_tensor(self.e_v)
-        x, y, z = axis
-        self._hat = as_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        self._hat_squared = as_tensor(np.outer(axis, axis) - np.eye(3))
-        turning = product(self._hat.numpy(), self.resting_rotation)
-        turning_squared = product(self._hat_squared.numpy(), self.resting_rotation)
+        hat_squared = np.outer(axis, axis) - np.eye(3)
+        constants = hat(axis), hat_squared, self.resting_rotation, e_u, self.e_v, axis
+        self._tensors = [as_tensor(constant) for constant in constants]
         self.arrays = Space(
             planar=True,
             axis=triple(axis),
             e_u=triple(e_u),
             e_v=triple(self.e_v),
             resting=matrix_of(self.resting_rotation),
-            turning=matrix_of(turning),
-            turning_squared=matrix_of(turning_squared),
+            turning=matrix_of(product(hat(axis), self.resting_rotation)),
+            turning_squared=matrix_of(product(hat_squared, self.resting_rotation)),
             offset=float(offset),
         )
 
@@ -142,14 +140,11 @@ class SE2Space(SearchSpace):
         import torch
 
         device = vectors.device
-        hat, hat_squared, rest = (
-            part.to(device) for part in (self._hat, self._hat_squared, self._rest)
-        )
-        e_u, e_v, axis = (part.to(device) for part in (self._e_u, self._e_v, self._axis))
+        turn, turn_squared, rest, e_u, e_v, axis = (part.to(device) for part in self._tensors)
         sine, cosine = torch.sin(vectors[:, 0]), torch.cos(vectors[:, 0])
-        turn = torch.eye(3, dtype=torch.float64, device=device) + sine[:, None, None] * hat
-        turn = turn + (1.0 - cosine)[:, None, None] * hat_squared
-        rotation = (turn[:, :, :, None] * rest[None, None]).sum(dim=2)
+        about_axis = torch.eye(3, dtype=torch.float64, device=device) + sine[:, None, None] * turn
+        about_axis = about_axis + (1.0 - cosine)[:, None, None] * turn_squared
+        rotation = (about_axis[:, :, :, None] * rest[None, None]).sum(dim=2)
         return rotation, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + self.offset * axis
 
 
