@@ -8,7 +8,7 @@ _LONGEST_VALUE = 80
 
 
 class ChselError(Exception):
-    """Base of all errors with a message meant for the user: what, where, what is accepted."""
+    """Base of all errors whose message is for the user: what, where, what is accepted."""
 
 
 class SettingError(ChselError):

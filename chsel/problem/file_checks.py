@@ -115,8 +115,8 @@ _TEXT_CHECKS = {"ply": _check_ply, "off": _check_off, "stl": _check_stl, "xyz": 
 def _compare(counts: dict[str, int], lines: int) -> None:
     announced = sum(counts.values())
     if lines != announced:
-        what = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise MeshError(f"it announces {announced} lines ({what}) and has {lines}")
+        listed = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise MeshError(f"it announces {announced} lines ({listed}) and has {lines}")
 
 
 def _text_lines(path: Path) -> Iterator[str]:

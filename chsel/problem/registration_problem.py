@@ -48,7 +48,7 @@ class RegistrationProblem:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the whole problem."""
+        """Digest of the problem."""
         parts = [self.sdf.digest, self.points.digest, digest(self.initial_set, self.low_cost_set)]
         numbers = np.array([*self.workspace.lower, *self.workspace.upper, self.free_resolution])
         key = np.array([self.key.seed, self.key.step], dtype=np.uint64)
@@ -125,7 +125,7 @@ class Observer(Protocol):
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
         """State of a stage at its start and after blocks of iterations.
 
-        vectors (B, d): of the search; for a quality-diversity search, the whole archive. cost (B,).
+        vectors (B, d): of the search; in quality-diversity search, of all elites. cost (B,).
         """
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:

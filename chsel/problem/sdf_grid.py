@@ -105,7 +105,7 @@ class SdfGrid:
     ) -> SdfGrid:
         """Sample the exact signed distance of a mesh over its padded bounding box.
 
-        Values are rounded to 32 bits (nanometres), which halves what a recording holds.
+        Values are rounded to 32 bits (nanometres), which halves the size in recordings.
         progress: called before each part of a large grid with the number of nodes done and of all
         nodes; it changes no bit.
         """

@@ -101,9 +101,9 @@ def locate_facilities(points: Any, chosen: Any, nearest: Any, apart: Any) -> Any
         nearest[i] = np.inf
         row = apart[i]
         for d in range(dimension):
-            of_all, own = points[d], points[d, i]
+            values, value = points[d], points[d, i]
             for j in range(count):
-                row[j] += (own - of_all[j]) * (own - of_all[j])
+                row[j] += (value - values[j]) * (value - values[j])
     for n in range(len(chosen)):
         if n > 0:
             best, least = -1, np.inf

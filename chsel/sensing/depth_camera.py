@@ -102,9 +102,9 @@ def occlusion_edges(
 def _least_around(image: FloatArray, reach: int) -> FloatArray:
     """The least (H, W) of the pixels up to `reach` away from each, along rows and columns."""
     least = np.pad(image, reach, constant_values=np.inf)
-    side, whole = 1, 2 * reach + 1
-    while side < whole:
-        step = min(side, whole - side)
+    side, size = 1, 2 * reach + 1
+    while side < size:
+        step = min(side, size - side)
         least = np.minimum(least[step:], least[:-step])
         least = np.minimum(least[:, step:], least[:, :-step])
         side += step

@@ -59,9 +59,9 @@ class FreeGrid:
         self._views = int(views)
         voxels = int(np.prod(self.shape))
         self._words = np.zeros(-(-voxels // 8), dtype=np.uint64)
-        met = self._words.view(np.uint8)[:voxels]  # in the current view
+        marks = self._words.view(np.uint8)[:voxels]  # in the current view
         self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views, then _REPORTED
-        self._grid = VoxelGrid(met, self.shape, np.array(workspace.lower), float(spacing))
+        self._grid = VoxelGrid(marks, self.shape, np.array(workspace.lower), float(spacing))
 
     def along_rays(self, origin: Any, ends: Any) -> int:
         """One view: mark what segments from origin (3,) or (N, 3) to ends (N, 3) pass, ends too.
@@ -107,8 +107,8 @@ class FreeGrid:
     ) -> int:
         """One view: mark the points of images whose depth is scaled by each of the factors (F,).
 
-        The way of the reference implementation, which leaves gaps between the images and in front
-        of all. Otherwise as from_depth.
+        As in the reference implementation, which leaves gaps between the images and in front of
+        all. Otherwise as from_depth.
         """
         move, mask = _pose(world_from_camera), camera.image("mask", mask, bool)
         factors = frozen("factors", factors, (None,), error=SettingError)
@@ -148,7 +148,7 @@ class FreeGrid:
 
     def _settle(self, views: int) -> int:
         """Count the marked voxels as seen in `views` more views; how many became free."""
-        fresh = int(settle(self._words, self._grid.met, self._seen, views, self._views))
+        fresh = int(settle(self._words, self._grid.marks, self._seen, views, self._views))
         self.count += fresh
         return fresh
 

@@ -12,13 +12,13 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
 
 _FARTHEST = 2.0**52  # voxels from the first: beyond, neighbours are the same number
-_SHORTEST = 1e-100  # voxels: a shorter way along an axis counts as none
+_SHORTEST = 1e-100  # voxels: shorter moves along an axis count as none
 
 
 class VoxelGrid(NamedTuple):
     """Marks of V voxels. Threads may mark one grid at once: all they ever do is write ones."""
 
-    met: NDArray[np.uint8]  # (V,) in C order, 1 for a marked voxel
+    marks: NDArray[np.uint8]  # (V,) in C order, 1 for a marked voxel
     counts: tuple[int, int, int]  # voxels per axis
     lower: FloatArray  # (3,): centre of the first voxel, metres
     spacing: float  # of the centres, metres
@@ -70,22 +70,22 @@ def mark_points(grid, points, moves, first, last):
             j = np.rint((y - lower[1]) / spacing)
             k = np.rint((z - lower[2]) / spacing)
             if 0.0 <= i < nx and 0.0 <= j < ny and 0.0 <= k < nz:
-                grid.met[(int(i) * ny + int(j)) * nz + int(k)] = 1
+                grid.marks[(int(i) * ny + int(j)) * nz + int(k)] = 1
 
 
 @compiled
-def settle(words, met, seen, gain, enough):
+def settle(words, marks, seen, gain, enough):
     """Add `gain` to the views `seen` (V,) of marked voxels, up to `enough`, and unmark them.
 
-    words: the bytes of `met` (V,) by eights, as most voxels are not marked. Returns the number of
+    words: the bytes of `marks` (V,) by eights, as most voxels are not marked. Returns the number of
     voxels that reached `enough`. Voxels with more than enough views stay as they are.
     """
     fresh = 0
     for word in range(len(words)):
         if words[word]:
-            for n in range(8 * word, min(8 * word + 8, len(met))):
-                if met[n]:
-                    met[n] = 0
+            for n in range(8 * word, min(8 * word + 8, len(marks))):
+                if marks[n]:
+                    marks[n] = 0
                     if seen[n] < enough:
                         seen[n] = min(seen[n] + gain, enough)
                         fresh += 1 if seen[n] == enough else 0
@@ -143,7 +143,7 @@ def _walk(grid, a, b):
     at_z = (face_k - az) * inverse_z if left_k > 0 else inf
     voxel, last = (i * ny + j) * nz + k, (far_i * ny + far_j) * nz + far_k
     stride_i, stride_j = step_i * ny * nz, step_j * nz
-    _mark(grid.met, voxel)
+    _mark(grid.marks, voxel)
     while voxel != last:
         at = min(at_x, at_y, at_z)
         if at_x == at:
@@ -161,13 +161,13 @@ def _walk(grid, a, b):
             left_k -= 1
             face_k += step_k
             at_z = (face_k - az) * inverse_z if left_k > 0 else inf
-        _mark(grid.met, voxel)
+        _mark(grid.marks, voxel)
 
 
 @leaf
-def _mark(met, voxel):
-    if met[voxel] == 0:  # most are marked already, and concurrent writes are slow
-        met[voxel] = 1
+def _mark(marks, voxel):
+    if marks[voxel] == 0:  # most are marked already, and concurrent writes are slow
+        marks[voxel] = 1
 
 
 @leaf
