@@ -17,26 +17,21 @@ GRADIENTS = ("defined", "exact")
 class CostSettings:
     """Settings of the relaxed cost, with the paper's symbols.
 
-    penetration_tolerance: alpha, the level (metres, negative) that free points may reach.
-    free_scale, occupied_scale: lambda. known_scale: weight of known-SDF points.
     free_term: "direct" sums over free points as Eq. 8 does; "interior" sums over points inside
-    the object that fall into free voxels, as the authors' experiments did.
-    interior_spacing: of those points, metres; by default |alpha|. volume_normalise: weigh them by
-    the volume they stand for in free voxels. known_tolerance: dead band of known-SDF points,
-    metres. lookup, outside: how the SDF grid is read, see SdfGrid.query. gradient: "defined"
-    is violation times normal (Eqs. 8 to 10); "exact" is the derivative of the value.
+    the object that lie in free voxels, as the authors' experiments did. gradient: "defined" is
+    violation times normal (Eqs. 8 to 10); "exact" is the derivative of the value.
     """
 
-    penetration_tolerance: float = -0.01
-    free_scale: float = 20.0
-    occupied_scale: float = 20.0
-    known_scale: float = 1.0
+    penetration_tolerance: float = -0.01  # alpha, the level that free points may reach, metres
+    free_scale: float = 20.0  # lambda
+    occupied_scale: float = 20.0  # lambda
+    known_scale: float = 1.0  # weight of known-SDF points
     free_term: str = "direct"
-    interior_spacing: float | None = None
-    volume_normalise: bool = False
-    known_tolerance: float = 0.0
-    lookup: str = "trilinear"
-    outside: str = "surface_point"
+    interior_spacing: float | None = None  # of interior points, metres; by default |alpha|
+    volume_normalise: bool = False  # weigh interior points by their share of a free voxel
+    known_tolerance: float = 0.0  # dead band of known-SDF points, metres
+    lookup: str = "trilinear"  # how the SDF grid is read, see SdfGrid.query
+    outside: str = "surface_point"  # and beyond its box
     gradient: str = "defined"
 
     presets: ClassVar[Presets] = {

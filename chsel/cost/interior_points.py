@@ -1,4 +1,4 @@
-"""The free term's other form: points inside of the object that must not fall into free voxels."""
+"""The other form of the free term: points inside the object that must not lie in free voxels."""
 
 from __future__ import annotations
 
@@ -14,33 +14,37 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.points import Lattice
 from chsel.problem.sdf_grid import SdfGrid
 
-FEW_INTERIOR_POINTS = 25
+FEW_INTERIOR_POINTS = 25  # fewer are worth a warning
 _MAX_VOXELS = 100_000_000
 _MAX_NODES = 10_000_000  # of the lattice over the SDF grid
 
 
 @dataclass(frozen=True)
 class InteriorPoints:
-    """Points (M, 3) inside of an object, with their depths (M,) > 0 and SDF gradients (M, 3)."""
+    """Points inside an object, on a lattice."""
 
-    points: FloatArray
-    depth: FloatArray
-    normals: FloatArray
+    points: FloatArray  # (M, 3), object frame
+    depth: FloatArray  # (M,) > 0, metres
+    normals: FloatArray  # (M, 3), gradients of the SDF
+    spacing: float  # of the lattice, metres
 
     def in_order(self, order: IntArray) -> InteriorPoints:
-        """The points that `order` (M,) numbers."""
-        return InteriorPoints(self.points[order], self.depth[order], self.normals[order])
+        """The points in an order (M,) of their indices."""
+        points, depth, normals = self.points[order], self.depth[order], self.normals[order]
+        return InteriorPoints(points, depth, normals, self.spacing)
 
-
-def interior_spacing(sdf: SdfGrid, settings: CostSettings) -> float:
-    """Metres between interior points."""
-    alpha = settings.penetration_tolerance
-    return settings.interior_spacing or max(-alpha, sdf.resolution / 4)
+    def weights(self, settings: CostSettings, free_resolution: float) -> FloatArray:
+        """What each point (M,) costs in a free voxel."""
+        scale = settings.free_scale
+        if settings.volume_normalise:
+            scale *= (self.spacing / free_resolution) ** 3
+        return scale * self.depth
 
 
 def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
     """The nodes of a lattice over the grid that are deeper than alpha."""
-    alpha, spacing = settings.penetration_tolerance, interior_spacing(sdf, settings)
+    alpha = settings.penetration_tolerance
+    spacing = settings.interior_spacing or max(-alpha, sdf.resolution / 4)
     lower, upper = sdf.bounds
     counts = np.floor((upper - lower) / spacing).astype(int) + 1
     if not math.prod(counts.tolist()) <= _MAX_NODES:
@@ -63,19 +67,16 @@ def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
             f"than {spacing} m describes the object better",
             stacklevel=3,
         )
-    return InteriorPoints(nodes[inside], -s[inside], n[inside])
+    return InteriorPoints(nodes[inside], -s[inside], n[inside], spacing)
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """Voxels that hold a free point, with a layer of others around: flags (nx, ny, nz).
+    """The voxels that hold a free point, with a layer of empty ones around."""
 
-    origin (3,): centre of the first voxel. resolution: side, metres.
-    """
-
-    origin: FloatArray
-    resolution: float
-    flags: BoolArray
+    origin: FloatArray  # (3,) centre of the first voxel
+    resolution: float  # side of a voxel, metres
+    flags: BoolArray  # (nx, ny, nz)
 
     @classmethod
     def around(cls, free: FloatArray, resolution: float) -> VoxelGrid:

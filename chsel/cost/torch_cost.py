@@ -1,18 +1,17 @@
-"""The relaxed cost of a pose (CHSEL, Eqs. 6 to 10), with the gradient that the paper defines."""
+"""The relaxed cost (CHSEL, Eqs. 6 to 10) in torch, with the gradient that the paper defines."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.interior_points import VoxelGrid, interior_points, interior_spacing
-from chsel.cost.torch_octree import FreeTree
+from chsel.cost.interior_points import VoxelGrid, interior_points
+from chsel.cost.torch_octree import NODES_PER_POSE, FreeTree, Pairs
 from chsel.errors import EngineError, require_positive
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
@@ -22,14 +21,14 @@ from chsel.problem.sdf_grid import SdfGrid
 
 
 def gpus() -> int:
-    """How many GPUs torch finds here."""
+    """The number of GPUs that torch finds on this machine."""
     return torch.cuda.device_count() if torch.cuda.is_available() else 0
 
 
 def device_named(name: str) -> torch.device:
-    """The device "cpu", "cuda" (the GPU that torch uses at present) or "cuda:N".
+    """The device "cpu", "cuda" (torch's current GPU) or "cuda:N".
 
-    Raises EngineError, with what is accepted here, for any other.
+    Raises EngineError, which lists the devices of this machine, for any other name.
     """
     count = gpus()
     accepted = ["cpu", *(["cuda"] if count else []), *(f"cuda:{n}" for n in range(count))]
@@ -37,29 +36,21 @@ def device_named(name: str) -> torch.device:
         return torch.device("cuda", torch.cuda.current_device())
     if name in accepted:
         return torch.device(name)
-    found = f"{count} GPU{'s' * (count > 1)}" if count else "no GPU"
-    but = f", but torch finds {found} here" if str(name).startswith("cuda") else ""
+    present = f"{count} GPU{'s' * (count > 1)}" if count else "no GPU"
+    but = f", but torch finds {present} here" if str(name).startswith("cuda") else ""
     raise EngineError(f"device is {name}{but}; accepted: {', '.join(accepted)}")
 
 
-_PAIRS_ON_CPU = 60_000
-_PAIRS_ON_GPU = 4_000_000
+_PAIRS_ON_CPU = 60_000  # fits its cache
+_PAIRS_ON_GPU = 4_000_000  # at most 1.6 GB of its memory
 
 
-@dataclass(frozen=True)
-class Part:
-    """A term of the cost for B poses: value (B,), gradient by R (B, 3, 3) and by t (B, 3)."""
+class Part(NamedTuple):
+    """A term of the cost for B poses, and its gradient."""
 
-    value: Tensor
-    by_rotation: Tensor
-    by_translation: Tensor
-
-    def __add__(self, other: Part) -> Part:
-        return Part(
-            self.value + other.value,
-            self.by_rotation + other.by_rotation,
-            self.by_translation + other.by_translation,
-        )
+    value: Tensor  # (B,)
+    by_rotation: Tensor  # (B, 3, 3)
+    by_translation: Tensor  # (B, 3)
 
 
 class RelaxedCost:
@@ -70,15 +61,14 @@ class RelaxedCost:
     differentiable by torch: the gradient is the one that Eqs. 8 to 10 define, pushed through
     x~ = R x + t.
 
-    Take it for gradients by torch, and with device "cuda" for the costs of 10^5 poses and more.
-    CompiledCost is what the methods take: on a processor it is 20 to 35 times as fast, and its
-    bits are the same on every machine. Here they are the same in every run on one device, and in
-    any batch there: sums run in a fixed order. Between devices, costs agree to a relative 1e-9.
+    Use it for gradients by torch, and with device "cuda" for the costs of 10^5 poses and more.
+    The methods use CompiledCost: on a processor it is 20 to 35 times as fast, and its bits are the
+    same on every machine. Those of RelaxedCost are the same in every run on one device, and in any
+    batch there, as sums run in a fixed order. Between devices, costs agree to a relative 1e-9.
 
-    pairs_at_once: how many pairs of pose and point are worked on together, at 250 to 400 bytes
-    each; one pose is never divided. By default 60 000 on a processor, for its cache, and 4 million
-    on a GPU, at most 1.6 GB of its memory.
-    Raises EngineError for a device that is not here.
+    pairs_at_once: how many pairs of pose and point are processed together, at 250 to 400 bytes
+    each; one pose is never divided. By default 60 000 on a processor and 4 million on a GPU.
+    Raises EngineError for a device that this machine does not have.
     """
 
     def __init__(
@@ -104,21 +94,16 @@ class RelaxedCost:
         self._known_sdf = as_tensor(points.sdf, self.device)
         self._tree: FreeTree | None = None
         self._interior: _InteriorPoints | None = None
-        if len(points.free):
-            self._look_at_free(points.free, free_resolution)
-
-    def _look_at_free(self, free: FloatArray, free_resolution: float) -> None:
-        sdf, settings = self.sdf, self.settings
-        alpha, lookup = settings.penetration_tolerance, settings.lookup
-        if not bool(sdf.active_cells(alpha, lookup).any()):
+        free, alpha, lookup = points.free, settings.penetration_tolerance, settings.lookup
+        if len(free) and not bool(sdf.active_cells(alpha, lookup).any()):
             warnings.warn(
                 f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
                 "use a smaller penetration_tolerance",
-                stacklevel=3,
+                stacklevel=2,
             )
-        if settings.free_term == "interior":
+        if len(free) and settings.free_term == "interior":
             self._interior = _InteriorPoints(sdf, free, free_resolution, settings, self.device)
-        else:
+        elif len(free):
             self._tree = FreeTree(sdf, free, free_resolution, alpha, lookup, self.device)
 
     @classmethod
@@ -148,84 +133,86 @@ class RelaxedCost:
         transforms = stacked(object_from_world)
         costs, size = np.empty(len(transforms)), self._poses_at_once
         for first in range(0, len(transforms), size):
-            some = as_tensor(transforms[first : first + size], self.device)
+            batch = as_tensor(transforms[first : first + size], self.device)
             with torch.no_grad():
-                costs[first : first + size] = self(some[:, :3, :3], some[:, :3, 3]).cpu().numpy()
+                costs[first : first + size] = self(batch[:, :3, :3], batch[:, :3, 3]).cpu().numpy()
         costs[~np.isfinite(transforms[:, :3]).all(axis=(1, 2))] = np.inf
         return costs
 
     def terms(self, rotation: Tensor, translation: Tensor) -> dict[str, Part]:
         """The weighted terms "free", "occupied" and "known" for B poses."""
         size = self._poses_at_once
-        chunks = zip(rotation.split(size), translation.split(size), strict=True)
-        parts = [
-            (self._free_part(r, t), self._occupied_part(r, t), self._known_part(r, t))
-            for r, t in chunks
-        ]
-        names = ("free", "occupied", "known")
-        return {name: _joined([part[i] for part in parts]) for i, name in enumerate(names)}
+        batches = list(zip(rotation.split(size), translation.split(size), strict=True))
+        terms = {"free": self._free, "occupied": self._of_occupied, "known": self._of_known}
+        return {name: _joined([term(r, t) for r, t in batches]) for name, term in terms.items()}
 
     @property
     def _poses_at_once(self) -> int:
-        free = 0 if self._tree is None else self._tree.usual
+        free = 0 if self._tree is None else NODES_PER_POSE
         interior = 0 if self._interior is None else len(self._interior.points)
         most = max(1, free, interior, len(self._occupied), len(self._known))
         return max(1, self.pairs_at_once // most)
 
-    def _free_part(self, rotation: Tensor, translation: Tensor) -> Part:
-        """lambda sum max(0, alpha - s), with gradient -lambda max(0, alpha - s) n."""
+    def _free(self, rotation: Tensor, translation: Tensor) -> Part:
+        """lambda sum max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8)."""
         if self._interior is not None:
             return self._interior.part(rotation, translation)
         if self._tree is None:
             return _zero(rotation)
-        found = self._tree.violated(rotation, translation, self.pairs_at_once)
-        if found is None:
+        violated = self._tree.violated(rotation, translation, self.pairs_at_once)
+        if violated is None:
             half = -(-len(rotation) // 2)
             halves = zip(rotation.split(half), translation.split(half), strict=True)
-            return _joined([self._free_part(r, t) for r, t in halves])
-        pose, world, points = found
-        s, n = self._query(points)
+            return _joined([self._free(r, t) for r, t in halves])
+        s, n = self._query(violated)
         violation = (self.settings.penetration_tolerance - s).clamp_min(0.0)
-        size = violation if self.settings.gradient == "defined" else (violation > 0.0).double()
-        scale = self.settings.free_scale
-        gradient = -scale * size[:, None] * n
-        return _sum_by_pose(rotation, pose, scale * violation, gradient, gradient, world)
+        return self._sum(rotation, violated, self.settings.free_scale, violation, -n)
 
-    def _occupied_part(self, rotation: Tensor, translation: Tensor) -> Part:
-        """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n."""
+    def _of_occupied(self, rotation: Tensor, translation: Tensor) -> Part:
+        """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
         if len(self._occupied) == 0:
             return _zero(rotation)
-        pose, world, points = _all_pairs(rotation, translation, self._occupied)
-        s, n = self._query(points)
+        pairs = _all_pairs(rotation, translation, self._occupied)
+        s, n = self._query(pairs)
         violation = (self.settings.penetration_tolerance + s).clamp_min(0.0)
-        size = violation if self.settings.gradient == "defined" else (violation > 0.0).double()
-        scale = self.settings.occupied_scale
-        gradient = scale * size[:, None] * n
-        return _sum_by_pose(rotation, pose, scale * violation, gradient, gradient, world)
+        return self._sum(rotation, pairs, self.settings.occupied_scale, violation, n)
 
-    def _known_part(self, rotation: Tensor, translation: Tensor) -> Part:
-        """sum |s - v|, with gradient (s - v) n."""
+    def _of_known(self, rotation: Tensor, translation: Tensor) -> Part:
+        """sum |s - v|, with gradient (s - v) n (Eq. 10)."""
         if len(self._known) == 0:
             return _zero(rotation)
-        pose, world, points = _all_pairs(rotation, translation, self._known)
-        s, n = self._query(points)
+        pairs = _all_pairs(rotation, translation, self._known)
+        s, n = self._query(pairs)
         difference = s - self._known_sdf.repeat(len(rotation))
         excess = (difference.abs() - self.settings.known_tolerance).clamp_min(0.0)
-        signed = excess * torch.sign(difference)
-        size = signed if self.settings.gradient == "defined" else torch.sign(signed)
-        scale = self.settings.known_scale
-        gradient = scale * size[:, None] * n
-        return _sum_by_pose(rotation, pose, scale * excess, gradient, gradient, world)
+        along = torch.sign(difference)[:, None] * n
+        return self._sum(rotation, pairs, self.settings.known_scale, excess, along)
 
-    def _query(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def _query(self, pairs: Pairs) -> tuple[Tensor, Tensor]:
         lookup, outside = self.settings.lookup, self.settings.outside
-        return self.sdf.query(points, lookup=lookup, outside=outside)
+        return self.sdf.query(pairs.local, lookup=lookup, outside=outside)
+
+    def _sum(
+        self, rotation: Tensor, pairs: Pairs, scale: float, violation: Tensor, along: Tensor
+    ) -> Part:
+        """Sums by pose of violations (P,), which grow along object-frame directions (P, 3)."""
+        exact = self.settings.gradient == "exact"
+        slope = (violation > 0.0).double() if exact else violation
+        gradient = scale * slope[:, None] * along
+        return _sum_by_pose(
+            rotation,
+            pairs.pose,
+            scale * violation,
+            by_translation=gradient,
+            left=gradient,
+            right=pairs.world,
+        )
 
 
 class _InteriorPoints:
-    """The free term over points inside of the object: lambda sum_j o_j w_j.
+    """The free term over points inside the object: lambda sum_j o_j w_j.
 
-    w_j = -s(m_j) for interior points m_j, o_j = 1 where m_j falls into a known free voxel. The
+    w_j = -s(m_j) for interior points m_j, o_j = 1 where m_j lies in a known free voxel. The
     gradient by the world point y_j is lambda o_j w_j R^T n_j: inwards, out of the free voxel.
     """
 
@@ -239,11 +226,8 @@ class _InteriorPoints:
     ) -> None:
         interior = interior_points(sdf, settings)
         voxels = VoxelGrid.around(free, free_resolution)
-        scale = settings.free_scale
-        if settings.volume_normalise:
-            scale *= (interior_spacing(sdf, settings) / free_resolution) ** 3
         self.points = as_tensor(interior.points, device)  # (M, 3)
-        self._weight = as_tensor(scale * interior.depth, device)
+        self._weight = as_tensor(interior.weights(settings, free_resolution), device)
         self._normal = as_tensor(interior.normals, device)
         self._is_free = torch.from_numpy(voxels.flags.reshape(-1)).to(device)
         self._counts = voxels.flags.shape
@@ -265,18 +249,20 @@ class _InteriorPoints:
         pull = weight[:, None] * self._normal[point]  # R dC/dy
         local = self.points[point] - translation[pose]
         by_world = moved(back[pose], nothing[pose], pull)
-        return _sum_by_pose(rotation, pose, weight, -pull, local, by_world)
+        return _sum_by_pose(
+            rotation, pose, weight, by_translation=-pull, left=local, right=by_world
+        )
 
 
 class _DefinedGradient(torch.autograd.Function):
-    """Returns the value forward and the gradient that the terms define backward."""
+    """Forward, the value; backward, the gradient that the terms define."""
 
     @staticmethod
     def forward(ctx: Any, rotation: Tensor, translation: Tensor, cost: RelaxedCost) -> Tensor:
-        terms = cost.terms(rotation.detach(), translation.detach())
-        total = terms["free"] + terms["occupied"] + terms["known"]
-        ctx.save_for_backward(total.by_rotation, total.by_translation)
-        return total.value
+        free, occupied, known = cost.terms(rotation.detach(), translation.detach()).values()
+        value, *gradient = (a + b + c for a, b, c in zip(free, occupied, known, strict=True))
+        ctx.save_for_backward(*gradient)
+        return value
 
     @staticmethod
     def backward(ctx: Any, by_value: Tensor) -> tuple[Tensor, Tensor, None]:
@@ -284,47 +270,42 @@ class _DefinedGradient(torch.autograd.Function):
         return by_value[:, None, None] * by_rotation, by_value[:, None] * by_translation, None
 
 
-def _all_pairs(
-    rotation: Tensor, translation: Tensor, points: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """All pairs of B poses and points (N, 3): the pose (B N,), the points, and them moved."""
+def _all_pairs(rotation: Tensor, translation: Tensor, points: Tensor) -> Pairs:
+    """All pairs of B poses and points (N, 3)."""
     count = len(rotation)
     pose = torch.arange(count, device=points.device).repeat_interleave(len(points))
-    there = moved(rotation[:, None], translation[:, None], points)
-    return pose, points.repeat(count, 1), there.reshape(-1, 3)
+    local = moved(rotation[:, None], translation[:, None], points)
+    return Pairs(pose, points.repeat(count, 1), local.reshape(-1, 3))
 
 
 def _sum_by_pose(
     rotation: Tensor,
     pose: Tensor,
     value: Tensor,
+    *,
     by_translation: Tensor,
     left: Tensor,
     right: Tensor,
 ) -> Part:
-    """Sum what pairs add to their poses: values (P,) and gradients; that by R is left right^T.
+    """Sums by pose (P,), ascending, of values (P,) and gradients (P, 3); that by R is left right^T.
 
-    pose (P,): ascending. Each sum runs in the order of its pairs: the same bits in any batch.
+    Each sum runs in the order of its pairs: the same bits in any batch.
     """
     count = len(rotation)
     if len(pose) == 0:
         return _zero(rotation)
     columns = [value[:, None], by_translation, *(left[:, i : i + 1] * right for i in range(3))]
     ends = torch.searchsorted(pose, torch.arange(count + 1, device=pose.device))
-    # Not one column alone: for two and more, torch adds rows one after another on a GPU, too.
+    # For two and more columns, torch adds rows one after another, on a GPU too.
     sums = torch.segment_reduce(torch.cat(columns, dim=1), "sum", lengths=ends.diff(), axis=0)
     return Part(sums[:, 0], sums[:, 4:].reshape(-1, 3, 3), sums[:, 1:4])
 
 
 def _zero(rotation: Tensor) -> Part:
-    """Nothing, for each of the rotations (B, 3, 3)."""
+    """Zero for each of the rotations (B, 3, 3)."""
     zeros = torch.zeros_like(rotation)
     return Part(zeros[:, 0, 0], zeros, zeros[:, 0])
 
 
 def _joined(parts: list[Part]) -> Part:
-    return Part(
-        torch.cat([part.value for part in parts]),
-        torch.cat([part.by_rotation for part in parts]),
-        torch.cat([part.by_translation for part in parts]),
-    )
+    return Part(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))

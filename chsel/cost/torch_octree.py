@@ -1,25 +1,34 @@
-"""Which free points a pose violates: a walk down an octree for all poses together."""
+"""Which free points poses violate: a walk down an octree for all poses together, in torch."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import clearance_of
 from chsel.numerics.octree import octree
 from chsel.problem.poses import as_tensor, moved, squared_length
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_lookup import cells_below
+
+NODES_PER_POSE = 256  # that a walk typically looks at together
+
+
+class Pairs(NamedTuple):
+    """Pairs of pose and point, by pose."""
+
+    pose: Tensor  # (P,) ascending indices
+    world: Tensor  # (P, 3) points
+    local: Tensor  # (P, 3) points moved by the poses
 
 
 class FreeTree:
     """Free points (N, 3) in an octree, and the cells of a grid that violate them.
 
-    alpha: the level, metres, below which a point is violated; lookup: see SdfGrid.query.
+    alpha: the level, metres, below which a point is violated. lookup: see SdfGrid.query.
     """
-
-    usual = 256
-    """Nodes that a pose needs at a time, about."""
 
     def __init__(
         self,
@@ -31,28 +40,25 @@ class FreeTree:
         device: torch.device,
     ) -> None:
         tree = octree(free, spacing)
-        cells = sdf.active_cells(alpha, lookup).numpy().reshape(sdf.shape)
         self._sdf, self._lookup = sdf, lookup
-        self._clearance = as_tensor(clearance_of(cells, sdf.resolution), device)
+        self._clearance = as_tensor(cells_below(sdf, alpha, lookup).clearance, device)
         self._centres = as_tensor(tree.spheres[:3].T, device)  # of the nodes, then the points
         self._radii = as_tensor(tree.spheres[3], device)
         self._starts = torch.tensor(tree.starts).to(device)
         self._depth = len(tree.levels) - 1
         self._top = torch.arange(int(tree.levels[1]), device=device)
 
-    def violated(
-        self, rotation: Tensor, translation: Tensor, most: int
-    ) -> tuple[Tensor, Tensor, Tensor] | None:
-        """The points in violating cells: their poses (P,), the points (P, 3), and them moved.
+    def violated(self, rotation: Tensor, translation: Tensor, most: int) -> Pairs | None:
+        """The points in violating cells, by pose, then in the order of the tree.
 
-        By pose, then in the order of the tree. Exact: the ball of a node that is left out, moved,
-        misses every such cell. None if several poses need more than `most` nodes together.
+        Exact: a node is left out only if its moved sphere misses every such cell. None if several
+        poses need more than `most` nodes together.
         """
         count, stretch = len(rotation), _stretch(rotation)
         pose = torch.arange(count, device=rotation.device).repeat_interleave(len(self._top))
         node = self._top.repeat(count)
         for _ in range(self._depth):
-            _, squared, clearance = self._look(rotation[pose], translation[pose], node)
+            _, squared, clearance = self._look_up(rotation[pose], translation[pose], node)
             reach = stretch[pose] * self._radii[node]
             near = clearance.clamp_min(0.0) + squared <= reach * reach
             pose, node = pose[near], node[near]
@@ -64,11 +70,11 @@ class FreeTree:
             pose = pose.repeat_interleave(children, output_size=total)
             node = (self._starts[node] - before).repeat_interleave(children, output_size=total)
             node = node + torch.arange(total, device=node.device)
-        points, squared, clearance = self._look(rotation[pose], translation[pose], node)
+        points, squared, clearance = self._look_up(rotation[pose], translation[pose], node)
         violated = (clearance < 0.0) & (squared == 0.0)
-        return pose[violated], self._centres[node[violated]], points[violated]
+        return Pairs(pose[violated], self._centres[node[violated]], points[violated])
 
-    def _look(
+    def _look_up(
         self, rotation: Tensor, translation: Tensor, node: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Moved centres (P, 3), their squared distances (P,) to the grid, clearances there (P,)."""
@@ -79,6 +85,6 @@ class FreeTree:
 
 
 def _stretch(matrices: Tensor) -> Tensor:
-    """How far matrices (B, 3, 3) stretch a vector, or more; 1 for rotations, but for rounding."""
+    """An upper bound of how far matrices (B, 3, 3) stretch a vector; about 1 for rotations."""
     gram = (matrices[:, :, :, None] * matrices[:, :, None, :]).sum(dim=1)
     return torch.sqrt(gram.abs().sum(dim=2).amax(dim=1)) * (1.0 + 1e-12)

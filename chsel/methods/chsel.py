@@ -23,7 +23,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space
-from chsel.problem.settings import PRESETS, Presets
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, normals
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
 from chsel.qd.measures import measure_named
@@ -79,18 +79,7 @@ class ChselSettings:
     starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)
     plane: PlaneSettings | None = None
 
-    presets: ClassVar[Presets] = {
-        preset: {
-            "cost": CostSettings.presets[preset],
-            "descent": DescentSettings.presets[preset],
-            "archive": ArchiveSettings.presets[preset],
-            "emitter": EmitterSettings.presets[preset],
-            "output": OutputSettings.presets[preset],
-            "online": OnlineSettings.presets[preset],
-            "starts": None,
-        }
-        for preset in PRESETS[1:]
-    }
+    presets: ClassVar[Presets] = {"paper": {"starts": None}, "reference": {"starts": None}}
 
     def __post_init__(self) -> None:
         require_choice("search", self.search, SEARCHES)

@@ -21,7 +21,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import PRESETS, Presets
+from chsel.problem.settings import Presets
 from chsel.qd.selection import ranked_hypotheses
 
 MOST_ITERATIONS = 1_000_000
@@ -100,14 +100,7 @@ class GradientDescentSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None
 
-    presets: ClassVar[Presets] = {
-        preset: {
-            "cost": CostSettings.presets[preset],
-            "descent": DescentSettings.presets[preset],
-            "online": OnlineSettings.presets[preset],
-        }
-        for preset in PRESETS[1:]
-    }
+    presets: ClassVar[Presets] = {}  # those of its groups
 
 
 class GradientDescent:

@@ -10,13 +10,12 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import MOST_SLACK, Model, Neighbours, evaluate, neighbours_of
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.objective import Objective
-from chsel.cost.objective_kernels import BETA1, BETA2, EPSILON, adam_step
+from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective, adam_step
 from chsel.errors import require_at_most, require_choice, require_positive
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import exp, log
-from chsel.numerics.octree import Found
+from chsel.numerics.octree import Candidates
 from chsel.numerics.pose_tuples import decode, pull_back
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
@@ -27,7 +26,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import PRESETS, Presets
+from chsel.problem.settings import Presets
 from chsel.qd.selection import ranked_hypotheses
 
 _LEAST = 1e-8  # of 2 h^2, which keeps gamma finite
@@ -66,28 +65,39 @@ def particles_at(vectors: FloatArray) -> Particles:
 
 
 class Surroundings(NamedTuple):
-    """What each particle has around it, see Neighbours: x, y, z, kept (P, S) and memory (P, 32).
+    """What each of P particles has around it, see Neighbours.
 
-    P is B, so that each remembers its own, or 1 where that would be too large. found: the scratch
-    that all share.
+    P is B, so that each remembers its neighbours, or 1 where that would be too large.
     """
 
-    x: FloatArray
+    x: FloatArray  # (P, S)
     y: FloatArray
     z: FloatArray
-    kept: Any
-    memory: FloatArray
-    found: Found
+    kept: Any  # (P, S)
+    number: IntArray  # (P, 1)
+    slack: FloatArray  # (P, 1)
+    gathered: FloatArray  # (P, 12)
+    last: FloatArray  # (P, 12)
+    scratch: Candidates  # of all particles
 
 
 def surroundings_of(model: Model, count: int) -> Surroundings:
     """Those of so many particles, met for the first time."""
-    found, memory = neighbours_of(model)
-    size = len(found.x)
+    scratch = neighbours_of(model).candidates
+    size = len(scratch.x)
     rows = count if count * size <= _MOST_REMEMBERED else 1
     x, y, z = (np.empty((rows, size)) for _ in range(3))
-    kept = np.empty((rows, size), dtype=found.kept.dtype)
-    return Surroundings(x, y, z, kept, np.full((rows, len(memory)), -1.0), found)
+    return Surroundings(
+        x=x,
+        y=y,
+        z=z,
+        kept=np.empty((rows, size), dtype=scratch.kept.dtype),
+        number=np.zeros((rows, 1), dtype=np.int64),
+        slack=np.full((rows, 1), -1.0),
+        gathered=np.zeros((rows, 12)),
+        last=np.zeros((rows, 12)),
+        scratch=scratch,
+    )
 
 
 @compiled
@@ -125,13 +135,16 @@ def _score(
     model: Any, space: Any, vector: Any, sharpness: Any, around: Any, n: Any, score: Any
 ) -> None:
     """Fill the gradient (d,) of log p by the n-th vector."""
-    row = n if len(around.memory) > 1 else 0
-    most_slack = MOST_SLACK if len(around.memory) > 1 else 0.0
-    x, y, z, kept, shared = around.x, around.y, around.z, around.kept, around.found
-    found = Found(x[row], y[row], z[row], shared.radius, shared.places, shared.nodes, kept[row])
-    near = Neighbours(found, around.memory[row])
+    row = n if len(around.x) > 1 else 0
+    most_slack = MOST_SLACK if len(around.x) > 1 else 0.0
+    x, y, z, kept, scratch = around.x, around.y, around.z, around.kept, around.scratch
+    candidates = Candidates(
+        x[row], y[row], z[row], scratch.radius, scratch.places, scratch.nodes, kept[row]
+    )
+    gathered, last = around.gathered[row], around.last[row]
+    near = Neighbours(candidates, around.number[row], around.slack[row], gathered, last)
     sums = evaluate(model, decode(space, vector), near, most_slack)
-    pull_back(space, vector, sums[4:13] + sums[1:4], score)
+    pull_back(space, vector, sums.by_pose, score)
     for j in range(len(score)):
         score[j] *= -sharpness
 
@@ -238,10 +251,7 @@ class SvgdSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None
 
-    presets: ClassVar[Presets] = {
-        preset: {"cost": CostSettings.presets[preset], "online": OnlineSettings.presets[preset]}
-        for preset in PRESETS[1:]
-    }
+    presets: ClassVar[Presets] = {}  # those of its groups
 
     def __post_init__(self) -> None:
         require_choice("kernel", self.kernel, ("reference", "median"))

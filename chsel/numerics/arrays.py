@@ -1,4 +1,4 @@
-"""Arrays at the border: checked once, then read-only float64."""
+"""Arrays of callers: checked once, then read-only float64."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def frozen(
     """A read-only, C-ordered copy of `value` with the given shape (None: any length).
 
     Takes numpy arrays, torch tensors and nested lists. Raises `error` with `name` in the message
-    if the value is no array of numbers, has another shape, or holds a value that is not finite.
+    if the value is not an array of numbers, has another shape, or holds a value that is not finite.
     """
-    torch = sys.modules.get("torch")  # who has a tensor has imported it; it takes seconds
+    torch = sys.modules.get("torch")  # importing it takes seconds; a tensor's owner has done so
     try:
         if torch is not None and isinstance(value, torch.Tensor):
             value = value.detach().cpu().numpy()

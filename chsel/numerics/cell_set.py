@@ -1,4 +1,4 @@
-"""Grids of cells, which cells points fall into, and how far they are from some of the cells."""
+"""Grids of cells: which cell a point lies in, and how far cells are from a set of them."""
 
 from __future__ import annotations
 
@@ -13,38 +13,28 @@ from chsel.numerics.compiler import inner, leaf
 
 
 class Box(NamedTuple):
-    """The nodes of a grid and the cells of its points, in numbers alone.
+    """The nodes of a grid and the cells of its points, in numbers alone."""
 
-    first, last: corner nodes, metres. inverse: nodes per metre. between: 0 if a point belongs to
-    the cell around the nearest node, 1 if to the cell between nodes, named after its lowest node.
-    most: the greatest index of a cell per axis. across, along: from a node to the next one on the
-    first and on the second axis, in a flat array.
-    """
-
-    first: tuple[float, float, float]
+    first: tuple[float, float, float]  # corner nodes, metres
     last: tuple[float, float, float]
-    inverse: float
-    between: float
-    most: tuple[float, float, float]
-    across: float
-    along: float
+    inverse: float  # nodes per metre
+    between: float  # 0: cells lie around nodes; 1: between nodes, numbered by their lowest node
+    most: tuple[float, float, float]  # the greatest index of a cell per axis
+    across: float  # steps in a flat array to the next node on the first axis,
+    along: float  # and on the second
 
 
 class Region(NamedTuple):
-    """A set of grid cells, and how far every other cell is from it.
-
-    clearance (nodes,): -1 for a cell of the set, else the squared distance in metres between any
-    point of the cell and any point of the set, or less.
-    """
+    """A set of grid cells, and how far every other cell is from it."""
 
     box: Box
-    clearance: Any
+    clearance: Any  # (nodes,) -1 in the set, else at most the squared distance to it, m^2; float32
 
 
 def box_of(
     first: FloatArray, resolution: float, shape: Sequence[int], *, between: bool = False
 ) -> Box:
-    """The box of a grid of nodes (nx, ny, nz) from its first node (3,) on."""
+    """The box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
     x, y, z = (int(count) for count in shape)
     last = first + (np.array([x, y, z]) - 1) * resolution
     most = triple(np.array([x, y, z]) - (2 if between else 1))
@@ -53,13 +43,13 @@ def box_of(
 
 
 def triple(values: Sequence[float] | FloatArray) -> tuple[float, float, float]:
-    """Three numbers as a tuple, which costs kernels nothing to pass on."""
+    """Three numbers as a tuple, which kernels pass on at no cost."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
 def clearance_of(cells: BoolArray, resolution: float) -> Any:
-    """Squared distances of grid cells (nx, ny, nz) to those that are set, flat, as in Region."""
+    """Squared distances of grid cells (nx, ny, nz) to the set ones: Region.clearance."""
     if not cells.any():
         return np.full(cells.size, np.inf, dtype=np.float32)
     # Between cells as boxes: one cell less on every axis than between their centres.
@@ -71,28 +61,24 @@ def clearance_of(cells: BoolArray, resolution: float) -> Any:
 
 
 class Places(NamedTuple):
-    """Where points fall: scratch of one thread.
+    """Where S points lie in a grid: scratch of one thread."""
 
-    beyond (S,): squared distance to the box of the grid. cell (S,): flat index of the cell.
-    u, v, w (S,): how far the point, drawn into the box, is from the cell's node, in cells.
-    """
-
-    beyond: FloatArray
-    cell: Any
-    u: FloatArray
+    beyond: FloatArray  # (S,) squared distance to the grid's box, m^2
+    cell: Any  # (S,) flat index of the cell, int32
+    u: FloatArray  # (S,) from the cell's node to the point, clamped to the box, in cells
     v: FloatArray
     w: FloatArray
 
 
 def places_for(size: int) -> Places:
-    """Scratch for so many points."""
+    """Scratch for `size` points."""
     u, v, w = (np.empty(size) for _ in range(3))
     return Places(np.empty(size), np.empty(size, dtype=np.int32), u, v, w)
 
 
 @inner
 def locate(move, box, x, y, z, places, count):
-    """Fill the places of the first `count` points x, y, z once moved; written to be vectorised."""
+    """Fill the places of the first `count` points x, y, z moved by `move`; vectorised."""
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     beyond, cell = places.beyond, places.cell
     u, v, w = places.u, places.v, places.w
@@ -100,7 +86,7 @@ def locate(move, box, x, y, z, places, count):
         a = move[0] * x[n] + move[1] * y[n] + move[2] * z[n] + move[9]
         b = move[3] * x[n] + move[4] * y[n] + move[5] * z[n] + move[10]
         c = move[6] * x[n] + move[7] * y[n] + move[8] * z[n] + move[11]
-        d = min(max(first[0], a), last[0])  # in this order, nan ends up in the box
+        d = min(max(first[0], a), last[0])  # in this order, NaN ends up in the box
         e = min(max(first[1], b), last[1])
         f = min(max(first[2], c), last[2])
         beyond[n] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
@@ -114,7 +100,7 @@ def locate(move, box, x, y, z, places, count):
 
 @leaf
 def _node(g, between, most):
-    """The node that names the cell of a grid coordinate: the nearest, or the one below."""
+    """The node of the cell that holds a grid coordinate: the nearest, or the one below."""
     nearest = np.rint(g)
     below = nearest - between
     return min(below if nearest > g else nearest, most)

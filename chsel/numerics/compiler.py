@@ -1,4 +1,4 @@
-"""How the inner loops are compiled."""
+"""How kernels are compiled, and where their machine code is kept."""
 
 from __future__ import annotations
 
@@ -23,17 +23,20 @@ from filelock import FileLock
 from numba.core import event
 
 CACHE_VARIABLE = "CHSEL_CACHE_DIR"
+Function = TypeVar("Function", bound=Callable[..., Any])
+
 _OTHERS_WRITE = 0o022
 _config: Any = numba.core.config
+_njit: Any = numba.njit  # its types leave out some options
 _log = logging.getLogger(__name__)
 
 
 @cache
 def cache_directory() -> Path:
-    """The folder of machine code: one for every version of the kernels and of numba, every CPU.
+    """The folder of machine code, one per version of the kernels and of numba, and per CPU.
 
-    In the folder that CHSEL_CACHE_DIR names, else in the user's cache folder, else in a temporary
-    one of the user's own: the first that can be written, and that nobody else can write to.
+    It is in the folder that CHSEL_CACHE_DIR names, else in the user's cache folder, else in a
+    private temporary one: the first that is writable for this user alone.
     """
     fingerprint = _fingerprint()
     named = os.environ.get(CACHE_VARIABLE)
@@ -42,7 +45,7 @@ def cache_directory() -> Path:
         wrong = _unusable(place, fingerprint)
         if wrong is None:
             return place / fingerprint
-        _log.warning("%s is %s, %s. They go where they go without it", CACHE_VARIABLE, named, wrong)
+        _log.warning("%s is %s, %s. The default folder is used", CACHE_VARIABLE, named, wrong)
     temporary = Path(tempfile.gettempdir()) / f"chsel-{_user()}"
     for place in (_user_cache() / "chsel" / "kernels", temporary):
         _make_private(place)
@@ -54,12 +57,12 @@ def cache_directory() -> Path:
 
 
 def has_kernels() -> bool:
-    """Whether any kernel was compiled and kept before."""
+    """Whether any kernel was compiled and kept earlier."""
     return any(cache_directory().rglob("*.nbi"))
 
 
 def _user() -> str:
-    """A name for who runs this; a number where the user may have no name, as in a container."""
+    """The user's name; elsewhere than on Windows the number, as containers have nameless users."""
     return getpass.getuser() if sys.platform == "win32" else str(os.getuid())
 
 
@@ -73,17 +76,17 @@ def _user_cache() -> Path:
 
 
 def kernel_sources() -> list[Path]:
-    """The files of this package that hold kernels: those that import this module, and itself."""
-    here = Path(__file__)
+    """The files of this package that hold kernels: this file, and those that import it."""
+    this_file = Path(__file__)
     return sorted(
         source
-        for source in here.parents[1].rglob("*.py")
-        if source == here or b"from chsel.numerics.compiler import" in source.read_bytes()
+        for source in this_file.parents[1].rglob("*.py")
+        if source == this_file or b"from chsel.numerics.compiler import" in source.read_bytes()
     )
 
 
 def _fingerprint() -> str:
-    """Digest of all that machine code depends on: callees in other files and the CPU included."""
+    """Digest of all that machine code depends on, callees in other files and the CPU included."""
     state = hashlib.blake2b(digest_size=8)
     for source in kernel_sources():
         state.update(source.read_bytes())
@@ -97,7 +100,7 @@ def _fingerprint() -> str:
 
 
 def _unusable(place: Path, fingerprint: str) -> str | None:
-    """Why the folder of that name in `place`, which is made, cannot be used; None if it can."""
+    """Make the folder of that name in `place`; returns why it cannot be used, None if it can."""
     directory = place / fingerprint
     try:
         _make(directory)
@@ -106,24 +109,21 @@ def _unusable(place: Path, fingerprint: str) -> str | None:
         return "which cannot be written; accepted: a folder for compiled kernels"
     if not all(_is_private(folder) for folder in (place, directory)):
         return (
-            "which others can write to, and compiled kernels are executed; accepted: a folder of "
-            "your own that only you can write to (chmod go-w)"
+            "which others can write to, and compiled kernels are executed; accepted: a folder "
+            "that only you can write to (chmod go-w)"
         )
     return None
 
 
 def _make(directory: Path) -> None:
-    """Make a folder and those above that do not exist, each for its owner alone.
-
-    Whatever the umask is: a default of several distributions leaves folders to a group.
-    """
+    """Make a folder and its missing parents, each private whatever the umask is."""
     missing = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     for folder in reversed(missing):
         folder.mkdir(mode=0o700, exist_ok=True)
 
 
 def _make_private(place: Path) -> None:
-    """Take write permission from others, where an earlier version left it to them."""
+    """Take write permission from others, to whom an earlier version may have left it."""
     try:
         if place.is_dir() and not _is_private(place):
             place.chmod(place.stat().st_mode & ~_OTHERS_WRITE)
@@ -132,36 +132,30 @@ def _make_private(place: Path) -> None:
 
 
 def _is_private(place: Path) -> bool:
-    """Whether nobody else can put code here."""
+    """Whether nobody else can write to a folder."""
     if sys.platform == "win32":
         return True
     state = place.stat()
     return state.st_uid == os.getuid() and not state.st_mode & _OTHERS_WRITE
 
 
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-config: Any = numba.core.config
-_njit: Any = numba.njit  # its types leave out some options
-
-
 def compiled(function: Function) -> Function:
-    """`function` as machine code: made on the first call, kept on disk, free of the GIL.
+    """`function` as machine code: compiled on the first call, kept on disk, run without the GIL.
 
-    No fast-math and no contraction, so that a * b + c is rounded twice on every CPU.
+    Without fast-math and contraction, so that a * b + c is rounded twice on every CPU.
     """
-    previous = config.CACHE_DIR
-    config.CACHE_DIR = str(cache_directory())
+    previous = _config.CACHE_DIR
+    _config.CACHE_DIR = str(cache_directory())
     try:
-        made: Any = _njit(cache=True, nogil=True, error_model="numpy")(function)
-        made._cache.save_overload = _one_at_a_time(made._cache.save_overload)
-        return made
+        kernel: Any = _njit(cache=True, nogil=True, error_model="numpy")(function)
+        kernel._cache.save_overload = _one_at_a_time(kernel._cache.save_overload)
+        return kernel
     finally:
-        config.CACHE_DIR = previous
+        _config.CACHE_DIR = previous
 
 
 def _one_at_a_time(save: Callable[..., None]) -> Callable[..., None]:
-    """Saving that waits for other processes.
+    """`save`, but by one process at a time.
 
     Numba reads the index of a kernel, names a file of machine code and writes both. Two processes
     at once, with different types of arguments, would give their code the same name.
@@ -177,25 +171,25 @@ def _one_at_a_time(save: Callable[..., None]) -> Callable[..., None]:
 def inner(function: Function) -> Function:
     """`function` for other kernels to call, not for Python.
 
-    It cannot make arrays, so that nothing is counted when arrays change hands.
+    It cannot make arrays, so that no references are counted when arrays are passed.
     """
-    made: Function = _njit(**_INNER)(function)
-    return made
+    kernel: Function = _njit(**_INNER)(function)
+    return kernel
 
 
 def leaf(function: Function) -> Function:
-    """Like `inner`, and always made part of its caller."""
-    made: Function = _njit(**_INNER, forceinline=True)(function)
-    return made
+    """Like `inner`, and always inlined into its caller."""
+    kernel: Function = _njit(**_INNER, forceinline=True)(function)
+    return kernel
 
 
 def spliced(function: Function) -> Function:
-    """Like `leaf`, for a few lines around a large function: put into its caller before it is typed.
+    """Like `leaf`, but inlined before types are inferred.
 
-    It is no function of its own to the compiler, which saves it going over the large one again.
+    For a few lines around a large function, which the compiler then goes over only once.
     """
-    made: Function = _njit(**_INNER, inline="always")(function)
-    return made
+    kernel: Function = _njit(**_INNER, inline="always")(function)
+    return kernel
 
 
 _INNER = {
@@ -209,9 +203,9 @@ _INNER = {
 
 @contextmanager
 def watched(show: Callable[[int], None]) -> Iterator[None]:
-    """Call `show` with the number of kernels compiled meanwhile, in place of the notice.
+    """Within this context, call `show` with the number of kernels compiled, instead of the notice.
 
-    It is called when the compilation of the first begins, with 0, and after each.
+    It is called with 0 when the first compilation begins, and after each.
     """
     _watch.count, _watch.show = 0, show
     try:
@@ -221,10 +215,10 @@ def watched(show: Callable[[int], None]) -> Iterator[None]:
 
 
 class _CompilerWatch(event.Listener):
-    """Reports that kernels are being compiled, and has short vectors made of straight code.
+    """Reports that kernels are being compiled, and vectorises their straight-line code.
 
-    Numba leaves the latter out unless it is switched on for the whole process; it makes the
-    interpolation of the SDF twice as fast, and changes no bit, as it reorders nothing.
+    Numba has the latter as a switch of the process, which is off otherwise. It makes interpolation
+    of the SDF twice as fast and changes no bit, as it reorders nothing.
     """
 
     def __init__(self) -> None:
@@ -232,14 +226,14 @@ class _CompilerWatch(event.Listener):
         self.show: Callable[[int], None] | None = None
         self._noticed = False
         self._depth = 0
-        self._usual = config.SLP_VECTORIZE
+        self._usual = _config.SLP_VECTORIZE
 
     def on_start(self, event: Any) -> None:
         """The compilation of a function, or of one that it calls, begins."""
         if not _is_kernel(event):
             return
         if self._depth == 0:
-            self._usual, config.SLP_VECTORIZE = config.SLP_VECTORIZE, 1
+            self._usual, _config.SLP_VECTORIZE = _config.SLP_VECTORIZE, 1
             self._report()
         self._depth += 1
 
@@ -249,13 +243,13 @@ class _CompilerWatch(event.Listener):
             return
         self._depth -= 1
         if self._depth == 0:
-            config.SLP_VECTORIZE = self._usual
+            _config.SLP_VECTORIZE = self._usual
             self.count += 1
             if self.show is not None:
                 self.show(self.count)
 
     def _report(self) -> None:
-        """To whoever watches; else in a single line for the whole process."""
+        """Tell who watches; without a watcher, log a single line per process."""
         if self.show is not None:
             if self.count == 0:
                 self.show(0)

@@ -16,8 +16,8 @@ def decompose(
 ) -> None:
     """Fill values (n,), ascending, and vectors (n, n), in columns, of a symmetric matrix (n, n).
 
-    The cyclic method of Jacobi (Golub and Van Loan, 2013, Sec. 8.5), row by row, in work (n, n).
-    Of every eigenvector, the entry of largest absolute value is positive, the first of equals.
+    Cyclic Jacobi by rows (Golub and Van Loan, 2013, Sec. 8.5); work (n, n) is scratch. The entry of
+    largest absolute value of each eigenvector, the first of equals, is positive.
     """
     n = len(values)
     for i in range(n):
@@ -39,7 +39,7 @@ def decompose(
 
 @inner
 def _rotate(work: FloatArray, vectors: FloatArray, p: int, q: int) -> bool:
-    """Make entry (p, q) zero by a rotation; False if it is nothing beside the diagonal."""
+    """Make entry (p, q) zero by a rotation; False if it is negligible beside the diagonal."""
     off, a, b = work[p, q], work[p, p], work[q, q]
     if abs(a) + abs(off) == abs(a) and abs(b) + abs(off) == abs(b):
         return False

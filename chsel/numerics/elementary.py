@@ -1,9 +1,9 @@
 """exp, log, sine and cosine, and arctangent with the same bits on every machine.
 
-Each brings its argument into a small interval without loss, sums a Taylor series there, and adds
-the large part last, with the rounding errors of the reduction as a correction. The series are
-as long as their first neglected term stays below 0.1 ulp. Errors measured against mpmath are below
-0.85 ulp. The C library is not called: its last bits depend on its version and on the CPU.
+Each reduces its argument to a small interval without loss, sums a Taylor series there, and adds
+the large part last, with the rounding errors of the reduction as a correction. The first neglected
+term of a series is below 0.1 ulp; errors against mpmath are below 0.85 ulp. The C library is not
+called: its last bits depend on its version and on the CPU.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ _HALF_PI = 1.5707963267948966
 _HALF_PI_TAIL = 6.123233995736766e-17  # pi/2 - _HALF_PI
 _TURN = 4.0 * _HALF_PI
 
-# pi/2 and ln 2 in parts with so many zeros at their ends that n times a part is exact, for
-# n < 2^20 and n < 2^11; the last part is rounded.
+# pi/2 and ln 2 in parts that end in enough zeros for n times a part to be exact, for n < 2^20 and
+# n < 2^11; the last part is rounded.
 _HALF_PI_PARTS = (
     float.fromhex("0x1.921fb544p+0"),
     float.fromhex("0x1.0b4611a6p-34"),
@@ -86,13 +86,13 @@ def exp(x: float) -> float:
     tail = (high - r) - low
     head = 1.0 + r
     y = head + (((1.0 - head) + r) + (r * r * _series(_EXP, r) + tail))
-    half = np.int64(np.floor(0.5 * k))  # 2^k itself may be no number where y 2^k is one
+    half = np.int64(np.floor(0.5 * k))  # 2^k may overflow where y 2^k does not
     return y * _power_of_2(half) * _power_of_2(np.int64(k) - half)
 
 
 @compiled
 def log(x: float) -> float:
-    """ln x, from x = 2^k m with sqrt(1/2) <= m < sqrt(2) and ln m = 2 artanh(s); nan below 0."""
+    """ln x, from x = 2^k m with sqrt(1/2) <= m < sqrt(2) and ln m = 2 artanh(s); NaN below 0."""
     if x != x or x < 0.0:
         return np.nan
     if x == 0.0:
@@ -152,10 +152,10 @@ def _remainder(x: float) -> float:
 
 @compiled
 def sine_cosine(x: float) -> tuple[float, float]:
-    """sin x and cos x of radians; nan for infinity.
+    """sin x and cos x of radians; NaN for infinity.
 
-    From 2^20 on, x is taken modulo the double next to 2 pi, which errs by less than 4e-17 |x|: less
-    than x itself was rounded.
+    From 2^20 on, x is taken modulo the double nearest to 2 pi, an error below 4e-17 |x|, which is
+    less than the rounding of x itself.
     """
     size = abs(x)
     if not size < np.inf:
@@ -275,7 +275,7 @@ def logs(x: FloatArray | float) -> FloatArray:
 
 
 def arctangents(y: FloatArray | float, x: FloatArray | float) -> FloatArray:
-    """The angles of the points (x, y), of the shape that x and y have in common."""
+    """The angles of the points (x, y), of the shape that x and y broadcast to."""
     y, x = np.broadcast_arrays(np.asarray(y, dtype=np.float64), np.asarray(x, dtype=np.float64))
     out = np.empty(x.size)
     _fill_arctangents(y.flatten(), x.flatten(), out)

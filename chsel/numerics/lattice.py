@@ -1,7 +1,7 @@
-"""Which points of a lattice lie in given cells, asked the other way round: cell by cell.
+"""Which points of a lattice lie in given cells, looked up cell by cell.
 
-A lattice coarser than the diagonal of a cell has at most one point in a cell, and that is the
-point nearest to the cell's centre. Few cells are faster asked so than many points are culled.
+A lattice coarser than the diagonal of a cell has at most one point in a cell: the one nearest to
+the cell's centre. For few cells this is faster than culling many points.
 """
 
 from __future__ import annotations
@@ -13,36 +13,32 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Box, Region, box_of, locate, triple
 from chsel.numerics.compiler import compiled, spliced
-from chsel.numerics.octree import Tree, rounding_margin
+from chsel.numerics.octree import Tree, copy_centre, rounding_margin
 
-MOST_CELLS = 300  # for which this is the faster way
-_TOLERANCE = 1e-6  # of the spacing, that points may be off the lattice
+MOST_CELLS = 300  # for which this is faster than a walk of the tree
+_TOLERANCE = 1e-6  # of the spacing: how far points may be off the lattice
 _MOST_NODES_PER_POINT = 64
 
 
-class Lattice(NamedTuple):
-    """Points on a lattice, and the cells that are asked for them; without cells it is not used.
+class LatticePoints(NamedTuple):
+    """Points of a tree on a lattice, and the cells of a region; without cells it is not used."""
 
-    box: the lattice with a layer of nothing around it. point_at (nodes,): the number of the point
-    there among the tree's, -1 for none. centres (3, A), cells (A,): of the region's cells.
-    """
-
-    box: Box
-    point_at: Any
-    centres: FloatArray
-    cells: Any
+    box: Box  # the lattice with an empty layer around it
+    point_at: Any  # (nodes,) number of the point there in the tree's order, -1 for none; int32
+    centres: FloatArray  # (3, A) of the region's cells
+    cells: Any  # (A,) flat indices of the region's cells, int32
 
 
-NO_LATTICE = Lattice(
-    box_of(np.zeros(3), 1.0, (1, 1, 1)),
-    np.zeros(0, dtype=np.int32),
-    np.zeros((3, 0)),
-    np.zeros(0, dtype=np.int32),
+NO_LATTICE = LatticePoints(
+    box=box_of(np.zeros(3), 1.0, (1, 1, 1)),
+    point_at=np.zeros(0, dtype=np.int32),
+    centres=np.zeros((3, 0)),
+    cells=np.zeros(0, dtype=np.int32),
 )
 
 
-def lattice_of(tree: Tree, spacing: float, region: Region) -> Lattice | None:
-    """The tree's points as a lattice; None if they form none that is coarse enough."""
+def lattice_of(tree: Tree, spacing: float, region: Region) -> LatticePoints | None:
+    """The tree's points as a lattice; None unless they form one that is coarse enough."""
     nodes = len(tree.starts) - 1
     points = tree.spheres[:3, nodes:]
     if points.shape[1] == 0:
@@ -61,7 +57,7 @@ def lattice_of(tree: Tree, spacing: float, region: Region) -> Lattice | None:
         return None
     box = box_of(origin, spacing, shape)
     cells = np.flatnonzero(region.clearance < 0.0)
-    return Lattice(box, point_at, cell_centres(region), cells.astype(np.int32))
+    return LatticePoints(box, point_at, cell_centres(region), cells.astype(np.int32))
 
 
 def cell_centres(region: Region) -> FloatArray:
@@ -74,7 +70,7 @@ def cell_centres(region: Region) -> FloatArray:
 
 @compiled
 def _fill(points, origin, spacing, counts, tolerance, point_at):
-    """Number the nodes by the points (3, N) on them; False if a point is off, or meets another."""
+    """Number the nodes by the points (3, N) on them; False if one is off, or a node has two."""
     for n in range(points.shape[1]):
         node = 0.0
         for axis in range(3):
@@ -90,37 +86,34 @@ def _fill(points, origin, spacing, counts, tolerance, point_at):
 
 
 @spliced
-def look_up(lattice, tree, region, move, back, found):
-    """Find the points that lie in the region once moved; how many they are, ascending.
+def look_up(lattice, tree, region, move, back, candidates):
+    """Collect the points that lie in the region once moved, in ascending order; returns how many.
 
+    Their numbers among the points are in candidates.kept.
     move: the map of points into the region's frame; back: its inverse. Both must be rigid.
     """
     spheres, nodes = tree.spheres, len(tree.starts) - 1
     centres, cells, point_at = lattice.centres, lattice.cells, lattice.point_at
     count = len(cells)
-    places = found.places
+    places, numbers, wanted = candidates.places, candidates.kept, candidates.nodes
+    x, y, z = candidates.x, candidates.y, candidates.z
     locate(back, lattice.box, centres[0], centres[1], centres[2], places, count)
     total = 0
     for n in range(count):
         point = point_at[places.cell[n]]
-        found.nodes[total], found.kept[total] = cells[n], point
+        wanted[total], numbers[total] = cells[n], point
         total += 1 if point >= 0 else 0
-    _fetch(spheres, nodes, found, total)
-    locate(move, region.box, found.x, found.y, found.z, places, total)
+    for n in range(total):
+        copy_centre(spheres, nodes + numbers[n], candidates, n)
+    locate(move, region.box, x, y, z, places, total)
     count = 0
-    for n in range(total):  # a point next to the cell that it was asked for is left out
-        found.kept[count] = found.kept[n]
-        count += 1 if places.cell[n] == found.nodes[n] else 0
-    _sort(found.kept, count)
-    _fetch(spheres, nodes, found, count)
-    return count
-
-
-@spliced
-def _fetch(spheres, nodes, found, count):
+    for n in range(total):  # a point beside the cell that it was looked up for is left out
+        numbers[count] = numbers[n]
+        count += 1 if places.cell[n] == wanted[n] else 0
+    _sort(numbers, count)
     for n in range(count):
-        node = nodes + found.kept[n]
-        found.x[n], found.y[n], found.z[n] = spheres[0, node], spheres[1, node], spheres[2, node]
+        copy_centre(spheres, nodes + numbers[n], candidates, n)
+    return count
 
 
 @spliced

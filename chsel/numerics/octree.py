@@ -1,7 +1,7 @@
-"""Which points a region can hold: an octree of points.
+"""An octree of points, and the points of it that can lie in a region.
 
-A point may be left out of a sum only if it adds nothing to it, so that a sum over what is left
-is the sum over all points, to the bit. The points' order is that of the tree, always.
+A point may be left out of a sum only if it adds nothing to it, so that the sum over the others is
+the sum over all points, to the bit. Sums always run in the order of the tree.
 """
 
 from __future__ import annotations
@@ -15,62 +15,52 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled, leaf, spliced
 
-_LEAF_SIZE = 4  # points in a leaf at least, in the mean
+_LEAF_SIZE = 4  # points in a leaf on average, at least
 _TOP_SIZE = 64  # nodes of the uppermost level at most
 _SUBDIVISION = 4  # cells of the finest level per spacing of the points, and a power of two
-_RADIX_BITS = 11
 
 
 class Tree(NamedTuple):
-    """Points in Morton order, and the cells of an octree over them, level by level.
+    """N points in Morton order, and the M nodes of an octree over them, level by level."""
 
-    spheres (4, M + N): centre and radius that hold what is in a node, the uppermost level first;
-    the N points are the last level, of radius 0. starts (M + 1,): the first child of each node,
-    then M + N. levels (L + 1,): the first node of each level, then M. order (N,): the places
-    that the points had.
-    """
-
-    spheres: FloatArray
-    starts: IntArray
-    levels: IntArray
-    order: IntArray
+    spheres: FloatArray  # (4, M + N) centre and radius around what is in a node; points have 0
+    starts: IntArray  # (M + 1,) the first child of each node, then M + N
+    levels: IntArray  # (L + 1,) the first node of each level, the uppermost first, then M
+    order: IntArray  # (N,) indices that the points had before
 
 
-class Found(NamedTuple):
-    """Scratch of one thread for points or nodes in question, and for what a walk finds.
+class Candidates(NamedTuple):
+    """Scratch of one thread: the points or nodes that a walk looks at and keeps."""
 
-    x, y, z, radius (S,): of them. places: see locate. nodes, kept (S,): which they are.
-    """
-
-    x: FloatArray
+    x: FloatArray  # (S,)
     y: FloatArray
     z: FloatArray
     radius: FloatArray
-    places: Places
-    nodes: Any
-    kept: Any
+    places: Places  # where they lie once moved
+    nodes: Any  # (S,) which they are, int32
+    kept: Any  # (S,) those that a walk keeps, int32
 
 
-def found_for(size: int) -> Found:
-    """Scratch for so many points and nodes."""
+def candidates_for(size: int) -> Candidates:
+    """Scratch for `size` points and nodes."""
     x, y, z, radius = (np.empty(size) for _ in range(4))
     nodes, kept = (np.empty(size, dtype=np.int32) for _ in range(2))
-    return Found(x, y, z, radius, places_for(size), nodes, kept)
+    return Candidates(x, y, z, radius, places_for(size), nodes, kept)
 
 
 def octree(points: FloatArray, spacing: float) -> Tree:
     """The tree of points (N, 3) about `spacing` metres apart.
 
-    Points in one cell of the finest level stay in their order. Raises PointsError for points too
-    far apart for their distance to be a number.
+    Points in one cell of the finest level stay in their order. Raises PointsError if the extent
+    of the points is not finite.
     """
     count = len(points)
     if count == 0:
         none = np.zeros(0, dtype=np.int64)
         return Tree(np.zeros((4, 0)), np.zeros(1, np.int64), np.zeros(1, np.int64), none)
-    points, box = np.array(points), np.empty(6)
-    _bounds(points, box)
-    extent = max(high - low for low, high in zip(*box.reshape(2, 3).tolist(), strict=True))
+    points = np.array(points)
+    bounds = np.array([[column.min(), column.max()] for column in points.T])  # (3, 2)
+    extent = max(high - low for low, high in bounds.tolist())
     if not extent < np.inf:
         raise PointsError(f"points span {extent} m; accepted: a finite extent")
     index_bits = count.bit_length()
@@ -79,35 +69,22 @@ def octree(points: FloatArray, spacing: float) -> Tree:
     while extent / quantum >= most:
         quantum *= 2.0
     keys = np.empty(count, dtype=np.int64)
-    _morton_keys(points, box[:3], 1.0 / quantum, index_bits, keys)
-    key_bits = 3 * int(extent / quantum + 1.0).bit_length()
-    keys = _sorted(keys, np.empty_like(keys), index_bits, index_bits + key_bits)
+    _morton_keys(points, bounds[:, 0].copy(), 1.0 / quantum, index_bits, keys)
+    keys.sort()
     order = keys & ((1 << index_bits) - 1)
     levels = np.zeros(24, dtype=np.int64)
     depth, finest = _count_levels(keys, index_bits, levels)
     levels = levels[: depth + 1]
     spheres = np.empty((4, levels[-1] + count))
     starts = np.empty(levels[-1] + 1, dtype=np.int64)
-    size = rounding_margin(box)
-    _build(points, keys, order, index_bits + 3 * finest, size, spheres, starts, levels)
+    margin = rounding_margin(bounds)
+    _build(points, keys, order, index_bits + 3 * finest, margin, spheres, starts, levels)
     return Tree(spheres, starts, levels, order)
 
 
 def rounding_margin(coordinates: FloatArray) -> float:
-    """More metres than rounding moves a point of such coordinates that is turned and shifted."""
+    """More metres than rounding moves a point of such coordinates in a rigid motion."""
     return 1e-9 + 1e-12 * float(np.abs(coordinates).max(initial=0.0))
-
-
-@compiled
-def _bounds(points, box):
-    """Fill box (6,) with the least and the greatest coordinates of points (N, 3), N > 0."""
-    x0, y0, z0 = points[0, 0], points[0, 1], points[0, 2]
-    x1, y1, z1 = x0, y0, z0
-    for n in range(1, len(points)):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
-        x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
-    box[0], box[1], box[2], box[3], box[4], box[5] = x0, y0, z0, x1, y1, z1
 
 
 @compiled
@@ -132,30 +109,8 @@ def _spread_bits(cell):
 
 
 @compiled
-def _sorted(keys, other, first_bit, last_bit):
-    """Keys in order of their bits from first_bit on: a stable radix sort. `other` is scratch."""
-    mask = (1 << _RADIX_BITS) - 1
-    starts = np.empty(mask + 1, dtype=np.int64)
-    for shift in range(first_bit, last_bit, _RADIX_BITS):
-        starts[:] = 0
-        for n in range(len(keys)):
-            starts[(keys[n] >> shift) & mask] += 1
-        total = 0
-        for digit in range(mask + 1):
-            count = starts[digit]
-            starts[digit] = total
-            total += count
-        for n in range(len(keys)):
-            digit = (keys[n] >> shift) & mask
-            other[starts[digit]] = keys[n]
-            starts[digit] += 1
-        keys, other = other, keys
-    return keys
-
-
-@compiled
 def _count_levels(keys, index_bits, levels):
-    """Fill levels with offsets; how many levels there are, and how coarse the lowest is."""
+    """Fill levels with offsets; returns how many levels there are, and how coarse the lowest is."""
     changes = np.zeros(24, dtype=np.int64)  # neighbours that share a cell from this level on
     for n in range(1, len(keys)):
         differing = (keys[n] ^ keys[n - 1]) >> index_bits
@@ -185,7 +140,7 @@ def _count_levels(keys, index_bits, levels):
 
 
 @compiled
-def _build(points, keys, order, shift, size, spheres, starts, levels):
+def _build(points, keys, order, shift, margin, spheres, starts, levels):
     """Fill spheres and starts from the points upwards. shift: bits of a key below a leaf's."""
     nodes, count = levels[-1], len(points)
     low, high = np.empty((3, nodes)), np.empty((3, nodes))
@@ -213,7 +168,7 @@ def _build(points, keys, order, shift, size, spheres, starts, levels):
             spheres[axis, node] = 0.5 * (low[axis, node] + high[axis, node])
             half = 0.5 * (high[axis, node] - low[axis, node])
             squared += half * half
-        spheres[3, node] = np.sqrt(squared) * (1.0 + 1e-12) + size
+        spheres[3, node] = np.sqrt(squared) * (1.0 + 1e-12) + margin
 
 
 @spliced
@@ -229,59 +184,59 @@ def _widen(low, high, node, child, is_first, nodes, spheres):
 
 
 @spliced
-def walk(tree, region, move, slack, found):
-    """Find the points that are within `slack` metres of a region once moved; how many they are.
+def walk(tree, region, move, slack, candidates):
+    """Collect the points that are within `slack` metres of a region once moved; returns how many.
 
-    They are in found.x, y, z, kept, in ascending order. A node is left out if no point of its
-    sphere can be so near; all points are found for an infinite slack.
+    They are in candidates.x, y, z, kept, in ascending order. A node is left out if no point of its
+    sphere can be so near; an infinite slack keeps all points.
     """
-    levels = tree.levels
+    levels, nodes = tree.levels, candidates.nodes
+    x, y, z = candidates.x, candidates.y, candidates.z
     count = 0
     if levels[len(levels) - 1] > 0:
-        for node in range(levels[1]):
-            found.kept[node] = node
-        count = _take(tree.spheres, found.kept, levels[1], found)
+        count = levels[1]
+        for node in range(count):
+            nodes[node] = node
+            copy_centre(tree.spheres, node, candidates, node)
+            candidates.radius[node] = tree.spheres[3, node]
         for level in range(len(levels)):
-            locate(move, region.box, found.x, found.y, found.z, found.places, count)
-            count = _keep(region.clearance, slack, found, count)
+            locate(move, region.box, x, y, z, candidates.places, count)
+            count = _keep(region.clearance, slack, candidates, count)
             if level < len(levels) - 1:
-                count = _expand(tree.spheres, tree.starts, count, found)
+                count = _expand(tree.spheres, tree.starts, count, candidates)
     return count
 
 
-@spliced
-def _take(spheres, nodes, count, found):
-    for n in range(count):
-        node = nodes[n]
-        found.nodes[n] = node
-        found.x[n], found.y[n] = spheres[0, node], spheres[1, node]
-        found.z[n], found.radius[n] = spheres[2, node], spheres[3, node]
-    return count
+@leaf
+def copy_centre(spheres, node, candidates, n):
+    """Make the centre of a node, or a point, that of the n-th candidate."""
+    candidates.x[n], candidates.y[n] = spheres[0, node], spheres[1, node]
+    candidates.z[n] = spheres[2, node]
 
 
 @spliced
-def _expand(spheres, starts, count, found):
-    """The children of the nodes kept."""
-    kept, nodes = found.kept, found.nodes
-    x, y, z, radius = found.x, found.y, found.z, found.radius
+def _expand(spheres, starts, count, candidates):
+    """Replace the nodes kept by their children."""
+    kept, nodes, radius = candidates.kept, candidates.nodes, candidates.radius
     total = 0
     for n in range(count):
         for child in range(starts[kept[n]], starts[kept[n] + 1]):
             nodes[total] = child
-            x[total], y[total] = spheres[0, child], spheres[1, child]
-            z[total], radius[total] = spheres[2, child], spheres[3, child]
+            copy_centre(spheres, child, candidates, total)
+            radius[total] = spheres[3, child]
             total += 1
     return total
 
 
 @spliced
-def _keep(clearance, slack, found, count):
-    """Keep what is near enough, in its order; the counting is free of branches."""
-    x, y, z, radius, nodes, kept = found.x, found.y, found.z, found.radius, found.nodes, found.kept
-    cell, beyond = found.places.cell, found.places.beyond
+def _keep(clearance, slack, candidates, count):
+    """Keep what is near enough, in its order, without branches."""
+    x, y, z, radius = candidates.x, candidates.y, candidates.z, candidates.radius
+    nodes, kept = candidates.nodes, candidates.kept
+    cell, beyond = candidates.places.cell, candidates.places.beyond
     total = 0
     for n in range(count):
-        # The region lies within its box, which is convex: so far at least, by Pythagoras.
+        # The region lies within its box, which is convex: at least this far, by Pythagoras.
         squared = max(clearance[cell[n]], np.float32(0.0)) + beyond[n]
         reach = radius[n] + slack
         kept[total] = nodes[n]

@@ -1,4 +1,4 @@
-"""Search vectors, poses, and gradients between them, one at a time.
+"""Poses in kernels: search vectors decoded, gradients pulled back, and points moved, one at a time.
 
 A pose is a tuple of 12: the rotation of object_from_world row by row, then the translation. So is
 a gradient by a pose. Tuples of 9 are matrices, row by row.
@@ -14,28 +14,25 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, leaf
 from chsel.numerics.elementary import sine_cosine
 
-_SHORTEST = 1e-12  # vectors are divided by at least this
+_SHORTEST = 1e-12  # the least length that vectors are divided by
 
 Triple = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
+Pose = tuple[float, ...]  # of length 12
 _NO_MATRIX: Matrix = (0.0,) * 9
 
 
-class Space(NamedTuple):
-    """A search space: SE(3), or planar with the plane's constants (see SE2Space).
-
-    axis, e_u, e_v: unit vectors. resting: R_0. turning, turning_squared: hat(a) R_0 and
-    hat(a)^2 R_0. offset: o, metres.
-    """
+class SpaceConstants(NamedTuple):
+    """A search space as kernels take it: SE(3), or planar with the plane's constants (SE2Space)."""
 
     planar: bool = False
-    axis: Triple = (0.0, 0.0, 0.0)
+    axis: Triple = (0.0, 0.0, 0.0)  # a, of unit length
     e_u: Triple = (0.0, 0.0, 0.0)
     e_v: Triple = (0.0, 0.0, 0.0)
-    resting: Matrix = _NO_MATRIX
-    turning: Matrix = _NO_MATRIX
-    turning_squared: Matrix = _NO_MATRIX
-    offset: float = 0.0
+    resting: Matrix = _NO_MATRIX  # R_0
+    turning: Matrix = _NO_MATRIX  # hat(a) R_0
+    turning_squared: Matrix = _NO_MATRIX  # hat(a)^2 R_0
+    offset: float = 0.0  # o, metres
 
 
 def matrix_of(rotation: FloatArray) -> Matrix:
@@ -54,7 +51,7 @@ def decode(space, x):
 
 @leaf
 def _spatial(x):
-    p, q, r, u, v, w, _, _, _ = _gram_schmidt(x)
+    p, q, r, u, v, w = _gram_schmidt(x)[:6]
     return p, q, r, u, v, w, q * w - r * v, r * u - p * w, p * v - q * u, x[6], x[7], x[8]
 
 
@@ -93,7 +90,7 @@ def _planar(space, x):
 
 @leaf
 def pull_back(space, x, by_pose, gradient):
-    """Fill the gradient (d,) by the search vector x from that by its pose."""
+    """Fill the gradient (d,) by the search vector x from the gradient by its pose."""
     if space.planar:
         _pull_back_planar(space, x, by_pose, gradient)
     else:
@@ -140,7 +137,7 @@ def _pull_back_planar(space, x, by_pose, gradient):
 
 @leaf
 def finite(pose):
-    """Whether a pose holds finite numbers, whose squares are finite, too."""
+    """Whether the squares of a pose's numbers are finite."""
     total = 0.0
     for value in pose:
         total += value * value
@@ -149,19 +146,14 @@ def finite(pose):
 
 @leaf
 def rigid(pose):
-    """Whether the rows of a pose's rotation are orthonormal, all but for rounding."""
+    """Whether the rows of a pose's rotation are orthonormal up to rounding."""
     worst = 0.0
     for i in range(3):
         for j in range(i + 1):
-            product = _dot_rows(pose, i, j)
+            a, b = 3 * i, 3 * j
+            product = pose[a] * pose[b] + pose[a + 1] * pose[b + 1] + pose[a + 2] * pose[b + 2]
             worst = max(worst, abs(product - (1.0 if i == j else 0.0)))
     return worst < 1e-9
-
-
-@leaf
-def _dot_rows(pose, i, j):
-    a, b = 3 * i, 3 * j
-    return pose[a] * pose[b] + pose[a + 1] * pose[b + 1] + pose[a + 2] * pose[b + 2]
 
 
 @leaf
@@ -173,12 +165,60 @@ def pose_at(poses, n):
 
 
 @leaf
+def moved(pose, x, y, z):
+    """R p + t of a point p = x, y, z."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
+        pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
+        pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
+    )
+
+
+@leaf
 def origin_within(pose, low, high):
-    """Whether a pose has the object's origin, -R^T t in the world, in a box."""
+    """Whether the object's origin, -R^T t in the world, lies in a box."""
     x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])
     y = -(pose[1] * pose[9] + pose[4] * pose[10] + pose[7] * pose[11])
     z = -(pose[2] * pose[9] + pose[5] * pose[10] + pose[8] * pose[11])
     return low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]
+
+
+@leaf
+def turned(pose, x, y, z):
+    """R v of a vector v = x, y, z."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z,
+        pose[3] * x + pose[4] * y + pose[5] * z,
+        pose[6] * x + pose[7] * y + pose[8] * z,
+    )
+
+
+@leaf
+def turned_back(pose, x, y, z):
+    """R^T v of a vector v = x, y, z."""
+    return (
+        pose[0] * x + pose[3] * y + pose[6] * z,
+        pose[1] * x + pose[4] * y + pose[7] * z,
+        pose[2] * x + pose[5] * y + pose[8] * z,
+    )
+
+
+@leaf
+def composed(left, right):
+    """The pose that moves by `right`, then by `left`."""
+    a, d, g = turned(left, right[0], right[3], right[6])
+    b, e, h = turned(left, right[1], right[4], right[7])
+    c, f, i = turned(left, right[2], right[5], right[8])
+    x, y, z = moved(left, right[9], right[10], right[11])
+    return a, b, c, d, e, f, g, h, i, x, y, z
+
+
+@leaf
+def inverted(pose):
+    """The inverse of a rigid pose: R^T, -R^T t."""
+    a, b, c, d, e, f, g, h, i, x, y, z = pose
+    u, v, w = turned_back(pose, x, y, z)
+    return a, d, g, b, e, h, c, f, i, -u, -v, -w
 
 
 @compiled

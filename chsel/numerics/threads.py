@@ -1,4 +1,4 @@
-"""Work spread over threads that all round as IEEE 754 says; results do not depend on how many."""
+"""Work spread over threads that all round as IEEE 754 specifies; no result depends on how many."""
 
 from __future__ import annotations
 
@@ -19,10 +19,7 @@ _VALUES = np.array([5e-324, 2.3e-308, 1.0, 2.0**-55])  # an array, so that nothi
 
 
 def require_ieee_arithmetic() -> None:
-    """Raise EngineError if this thread flushes subnormal numbers to zero, or rounds otherwise.
-
-    Otherwise than to the nearest number, that is.
-    """
+    """Raise EngineError if this thread flushes subnormals to zero, or does not round to nearest."""
     if not _rounds_to_nearest(_VALUES):
         raise EngineError(
             "this thread does not round to the nearest number, so results would differ from those "
@@ -38,21 +35,19 @@ def require_ieee_arithmetic() -> None:
 
 @compiled
 def _keeps_subnormals(values: Any) -> Any:
-    """As operands, and as results."""
+    """Whether subnormal operands, and subnormal results, differ from zero."""
     return values[0] > 0.0 and values[1] * 0.25 > 0.0
 
 
 @compiled
 def _rounds_to_nearest(values: Any) -> Any:
-    """Upwards, the sum would be larger; downwards and towards zero, the difference smaller."""
+    """Rounding up would raise the sum; rounding down or towards zero, lower the difference."""
     return values[2] + values[3] == values[2] and values[2] - values[3] == values[2]
 
 
-MOST_THREADS = 256
-"""Of one process, or processes of one command: more than these cannot be what is meant."""
-
-_SHARES = 4  # pieces per thread, so that none waits long for another
-_here = threading.local()
+MOST_THREADS = 256  # of a process, or processes of a command; a larger number is a mistake
+_PIECES_PER_THREAD = 4  # so that no thread waits long for another
+_thread = threading.local()
 
 
 def spread(
@@ -64,24 +59,24 @@ def spread(
 ) -> None:
     """Call run(first, last, scratch) on pieces of range(count), on as many threads as torch uses.
 
-    scratch: makes what one thread works in. The pieces must not depend on each other. least: how
-    many at least are worth another thread.
+    scratch: makes the scratch of one thread. The pieces must not depend on each other. least: the
+    smallest number that is worth another thread.
     """
     import torch
 
     most = min(torch.get_num_threads(), count // least)
-    if most <= 1 or hasattr(_here, "works"):  # a worker must not wait for workers
+    if most <= 1 or hasattr(_thread, "is_worker"):  # it must not wait for workers
         if count:
             run(0, count, scratch())
         return
-    size = -(-count // (most * _SHARES))
+    size = -(-count // (most * _PIECES_PER_THREAD))
     pieces = iter(range(0, count, size))
 
     def work() -> None:
         require_ieee_arithmetic()
-        own = scratch()
+        mine = scratch()
         for first in pieces:
-            run(first, min(first + size, count), own)
+            run(first, min(first + size, count), mine)
 
     others = [_pool(most - 1).submit(work) for _ in range(most - 1)]
     try:
@@ -93,14 +88,17 @@ def spread(
 
 
 def require_threads(name: str, count: object) -> None:
-    """Raise SettingError unless a number of threads or processes is one that can be meant."""
+    """Raise SettingError unless `count` is a sensible number of threads or processes."""
     if type(count) is not int or not 1 <= count <= MOST_THREADS:
         raise SettingError(f"{name} is {count!r}; accepted: an integer from 1 to {MOST_THREADS}")
 
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """As many threads for a while, of torch and of the kernels. SettingError for too many."""
+    """Use `count` threads within this context, in torch and in the kernels.
+
+    Raises SettingError unless it is an integer from 1 to MOST_THREADS.
+    """
     require_threads("threads", count)
     import torch
 
@@ -118,7 +116,7 @@ def _pool(count: int) -> ThreadPoolExecutor:
 
 
 def _become_worker() -> None:
-    _here.works = True
+    _thread.is_worker = True
 
 
 if hasattr(os, "register_at_fork"):

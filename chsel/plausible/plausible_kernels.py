@@ -13,7 +13,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import Box, Region, locate
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
-from chsel.numerics.octree import Found, Tree, found_for, walk
+from chsel.numerics.octree import Candidates, Tree, candidates_for, walk
 from chsel.numerics.pose_tuples import finite, pose_at, rigid
 from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 
@@ -94,7 +94,7 @@ class Scan(NamedTuple):
 class Room(NamedTuple):
     """Scratch of one thread, and what it has found: numbers and costs of poses (C,)."""
 
-    found: Found
+    found: Candidates
     turned: FloatArray
     stack: IntArray
     pose: IntArray
@@ -107,7 +107,7 @@ def room_for(model: Evaluation, known: int, blocks: int, capacity: int) -> Room:
     size = max(_MOST_DISTINCT + 1, *(array.shape[1] for array in points))
     stack = np.empty(blocks, dtype=np.int64)
     pose = np.empty(capacity, dtype=np.int64)
-    return Room(found_for(size), np.empty((3, known)), stack, pose, np.empty(capacity))
+    return Room(candidates_for(size), np.empty((3, known)), stack, pose, np.empty(capacity))
 
 
 @inner

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Box, box_of
+from chsel.numerics.cell_set import Box, Region, box_of, clearance_of
 from chsel.numerics.compiler import leaf
 from chsel.problem.sdf_grid import SdfGrid
 
@@ -26,6 +26,17 @@ def distance_field(sdf: SdfGrid, lookup: str, outside: str) -> DistanceField:
     trilinear = lookup == "trilinear"
     box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
     return DistanceField(box, sdf.table, trilinear, outside == "bounding_box")
+
+
+def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
+    """The cells of a grid that read any value below `level`, derived once."""
+
+    def make() -> Region:
+        box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
+        below = sdf.active_cells(level, lookup).numpy().reshape(sdf.shape)
+        return Region(box, clearance_of(below, sdf.resolution))
+
+    return sdf.derived(("cells below", level, lookup), make)
 
 
 @leaf

@@ -12,7 +12,7 @@ from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray, frozen
 from chsel.numerics.cell_set import triple
 from chsel.numerics.elementary import arctangents
-from chsel.numerics.pose_tuples import Space, decode_all, matrix_of
+from chsel.numerics.pose_tuples import SpaceConstants, decode_all, matrix_of
 from chsel.problem.points import Workspace
 from chsel.problem.poses import (
     Poses,
@@ -34,7 +34,7 @@ class SearchSpace(ABC):
     """Vectors x (B, d) that represent poses."""
 
     dimension: int  # d
-    arrays: Space  # for kernels
+    arrays: SpaceConstants  # for kernels
 
     @abstractmethod
     def encode(self, poses: Poses) -> FloatArray:
@@ -55,7 +55,7 @@ class SE3Space(SearchSpace):
     """x = [first row of R, second row of R, t] (CHSEL, Sec. IV-C)."""
 
     dimension = 9
-    arrays = Space()
+    arrays = SpaceConstants()
 
     def encode(self, poses: Poses) -> FloatArray:
         """The 9-D vectors of poses."""
@@ -110,7 +110,7 @@ class SE2Space(SearchSpace):
         hat_squared = np.outer(axis, axis) - np.eye(3)
         constants = hat(axis), hat_squared, self.resting_rotation, e_u, self.e_v, axis
         self._tensors = [as_tensor(constant) for constant in constants]
-        self.arrays = Space(
+        self.arrays = SpaceConstants(
             planar=True,
             axis=triple(axis),
             e_u=triple(e_u),

@@ -11,14 +11,66 @@ import dataclasses
 import difflib
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from typing import Any, TypeVar
 
-from chsel.errors import SettingError, quoted, require_choice
+from chsel.errors import (
+    SettingError,
+    quoted,
+    require_at_most,
+    require_choice,
+    require_positive,
+)
 
 Settings = TypeVar("Settings")
 Presets = Mapping[str, Mapping[str, Any]]
 PRESETS = ("default", "paper", "reference")
+
+
+Check = Callable[[str, Any], None]
+
+
+class CheckedSettings:
+    """Base of settings whose annotations say what their fields accept.
+
+    A field `rate: Annotated[float, positive]` raises SettingError for other values; None passes
+    where the type has it. A class that checks more, such as pairs of fields, extends __post_init__.
+    """
+
+    def __post_init__(self) -> None:
+        for name, checks in _checks_of(type(self)).items():  # type: ignore[arg-type]
+            value = getattr(self, name)
+            if value is not None:
+                for check in checks:
+                    check(name, value)
+
+
+def positive(name: str, value: Any) -> None:
+    """A finite number above 0."""
+    require_positive(name, value)
+
+
+def not_negative(name: str, value: Any) -> None:
+    """A finite number of at least 0."""
+    require_positive(name, value, zero=True)
+
+
+def at_most(most: float) -> Check:
+    """A number of at most `most`."""
+    return partial(require_at_most, most=most)
+
+
+def one_of(*accepted: str) -> Check:
+    """One of the accepted names."""
+    return partial(require_choice, accepted=accepted)
+
+
+@cache
+def _checks_of(cls: type) -> dict[str, tuple[Check, ...]]:
+    hints = typing.get_type_hints(cls, include_extras=True)
+    annotated = {name: hint for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+    return {name: hint.__metadata__ for name, hint in annotated.items()}
 
 
 def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) -> Settings:
@@ -40,10 +92,19 @@ def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str)
 
 
 def in_preset(settings: Settings, preset: str) -> Settings:
-    """Settings of the preset `default` with what differs in another one, see `PRESETS`."""
+    """Settings of the preset `default` as another one of `PRESETS` has them.
+
+    Each group of settings changes as its own class says, then what `presets` of this class names.
+    A class without `presets` is the same in all of them, with its groups.
+    """
     require_choice("preset", preset, PRESETS)
-    changes = getattr(settings, "presets", {}).get(preset, {})
-    return changed_settings(settings, changes, f"preset {preset}")
+    presets = getattr(settings, "presets", None)
+    if presets is None:
+        return settings
+    values = vars(settings).items()
+    groups = {n: in_preset(v, preset) for n, v in values if dataclasses.is_dataclass(v)}
+    settings = dataclasses.replace(settings, **groups)  # type: ignore[type-var]
+    return changed_settings(settings, presets.get(preset, {}), f"preset {preset}")
 
 
 def settings_mapping(settings: Any) -> dict[str, Any]:

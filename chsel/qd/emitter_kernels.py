@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.cost.objective_kernels import (
+from chsel.cost.objective import (
     BETA1,
     BETA2,
     EPSILON,

@@ -61,7 +61,7 @@ class Energy:
             gradient="exact",
         )
         resolution = problem.free_resolution
-        cost = CompiledCost(sdf, known, settings, free_resolution=resolution, way="tree")
+        cost = CompiledCost(sdf, known, settings, free_resolution=resolution, culling="octree")
         self.objective = Objective(cost, space)
         self._model = cost.model
         self._fitting = cost.at_level(sdf, _FIT_LEVEL - tolerance)

@@ -10,14 +10,14 @@ import numpy as np
 from chsel.cost.cost_kernels import Model
 from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner
-from chsel.numerics.octree import Found, found_for, walk
+from chsel.numerics.octree import Candidates, candidates_for, walk
 from chsel.numerics.pose_tuples import pose_at
 from chsel.problem.sdf_lookup import distance_at, value_between_nodes
 
 
-def found_around(model: Model) -> Found:
+def found_around(model: Model) -> Candidates:
     """Scratch of one thread for the points of a model."""
-    return found_for(max(model.free.tree.spheres.shape[1], 1))
+    return candidates_for(max(model.free.tree.spheres.shape[1], 1))
 
 
 @inner

@@ -10,16 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.cost.cost_kernels import Model, place_in_world, remember, travel
+from chsel.cost.cost_kernels import Model, remember, travel
 from chsel.methods.anchored.energy_kernels import found_around
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
-from chsel.numerics.octree import Found, walk
+from chsel.numerics.octree import Candidates, walk
 from chsel.numerics.pose_tuples import pose_at
 from chsel.problem.sdf_lookup import distance_in_box, distance_with_gradient
 
-_GATHERED = 0  # where the memory holds the place and rotation that points were gathered at
 _SLACK = 0.04  # metres that a pose may move before they are gathered again
 _FIRST_DAMPING = 1e-2  # of the mean of the diagonal
 _LESS, _MORE = 0.3, 5.0  # damping, after a step that was good or bad
@@ -47,7 +46,7 @@ class Fit(NamedTuple):
     normal equations, below the diagonal. solved (d, d), row (d,): of their solution. twist (6,).
     """
 
-    found: Found
+    found: Candidates
     memory: FloatArray
     normal: FloatArray
     right: FloatArray
@@ -94,8 +93,7 @@ def _fitted(model, twists, pose, iterations, fit):
         if not _solve(fit, damping * trace / dimension + 1e-12):
             break
         trial = _moved_by(twists, pose, fit)
-        place = place_in_world(model.free.centre, trial)
-        if travel(place, model.free.radius, trial, memory, _GATHERED) > _SLACK:
+        if travel(model.free, trial, memory) > _SLACK:
             count = _gather(model, trial, memory, found)
         tried = _squares(model, twists, trial, found, count, fit, False)
         if tried < squares:
@@ -114,7 +112,7 @@ def _fitted(model, twists, pose, iterations, fit):
 
 @spliced
 def _gather(model, pose, memory, found):
-    remember(place_in_world(model.free.centre, pose), pose, memory, _GATHERED)
+    remember(model.free, pose, memory)
     return walk(model.free.tree, model.free.region, pose, _SLACK + model.free.margin, found)
 
 

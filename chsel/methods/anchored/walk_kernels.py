@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.cost.cost_kernels import Model, place_in_world, remember, travel
+from chsel.cost.cost_kernels import Model, remember, travel
 from chsel.methods.anchored.energy_kernels import found_around, known_below, with_free
 from chsel.methods.anchored.fit_kernels import moved_about
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner
 from chsel.numerics.elementary import exp
-from chsel.numerics.octree import Found, walk
+from chsel.numerics.octree import Candidates, walk
 from chsel.numerics.pose_tuples import origin_within, pose_at
 
 DRAWS = 9  # random numbers that a move takes
@@ -47,8 +47,8 @@ class Stride(NamedTuple):
 class Steps(NamedTuple):
     """Scratch of one thread."""
 
-    found: Found
-    memory: FloatArray
+    found: Candidates
+    memory: FloatArray  # (12,), the pose that they were gathered around, see remember
 
 
 def steps_for(model: Model) -> Steps:
@@ -125,10 +125,9 @@ def walk_below(model, stride, floor, chains, draws, before, first, last, steps):
 def _gathered(model, pose, trial, size, count, slack, steps):
     """How many points were gathered around the trial or one before, and with what slack."""
     free, memory = model.free, steps.memory
-    place = place_in_world(free.centre, trial)
-    if slack < 0.0 or travel(place, free.radius, trial, memory, 0) > slack:
+    if slack < 0.0 or travel(free, trial, memory) > slack:
         slack = min(max(_SLACKS * size, _LEAST_SLACK), _MOST_SLACK)
-        remember(place, trial, memory, 0)
+        remember(free, trial, memory)
         count = walk(free.tree, free.region, trial, slack + free.margin, steps.found)
     return count, slack
 

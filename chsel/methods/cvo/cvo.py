@@ -100,12 +100,12 @@ class CvoSettings:
 
     _AUTHORS: ClassVar = {"ell_min": 0.1, "c": 7.0, "origin": "world", "stop_below": None}
     presets: ClassVar[Presets] = {
-        "paper": {**_AUTHORS, "online": OnlineSettings.presets["paper"]},
+        "paper": _AUTHORS,
         "reference": {
             **_AUTHORS,
             "sp_thres": 6e-4,
             "surface_band": 0.005,
-            "online": {**OnlineSettings.presets["reference"], "update": "own"},
+            "online": {"update": "own"},
         },
     }
 

@@ -55,10 +55,7 @@ class IcpSettings:
     stop_below: float | None = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
-    presets: ClassVar[Presets] = {
-        "paper": {"redraw": "registration", "online": OnlineSettings.presets["paper"]},
-        "reference": {"online": OnlineSettings.presets["reference"]},
-    }
+    presets: ClassVar[Presets] = {"paper": {"redraw": "registration"}}
 
     def __post_init__(self) -> None:
         require_positive("surface_points", self.surface_points)

@@ -22,7 +22,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import PRESETS, Presets
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose
 from chsel.qd.archive import GridArchive
 from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me, update_cells
@@ -45,14 +45,7 @@ class MedialConstraintSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None
 
-    presets: ClassVar[Presets] = {
-        preset: {
-            "cost": MedialCostSettings.presets[preset],
-            "cma_es": CmaEsSettings.presets[preset],
-            "online": OnlineSettings.presets[preset],
-        }
-        for preset in PRESETS[1:]
-    }
+    presets: ClassVar[Presets] = {}  # those of its groups
 
 
 class MedialConstraint:
@@ -107,22 +100,10 @@ class MedialConstraintCmaMeSettings:
     plane: PlaneSettings | None = None
 
     presets: ClassVar[Presets] = {
-        "paper": {
-            **MedialConstraintSettings.presets["paper"],
-            "archive": {
-                **ArchiveSettings.presets["paper"],
-                "tolerance_per_point": 1e-3,  # without effect, as no estimate is left out
-                "tolerance": 1e-6,  # the same
-            },
-            "emitter": EmitterSettings.presets["paper"],
-            "output": OutputSettings.presets["paper"],
+        "paper": {  # without effect, as no estimate is left out
+            "archive": {"tolerance_per_point": 1e-3, "tolerance": 1e-6}
         },
-        "reference": {
-            **MedialConstraintSettings.presets["reference"],
-            "archive": ArchiveSettings.presets["reference"],
-            "emitter": EmitterSettings.presets["reference"],
-            "output": OutputSettings.presets["reference"],
-        },
+        "reference": {},
     }
 
     def __post_init__(self) -> None:

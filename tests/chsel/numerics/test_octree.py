@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from chsel.errors import PointsError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Region, box_of, clearance_of
-from chsel.numerics.octree import Tree, found_for, octree, walk
+from chsel.numerics.octree import Tree, candidates_for, octree, walk
 
 STAY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -140,7 +140,7 @@ def walked(tree, region, move, slack, found):  # type: ignore[no-untyped-def]
 
 def found_within(tree: Tree, region: Region, slack: float) -> IntArray:
     """Numbers in the tree's order of the points that a walk finds."""
-    found = found_for(tree.spheres.shape[1])
+    found = candidates_for(tree.spheres.shape[1])
     count = walked(tree, region, STAY, slack, found)
     numbers = found.kept[:count].astype(np.int64) - nodes_of(tree)
     places = tree.spheres[:3, nodes_of(tree) :]

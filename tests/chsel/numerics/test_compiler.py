@@ -94,7 +94,7 @@ def test_a_named_folder_that_cannot_be_written_is_named_and_passed_over(tmp_path
     _, said = result_of(process)
     assert said.splitlines()[0] == (
         f"CHSEL_CACHE_DIR is {file}, which cannot be written; accepted: a folder for compiled "
-        "kernels. They go where they go without it"
+        "kernels. The default folder is used"
     )
     assert (tmp_path / "chsel" / "kernels").is_dir()
     assert file.read_text() == "no folder"
@@ -108,8 +108,8 @@ def test_a_named_folder_that_others_can_write_to_is_named_and_passed_over(tmp_pa
     _, said = result_of(start(COMPUTE, tmp_path, **names))
     assert said.splitlines()[0] == (
         f"CHSEL_CACHE_DIR is {open_to_all}, which others can write to, and compiled kernels are "
-        "executed; accepted: a folder of your own that only you can write to (chmod go-w). They go "
-        "where they go without it"
+        "executed; accepted: a folder that only you can write to (chmod go-w). The default folder "
+        "is used"
     )
     assert not kernels_in(open_to_all)
     assert kernels_in(tmp_path / "xdg")

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.objective import Objective
-from chsel.cost.objective_kernels import BETA1, BETA2, EPSILON
+from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective
 from chsel.errors import EngineError, PointsError, PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
@@ -65,15 +64,19 @@ class Case:
     def sdf(self) -> SdfGrid:
         return grid_of(self.shape)
 
-    def objective(self, way: str = "fastest") -> Objective:
+    def objective(self, culling: str = "automatic") -> Objective:
         cost = CompiledCost(
-            self.sdf, self.points, self.settings, free_resolution=self.free_resolution, way=way
+            self.sdf,
+            self.points,
+            self.settings,
+            free_resolution=self.free_resolution,
+            culling=culling,
         )
         return Objective(cost, self.space)
 
-    def other_ways(self) -> list[Objective]:
-        """Every way to find free points that these points allow."""
-        found = [self.objective("direct"), self.objective("tree")]
+    def other_cullings(self) -> list[Objective]:
+        """Every culling that these points allow."""
+        found = [self.objective("none"), self.objective("octree")]
         with suppress(SettingError):
             found.append(self.objective("lattice"))
         return found
@@ -147,10 +150,10 @@ def test_costs_and_gradients_are_those_of_the_torch_cost(case: Case) -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(case=cases())
-def test_ways_to_find_points_batches_threads_and_gradients_change_no_bit(case: Case) -> None:
+def test_culling_batches_threads_and_gradients_change_no_bit(case: Case) -> None:
     objective, vectors = case.objective(), case.vectors
     costs, gradients = objective.costs_and_gradients(vectors)
-    for other in case.other_ways():
+    for other in case.other_cullings():
         other_costs, other_gradients = other.costs_and_gradients(vectors)
         assert_same_bits(costs, other_costs)
         assert_same_bits(gradients, other_gradients)
@@ -190,8 +193,8 @@ def descended_plainly(
 def test_descent_with_neighbour_lists_is_to_the_bit_descent_over_all_points(
     case: Case, rate: float
 ) -> None:
-    plain = descended_plainly(case.objective("direct"), case.vectors, 3.0, rate, 40)
-    for other in case.other_ways():
+    plain = descended_plainly(case.objective("none"), case.vectors, 3.0, rate, 40)
+    for other in case.other_cullings():
         assert_same_bits(other.descended(case.vectors, 3.0, rate, 40), plain)
     objective = case.objective()
     with threads(2):
@@ -219,7 +222,7 @@ def test_an_object_that_turns_misses_none_of_the_points_that_it_sweeps(
     vectors = np.zeros((8, 3))
     vectors[:, 0] = np.arange(8) * 0.7
     case = Case("fine l_shape", points, changes, 0.005, vectors, Turntable(grid_of("l_shape")))
-    plain = descended_plainly(case.objective("direct"), vectors, 1.0, turn, 50)
+    plain = descended_plainly(case.objective("none"), vectors, 1.0, turn, 50)
     assert (np.abs(plain[:, 0] - vectors[:, 0]) > 5.0 * turn).any()
     assert_same_bits(case.objective().descended(vectors, 1.0, turn, 50), plain)
 
@@ -279,8 +282,8 @@ def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(
     transforms[0] = np.eye(4)
     poses = Poses.of(transforms)
     culled, direct = (
-        CompiledCost(sdf, KnownPoints(free), changes, free_resolution=0.005, way=way)
-        for way in ("tree", "direct")
+        CompiledCost(sdf, KnownPoints(free), changes, free_resolution=0.005, culling=culling)
+        for culling in ("octree", "none")
     )
     costs = culled.costs(poses)
     assert costs[0] > 1.0
@@ -381,14 +384,14 @@ EDGES = [
     ("free_term", "spacing", "named"),
     [("interior", 0.05, "interior has none"), ("direct", 0.001, "no lattice coarser")],
 )
-def test_a_way_that_does_not_fit_is_refused(free_term: str, spacing: float, named: str) -> None:
+def test_a_culling_that_does_not_fit_is_refused(free_term: str, spacing: float, named: str) -> None:
     sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.01)
     points = KnownPoints(free=np.eye(3) * 0.2)
     settings = CostSettings(free_term=free_term)
-    with pytest.raises(SettingError, match=f"way is lattice.*{named}.*accepted: fastest"):
-        CompiledCost(sdf, points, settings, free_resolution=spacing, way="lattice")
-    with pytest.raises(SettingError, match="way is 'quick'; accepted: fastest, direct"):
-        CompiledCost(sdf, points, settings, way="quick")
+    with pytest.raises(SettingError, match=f"culling is lattice.*{named}.*accepted: automatic"):
+        CompiledCost(sdf, points, settings, free_resolution=spacing, culling="lattice")
+    with pytest.raises(SettingError, match="culling is 'quick'; accepted: automatic, none"):
+        CompiledCost(sdf, points, settings, culling="quick")
 
 
 @pytest.mark.parametrize(
@@ -403,7 +406,7 @@ def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term:
     changes = CostSettings(free_term=free_term)
     case = Case("box", edge_points(name), changes, 0.01, vectors, SE3Space())
     assert_equals_torch(case)
-    culled, direct = case.objective(), case.objective("direct")
+    culled, direct = case.objective(), case.objective("none")
     for one, other in zip(
         culled.costs_and_gradients(vectors), direct.costs_and_gradients(vectors), strict=True
     ):
@@ -426,7 +429,7 @@ def test_a_scene_far_from_the_origin_is_culled_without_loss(far: float, free_ter
     points = KnownPoints(free, known=free[:9] + 0.01)
     changes = CostSettings(free_term=free_term)
     case = Case("box", points, changes, 0.01, vectors, SE3Space())
-    culled, direct = case.objective(), case.objective("direct")
+    culled, direct = case.objective(), case.objective("none")
     assert (culled.costs(vectors)[1:] > 0.0).any()
     assert_same_bits(culled.costs(vectors), direct.costs(vectors))
     plain = descended_plainly(direct, vectors, 1.0, 1e-3, 30)
@@ -476,7 +479,7 @@ def test_products_that_are_no_number_read_nothing_outside_of_the_grid(
 
 @pytest.mark.parametrize("free_resolution", [0.01, 0.022])
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
-def test_matrices_that_are_no_rotations_cost_the_same_bits_in_every_way(
+def test_matrices_that_are_no_rotations_cost_the_same_bits_with_every_culling(
     free_term: str, free_resolution: float
 ) -> None:
     stream = np.random.default_rng(15)
@@ -486,13 +489,13 @@ def test_matrices_that_are_no_rotations_cost_the_same_bits_in_every_way(
     transforms[0, :3, :3] = 5.0 * np.eye(3)
     transforms[1, :3, :3] = np.diag([0.1, 4.0, 0.0])
     sdf, points, changes = grid_of("box"), KnownPoints(free), CostSettings(free_term=free_term)
-    fastest, tree, direct = (
-        CompiledCost(sdf, points, changes, free_resolution=free_resolution, way=way)
-        for way in ("fastest", "tree", "direct")
+    automatic, tree, direct = (
+        CompiledCost(sdf, points, changes, free_resolution=free_resolution, culling=culling)
+        for culling in ("automatic", "octree", "none")
     )
     costs = direct.evaluate(transforms)
     assert (costs > 0.0).sum() > 20
-    assert_same_bits(fastest.evaluate(transforms), costs)
+    assert_same_bits(automatic.evaluate(transforms), costs)
     assert_same_bits(tree.evaluate(transforms), costs)
 
 
@@ -507,7 +510,7 @@ def test_rows_that_span_no_plane_descend_to_the_same_bits() -> None:
         "box", KnownPoints(near, near[:3], near[:9]), CostSettings(), 0.01, vectors,
         SE3Space(),
     )  # fmt: skip
-    plain = descended_plainly(case.objective("direct"), vectors, 4.0, 0.01, 30)
+    plain = descended_plainly(case.objective("none"), vectors, 4.0, 0.01, 30)
     assert np.isfinite(plain).all()
     assert_same_bits(case.objective().descended(vectors, 4.0, 0.01, 30), plain)
 

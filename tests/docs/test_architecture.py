@@ -1,0 +1,142 @@
+"""docs/architecture.md: its recipes, carried out in a copy of the repository, do what they say."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from chsel import CompiledCost
+from replay.mcap.reader import Recording, read_recording
+from tests.docs.page import commands_in, named_blocks, section, shell, take_over
+
+PAGE = "architecture.md"
+REPOSITORY = Path(__file__).resolve().parents[2]
+PACKAGES = ("chsel", "conf", "replay", "runners")
+RECIPES = ("Adding a method", "Adding an object", "Adding a session kind", "Adding an event")
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the repository in which all recipes were carried out, one after the other."""
+    folder = tmp_path_factory.mktemp("copy")
+    unwanted = shutil.ignore_patterns("__pycache__")
+    for package in PACKAGES:
+        shutil.copytree(REPOSITORY / package, folder / package, ignore=unwanted)
+    shutil.copy(REPOSITORY / "pyproject.toml", folder)
+    for title in RECIPES:
+        recipe = section(PAGE, title)
+        assert take_over(recipe, folder)
+        for command in commands_in(recipe):
+            run(command, folder)
+    return folder
+
+
+def run(command: str, folder: Path) -> str:
+    """Run a command on the copy's packages; kernels are compiled for it alone."""
+    done = shell(command, folder, PYTHONPATH=str(folder), CHSEL_CACHE_DIR=str(folder / "kernels"))
+    assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+def path_of(folder: Path, name: str) -> Path:
+    (path,) = folder.glob(f"logs/probe/*_{name}_*/recording.mcap")
+    return path
+
+
+def recorded(folder: Path, name: str) -> Recording:
+    return read_recording(path_of(folder, name))
+
+
+def test_a_method_anneals_every_start(copy: Path) -> None:
+    recording = recorded(copy, "mustard_annealing")
+    assert recording.start.config["method"]["temperature"] == 1.0
+    steps = [step for step in recording.steps if recording.has_result(step)]
+    assert steps
+    for step in steps:
+        problem, found = recording.problem(step), recording.hypotheses(step)
+        assert len(found.cost) == len(problem.initial_set) == 30
+        before = np.sort(CompiledCost.of(problem).evaluate(problem.initial_set))
+        assert (found.cost <= before).all()
+        assert found.cost.sum() < before.sum()
+
+
+def test_a_method_has_the_presets_of_its_groups(copy: Path) -> None:
+    shown = run("python -m runners.probe method=annealing preset=paper --cfg job --resolve", copy)
+    method = yaml.safe_load(shown)["method"]
+    assert (method["name"], method["rounds"]) == ("annealing", 200)
+    assert method["cost"]["lookup"] == "nearest"
+
+
+def test_its_kernel_is_checked_as_all_are(copy: Path) -> None:
+    code = "from chsel.numerics.compiler import kernel_sources as k; print(*k(), sep='\\n')"
+    assert str(copy / "chsel" / "methods" / "annealing.py") in run(f'python -c "{code}"', copy)
+    assert list((copy / "kernels").rglob("annealing.accepted*.nbi"))
+
+
+def test_an_object_is_probed_where_its_configuration_says(copy: Path) -> None:
+    recording = recorded(copy, "bottle_gradient_descent")
+    assert np.allclose(recording.start.mesh.extents, (0.07, 0.07, 0.2), atol=1e-3)
+    assert recording.start.config["configuration"] == "bottle"
+    truth = recording.start.world_from_object
+    assert truth is not None
+    assert np.allclose(truth[:3, 3], (0.25, 0.0, 0.0), atol=1e-6)
+    assert len(recording.probes) == 4
+    assert sum(len(probe.contacts) for probe in recording.probes) > 0
+
+
+def test_a_session_kind_yields_contacts_on_the_object(copy: Path) -> None:
+    recording = recorded(copy, "mustard_gradient_descent")
+    assert recording.start.session == "touches"
+    assert [len(probe.contacts) for probe in recording.probes] == [8, 8]
+    contacts = np.concatenate([probe.contacts for probe in recording.probes])
+    _, distance, _ = recording.start.mesh.nearest.on_surface(contacts - (0.3, 0.0, 0.0))
+    assert distance.max() < 1e-6
+    assert recording.hypotheses(1).cost[0] < recording.hypotheses(0).cost[-1]
+
+
+def test_an_event_is_written_read_listed_and_exported(copy: Path) -> None:
+    path = path_of(copy, "spam_can_gradient_descent")
+    info = json.loads(run(f"python -m replay info {path} --json", copy))
+    assert info["messages"]["/contact_forces"] == 2
+    code = (
+        "import sys; from replay.mcap.reader import read_recording; "
+        "events = list(read_recording(sys.argv[1]).events()); "
+        "forces = [event.newtons for event in events if type(event).__name__ == 'ContactForces']; "
+        "print([force.shape for force in forces], *(force.max() for force in forces), sep=';')"
+    )
+    shapes, *greatest = run(f'python -c "{code}" {path}', copy).split(";")
+    assert shapes == "[(8,), (8,)]"
+    rows = json.loads((copy / "forces.json").read_text())
+    exported = [row["value"] for row in rows if row["name"] == "greatest_newtons"]
+    assert exported == [float(text) for text in greatest]
+    assert len(set(exported)) == 2
+    assert path.with_name("recording.rrd").stat().st_size > 1000
+
+
+def test_recordings_of_before_the_event_stay_readable(copy: Path) -> None:
+    stored = REPOSITORY / "tests" / "replays" / "spam_can_gradient_descent.mcap"
+    info = run(f"python -m replay info --check {stored}", copy)
+    assert "all checksums and digests are right" in " ".join(info.split())
+
+
+def test_files_and_classes_that_the_page_names_exist() -> None:
+    prose = re.sub(r"^```.*?^```$", "", (REPOSITORY / "docs" / PAGE).read_text(), flags=re.M | re.S)
+    words = set(re.findall(r"`([\w./-]+)`", prose))
+    files = [file for package in PACKAGES for file in (REPOSITORY / package).rglob("*.*")]
+    files += (REPOSITORY / "tests").rglob("*.*")
+    recipes = "".join(section(PAGE, title) for title in RECIPES)
+    paths = {"/" + name for name, _, _ in named_blocks(recipes)}
+    paths |= {"/" + file.relative_to(REPOSITORY).as_posix() for file in files}
+    named = {word for word in words if word.endswith((".py", ".yaml", ".json"))}
+    assert len(named) > 30
+    assert {word for word in named if not any(path.endswith("/" + word) for path in paths)} == set()
+    text = "".join(file.read_text() for file in files if file.suffix == ".py")
+    classes = {word for word in words if re.fullmatch(r"(?:[A-Z][a-z0-9]+){2,}", word)}
+    assert len(classes) > 8
+    assert {word for word in classes if not re.search(rf"\b{word}\b", text)} == set()
