@@ -8,7 +8,7 @@ _LONGEST_VALUE = 80
 
 
 class ChselError(Exception):
-    """Base of all errors with a message meant for the user: what, where, what is accepted."""
+    """Base of all errors whose message is for the user: what, where, what is accepted."""
 
 
 class SettingError(ChselError):
@@ -48,30 +48,27 @@ class RecordingError(ChselError):
 
 
 class InputWarning(UserWarning):
-    """What was given can be registered, and is hardly meant.
-
-    code: names the kind of warning, for programs. text: one line, with numbers and what to do.
-    """
+    """The input can be registered, but is probably a mistake."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(code, text)
-        self.code = code
-        self.text = text
+        self.code = code  # kind of warning, for programs
+        self.text = text  # one line, with numbers and what to do
 
     def __str__(self) -> str:
         return self.text
 
 
 class PointsWarning(InputWarning):
-    """Known points are hardly those of the object, or no hypothesis explains them."""
+    """Known points are probably not those of the object, or no hypothesis explains them."""
 
 
 class MeshWarning(InputWarning):
-    """A mesh, or the size of an object, is hardly meant."""
+    """A mesh, or the size of an object, is probably a mistake."""
 
 
 def quoted(value: object) -> str:
-    """A value as an error quotes it: on one line, of bounded length; of large things the type."""
+    """A value as errors quote it: on one line, of bounded length; the type of a long value."""
     text = " ".join(repr(value).split())
     return text if len(text) <= _LONGEST_VALUE else f"a {type(value).__name__}"
 
@@ -84,7 +81,7 @@ def require_choice(name: str, value: object, accepted: Iterable[str]) -> None:
 
 
 def require_at_most(name: str, value: float, most: float) -> None:
-    """Raise SettingError if `value` is beyond what any registration can need."""
+    """Raise SettingError if `value` is above a limit."""
     if value > most:
         raise SettingError(f"{name} is {value!r}; accepted: at most {most:_}")
 
@@ -98,6 +95,6 @@ def require_positive(name: str, value: float, *, zero: bool = False) -> None:
 
 
 def require_instance(name: str, value: object, kind: type, accepted: str) -> None:
-    """Raise SettingError unless `value` is of a kind."""
+    """Raise SettingError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         raise SettingError(f"{name} is {quoted(value)}; accepted: {accepted}")

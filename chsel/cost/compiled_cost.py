@@ -21,7 +21,7 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import cells_below, field_of
+from chsel.problem.sdf_lookup import cells_below, distance_field
 
 CULLINGS = ("automatic", "none", "octree", "lattice")
 _POSES_PER_THREAD = 200  # fewer are evaluated faster than a thread wakes up
@@ -50,7 +50,7 @@ class CompiledCost:
         require_choice("culling", culling, CULLINGS)
         self.settings = settings = settings or CostSettings()
         self.model = Model(
-            field=field_of(sdf, settings.lookup, settings.outside),
+            field=distance_field(sdf, settings.lookup, settings.outside),
             free=_free_term(sdf, points.free, settings, free_resolution, culling),
             occupied=points.occupied.T.copy(),
             known=points.known.T.copy(),

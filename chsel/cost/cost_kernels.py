@@ -24,7 +24,7 @@ from chsel.numerics.pose_tuples import (
     rigid,
     turned_back,
 )
-from chsel.problem.sdf_lookup import Field, continued, sample
+from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 
 MOST_SLACK = 0.03  # metres
 STEPS_AHEAD = 3.0  # that gathered neighbours should last
@@ -51,7 +51,7 @@ class FreeTerm(NamedTuple):
 class Model(NamedTuple):
     """All that the relaxed cost of a pose depends on, but the pose; see CostSettings."""
 
-    field: Field
+    field: DistanceField
     free: FreeTerm
     occupied: FloatArray  # (3, K), world
     known: FloatArray  # (3, M), world
@@ -192,7 +192,7 @@ def _free_sums(model, candidates, count):
     sums = _NOTHING
     for n in range(count):
         if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
-            s, nx, ny, nz = sample(trilinear, box, table, places, n)
+            s, nx, ny, nz = distance_in_box(trilinear, box, table, places, n)
             violation = max(model.alpha - s, 0.0)
             size = -model.free_scale * _slope(model, violation)
             value = model.free_scale * violation
@@ -256,10 +256,10 @@ def _with_known(sums, model, pose, places):
 @spliced
 def _distance_at(field, table, places, n, pose, x, y, z):
     """Signed distance and gradient at the n-th of the places, that of a world point x, y, z."""
-    inside = sample(field.trilinear, field.box, table, places, n)
+    inside = distance_in_box(field.trilinear, field.box, table, places, n)
     if places.beyond[n] > 0.0:
         x, y, z = moved(pose, x, y, z)
-        return continued(field.box_distance, field.box, inside, x, y, z)
+        return distance_beyond_box(field.box_distance, field.box, inside, x, y, z)
     return inside
 
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.octree import octree
-from chsel.problem.poses import as_tensor, moved
-from chsel.problem.sdf_grid import SdfGrid, squared_length
+from chsel.problem.poses import as_tensor, moved, squared_length
+from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import cells_below
 
 NODES_PER_POSE = 256  # that a walk typically looks at together

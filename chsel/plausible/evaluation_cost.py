@@ -18,8 +18,13 @@ from chsel.problem.points import KnownPoints, Lattice
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import Field, continued, field_of, sample
-from chsel.problem.subset import far_apart
+from chsel.problem.sdf_lookup import (
+    DistanceField,
+    distance_beyond_box,
+    distance_field,
+    distance_in_box,
+)
+from chsel.problem.subset import farthest_points
 
 _POSES_PER_THREAD = 500
 _MOST_DISTINCT = 32  # violated free points that are counted one by one at first
@@ -41,7 +46,7 @@ class Divisors(NamedTuple):
 class EvaluationModel(NamedTuple):
     """All that the evaluation cost of a pose depends on."""
 
-    field: Field
+    field: DistanceField
     tree: Tree  # of the free points
     region: Region  # cells of the object in which a free point can violate
     occupied: FloatArray  # (3, K), world
@@ -70,7 +75,7 @@ class EvaluationCost:
         voxels, point_in = _voxels(tree, problem.free_resolution)
         occupied = points.occupied if settings.occupied else np.zeros((0, 3))
         self.model = EvaluationModel(
-            field=field_of(sdf, settings.lookup, settings.outside),
+            field=distance_field(sdf, settings.lookup, settings.outside),
             tree=tree,
             region=_region(sdf, level, settings.lookup),
             occupied=occupied.T.copy(),
@@ -123,7 +128,7 @@ def _inside(sdf: SdfGrid, level: float) -> FloatArray:
     nodes = np.argwhere(sdf.values <= level)
     nodes = nodes[:: max(1, len(nodes) // _MOST_CANDIDATES)]
     points = sdf.origin + nodes * sdf.resolution
-    return points[far_apart(points, _MOST_INSIDE)].T.copy()
+    return points[farthest_points(points, _MOST_INSIDE)].T.copy()
 
 
 def _voxels(tree: Tree, resolution: float) -> tuple[Box, Any]:
@@ -207,13 +212,13 @@ def _occupied_count(model: EvaluationModel, pose: Pose, scratch: Candidates) -> 
 
 @leaf
 def _distance(
-    field: Field, pose: Pose, x: float, y: float, z: float, places: Places, n: int
+    field: DistanceField, pose: Pose, x: float, y: float, z: float, places: Places, n: int
 ) -> float:
     """Signed distance of a world point, whose place in the grid is the n-th of the places."""
-    inside = sample(field.trilinear, field.box, field.table, places, n)
+    inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
     if places.beyond[n] > 0.0:
         a, b, c = moved(pose, x, y, z)
-        inside = continued(field.box_distance, field.box, inside, a, b, c)
+        inside = distance_beyond_box(field.box_distance, field.box, inside, a, b, c)
     return inside[0]
 
 
@@ -264,7 +269,7 @@ def _violates(model: EvaluationModel, places: Places, n: int) -> bool:
     if model.region.clearance[places.cell[n]] >= 0.0 or places.beyond[n] > 0.0:
         return False
     field = model.field
-    inside = sample(field.trilinear, field.box, field.table, places, n)
+    inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
     return inside[0] <= model.level
 
 

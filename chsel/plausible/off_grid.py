@@ -24,7 +24,7 @@ from chsel.problem.poses import Poses, compose, inverse, product, rotation_vecto
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE3Space
 from chsel.problem.streams import normals, uniforms
-from chsel.problem.subset import far_apart
+from chsel.problem.subset import farthest_points
 from chsel.problem.surface import surface_points
 
 _SHRINK = 0.5  # of the steps of local members
@@ -86,7 +86,7 @@ def local_members(
         if n >= _ROUNDS // 2 and len(costs) >= _ENOUGH * wanted:
             break
     places = _places(pool, cost.problem.sdf)
-    chosen = np.sort(far_apart(places, known + wanted, given=known))[known:]
+    chosen = np.sort(farthest_points(places, known + wanted, given=known))[known:]
     return pool[chosen], costs[chosen - known]
 
 
@@ -124,7 +124,7 @@ def modes_between(
     sdf = cost.problem.sdf
     starts = _nearly_plausible(grid, cost, members[0], settings)
     starts = starts[random_subset(len(starts), _CANDIDATES, plausible_stream(seed, _MODE_STREAM))]
-    starts = starts[far_apart(_places(starts, sdf), settings.starts)]
+    starts = starts[farthest_points(_places(starts, sdf), settings.starts)]
     if len(starts) == 0:
         return np.zeros((0, 4, 4)), np.zeros(0)
     poses, costs = _climbed(cost, starts, limit, seed)

@@ -28,7 +28,7 @@ from chsel.plausible.plausible_settings import Offsets, PoseGridSettings
 from chsel.plausible.position_blocks import Blocks, DistanceBounds, blocks_of, bounds_of
 from chsel.problem.poses import axis_angle, compose, random_rotations
 from chsel.problem.streams import Purpose, StreamKey, uniforms
-from chsel.problem.subset import far_apart
+from chsel.problem.subset import farthest_points
 
 MOST_MEMBERS = 2_000_000
 _CAPACITY = 50_000  # poses that a thread finds before it hands them over, at least
@@ -155,7 +155,7 @@ def _blocks(offsets: Offsets, margin: float) -> Blocks:
 
 def _most_informative_first(known: FloatArray) -> IntArray:
     """Known points, each far from those before it, then at random: to reject poses early."""
-    first = far_apart(known, _MOST_INFORMATIVE)
+    first = farthest_points(known, _MOST_INFORMATIVE)
     rest = np.argsort(uniforms(plausible_stream(0), 0.0, 1.0, len(known)), kind="stable")
     return np.concatenate([first, rest[~np.isin(rest, first)]])
 

@@ -21,7 +21,12 @@ from chsel.numerics.pose_tuples import composed, inverted, moved, pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses, compose, inverse, product, rotated, stacked
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import Field, continued, field_of, sample
+from chsel.problem.sdf_lookup import (
+    DistanceField,
+    distance_beyond_box,
+    distance_field,
+    distance_in_box,
+)
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 
 if TYPE_CHECKING:
@@ -73,7 +78,7 @@ class SurfaceDistance:
         if mesh is None and settings.method != "grid":
             raise SettingError(f"method {settings.method} needs a mesh; accepted without: grid")
         self._points = np.ascontiguousarray(points.T)
-        self._field = field_of(sdf, "trilinear", "surface_point")
+        self._field = distance_field(sdf, "trilinear", "surface_point")
         if mesh is not None:
             self._vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
             self._faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
@@ -183,7 +188,7 @@ class PosePairs(NamedTuple):
 
 @compiled
 def mean_squares(
-    field: Field,
+    field: DistanceField,
     points: FloatArray,
     pairs: PosePairs,
     out: FloatArray,
@@ -201,9 +206,9 @@ def mean_squares(
             locate(move, field.box, xs, ys, zs, places, len(xs))
             total = 0.0
             for n in range(len(xs)):
-                inside = sample(field.trilinear, field.box, field.table, places, n)
+                inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
                 if places.beyond[n] > 0.0:
                     x, y, z = moved(move, xs[n], ys[n], zs[n])
-                    inside = continued(field.box_distance, field.box, inside, x, y, z)
+                    inside = distance_beyond_box(field.box_distance, field.box, inside, x, y, z)
                 total += inside[0] * inside[0]
             out[b, p] = total / len(xs)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.plausible.surface_distance import surface_points
-from chsel.problem.poses import axis_angle, rotations
+from chsel.problem.poses import axis_angle, rotation_matrices
 from chsel.problem.streams import StreamKey
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class RotatedSurface:
             half = -0.5 * np.linalg.solve(hessian, gradient[..., None])[..., 0]
             quaternion = np.concatenate([half, np.ones((len(half), 1))], axis=1)
             quaternion /= np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
-            turns = rotations(quaternion) @ turns
+            turns = rotation_matrices(quaternion) @ turns
         return turns
 
     def coarse_errors(self, turns: FloatArray, count: int = 128) -> FloatArray:
@@ -236,7 +236,7 @@ def _spread() -> tuple[FloatArray, IntArray]:
     pairs += [(outer, np.sin(second)), (outer, np.cos(second))]
     quaternion = np.array([radius * share for radius, share in pairs]).T
     _, index = cKDTree(np.concatenate([quaternion, -quaternion])).query(quaternion, k=_NEIGHBOURS)
-    return rotations(quaternion), index % _SPREAD
+    return rotation_matrices(quaternion), index % _SPREAD
 
 
 def _angles_between(turns: FloatArray, others: FloatArray) -> FloatArray:

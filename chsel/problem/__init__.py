@@ -1,1 +1,1 @@
-"""What a registration is: points, mesh, distances, poses, random streams, the problem."""
+"""What a registration is: points, mesh, signed distances, poses, random streams, the problem."""

@@ -1,11 +1,11 @@
-"""Files that others wrote: complete, of bounded size, and no device or pipe."""
+"""Checks of files from outside: no device or pipe, complete, and of bounded size."""
 
 from __future__ import annotations
 
 import stat
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,45 +14,48 @@ import numpy as np
 
 from chsel.errors import ChselError, MeshError
 
-_KINDS = (
+MOST_BYTES = 512 * 2**20  # of the arrays of an .npz file, unpacked: 16 million points with steps
+
+_SPECIAL_FILES = (
     (stat.S_ISFIFO, "a FIFO"),
     (stat.S_ISSOCK, "a socket"),
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+_ENTRY = b"PK\x01\x02"  # begins each entry of a zip directory
+_ENCRYPTED = 0x1  # bit of a zip member's flags
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # zipfile limits only their unpacking
+_PIECE = 2**20  # bytes that are unpacked at once
+_LONGEST_NAME = 60
 
 
 def refuse_special_file(name: str, path: Path, error: type[ChselError]) -> None:
     """Raise `error` if `path` is a FIFO, a socket or a device, or a link to one.
 
-    name: of the file in the message, such as "recording a.mcap". Whether the file exists, is a
-    folder or may be read is for the system to say when it is opened.
+    name: of the file in the message, such as "recording a.mcap". Other paths pass, also those that
+    do not exist or cannot be opened.
     """
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
         return
-    for is_kind, kind in _KINDS:
+    for is_kind, kind in _SPECIAL_FILES:
         if is_kind(mode):
             raise error(f"{name} is {kind}; accepted: a file")
 
 
-_PLY_END = b"end_header"
-
-
 def check_complete(path: Path, kind: str) -> None:
-    """Raise MeshError if a file holds less than it announces, or lines that no reader expects.
+    """Raise MeshError if a file of text is shorter than it announces or has unexpected lines.
 
-    kind: "ply", "off", "stl" or "xyz"; others pass. Only files of text can be cut unnoticed: for
-    binary ones the readers compare the size themselves. The message names no file.
+    kind: "ply", "off", "stl" or "xyz"; other kinds and binary files pass, as their readers compare
+    sizes themselves. The message does not name the file.
     """
-    check = _CHECKS.get(kind)
-    if check is not None:
-        check(path)
+    if kind in _TEXT_CHECKS:
+        _TEXT_CHECKS[kind](path)
 
 
 def _check_ply(path: Path) -> None:
-    """Text: each vertex, face and other element is a line after the header."""
+    """Each vertex, face and other element is a line after the header."""
     with path.open("rb") as file:
         counts: dict[str, int] = {}
         for line in file:
@@ -61,13 +64,13 @@ def _check_ply(path: Path) -> None:
                 return
             if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
                 counts[words[1].decode("ascii", "replace")] = int(words[2])
-            if line.strip() == _PLY_END:
+            if line.strip() == b"end_header":
                 break
         _compare(counts, sum(1 for line in file if line.strip()))
 
 
 def _check_off(path: Path) -> None:
-    """Text: a line of counts, then each vertex and each face on a line of its own."""
+    """A line of counts, then a line for each vertex and each face."""
     lines = _text_lines(path)
     head = next(lines, "").removeprefix("COFF").removeprefix("OFF").strip()
     words = (head or next(lines, "")).split()
@@ -84,24 +87,16 @@ def _check_off(path: Path) -> None:
 
 
 def _check_stl(path: Path) -> None:
-    """Text: as many facets end as begin, and as many solids."""
+    """As many facets and solids end as begin."""
     with path.open("rb") as file:
-        if not file.read(80).lstrip().lower().startswith(b"solid"):
+        head = file.read(80).lower()
+        if not head.lstrip().startswith(b"solid"):
             return
-        file.seek(0)
-        begun, ended = _stl_words(file.read())
-    if begun == 0:  # a binary file whose comment begins like a text
-        return
-    if begun != ended:
+        lines = (head + file.read().lower()).splitlines()
+    count = Counter(words[0] for words in map(bytes.split, lines) if words)
+    begun, ended = count[b"facet"] + count[b"solid"], count[b"endfacet"] + count[b"endsolid"]
+    if count[b"facet"] and begun != ended:  # without any, a binary file with such a comment
         raise MeshError(f"it has {ended} whole facets and solids of {begun} that begin")
-
-
-def _stl_words(content: bytes) -> tuple[int, int]:
-    lines = [line.split()[:1] for line in content.lower().splitlines()]
-    begun = sum(words in ([b"facet"], [b"solid"]) for words in lines)
-    facets = sum(words == [b"facet"] for words in lines)
-    ended = sum(words in ([b"endfacet"], [b"endsolid"]) for words in lines)
-    return (begun if facets else 0), ended
 
 
 def _check_xyz(path: Path) -> None:
@@ -114,39 +109,23 @@ def _check_xyz(path: Path) -> None:
             raise MeshError(f"point {number} has {count} numbers, the first one has {columns}")
 
 
+_TEXT_CHECKS = {"ply": _check_ply, "off": _check_off, "stl": _check_stl, "xyz": _check_xyz}
+
+
 def _compare(counts: dict[str, int], lines: int) -> None:
     announced = sum(counts.values())
     if lines != announced:
-        what = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise MeshError(f"it announces {announced} lines ({what}) and has {lines}")
+        listed = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise MeshError(f"it announces {announced} lines ({listed}) and has {lines}")
 
 
 def _text_lines(path: Path) -> Iterator[str]:
-    """Lines that hold more than a comment."""
+    """Lines without comments that are not empty."""
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             content = line.partition("#")[0].strip()
             if content:
                 yield content
-
-
-_CHECKS: dict[str, Callable[[Path], None]] = {
-    "ply": _check_ply,
-    "off": _check_off,
-    "stl": _check_stl,
-    "xyz": _check_xyz,
-}
-
-
-MOST_BYTES = 512 * 2**20
-"""Of all arrays together, unpacked: 16 million points with their steps."""
-
-_SUFFIX = ".npy"
-_ENTRY = b"PK\x01\x02"  # begins each entry of a zip directory
-_ENCRYPTED = 0x1  # bit of a zip member's flags
-_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # zipfile bounds no others' unpacking
-_PIECE = 2**20  # bytes that are unpacked at once
-_LONGEST_NAME = 60
 
 
 def read_npz(
@@ -156,10 +135,10 @@ def read_npz(
     most_bytes: int = MOST_BYTES,
     error: type[ChselError],
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """The arrays by their names; every checksum is compared, no pickled object is loaded.
+    """The arrays by name; every checksum is compared, and no pickled object is loaded.
 
-    accepted: names that the arrays may have (None: any). most_bytes: of all arrays, unpacked;
-    nothing is unpacked beyond it. Raises `error` with one line for whatever is wrong.
+    accepted: names that the arrays may have (None: any). most_bytes: limit of all arrays, unpacked.
+    Raises `error` with a message of one line for any defect of the file.
     """
     refuse_special_file("it", path, error)
     try:
@@ -170,7 +149,7 @@ def read_npz(
             return {_array_name(member): _array(archive, member) for member in members}
     except ChselError:
         raise
-    except Exception as problem:  # zipfile, its decompressors and numpy raise anything
+    except Exception as problem:  # zipfile, its decompressors and numpy raise many kinds
         reason = " ".join(str(problem).split()) or type(problem).__name__
         raise error(f"not a readable .npz file ({reason[:200]})") from None
 
@@ -178,7 +157,7 @@ def read_npz(
 def _check_directory(path: Path, start: int, count: int) -> None:
     """Raise ValueError unless the directory from byte `start` on lists `count` arrays.
 
-    zipfile passes over entries where a damaged length makes them part of the one before.
+    zipfile skips entries that a damaged length makes part of the previous one.
     """
     with path.open("rb") as file:
         file.seek(start)
@@ -193,7 +172,7 @@ def _check_members(
     most_bytes: int,
     error: type[ChselError],
 ) -> None:
-    """Raise `error` for what should not even be unpacked."""
+    """Raise `error` for members that must not be unpacked."""
     counts = Counter(map(_array_name, members))
     for member in members:
         name = _array_name(member)
@@ -206,7 +185,7 @@ def _check_members(
             raise error(f"array {shown} is encrypted; accepted: arrays without a password")
         if member.compress_type not in _COMPRESSIONS:
             raise error(f"array {shown} is not compressed as numpy does; accepted: np.savez")
-    size = sum(member.file_size for member in members)  # zipfile reads no more than this
+    size = sum(member.file_size for member in members)  # zipfile unpacks no more than this
     if size > most_bytes:
         raise error(
             f"its arrays have {size / 2**20:.0f} MiB unpacked; "
@@ -215,7 +194,7 @@ def _check_members(
 
 
 def _array_name(member: zipfile.ZipInfo) -> str:
-    return member.filename.removesuffix(_SUFFIX)
+    return member.filename.removesuffix(".npy")
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray[Any, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -11,10 +13,14 @@ from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 
-MOST_APART = 10.0  # object diameters between contacts, and from a contact to the free points
-NEVER_APART = 100.0  # object diameters between contacts: a tenth of an object, in millimetres
-NEVER_AROUND = 1000.0  # object diameters between any points: an object's size, in millimetres
-MOST_OUTSIDE = 0.2  # object diameters from the workspace to a contact
+# In diameters of the object:
+MOST_APART = 10.0  # between contacts, and from a contact to the free points
+NEVER_APART = 100.0  # between contacts: a tenth of an object whose points are in millimetres
+NEVER_AROUND = 1000.0  # between any points: an object whose points are in millimetres
+MOST_OUTSIDE = 0.2  # from the workspace to a contact
+MOST_OFF = 0.04  # average error of known points
+
+MOST_NOISE = 10.0  # noise levels that the lowest energy may have
 _BLOCK = np.array(sorted(np.ndindex(3, 3, 3), key=lambda at: at != (1, 1, 1))) - 1  # centre first
 _MOST_VOXELS = 2.0**62  # that can be numbered
 
@@ -25,23 +31,25 @@ def check_points(
     free_resolution: float,
     workspace: Workspace | None = None,
 ) -> list[PointsWarning]:
-    """What is suspicious about known points; nothing for points that are as a session gives them.
+    """Warnings about suspicious points; none for points as a session yields them.
 
     diameter: of the object, metres. free_resolution: side of a free voxel, metres. workspace: where
-    the object can be, if that was given and not derived from the points.
+    the object can be, if it was given and not derived from the points.
     Raises PointsError for points that no object of this size can have.
     """
     if points.count == 0 or diameter <= 0.0:
         return []
     touching = np.concatenate([points.contacts, points.occupied])
-    warnings = [*_extent(points, touching, diameter), *_distance_to_free(points, diameter)]
-    if workspace is not None:
-        warnings += _outside_of_workspace(touching, diameter, workspace)
-    return warnings + _within_free_space(points.contacts, points.free, free_resolution)
+    return [
+        *_extent(points, touching, diameter),
+        *_distance_to_free(points, diameter),
+        *_outside_of_workspace(touching, diameter, workspace),
+        *_within_free_space(points.contacts, points.free, free_resolution),
+    ]
 
 
 def check_contacts(points: KnownPoints) -> list[PointsWarning]:
-    """Whether any point says where the object is, and not only where it is not."""
+    """A warning if the points only show where the object is not."""
     if points.count == 0 or len(points.known) or len(points.occupied):
         return []
     text = (
@@ -51,10 +59,10 @@ def check_contacts(points: KnownPoints) -> list[PointsWarning]:
     return [PointsWarning("no_contact", text)]
 
 
-def _extent(points: KnownPoints, touching: FloatArray, diameter: float) -> list[PointsWarning]:
-    """Points on and in one rigid object are a diameter apart at most.
+def _extent(points: KnownPoints, touching: FloatArray, diameter: float) -> Iterator[PointsWarning]:
+    """Points on and in one rigid object are at most a diameter apart.
 
-    Far too large a span is an error, unless it is that of a few outliers.
+    A far larger span is an error, unless a few outliers cause it.
     """
     for what, group, most in (
         ("points on the object", touching, NEVER_APART),
@@ -66,67 +74,66 @@ def _extent(points: KnownPoints, touching: FloatArray, diameter: float) -> list[
                 "they in millimetres? accepted: points in metres, and the object in the same unit"
             )
     extent = _diagonal(touching)
-    if extent <= MOST_APART * diameter:
-        return []
-    text = (
-        f"points on the object span {extent:.3g} m, and the object is {diameter:.3g} m; check "
-        "units and frames, and remove outliers"
-    )
-    return [PointsWarning("contacts_apart", text)]
+    if extent > MOST_APART * diameter:
+        text = (
+            f"points on the object span {extent:.3g} m, and the object is {diameter:.3g} m; check "
+            "units and frames, and remove outliers"
+        )
+        yield PointsWarning("contacts_apart", text)
 
 
-def _distance_to_free(points: KnownPoints, diameter: float) -> list[PointsWarning]:
+def _distance_to_free(points: KnownPoints, diameter: float) -> Iterator[PointsWarning]:
     contacts, free, most = points.contacts, points.free, MOST_APART * diameter
     near = _diagonal(np.concatenate([contacts, free])) <= most
     if near or len(contacts) == 0 or len(free) == 0:
-        return []
+        return
     distance, _ = cKDTree(free).query(contacts)
     far = distance > most
-    if not far.any():
-        return []
-    text = (
-        f"{_of(far)} are more than {MOST_APART:g} object diameters from all free points, the "
-        f"farthest {distance.max():.3g} m; check that both are in one frame and one unit"
-    )
-    return [PointsWarning("contacts_far_from_free", text)]
+    if far.any():
+        text = (
+            f"{_count(far, 'contacts')} are more than {MOST_APART:g} object diameters from all "
+            f"free points, the farthest {distance.max():.3g} m; check that both are in one frame "
+            "and one unit"
+        )
+        yield PointsWarning("contacts_far_from_free", text)
 
 
 def _outside_of_workspace(
-    touching: FloatArray, diameter: float, workspace: Workspace
-) -> list[PointsWarning]:
-    if len(touching) == 0:
-        return []
+    touching: FloatArray, diameter: float, workspace: Workspace | None
+) -> Iterator[PointsWarning]:
+    if workspace is None or len(touching) == 0:
+        return
     lower, upper = workspace.bounds
     beyond = np.maximum(np.maximum(lower - touching, touching - upper), 0.0)
     distance = np.sqrt((beyond**2).sum(axis=1))
+    sides = zip(workspace.lower, workspace.upper, strict=True)
+    box = "[" + ", ".join(f"[{low:g}, {high:g}]" for low, high in sides) + "]"
     if float(distance.min()) > diameter:
         raise PointsError(
-            f"all points on the object are outside of the workspace {_box(workspace)}, the nearest "
+            f"all points on the object are outside of the workspace {box}, the nearest "
             f"{distance.min():.3g} m from it; accepted: a workspace that holds the object"
         )
     outside = distance > MOST_OUTSIDE * diameter
-    if not outside.any():
-        return []
-    text = (
-        f"{_of(outside, 'points on the object')} are outside of the workspace {_box(workspace)}, "
-        f"the farthest {distance.max():.3g} m from it; check workspace, units and frames"
-    )
-    return [PointsWarning("contacts_outside", text)]
+    if outside.any():
+        text = (
+            f"{_count(outside, 'points on the object')} are outside of the workspace {box}, the "
+            f"farthest {distance.max():.3g} m from it; check workspace, units and frames"
+        )
+        yield PointsWarning("contacts_outside", text)
 
 
 def _within_free_space(
     contacts: FloatArray, free: FloatArray, resolution: float
-) -> list[PointsWarning]:
+) -> Iterator[PointsWarning]:
     if len(contacts) == 0 or len(free) == 0:
-        return []
+        return
     within = _enclosed(contacts, free, resolution)
-    if not within.any():
-        return []
-    text = (
-        f"{_of(within)} are in free space: at a free point, or in a free voxel of {resolution:g} "
-        "m with free voxels all around; end free space before the surface"
-    )
-    return [PointsWarning("contacts_in_free_space", text)]
+    if within.any():
+        text = (
+            f"{_count(within, 'contacts')} are in free space: at a free point, or in a free voxel "
+            f"of {resolution:g} m with free voxels all around; end free space before the surface"
+        )
+        yield PointsWarning("contacts_in_free_space", text)
 
 
 def _enclosed(contacts: FloatArray, free: FloatArray, resolution: float) -> BoolArray:
@@ -138,20 +145,19 @@ def _enclosed(contacts: FloatArray, free: FloatArray, resolution: float) -> Bool
     lattice = Lattice(tuple(free[0].tolist()), resolution)
     wanted = lattice.voxels(contacts)[:, None] + _BLOCK  # (C, 27, 3)
     lower = wanted.min(axis=(0, 1))
-    shape = wanted.max(axis=(0, 1)) - lower + 1
+    shape = tuple(wanted.max(axis=(0, 1)) - lower + 1)
     if np.prod(shape, dtype=float) > _MOST_VOXELS:
         return np.zeros(len(contacts), dtype=bool)
     voxels = lattice.voxels(free) - lower
     near = ((voxels >= 0) & (voxels < shape)).all(axis=1)
-    numbers = np.ravel_multi_index(tuple(voxels[near].T), tuple(shape))
-    wanted_numbers = np.ravel_multi_index(tuple((wanted - lower).reshape(-1, 3).T), tuple(shape))
-    wanted_numbers = wanted_numbers.reshape(-1, len(_BLOCK))
+    numbers = np.ravel_multi_index(tuple(voxels[near].T), shape)
+    wanted_numbers = np.ravel_multi_index(tuple(np.moveaxis(wanted - lower, -1, 0)), shape)
     enclosed = np.isin(wanted_numbers, numbers).all(axis=1)
     beside = free[near][np.isin(numbers, wanted_numbers[:, 0])]
     places = {point.tobytes() for point in beside}
     same = np.array([contact.tobytes() in places for contact in contacts])
-    found: BoolArray = enclosed | same
-    return found
+    either: BoolArray = enclosed | same
+    return either
 
 
 def _diagonal(points: FloatArray) -> float:
@@ -160,23 +166,14 @@ def _diagonal(points: FloatArray) -> float:
 
 
 def _spread(points: FloatArray) -> float:
-    """Twice the distance (m) from the median point (N, 3) that nine in ten points do not exceed."""
+    """Twice the 90th percentile (m) of the distances of points (N, 3) from their median."""
     away = points - np.median(points, axis=0)
     distance = np.sqrt((away**2).sum(axis=1))
     return 2.0 * float(np.percentile(distance, 90.0, method="lower"))
 
 
-def _of(chosen: BoolArray, what: str = "contacts") -> str:
+def _count(chosen: BoolArray, what: str) -> str:
     return f"{int(chosen.sum())} of {len(chosen)} {what}"
-
-
-def _box(workspace: Workspace) -> str:
-    sides = zip(workspace.lower, workspace.upper, strict=True)
-    return "[" + ", ".join(f"[{low:g}, {high:g}]" for low, high in sides) + "]"
-
-
-MOST_OFF = 0.04  # object diameters by which known points are off on average
-MOST_NOISE = 10.0  # noise levels that a lowest energy can have
 
 
 def check_fit(
@@ -184,8 +181,8 @@ def check_fit(
 ) -> list[PointsWarning]:
     """A warning if the best hypothesis contradicts the points by more than inexact sensors can.
 
-    What it leaves, by the SDF and whatever the method's cost is: the distance between known points
-    and their level, the depth of free points in the object, the height of occupied ones above it.
+    By the SDF, whatever the method's cost is: the distance between known points and their level,
+    the depth of free points in the object, and the height of occupied points above it.
     noise: of known points by the method's settings, metres, if its costs are energies in metres.
     """
     sdf, points, best = problem.sdf, problem.points, hypotheses.object_from_world[0]
@@ -198,18 +195,18 @@ def check_fit(
     off = np.abs(signed(points.known) - points.sdf)
     depth = float(-signed(points.free).min(initial=0.0))
     height = float(signed(points.occupied).max(initial=0.0))
-    found = []
+    contradictions = []
     if len(off) and off.mean() > tolerance:
         mean, most = _length(float(off.mean())), _length(float(off.max()))
-        found.append(f"known points are {mean} off on average (up to {most})")
+        contradictions.append(f"known points are {mean} off on average (up to {most})")
     if depth > tolerance + problem.free_resolution:
-        found.append(f"free points are up to {_length(depth)} inside")
+        contradictions.append(f"free points are up to {_length(depth)} inside")
     if height > tolerance + problem.free_resolution:
-        found.append(f"occupied points are up to {_length(height)} outside")
-    if found:
+        contradictions.append(f"occupied points are up to {_length(height)} outside")
+    if contradictions:
         text = (
-            f"no hypothesis explains the points: at the best, {', '.join(found)}; check units, "
-            "frames, and the object and its scale"
+            f"no hypothesis explains the points: for the best, {', '.join(contradictions)}; check "
+            "units, frames, and the object and its scale"
         )
         return [PointsWarning("no_fit", text)]
     energy = float(hypotheses.cost[0])

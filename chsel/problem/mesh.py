@@ -17,15 +17,87 @@ from chsel.problem.file_checks import check_complete, refuse_special_file
 if TYPE_CHECKING:
     import trimesh
 
-_NEAR = 0.5  # diameters of the largest body; a part of an object is nearer to its other parts
-_MOST_BODIES = 1000  # the largest ones are compared
+SMALLEST = 0.005  # metres; objects that a gripper probes have a larger extent
+LARGEST = 10.0  # metres; a larger extent is probably in millimetres
+MANY_FACES = 200_000  # a mesh of more is slow
+ENOUGH_FACES = 50_000  # of an object of the size of a hand: sides of 1 mm
+_SECONDS_PER_FACE = 1.5e-5  # on one core: merging vertices, and a grid of 60 000 nodes
+_NEAR = 0.5  # largest gap between the bodies of one object, in diameters of the largest body
+_MOST_BODIES = 1000  # that are compared, the largest ones
+_NOT_MESHES = {"bz2", "dxf", "stl_ascii", "svg", "tar.bz2", "tar.gz", "xyz", "zip"}
+
+
+def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
+    """The checked mesh in a file of any format that trimesh reads; scenes become one mesh.
+
+    scale: metres per unit of the file. Checks and raises as `clean_mesh`, and MeshError if the file
+    does not exist or cannot be read.
+    """
+    if not isinstance(path, str | Path):
+        raise MeshError(f"mesh file is {quoted(path)}; accepted: the path of a file")
+    path = Path(path).expanduser()
+    refuse_special_file(f"mesh file {path}", path, MeshError)
+    if not path.is_file():
+        kind = "is a folder" if path.is_dir() else "does not exist"
+        raise MeshError(f"mesh file {path} {kind}; accepted: {_accepted_files()}")
+    loaded = _read(path)
+    return clean_mesh(loaded.vertices, loaded.faces, name=f"mesh file {path}", scale=scale)
+
+
+def clean_mesh(
+    vertices: Any, faces: Any, *, name: str = "mesh", scale: float = 1.0
+) -> trimesh.Trimesh:
+    """A checked mesh in metres: equal vertices merged, faces turned outward, float64.
+
+    vertices (V, 3): in units of `scale` metres. faces (F, 3): indices of vertices. Warns about
+    meshes that are open after merging, have bodies far apart, or have more than MANY_FACES faces.
+    Raises MeshError if there are no faces, a number is not finite, an index has no vertex, the mesh
+    is flat, or its size in metres is not that of an object.
+    """
+    import trimesh
+
+    require_positive("mesh scale", scale)
+    vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
+    faces = frozen(f"{name}: faces", faces, (None, 3), dtype=np.int64, error=MeshError)
+    _check_faces(name, len(vertices), faces)
+    if len(faces) > MANY_FACES:
+        seconds = len(faces) * _SECONDS_PER_FACE
+        warnings.warn(
+            f"{name} has {len(faces):,} faces: making its signed distance grid takes "
+            f"{seconds:.0f} s or more; a decimated mesh of {ENOUGH_FACES:,} faces is as good",
+            stacklevel=2,
+        )
+    _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale)
+
+    # Without textures and normals, whose seams would keep vertices apart.
+    mesh = trimesh.Trimesh(vertices * scale, faces, process=False)
+    mesh.merge_vertices()
+    a, b, c = mesh.faces.T
+    mesh.update_faces((a != b) & (b != c) & (c != a))  # merging may collapse faces
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) == 0:
+        raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
+    _turn_outward(mesh)
+    if not mesh.is_watertight:
+        text = (
+            f"{name} is open even after merging its vertices; the winding number decides what is "
+            "inside, which is inexact near the holes"
+        )
+        warnings.warn(MeshWarning("open_mesh", text), stacklevel=2)
+    for warning in check_bodies(mesh, name):
+        warnings.warn(warning, stacklevel=2)
+    return mesh
+
+
+def mesh_digest(mesh: trimesh.Trimesh) -> str:
+    """Digest of a mesh: of its vertices as float64 and its faces as int64."""
+    return digest(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
 def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
-    """A warning if bodies of a mesh (metres) are too far from one another for a single object.
+    """A warning if bodies of a mesh (metres) are too far apart for a single object.
 
-    The distance between two bodies is that of the boxes around them, and bodies that are near to
-    one another count as one.
+    The distance between two bodies is that of the boxes around them; near bodies count as one.
     """
     lower, upper = _boxes(mesh)
     apart = np.maximum(np.maximum(lower[:, None] - upper, lower - upper[:, None]), 0.0)
@@ -43,7 +115,7 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
 
 
 def _boxes(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corners (bodies, 3) of the boxes around what faces connect, largest first."""
+    """Lower and upper corners (bodies, 3) of the boxes of connected faces, largest first."""
     a, b, c = np.asarray(mesh.faces).T
     edges = np.concatenate([a, b]), np.concatenate([b, c])
     count = len(mesh.vertices)
@@ -56,85 +128,8 @@ def _boxes(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
     return lower[largest_first], upper[largest_first]
 
 
-SMALLEST = 0.005  # m: the largest extent of anything that a gripper probes is above this
-LARGEST = 10.0  # m: above this, a file is in millimetres rather than metres
-MANY_FACES = 200_000  # above this, a mesh takes its time
-ENOUGH_FACES = 50_000  # of an object that a hand holds: sides of 1 mm
-_SECONDS_PER_FACE = 1.5e-5  # of a core: merging vertices, and a grid of 60 000 nodes
-_NOT_MESHES = {"bz2", "dxf", "stl_ascii", "svg", "tar.bz2", "tar.gz", "xyz", "zip"}
-
-
-def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
-    """The mesh in a file of any kind that trimesh reads, ready to be measured against.
-
-    Scenes are joined to one mesh. `scale` multiplies the file's units into metres. Otherwise, and
-    in the errors raised, as `clean_mesh`; MeshError also if the file is not found or not readable.
-    """
-    if not isinstance(path, str | Path):
-        raise MeshError(f"mesh file is {quoted(path)}; accepted: the path of a file")
-    path = Path(path).expanduser()
-    refuse_special_file(f"mesh file {path}", path, MeshError)
-    if not path.is_file():
-        kind = "is a folder" if path.is_dir() else "does not exist"
-        raise MeshError(f"mesh file {path} {kind}; accepted: {_accepted_files()}")
-    loaded = _read(path)
-    return clean_mesh(loaded.vertices, loaded.faces, name=f"mesh file {path}", scale=scale)
-
-
-def clean_mesh(
-    vertices: Any, faces: Any, *, name: str = "mesh", scale: float = 1.0
-) -> trimesh.Trimesh:
-    """A checked mesh in metres: vertices merged, faces turned outward, float64.
-
-    vertices (V, 3) in the file's units; faces (F, 3) indices into them. Vertices at one place
-    become one. A mesh that is still open is kept with a MeshWarning: the winding number decides
-    what is inside it. So is one of bodies that are far apart, and one of more than MANY_FACES
-    faces, of which the warning says what it costs. Raises MeshError if there are no faces, a number
-    is not finite, an index has no vertex, the mesh is flat, or its size in metres is not that of an
-    object.
-    """
-    import trimesh
-
-    require_positive("mesh scale", scale)
-    vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
-    faces = frozen(f"{name}: faces", faces, (None, 3), dtype=np.int64, error=MeshError)
-    _check_faces(name, len(vertices), faces)
-    if len(faces) > MANY_FACES:
-        seconds = len(faces) * _SECONDS_PER_FACE
-        warnings.warn(
-            f"{name} has {len(faces):,} faces: making its signed distance grid takes "
-            f"{seconds:.0f} s or more; a decimated mesh of {ENOUGH_FACES:,} faces is as good",
-            stacklevel=2,
-        )
-    _check_size(name, np.ptp(vertices[np.unique(faces)], axis=0) * scale)
-
-    # Only positions are taken over, so seams of texture or normals keep no vertices apart.
-    mesh = trimesh.Trimesh(vertices * scale, faces, process=False)
-    mesh.merge_vertices()
-    a, b, c = mesh.faces.T
-    mesh.update_faces((a != b) & (b != c) & (c != a))  # what merging collapsed to a line
-    mesh.remove_unreferenced_vertices()
-    if len(mesh.faces) == 0:
-        raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
-    _turn_outward(mesh)
-    if not mesh.is_watertight:
-        text = (
-            f"{name} is open even after merging its vertices; the winding number decides what is "
-            "inside, which is inexact near the holes"
-        )
-        warnings.warn(MeshWarning("open_mesh", text), stacklevel=2)
-    for warning in check_bodies(mesh, name):
-        warnings.warn(warning, stacklevel=2)
-    return mesh
-
-
-def mesh_digest(mesh: trimesh.Trimesh) -> str:
-    """A name for the exact content of a mesh: of its vertices as float64 and its faces as int64."""
-    return digest(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
-
-
 def _read(path: Path) -> trimesh.Trimesh:
-    """The file as one mesh, as it stands in the file."""
+    """The content of a file as one mesh, unchecked."""
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
@@ -145,9 +140,10 @@ def _read(path: Path) -> trimesh.Trimesh:
         loaded = trimesh.load(
             str(path), file_type=kind, force="mesh", process=False, skip_materials=True
         )
-    except Exception as error:  # readers of damaged files raise whatever they stumble over
-        missing = isinstance(error, ImportError)  # only the guess at a text's encoding needs more
-        reason = "it is damaged" if missing else " ".join(str(error).split())
+    except Exception as error:  # readers raise all kinds of errors on damaged files
+        # An ImportError comes from guessing the encoding of a text that is not one.
+        damaged = isinstance(error, ImportError)
+        reason = "it is damaged" if damaged else " ".join(str(error).split())
         raise MeshError(
             f"mesh file {path} cannot be read as .{kind}: {reason}; accepted: {_accepted_files()}"
         ) from error
@@ -184,7 +180,7 @@ def _check_size(name: str, extents: np.ndarray) -> None:
 
 
 def _turn_outward(mesh: trimesh.Trimesh) -> None:
-    """Make neighbouring faces agree, and the volume of a closed mesh positive."""
+    """Make the winding of faces consistent, and the volume of a closed mesh positive."""
     import trimesh
 
     if not mesh.is_winding_consistent:

@@ -1,4 +1,4 @@
-"""What touch and sight have told: free, occupied and known-SDF points in the world."""
+"""What touch and sight have shown: free, occupied and known-SDF points in the world."""
 
 from __future__ import annotations
 
@@ -21,17 +21,15 @@ def _no_points() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class KnownPoints:
-    """Known points in world coordinates, in metres (CHSEL, Sec. III: the sets of semantics).
+    """Known points in world coordinates, metres, by their semantics (CHSEL, Sec. III).
 
-    free (N, 3): outside of the object. occupied (K, 3): inside of it. known (M, 3): points whose
-    signed distance to the surface is known to be known_sdf (M,), 0 for contacts.
     Raises PointsError for wrong shapes and values that are not finite.
     """
 
-    free: FloatArray = field(default_factory=_no_points)
-    occupied: FloatArray = field(default_factory=_no_points)
-    known: FloatArray = field(default_factory=_no_points)
-    known_sdf: FloatArray | None = None
+    free: FloatArray = field(default_factory=_no_points)  # (N, 3), outside of the object
+    occupied: FloatArray = field(default_factory=_no_points)  # (K, 3), inside of it
+    known: FloatArray = field(default_factory=_no_points)  # (M, 3), of known signed distance
+    known_sdf: FloatArray | None = None  # (M,), that distance; None: 0 for all, contacts
 
     def __post_init__(self) -> None:
         for name in ("free", "occupied", "known"):
@@ -52,12 +50,12 @@ class KnownPoints:
 
     @property
     def count(self) -> int:
-        """How many points there are in all classes."""
+        """Number of points in all classes."""
         return len(self.free) + len(self.occupied) + len(self.known)
 
     @property
     def contacts(self) -> FloatArray:
-        """The known points on the surface, those of signed distance 0 (M', 3)."""
+        """The known points on the surface, with signed distance 0 (M', 3)."""
         return self.known[self.sdf == 0.0]
 
     @cached_property
@@ -83,19 +81,20 @@ class KnownPoints:
 
 
 class GrowingPoints:
-    """The known points of a session so far: copied only when all are asked for.
-
-    free, occupied, known, contacts: how many there are, without a copy.
-    """
+    """The known points of a session so far, joined only when all are asked for."""
 
     def __init__(self, initial: KnownPoints) -> None:
-        self._parts = [initial]
-        self._counts = _counts(initial)
+        self.free = self.occupied = self.known = self.contacts = 0  # numbers of points
+        self._parts: list[KnownPoints] = []
+        self.add(initial)
 
     def add(self, new: KnownPoints) -> None:
-        """New points follow those so far."""
+        """Append new points."""
         self._parts.append(new)
-        self._counts = self._counts + _counts(new)
+        self.free += len(new.free)
+        self.occupied += len(new.occupied)
+        self.known += len(new.known)
+        self.contacts += len(new.contacts)
 
     def all(self) -> KnownPoints:
         """All points so far; the same value until more are added."""
@@ -104,39 +103,16 @@ class GrowingPoints:
         return self._parts[0]
 
     @property
-    def free(self) -> int:
-        return int(self._counts[0])
-
-    @property
-    def occupied(self) -> int:
-        return int(self._counts[1])
-
-    @property
-    def known(self) -> int:
-        return int(self._counts[2])
-
-    @property
-    def contacts(self) -> int:
-        return int(self._counts[3])
-
-    @property
     def count(self) -> int:
-        """How many points there are in all classes."""
+        """Number of points in all classes."""
         return self.free + self.occupied + self.known
-
-
-def _counts(points: KnownPoints) -> np.ndarray:
-    """Numbers of points (4,): free, occupied, known, contacts."""
-    return np.array(
-        [len(points.free), len(points.occupied), len(points.known), len(points.contacts)]
-    )
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """The box of the world in which the object must be: lower and upper corner (3,), metres."""
+    """The box of the world in which the object must be."""
 
-    lower: tuple[float, float, float]
+    lower: tuple[float, float, float]  # corners, metres
     upper: tuple[float, float, float]
 
     def __post_init__(self) -> None:
@@ -163,10 +139,10 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Lattice:
-    """A regular lattice of voxel centres: origin (3,) plus whole multiples of `spacing` metres."""
+    """A regular lattice of voxel centres: the origin plus integer multiples of the spacing."""
 
-    origin: tuple[float, float, float]
-    spacing: float
+    origin: tuple[float, float, float]  # metres
+    spacing: float  # metres
 
     def __post_init__(self) -> None:
         require_positive("voxel spacing", self.spacing)
@@ -181,14 +157,14 @@ class Lattice:
 
 
 class FreeVoxels:
-    """Free space met so far, one point a voxel (the density cap of CHSEL, Sec. IV-B)."""
+    """Free space so far, one point per voxel (the density cap of CHSEL, Sec. IV-B)."""
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
         self._seen: set[tuple[int, int, int]] = set()
 
     def add(self, points: FloatArray) -> FloatArray:
-        """Mark the voxels of points (N, 3); centres (N', 3) of those new, in order of index."""
+        """Add the voxels of points (N, 3); return the centres (N', 3) of new ones by index."""
         voxels = np.unique(self.lattice.voxels(np.asarray(points, float).reshape(-1, 3)), axis=0)
         new = [voxel for voxel in map(tuple, voxels.tolist()) if voxel not in self._seen]
         self._seen.update(new)

@@ -1,4 +1,4 @@
-"""Rigid transforms and rotations: matrices, quaternions, the 9-D vectors of CHSEL."""
+"""Poses and rigid transforms, then rotations, then quaternions, then the same in torch."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 RIGID_TOLERANCE = 1e-6
+SENSOR_TOLERANCE = 1e-3  # of poses from files and sensors, which are often rounded
+_SMALL = 1e-6  # radians, below which a straight line is as good as an arc
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,7 @@ class Poses:
 
     @classmethod
     def of(cls, object_from_world: Any) -> Poses:
-        """The poses of transforms (B, 4, 4), finite or not; PoseError for another shape."""
+        """The poses of transforms (B, 4, 4), finite or not. Raises PoseError for another shape."""
         transforms = stacked(object_from_world)
         rotations = transforms[:, :3, :3].reshape(-1, 9)
         return cls(np.concatenate([rotations, transforms[:, :3, 3]], axis=1))
@@ -86,7 +88,7 @@ class Poses:
 
 
 def stacked(object_from_world: Any) -> FloatArray:
-    """Transforms (B, 4, 4) as numbers, finite or not; PoseError for another shape."""
+    """Transforms (B, 4, 4) as an array, finite or not. Raises PoseError for another shape."""
     transforms = np.asarray(object_from_world, dtype=np.float64)
     if transforms.ndim != 3 or transforms.shape[1:] != (4, 4):
         raise PoseError(
@@ -111,11 +113,11 @@ def check_rigid(name: str, transforms: FloatArray, tolerance: float = RIGID_TOLE
 
 
 def nearest_rigid(name: str, transforms: FloatArray) -> FloatArray:
-    """Transforms (B, 4, 4) with rotations made exact, as numbers from a file are often rounded.
+    """Transforms (B, 4, 4) with the nearest exact rotations, for numbers rounded in a file.
 
     Raises PoseError unless they are rigid within 1e-3.
     """
-    check_rigid(name, transforms, 1e-3)
+    check_rigid(name, transforms, SENSOR_TOLERANCE)
     left, _, right = np.linalg.svd(transforms[:, :3, :3])
     return compose(left @ right, transforms[:, :3, 3])
 
@@ -127,20 +129,6 @@ def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     transforms[..., :3, 3] = translation
     transforms[..., 3, 3] = 1.0
     return transforms
-
-
-def product(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Matrix products (..., 3, 3) of (..., 3, 3), each sum in the order of its index."""
-    total = left[..., :, 0, None] * right[..., None, 0, :]
-    total = total + left[..., :, 1, None] * right[..., None, 1, :]
-    return total + left[..., :, 2, None] * right[..., None, 2, :]
-
-
-def rotated(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (..., 3) turned by rotations (..., 3, 3), each sum in the order of its index."""
-    total = rotation[..., 0] * vectors[..., 0, None]
-    total = total + rotation[..., 1] * vectors[..., 1, None]
-    return total + rotation[..., 2] * vectors[..., 2, None]
 
 
 def inverse(transforms: FloatArray) -> FloatArray:
@@ -155,15 +143,42 @@ def apply(transforms: FloatArray, points: FloatArray) -> FloatArray:
     return moved + transforms[..., None, :3, 3]
 
 
+def interpolated(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Transforms (N, 4, 4) at fractions (N,) of the way from first to second (N, 4, 4)."""
+    t = np.asarray(fraction, dtype=np.float64)[:, None]
+    position = (1.0 - t) * first[:, :3, 3] + t * second[:, :3, 3]
+    turned = slerp(quaternions(first[:, :3, :3]), quaternions(second[:, :3, :3]), fraction)
+    return compose(rotation_matrices(turned), position)
+
+
+def product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Matrix products (..., 3, 3) of (..., 3, 3), each sum in the order of its index."""
+    total = left[..., :, 0, None] * right[..., None, 0, :]
+    total = total + left[..., :, 1, None] * right[..., None, 1, :]
+    return total + left[..., :, 2, None] * right[..., None, 2, :]
+
+
+def rotated(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 3) multiplied by rotations (..., 3, 3), each sum in the order of its index."""
+    total = rotation[..., 0] * vectors[..., 0, None]
+    total = total + rotation[..., 1] * vectors[..., 1, None]
+    return total + rotation[..., 2] * vectors[..., 2, None]
+
+
 def axis_angle(axis: FloatArray, angle: FloatArray | float) -> FloatArray:
     """Rotations (..., 3, 3) about unit axes (..., 3) by angles (...) in radians (Rodrigues)."""
     sine, cosine = (values[..., None, None] for values in sines_cosines(angle))
-    hat = np.zeros((*axis.shape[:-1], 3, 3))
-    hat[..., 0, 1], hat[..., 0, 2] = -axis[..., 2], axis[..., 1]
-    hat[..., 1, 0], hat[..., 1, 2] = axis[..., 2], -axis[..., 0]
-    hat[..., 2, 0], hat[..., 2, 1] = -axis[..., 1], axis[..., 0]
     outer = axis[..., :, None] * axis[..., None, :]
-    return cosine * np.eye(3) + sine * hat + (1.0 - cosine) * outer
+    return cosine * np.eye(3) + sine * hat(axis) + (1.0 - cosine) * outer
+
+
+def hat(vectors: FloatArray) -> FloatArray:
+    """The matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    matrices = np.zeros((*vectors.shape, 3))
+    matrices[..., 0, 1], matrices[..., 0, 2] = -vectors[..., 2], vectors[..., 1]
+    matrices[..., 1, 0], matrices[..., 1, 2] = vectors[..., 2], -vectors[..., 0]
+    matrices[..., 2, 0], matrices[..., 2, 1] = -vectors[..., 1], vectors[..., 0]
+    return matrices
 
 
 def roll_pitch_yaw(angles: FloatArray) -> FloatArray:
@@ -184,82 +199,27 @@ def random_rotations(stream: np.random.Generator, count: int) -> FloatArray:
     """Rotations (count, 3, 3), uniform on SO(3): normalised Gaussian quaternions."""
     drawn = normals(stream, (count, 4))  # w x y z
     unit = drawn / np.sqrt((drawn**2).sum(axis=1, keepdims=True))
-    return rotations(unit[:, [1, 2, 3, 0]])
+    return rotation_matrices(unit[:, [1, 2, 3, 0]])
 
 
 def rotation_angle(rotation: FloatArray) -> FloatArray:
-    """Angle in radians of rotations (..., 3, 3), in [0, pi], exact for small angles too."""
+    """Angles (...) in radians of rotations (..., 3, 3), in [0, pi], accurate for small ones too."""
     trace = np.trace(rotation, axis1=-2, axis2=-1)
     return arctangents(np.sqrt((twice_sine_axis(rotation) ** 2).sum(axis=-1)), trace - 1.0)
 
 
 def twice_sine_axis(rotation: FloatArray) -> FloatArray:
     """2 sin(angle) axis (..., 3) of rotations (..., 3, 3): their skew part."""
-    return np.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        axis=-1,
-    )
-
-
-def decode_6d(rows: Tensor) -> Tensor:
-    """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
-    import torch
-
-    first, second = rows[:, 0:3], rows[:, 3:6]
-    b1 = first / _length(first)
-    b2 = second - _dot(b1, second) * b1
-    b2 = b2 / _length(b2)
-    b3 = torch.stack(
-        [
-            b1[:, 1] * b2[:, 2] - b1[:, 2] * b2[:, 1],
-            b1[:, 2] * b2[:, 0] - b1[:, 0] * b2[:, 2],
-            b1[:, 0] * b2[:, 1] - b1[:, 1] * b2[:, 0],
-        ],
-        dim=1,
-    )
-    return torch.stack([b1, b2, b3], dim=1)
-
-
-def _length(vectors: Tensor) -> Tensor:
-    # Kept away from 0, so that a degenerate 6-D vector decodes to finite numbers.
-
-    return _dot(vectors, vectors).sqrt().clamp_min(1e-12)
-
-
-def _dot(left: Tensor, right: Tensor) -> Tensor:
-    """Products (B, 1) of vectors (B, 3), each sum in the order of its index."""
-    products = left * right
-    return products[:, 0:1] + products[:, 1:2] + products[:, 2:3]
-
-
-def moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
-    """R x + t (..., 3) of rotations (..., 3, 3), translations (..., 3) and points (..., 3).
-
-    Written out, as a matrix product adds in an order that depends on the machine.
-    """
-    columns = [rotation[..., i] * points[..., i, None] for i in range(3)]
-    return columns[0] + columns[1] + columns[2] + translation
-
-
-def as_tensor(value: Any, device: torch.device | str = "cpu") -> Tensor:
-    """A float64 tensor that shares no memory with a read-only array."""
-    import torch
-
-    return torch.tensor(np.asarray(value), dtype=torch.float64).to(device)
-
-
-_SMALL = 1e-6  # radians, below which a straight line is as good as an arc
+    r = np.moveaxis(rotation, (-2, -1), (0, 1))
+    return np.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]], axis=-1)
 
 
 def quaternions(rotation: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4) of rotations (N, 3, 3); their sign is arbitrary.
+    """Unit quaternions (N, 4), x y z w, of rotations (N, 3, 3); their sign is arbitrary.
 
-    Each row of the outer product of a quaternion with itself is a multiple of it, and all its
-    entries follow from the rotation without a root; the row of the largest entry is the stablest.
+    Each row of the outer product of a quaternion with itself is a multiple of it, and its entries
+    follow from the rotation without a root; the row with the largest diagonal entry is used, as it
+    is the most accurate.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(rotation, 0, -1)
     outer = np.array(
@@ -276,8 +236,8 @@ def quaternions(rotation: FloatArray) -> FloatArray:
     return unit
 
 
-def rotations(quaternion: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) of unit quaternions (N, 4)."""
+def rotation_matrices(quaternion: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) of unit quaternions (N, 4), x y z w."""
     x, y, z, w = quaternion.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -288,10 +248,9 @@ def rotations(quaternion: FloatArray) -> FloatArray:
 
 
 def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Unit quaternions (N, 4) at fractions (N,) of the shorter arcs from one to the other (N, 4).
+    """Unit quaternions (N, 4) at fractions (N,) of the shorter arcs from first to second (N, 4).
 
-    q(t) = (sin((1 - t) a) p + sin(t a) q) / sin a, with the angle a between p and q or -q. The same
-    bits on every machine.
+    q(t) = (sin((1 - t) a) p + sin(t a) q) / sin a, with the angle a between p and q or -q.
     """
     t = np.asarray(fraction, dtype=np.float64)[:, None]
     second = np.where(_product(first, second) < 0.0, -second, second)
@@ -311,9 +270,51 @@ def _product(left: FloatArray, right: FloatArray) -> FloatArray:
     return ((terms[:, 0] + terms[:, 1]) + (terms[:, 2] + terms[:, 3]))[:, None]
 
 
-def interpolated(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) on the way from first to second (N, 4, 4), at fraction (N,) of it."""
-    t = np.asarray(fraction, dtype=np.float64)[:, None]
-    position = (1.0 - t) * first[:, :3, 3] + t * second[:, :3, 3]
-    turned = slerp(quaternions(first[:, :3, :3]), quaternions(second[:, :3, :3]), fraction)
-    return compose(rotations(turned), position)
+def as_tensor(value: Any, device: torch.device | str = "cpu") -> Tensor:
+    """A float64 copy of an array, on a device."""
+    import torch
+
+    return torch.tensor(np.asarray(value), dtype=torch.float64).to(device)
+
+
+def moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
+    """R x + t (..., 3) of rotations (..., 3, 3), translations (..., 3) and points (..., 3).
+
+    Written out, because a matrix product sums in an order that depends on the machine.
+    """
+    columns = [rotation[..., i] * points[..., i, None] for i in range(3)]
+    return columns[0] + columns[1] + columns[2] + translation
+
+
+def decode_6d(rows: Tensor) -> Tensor:
+    """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
+    import torch
+
+    first, second = rows[:, 0:3], rows[:, 3:6]
+    b1 = first / length(first)
+    b2 = second - _dot(b1, second) * b1
+    b2 = b2 / length(b2)
+    b3 = torch.stack(
+        [
+            b1[:, 1] * b2[:, 2] - b1[:, 2] * b2[:, 1],
+            b1[:, 2] * b2[:, 0] - b1[:, 0] * b2[:, 2],
+            b1[:, 0] * b2[:, 1] - b1[:, 1] * b2[:, 0],
+        ],
+        dim=1,
+    )
+    return torch.stack([b1, b2, b3], dim=1)
+
+
+def length(vectors: Tensor) -> Tensor:
+    """Lengths (B, 1) of vectors (B, 3), of at least 1e-12 so that they can be divided by."""
+    return squared_length(vectors).sqrt().clamp_min(1e-12)
+
+
+def squared_length(vectors: Tensor) -> Tensor:
+    """Squared lengths (B, 1) of vectors (B, 3), each sum in the order of its index."""
+    return _dot(vectors, vectors)
+
+
+def _dot(left: Tensor, right: Tensor) -> Tensor:
+    products = left * right
+    return products[:, 0:1] + products[:, 1:2] + products[:, 2:3]

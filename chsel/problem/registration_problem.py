@@ -1,4 +1,4 @@
-"""Who may watch a registration. Watching changes no bit of its result."""
+"""One registration: the problem that determines it, its result, and who may observe it."""
 
 from __future__ import annotations
 
@@ -18,24 +18,17 @@ from chsel.problem.streams import StreamKey
 
 @dataclass(frozen=True, eq=False)
 class RegistrationProblem:
-    """Everything that determines the outcome of one registration, and nothing else.
+    """Everything that determines the outcome of one registration, and nothing else."""
 
-    sdf: signed distance grid of the object, in its frame.
-    points: the known points, in the world.
-    initial_set: E_0 (B, 4, 4), object_from_world.
-    low_cost_set: E_l (L, 4, 4), object_from_world; may be empty.
-    workspace: where the object can be.
-    free_resolution: side in metres of the voxels into which free points were merged.
-    key: of the random streams.
-    """
-
-    sdf: SdfGrid
-    points: KnownPoints
-    initial_set: FloatArray
-    workspace: Workspace
-    free_resolution: float
-    key: StreamKey
-    low_cost_set: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    sdf: SdfGrid  # signed distances of the object, in its frame
+    points: KnownPoints  # in the world
+    initial_set: FloatArray  # E_0 (B, 4, 4), object_from_world
+    workspace: Workspace  # where the object can be
+    free_resolution: float  # side of the voxels into which free points were merged, metres
+    key: StreamKey  # of the random streams
+    low_cost_set: FloatArray = field(  # E_l (L, 4, 4), object_from_world; may be empty
+        default_factory=lambda: np.zeros((0, 4, 4))
+    )
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
@@ -55,7 +48,7 @@ class RegistrationProblem:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the whole problem."""
+        """Digest of the problem."""
         parts = [self.sdf.digest, self.points.digest, digest(self.initial_set, self.low_cost_set)]
         numbers = np.array([*self.workspace.lower, *self.workspace.upper, self.free_resolution])
         key = np.array([self.key.seed, self.key.step], dtype=np.uint64)
@@ -65,24 +58,18 @@ class RegistrationProblem:
 
 @dataclass(frozen=True, eq=False)
 class ArchiveSnapshot:
-    """The occupied cells of a quality-diversity archive at one moment.
+    """The occupied cells of a quality-diversity archive at one moment."""
 
-    shape (k,): cells per measure. lower, upper (k,): the range of each measure.
-    cells (C,): index of each occupied cell, row-major, last measure fastest.
-    solutions (C, d): raw search vectors. objectives (C,): minus the cost. measures (C, k).
-    measure_names (k,): what the axes are, with units. iteration: quality-diversity iterations done.
-    """
-
-    iteration: int
-    refinement: int
-    measure_names: tuple[str, ...]
-    shape: tuple[int, ...]
-    lower: FloatArray
-    upper: FloatArray
-    cells: IntArray
-    solutions: FloatArray
-    objectives: FloatArray
-    measures: FloatArray
+    iteration: int  # quality-diversity iterations done
+    refinement: int  # passes of the method before this search
+    measure_names: tuple[str, ...]  # (k,): names of the axes, with units
+    shape: tuple[int, ...]  # (k,): cells per measure
+    lower: FloatArray  # (k,): range of each measure
+    upper: FloatArray  # (k,)
+    cells: IntArray  # (C,): index of each occupied cell, row-major, last measure fastest
+    solutions: FloatArray  # (C, d): raw search vectors
+    objectives: FloatArray  # (C,): minus the cost
+    measures: FloatArray  # (C, k)
 
     @property
     def coverage(self) -> float:
@@ -102,24 +89,18 @@ class ArchiveSnapshot:
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """The result of one registration: B poses, best first.
+    """The result of one registration: B poses, best first."""
 
-    object_from_world (B, 4, 4). cost (B,): the relaxed cost of exactly these poses, ascending.
-    duplicate (B,): True for a pose that repeats an earlier one. cell (B,): the archive cell that
-    it came from, -1 for none. elites (L, 4, 4): object_from_world of all solutions kept, from
-    which the next E_l follows. archive: the last snapshot, if the method keeps an archive.
-    """
-
-    object_from_world: FloatArray
-    cost: FloatArray
-    duplicate: BoolArray
-    cell: IntArray
-    elites: FloatArray
-    archive: ArchiveSnapshot | None = None
+    object_from_world: FloatArray  # (B, 4, 4)
+    cost: FloatArray  # (B,): the relaxed cost of exactly these poses, ascending
+    duplicate: BoolArray  # (B,): whether a pose repeats an earlier one
+    cell: IntArray  # (B,): the archive cell that a pose came from, -1 for none
+    elites: FloatArray  # (L, 4, 4): object_from_world of all solutions, from which E_l follows
+    archive: ArchiveSnapshot | None = None  # the last one, if the method keeps an archive
 
     @property
     def distinct(self) -> int:
-        """How many of the poses are not repetitions."""
+        """Number of poses that are not duplicates."""
         return int((~self.duplicate).sum())
 
     @cached_property
@@ -130,18 +111,21 @@ class Hypotheses:
 
 
 class Observer(Protocol):
-    """Receives what happens within a registration; the arrays it gets are not its own to change."""
+    """Is called during a registration, without changing any bit of its result.
 
+    An observer must not modify the arrays that it receives.
+    """
+
+    # Quality-diversity iterations between archive snapshots; 0: only the first and the last.
     snapshot_interval: int
-    """Quality-diversity iterations between archive snapshots; 0 for the first and last alone."""
 
     def progress(self, stage: str, iteration: int, total: int) -> None:
         """A stage has finished `iteration` of `total` iterations."""
 
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """State of a stage at its start and after blocks of iterations: vectors, costs (B,).
+        """State of a stage at its start and after blocks of iterations.
 
-        vectors (B, d): of the search; of a quality-diversity search, all that its archive holds.
+        vectors (B, d): of the search; in quality-diversity search, of all elites. cost (B,).
         """
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:
@@ -149,7 +133,7 @@ class Observer(Protocol):
 
 
 class NullObserver:
-    """Watches nothing."""
+    """Ignores everything."""
 
     snapshot_interval = 0
 

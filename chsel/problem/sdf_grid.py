@@ -1,4 +1,4 @@
-"""Signed distance to an object: exact from a mesh, and cached on a grid."""
+"""Signed distance to an object: exact from a mesh, and sampled on a grid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from chsel.errors import MeshError, SdfError, quoted, require_choice, require_positive
 from chsel.numerics.arrays import FloatArray, IntArray, digest, frozen
-from chsel.problem.poses import as_tensor
+from chsel.problem.poses import as_tensor, length
 
 if TYPE_CHECKING:
     import torch
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 LOOKUPS = ("nearest", "trilinear")
 OUTSIDE = ("surface_point", "bounding_box")
 MAX_NODES = 50_000_000
-FINEST, COARSEST = 1e-6, 1e3  # m: of a grid's nodes, so that no node's place is lost to rounding
-FARTHEST = 1e6  # m: of a grid's first node
+FINEST, COARSEST = 1e-6, 1e3  # spacing of nodes, metres, so that rounding merges no nodes
+FARTHEST = 1e6  # coordinates of the first node, metres
 Derived = TypeVar("Derived")
-_PART_NODES = 250_000  # of a grid that are sampled at once, at least
-_PART_FACES = 5  # and one for so many faces: preparing 1.3 million costs as much as 65 000 nodes
-_NORMAL_RANGE = 1e-3  # nearer than this to the surface, the face normal is the better gradient
+_PART_NODES = 250_000  # least number of nodes that are sampled at once
+_PART_FACES = 5  # faces per node of a part: preparing 1.3 million costs as much as 65 000 nodes
+_NORMAL_RANGE = 1e-3  # metres; nearer to the surface, the face normal is the better gradient
 
 
 def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -46,39 +46,34 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     kind = igl.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
     signed, face, closest = igl.signed_distance(queries, vertices, faces, sign_type=kind)[:3]
     away = np.where(signed[:, None] < 0.0, closest - queries, queries - closest)
-    length = np.sqrt((away**2).sum(axis=1))
-    near = length < _NORMAL_RANGE
-    gradient = away / np.where(near, 1.0, length)[:, None]
+    distance = np.sqrt((away**2).sum(axis=1))
+    near = distance < _NORMAL_RANGE
+    gradient = away / np.where(near, 1.0, distance)[:, None]
     gradient[near] = _face_normals(vertices, faces[face[near]])
     return np.asarray(signed, dtype=np.float64), gradient
 
 
 class _Tensors(NamedTuple):
-    """A grid on a device: corners (3,), the last lowest node of eight (3,), values and gradients.
+    """A grid on a device."""
 
-    values (nodes,), gradients (nodes, 3).
-    """
-
-    first: Tensor
-    last: Tensor
-    top: Tensor
-    values: Tensor
-    gradients: Tensor
+    first: Tensor  # (3,): first node, metres
+    last: Tensor  # (3,): last node, metres
+    top: Tensor  # (3,): indices of the last node that is the lowest of eight
+    values: Tensor  # (nodes,), metres
+    gradients: Tensor  # (nodes, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class SdfGrid:
     """Signed distances and their gradients at the nodes of a regular grid in the object frame.
 
-    origin (3,): first node, metres. resolution: node spacing, metres. values (nx, ny, nz): signed
-    distance in metres, negative inside. gradients (nx, ny, nz, 3): unit gradients.
     Raises SdfError if a shape is wrong, a value is not finite, or a node of the border is inside.
     """
 
-    origin: FloatArray
-    resolution: float
-    values: FloatArray
-    gradients: FloatArray
+    origin: FloatArray  # (3,): first node, metres
+    resolution: float  # node spacing, metres
+    values: FloatArray  # (nx, ny, nz): signed distance in metres, negative inside
+    gradients: FloatArray  # (nx, ny, nz, 3): unit gradients
 
     def __post_init__(self) -> None:
         require_positive("SDF resolution", self.resolution)
@@ -110,9 +105,9 @@ class SdfGrid:
     ) -> SdfGrid:
         """Sample the exact signed distance of a mesh over its padded bounding box.
 
-        Values are rounded to 32 bits (nanometres), which halves what a recording holds.
-        progress: called with the number of nodes done and of all, before each part of a large
-        grid; it changes no bit.
+        Values are rounded to 32 bits (nanometres), which halves the size in recordings.
+        progress: called before each part of a large grid with the number of nodes done and of all
+        nodes; it changes no bit.
         """
         import trimesh
 
@@ -169,18 +164,18 @@ class SdfGrid:
         return np.concatenate([self.values[..., None], self.gradients], axis=-1).reshape(-1, 4)
 
     def derived(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
-        """What `make` makes of this grid, kept under a key for as long as the grid lives."""
+        """The value of `make()`, kept under a key for as long as the grid lives."""
         if key not in self._derived:
             self._derived[key] = make()
-        made: Derived = self._derived[key]
-        return made
+        value: Derived = self._derived[key]
+        return value
 
     @cached_property
     def _derived(self) -> dict[Hashable, Any]:
         return {}
 
     def active_cells(self, level: float, lookup: str) -> Tensor:
-        """Flags of the cells, as `cells` counts them, that read any value below `level`."""
+        """Flags of the cells, numbered as by `cells`, that read any value below `level`."""
         import torch
 
         below = self.values < level
@@ -194,7 +189,7 @@ class SdfGrid:
         return torch.from_numpy(below.reshape(-1).copy())
 
     def cells(self, points: Tensor, lookup: str) -> Tensor:
-        """Flat index (P,) of what points (P, 3) within the grid read.
+        """Flat index (P,) of the nodes that points (P, 3) within the grid read.
 
         The nearest node for lookup "nearest", the lowest of eight nodes for "trilinear".
         """
@@ -202,7 +197,7 @@ class SdfGrid:
         return self._flat(cell.round() if lookup == "nearest" else self._base(cell))
 
     def clamped(self, points: Tensor) -> Tensor:
-        """The points of the grid's box (P, 3) nearest to points (P, 3); no nan stays one."""
+        """The points of the grid's box (P, 3) nearest to points (P, 3), never NaN."""
         grid = self._on(points.device)
         return points.fmax(grid.first).fmin(grid.last)
 
@@ -212,12 +207,13 @@ class SdfGrid:
 
     def _on(self, device: torch.device) -> _Tensors:
         """The grid on a device, where it stays."""
-        return self.derived(("tensors", device), lambda: self._made_on(device))
 
-    def _made_on(self, device: torch.device) -> _Tensors:
-        tables = self.values.reshape(-1), self.gradients.reshape(-1, 3)
-        parts = (*self.bounds, np.array(self.shape) - 2.0, *tables)
-        return _Tensors(*(as_tensor(part, device) for part in parts))
+        def make() -> _Tensors:
+            tables = self.values.reshape(-1), self.gradients.reshape(-1, 3)
+            parts = (*self.bounds, np.array(self.shape) - 2.0, *tables)
+            return _Tensors(*(as_tensor(part, device) for part in parts))
+
+        return self.derived(("tensors", device), make)
 
     def query(
         self, points: Any, *, lookup: str = "nearest", outside: str = "surface_point"
@@ -226,7 +222,7 @@ class SdfGrid:
 
         lookup "nearest" takes the nearest node, ties to even (CHSEL, Sec. IV-B); "trilinear"
         interpolates values and gradients. Outside of the grid, "surface_point" returns the
-        distance to the surface point closest to the nearest point of the grid, an upper bound;
+        distance to the surface point closest to the grid's nearest point, an upper bound;
         "bounding_box" returns the distance to the grid's box.
         """
         import torch
@@ -243,11 +239,11 @@ class SdfGrid:
             return value, gradient
         away = points[beyond] - clamped[beyond]
         if outside == "surface_point":
-            unit = gradient[beyond] / _length(gradient[beyond])
+            unit = gradient[beyond] / length(gradient[beyond])
             away = away + value[beyond, None] * unit
-        length = _length(away)
-        value[beyond] = length[:, 0]
-        gradient[beyond] = away / length
+        distance = length(away)
+        value[beyond] = distance[:, 0]
+        gradient[beyond] = away / distance
         return value, gradient
 
     def _nearest(self, cell: Tensor) -> tuple[Tensor, Tensor]:
@@ -277,7 +273,7 @@ class SdfGrid:
 
 
 def _parts(nodes: FloatArray, face_count: int) -> list[FloatArray]:
-    """The nodes (N, 3) in parts, each so large that preparing the mesh anew costs little of it."""
+    """The nodes (N, 3) in parts, so large that preparing the mesh for each costs little."""
     size = max(_PART_NODES, face_count // _PART_FACES)
     return [nodes[first : first + size] for first in range(0, len(nodes), size)]
 
@@ -288,26 +284,16 @@ def _check_resolution(resolution: float) -> None:
 
 
 def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals (F, 3) from positions alone: a mesh may carry others from its file."""
+    """Unit normals (F, 3) computed from positions: those in a mesh file may differ."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
     return normal / np.maximum(np.sqrt((normal**2).sum(axis=1, keepdims=True)), 1e-300)
 
 
 def _rounded(values: FloatArray) -> FloatArray:
-    return values.astype(np.float32).astype(np.float64) + 0.0  # and no negative zeros
+    return values.astype(np.float32).astype(np.float64) + 0.0  # without negative zeros
 
 
 def _border(values: FloatArray) -> list[FloatArray]:
     """The six faces of a grid."""
     return [np.take(values, end, axis=axis) for axis in range(3) for end in (0, -1)]
-
-
-def squared_length(vectors: Tensor) -> Tensor:
-    """Squared lengths (P, 1) of vectors (P, 3), each sum in the order of its index."""
-    squares = vectors * vectors
-    return squares[:, 0:1] + squares[:, 1:2] + squares[:, 2:3]
-
-
-def _length(vectors: Tensor) -> Tensor:
-    return squared_length(vectors).sqrt().clamp_min(1e-12)

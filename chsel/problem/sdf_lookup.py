@@ -1,4 +1,4 @@
-"""The signed distance grid, as the inner loops read it."""
+"""Signed distances and gradients as kernels read them from a grid."""
 
 from __future__ import annotations
 
@@ -12,24 +12,20 @@ from chsel.numerics.compiler import leaf
 from chsel.problem.sdf_grid import SdfGrid
 
 
-class Field(NamedTuple):
-    """Signed distances and gradients at the nodes of a grid.
-
-    table (nodes, 4): value and gradient of each node. trilinear: interpolate, else read the
-    nearest node. box_distance: how distances continue outside, see SdfGrid.query.
-    """
+class DistanceField(NamedTuple):
+    """Signed distances and gradients at the nodes of a grid."""
 
     box: Box
-    table: FloatArray
-    trilinear: bool
-    box_distance: bool
+    table: FloatArray  # (nodes, 4): value and gradient of each node
+    trilinear: bool  # interpolate, else read the nearest node
+    box_distance: bool  # how distances continue outside of the grid, see SdfGrid.query
 
 
-def field_of(sdf: SdfGrid, lookup: str, outside: str) -> Field:
-    """The field of a signed distance grid."""
+def distance_field(sdf: SdfGrid, lookup: str, outside: str) -> DistanceField:
+    """The signed distance field that kernels read; lookup, outside: see SdfGrid.query."""
     trilinear = lookup == "trilinear"
     box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
-    return Field(box, sdf.table, trilinear, outside == "bounding_box")
+    return DistanceField(box, sdf.table, trilinear, outside == "bounding_box")
 
 
 def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
@@ -44,17 +40,18 @@ def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
 
 
 @leaf
-def sample(trilinear, box, table, places, n):
-    """Signed distance and its gradient (s, n_x, n_y, n_z) at a place in the box."""
+def distance_in_box(trilinear, box, table, places, n):
+    """Signed distance and gradient (s, n_x, n_y, n_z) at place n, which is in the box."""
     if trilinear:
-        return interpolated(box, table, places.cell[n], places.u[n], places.v[n], places.w[n])
+        u, v, w = places.u[n], places.v[n], places.w[n]
+        return distance_between_nodes(box, table, places.cell[n], u, v, w)
     at = places.cell[n]
     return table[at, 0], table[at, 1], table[at, 2], table[at, 3]
 
 
 @leaf
-def interpolated(box, table, base, u, v, w):
-    """The same in the cell of the node `base`, at u, v, w of its sides."""
+def distance_between_nodes(box, table, base, u, v, w):
+    """The same in the cell whose lowest node is `base`, at fractions u, v, w of its sides."""
     across, along = int(box.across), int(box.along)
     s = nx = ny = nz = 0.0
     for corner in range(8):
@@ -69,8 +66,8 @@ def interpolated(box, table, base, u, v, w):
 
 
 @leaf
-def continued(box_distance, box, inside, x, y, z):
-    """The same at a point beyond the box, from that at the point of the box nearest to it."""
+def distance_beyond_box(box_distance, box, inside, x, y, z):
+    """The same at a point x, y, z outside, from `inside` at the nearest point of the box."""
     s, nx, ny, nz = inside
     first, last = box.first, box.last
     ax = x - min(max(x, first[0]), last[0])
@@ -87,13 +84,13 @@ def continued(box_distance, box, inside, x, y, z):
 
 @leaf
 def distance_at(field, pose, x, y, z):
-    """Signed distance at a world point, interpolated."""
+    """Interpolated signed distance at a world point."""
     return distance_with_gradient(field, pose, x, y, z)[0]
 
 
 @leaf
 def distance_with_gradient(field, pose, x, y, z):
-    """Signed distance and its gradient (s, n_x, n_y, n_z) at a world point, interpolated."""
+    """Interpolated signed distance and gradient (s, n_x, n_y, n_z) at a world point."""
     box, table = field.box, field.table
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     a = pose[0] * x + pose[1] * y + pose[2] * z + pose[9]
@@ -109,16 +106,16 @@ def distance_with_gradient(field, pose, x, y, z):
     u, v, w = u - i, v - j, w - k
     across, along = int(box.across), int(box.along)
     at = int(i) * across + int(j) * along + int(k)
-    s = value_in_cell(table, at, across, along, u, v, w)
-    _, nx, ny, nz = interpolated(box, table, at, u, v, w)
+    s = value_between_nodes(table, at, across, along, u, v, w)
+    _, nx, ny, nz = distance_between_nodes(box, table, at, u, v, w)
     if a != d or b != e or c != f:
-        s, nx, ny, nz = continued(field.box_distance, box, (s, nx, ny, nz), a, b, c)
+        s, nx, ny, nz = distance_beyond_box(field.box_distance, box, (s, nx, ny, nz), a, b, c)
     return s, nx, ny, nz
 
 
 @leaf
-def value_in_cell(table, at, across, along, u, v, w):
-    """Signed distance in the cell `at`, at u, v, w of its sides."""
+def value_between_nodes(table, at, across, along, u, v, w):
+    """Signed distance in the cell whose lowest node is `at`, at fractions u, v, w of its sides."""
     low, high = 1.0 - w, w
     a = low * table[at, 0] + high * table[at + 1, 0]
     b = low * table[at + along, 0] + high * table[at + along + 1, 0]

@@ -18,6 +18,7 @@ from chsel.problem.poses import (
     Poses,
     as_tensor,
     decode_6d,
+    hat,
     product,
     rotated,
     rotation_vector,
@@ -30,14 +31,14 @@ if TYPE_CHECKING:
 
 
 class SearchSpace(ABC):
-    """Vectors x (B, d) that stand for poses."""
+    """Vectors x (B, d) that represent poses."""
 
     dimension: int  # d
-    arrays: SpaceConstants  # as the kernels take it
+    arrays: SpaceConstants  # for kernels
 
     @abstractmethod
     def encode(self, poses: Poses) -> FloatArray:
-        """Vectors (B, d) of poses; the nearest ones if the space is smaller."""
+        """Vectors (B, d) of poses, or of the nearest poses in the space."""
 
     @abstractmethod
     def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,16 +70,15 @@ class SE3Space(SearchSpace):
 class PlaneSettings:
     """An object that stands on a plane and only turns and slides on it.
 
-    axis: normal of the plane in the object's frame when the object rests (unit vector after
-    normalisation). resting_rotation: rotation vector of object_from_world at rest, radians,
-    for an object that lies on its side. plane_height: of the plane above the world's origin along
-    its normal, metres; or offset: axis . t of object_from_world, metres. Give one of the two.
+    Either plane_height or offset is required, and not both.
     """
 
+    # Normal of the plane in the frame of the resting object; it is normalised.
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    # R_0 of an object that does not stand upright: rotation vector of object_from_world, radians.
     resting_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    plane_height: float | None = None
-    offset: float | None = None
+    plane_height: float | None = None  # above the world's origin along the normal, metres
+    offset: float | None = None  # o = axis . t of object_from_world, metres
 
     def __post_init__(self) -> None:
         axis = frozen("plane.axis", self.axis, (3,), error=SettingError)
@@ -94,7 +94,8 @@ class SE2Space(SearchSpace):
     dimension = 3
 
     def __init__(self, settings: PlaneSettings, sdf: SdfGrid) -> None:
-        axis = np.array(settings.axis) / np.sqrt((np.array(settings.axis) ** 2).sum())
+        axis = np.array(settings.axis)
+        axis = axis / np.sqrt((axis**2).sum())
         along_z = abs(abs(axis[2]) - 1.0) < 1e-9
         other = np.array([0.0, -1.0, 0.0]) if along_z else np.array([0.0, 0.0, -1.0])
         e_u = np.cross(axis, other)
@@ -106,27 +107,23 @@ class SE2Space(SearchSpace):
         self.axis, self.e_u, self.e_v = axis, e_u, np.cross(axis, e_u)
         self.offset = offset
         self.resting_rotation = rotation_vector(np.array(settings.resting_rotation))
-        self._axis, self._rest = as_tensor(axis), as_tensor(self.resting_rotation)
-        self._e_u, self._e_v = as_tensor(e_u), as_tensor(self.e_v)
-        x, y, z = axis
-        self._hat = as_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        self._hat_squared = as_tensor(np.outer(axis, axis) - np.eye(3))
-        turning = product(self._hat.numpy(), self.resting_rotation)
-        turning_squared = product(self._hat_squared.numpy(), self.resting_rotation)
+        hat_squared = np.outer(axis, axis) - np.eye(3)
+        constants = hat(axis), hat_squared, self.resting_rotation, e_u, self.e_v, axis
+        self._tensors = [as_tensor(constant) for constant in constants]
         self.arrays = SpaceConstants(
             planar=True,
             axis=triple(axis),
             e_u=triple(e_u),
             e_v=triple(self.e_v),
             resting=matrix_of(self.resting_rotation),
-            turning=matrix_of(turning),
-            turning_squared=matrix_of(turning_squared),
+            turning=matrix_of(product(hat(axis), self.resting_rotation)),
+            turning_squared=matrix_of(product(hat_squared, self.resting_rotation)),
             offset=float(offset),
         )
 
     @property
     def upward(self) -> FloatArray:
-        """The plane's axis in the world (3,): R^T a, the same for every pose."""
+        """The plane's normal in the world (3,): R^T a, the same for every pose."""
         return (self.resting_rotation * self.axis[:, None]).sum(axis=0)
 
     def encode(self, poses: Poses) -> FloatArray:
@@ -143,14 +140,11 @@ class SE2Space(SearchSpace):
         import torch
 
         device = vectors.device
-        hat, hat_squared, rest = (
-            part.to(device) for part in (self._hat, self._hat_squared, self._rest)
-        )
-        e_u, e_v, axis = (part.to(device) for part in (self._e_u, self._e_v, self._axis))
+        turn, turn_squared, rest, e_u, e_v, axis = (part.to(device) for part in self._tensors)
         sine, cosine = torch.sin(vectors[:, 0]), torch.cos(vectors[:, 0])
-        turn = torch.eye(3, dtype=torch.float64, device=device) + sine[:, None, None] * hat
-        turn = turn + (1.0 - cosine)[:, None, None] * hat_squared
-        rotation = (turn[:, :, :, None] * rest[None, None]).sum(dim=2)
+        about_axis = torch.eye(3, dtype=torch.float64, device=device) + sine[:, None, None] * turn
+        about_axis = about_axis + (1.0 - cosine)[:, None, None] * turn_squared
+        rotation = (about_axis[:, :, :, None] * rest[None, None]).sum(dim=2)
         return rotation, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + self.offset * axis
 
 
@@ -162,9 +156,9 @@ def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:
 def origin_bounds(
     workspace: Workspace, space: SearchSpace, margin: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the object's origin may be (3,): the workspace, widened by a margin in metres.
+    """Bounds (3,) of the object's origin: the workspace plus a margin in metres.
 
-    For an object on a plane, it is widened further until it meets the plane.
+    For an object on a plane, the margin grows until the bounds meet the plane.
     """
     lower, upper = workspace.bounds
     if isinstance(space, SE2Space):
@@ -176,7 +170,7 @@ def origin_bounds(
 
 
 def _lowest_point(sdf: SdfGrid, axis: FloatArray) -> float:
-    """The least a . x over the object's surface, read off the grid's nodes near the surface."""
+    """The least a . x on the object's surface, from the grid's nodes near the surface."""
     near = np.abs(sdf.values) < 2.0 * sdf.resolution
     nodes = sdf.origin + np.argwhere(near) * sdf.resolution
     surface = nodes - sdf.values[near][:, None] * sdf.gradients[near]

@@ -13,12 +13,11 @@ from chsel.errors import SettingError, quoted
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.elementary import logs, sines_cosines
 
-LAST_STEP = 2**32 - 1
-"""The last step of a session that random streams tell apart."""
+LAST_STEP = 2**32 - 1  # of a session; random streams distinguish no more steps
 
 
 class Purpose(IntEnum):
-    """What random numbers are for. Values are part of every recording: never renumber them."""
+    """What random numbers are used for. Recordings depend on the values: never renumber them."""
 
     INITIAL_POSES = 1
     UPDATE_NOISE = 2
@@ -40,10 +39,10 @@ class Purpose(IntEnum):
 
 @dataclass(frozen=True)
 class StreamKey:
-    """Key of all random streams of one registration: the session's seed and the step."""
+    """Key of all random streams of one registration."""
 
-    seed: int
-    step: int
+    seed: int  # of the session, 64 bits
+    step: int  # of the session, 32 bits
 
     def __post_init__(self) -> None:
         for name, bits in (("seed", 64), ("step", 32)):
@@ -56,7 +55,7 @@ class StreamKey:
             object.__setattr__(self, name, int(value))
 
     def stream(self, purpose: Purpose, index: int = 0) -> np.random.Generator:
-        """The Philox stream of one purpose; `index` tells repetitions within a step apart."""
+        """The Philox stream of one purpose; `index` distinguishes repetitions within a step."""
         word = (self.step << 32) | (int(purpose) << 20) | index
         return np.random.Generator(np.random.Philox(key=(word << 64) | self.seed))
 
@@ -67,18 +66,18 @@ def uniforms(
     upper: ArrayLike,
     shape: int | tuple[int, ...],
 ) -> FloatArray:
-    """Numbers of that shape, uniform in [lower, upper)."""
+    """Numbers of a shape, uniform in [lower, upper)."""
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     return lower + (upper - lower) * stream.random(shape)
 
 
 def normals(stream: np.random.Generator, shape: int | tuple[int, ...]) -> FloatArray:
-    """Standard normal numbers of that shape, in C order (Box and Muller).
+    """Standard normal numbers of a shape, in C order (Box and Muller).
 
     Numbers 2i and 2i + 1 are r cos(a) and r sin(a), with r = sqrt(-2 ln(1 - u)) and a = 2 pi v,
-    of the uniform numbers 2i and 2i + 1 of the stream, u and v in [0, 1). Of an odd count the last
-    sine is left out. No number is beyond 8.6. Unlike numpy's, they depend on the stream's raw
-    output alone, not on numpy's version or the C library.
+    where u and v are the uniform numbers 2i and 2i + 1 of the stream, in [0, 1). The last sine is
+    omitted for an odd count. No magnitude exceeds 8.6. Unlike numpy's, they depend only on the
+    stream's raw output, not on numpy's version or the C library.
     """
     count = int(np.prod(shape))
     u, v = stream.random(((count + 1) // 2, 2)).T

@@ -1,4 +1,4 @@
-"""Poses that stand for many: farthest points, and facility location."""
+"""Choosing few of many: farthest points, and facility location on poses."""
 
 from __future__ import annotations
 
@@ -12,15 +12,22 @@ from chsel.numerics.pose_tuples import pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import distance_at, field_of
+from chsel.problem.sdf_lookup import distance_at, distance_field
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
 
+_PLACES = 64  # of a descriptor
 
-def far_apart(points: FloatArray, most: int, *, given: int = 0) -> IntArray:
-    """Which of points (N, d) to take so that every next one is the farthest from those before.
 
-    given: so many of the first points come first, as they are.
+def evenly_spaced(size: int, count: int) -> IntArray:
+    """At most `count` of the numbers below size, evenly spaced, beginning with 0."""
+    return np.arange(size) if size <= count else np.arange(count) * size // count
+
+
+def farthest_points(points: FloatArray, most: int, *, given: int = 0) -> IntArray:
+    """Indices of at most `most` of points (N, d), each the farthest from those before it.
+
+    The first `given` points come first, in their order.
     """
     chosen = np.zeros(min(most, len(points)), dtype=np.int64)
     squared = np.full(len(points), np.inf)
@@ -30,6 +37,43 @@ def far_apart(points: FloatArray, most: int, *, given: int = 0) -> IntArray:
         squared = np.minimum(squared, (difference * difference).sum(axis=1))
         squared[chosen[n]] = -1.0
     return chosen
+
+
+def farthest_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+    """Indices of at most `count` poses, each the farthest from those before it by descriptors."""
+    return farthest_points(surface_descriptors(sdf, poses), count)
+
+
+def representative_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+    """Indices of poses such that every pose is near to one of them; the first is always chosen.
+
+    Fewer than `count` if all others have the same descriptors as chosen ones.
+    """
+    size = len(poses)
+    chosen = np.zeros(min(count, size), dtype=np.int64)
+    descriptors = np.ascontiguousarray(surface_descriptors(sdf, poses).T)
+    located = locate_facilities(descriptors, chosen, np.empty(size), np.empty((size, size)))
+    return chosen[:located]
+
+
+def surface_descriptors(sdf: SdfGrid, poses: Poses) -> FloatArray:
+    """Distances in metres (B, 64) from fixed places in the world to the object's surface.
+
+    The places lie on the surface in some of the poses, so descriptors differ as much as posed
+    surfaces do: not at all between poses that a symmetry of the object maps to each other.
+    """
+    stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
+    surface = sdf.derived("descriptors", lambda: surface_points(sdf, _PLACES, stream))
+    some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
+    places = rotated(np.swapaxes(some.rotations, 1, 2), surface - some.translations)
+    field = distance_field(sdf, "trilinear", "surface_point")
+    distances = np.empty((len(poses), _PLACES))
+
+    def run(first: int, last: int, _: Any) -> None:
+        distances_from_surface(field, poses.numbers, places, distances, first, last)
+
+    spread(run, len(poses), lambda: None, least=100)
+    return distances
 
 
 @compiled
@@ -45,10 +89,11 @@ def distances_from_surface(
 
 @compiled
 def locate_facilities(points: Any, chosen: Any, nearest: Any, apart: Any) -> Any:
-    """Choose points (d, C) so that all are near to a chosen one: by the mean square.
+    """Greedily choose points (d, C) so that the sum of squared distances to them is least.
 
-    The first, then what takes off the most. nearest (C,), apart (C, C): scratch. Returns how many
-    of chosen (B,) there are before all others are like them.
+    The first point, then always the one that lowers the sum the most. chosen (B,): indices to
+    fill. nearest (C,), apart (C, C): scratch. Returns the number of chosen points, less than B if
+    all others equal chosen ones.
     """
     dimension, count = points.shape
     apart[:] = 0.0
@@ -56,9 +101,9 @@ def locate_facilities(points: Any, chosen: Any, nearest: Any, apart: Any) -> Any
         nearest[i] = np.inf
         row = apart[i]
         for d in range(dimension):
-            of_all, own = points[d], points[d, i]
+            values, value = points[d], points[d, i]
             for j in range(count):
-                row[j] += (own - of_all[j]) * (own - of_all[j])
+                row[j] += (value - values[j]) * (value - values[j])
     for n in range(len(chosen)):
         if n > 0:
             best, least = -1, np.inf
@@ -70,58 +115,9 @@ def locate_facilities(points: Any, chosen: Any, nearest: Any, apart: Any) -> Any
                     total += min(nearest[j], apart[i, j])
                 if total < least:
                     best, least = i, total
-            if best < 0:  # all are chosen, or alike
+            if best < 0:  # every other point equals a chosen one
                 return n
             chosen[n] = best
         for j in range(count):
             nearest[j] = min(nearest[j], apart[chosen[n], j])
     return len(chosen)
-
-
-_PLACES = 64
-
-
-def outlined(sdf: SdfGrid, poses: Poses) -> FloatArray:
-    """How far fixed places in the world are from the object's surface, (B, 64), metres.
-
-    The places lie on the surface in some of these poses, so that poses differ in
-    them as much as their surfaces do: not at all where the object is symmetric.
-    """
-    surface = sdf.derived("outline", lambda: _points(sdf))
-    some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
-    places = rotated(np.swapaxes(some.rotations, 1, 2), surface - some.translations)
-    field = field_of(sdf, "trilinear", "surface_point")
-    distances = np.empty((len(poses), _PLACES))
-
-    def run(first: int, last: int, _: Any) -> None:
-        distances_from_surface(field, poses.numbers, places, distances, first, last)
-
-    spread(run, len(poses), lambda: None, least=100)
-    return distances
-
-
-def _points(sdf: SdfGrid) -> FloatArray:
-    return surface_points(sdf, _PLACES, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
-
-
-def spaced(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
-    """Which poses to take so that each next one is the farthest from those before."""
-    return far_apart(outlined(sdf, poses), count)
-
-
-def representative(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
-    """Which poses to take so that all are near to one of them; the first always is.
-
-    Fewer than count where all others are the same as chosen ones.
-    """
-    size = len(poses)
-    chosen = np.zeros(min(count, size), dtype=np.int64)
-    squares = np.empty((size, size))
-    outlines = np.ascontiguousarray(outlined(sdf, poses).T)
-    done = locate_facilities(outlines, chosen, np.empty(size), squares)
-    return chosen[:done]
-
-
-def evenly(size: int, count: int) -> IntArray:
-    """At most so many of the numbers below size, evenly spaced, the first among them."""
-    return np.arange(size) if size <= count else np.arange(count) * size // count

@@ -1,4 +1,4 @@
-"""Points on the surface of an object that is known by its signed distance grid alone."""
+"""Points on the surface of an object, from its signed distance grid alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CENTRE_POINTS = 1000
 _TETRAHEDRA = np.array(
     [np.cumsum([(0, 0, 0), *np.eye(3, dtype=np.int64)[list(p)]], 0) for p in permutations(range(3))]
 )
-# Which edges the surface crosses, by how many corners are inside, those inside counted first.
+# Edges that the surface crosses, by the number of corners inside, when these are numbered first.
 _TRIANGLES = {
     1: (((0, 1), (0, 2), (0, 3)),),
     2: (((0, 2), (0, 3), (1, 3)), ((0, 2), (1, 3), (1, 2))),
@@ -27,9 +27,9 @@ _TRIANGLES = {
 def surface_points(sdf: SdfGrid, count: int, stream: np.random.Generator) -> FloatArray:
     """Points (count, 3) in the object frame, metres, uniform by area on the surface of a grid.
 
-    Drawn where the grid's values, linear on tetrahedra between its nodes, are zero, then moved by
-    one Newton step onto the surface that the gradients show as well. Flat sides are exact, edges
-    are cut by less than the resolution, parts thinner than it may be missing.
+    Drawn on the zero level of the grid's values, linear on tetrahedra between nodes, then moved by
+    one Newton step that uses the gradients too. Flat sides are exact, edges are cut off by less
+    than the resolution, and parts thinner than the resolution may be missing.
     Raises SdfError if no node is inside of the object.
     """
     triangles = sdf.derived("surface", lambda: _zero_level(sdf))
@@ -38,8 +38,8 @@ def surface_points(sdf: SdfGrid, count: int, stream: np.random.Generator) -> Flo
             "no node of the SDF grid is inside of the object; accepted: a resolution fine enough "
             "for one"
         )
-    corner, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2]
-    v = v - corner
+    corner = triangles[:, 0]
+    u, v = triangles[:, 1] - corner, triangles[:, 2] - corner
     area = np.sqrt((np.cross(u, v) ** 2).sum(axis=1))
     reached = np.cumsum(area)
     chosen, root, share = stream.random((count, 3)).T
@@ -58,20 +58,15 @@ def has_surface(sdf: SdfGrid) -> bool:
 
 def object_centre(sdf: SdfGrid) -> FloatArray:
     """The mean (3,) of points on the surface of a grid, in the object frame."""
-    return sdf.derived("centre", lambda: _centre(sdf))
-
-
-def _centre(sdf: SdfGrid) -> FloatArray:
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    centre: FloatArray = surface_points(sdf, _CENTRE_POINTS, stream).mean(axis=0)
-    return centre
+    return sdf.derived("centre", lambda: surface_points(sdf, _CENTRE_POINTS, stream).mean(axis=0))
 
 
 def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
     """Points (P, 3) moved by - s n, with s = sum w_i (s_i + g_i . (x - x_i) / 2) over 8 nodes.
 
-    Where the surface is curved, interpolated values err to one side and values continued along
-    gradients as much to the other: their mean errs by the third order of the resolution.
+    On a curved surface, interpolated values err to one side and values extrapolated along gradients
+    as much to the other; the error of their mean is of third order in the resolution.
     """
     cell = (points - sdf.origin) / sdf.resolution
     base = np.minimum(np.floor(cell), np.array(sdf.shape) - 2).astype(np.int64)
@@ -88,7 +83,7 @@ def _refined(sdf: SdfGrid, points: FloatArray) -> FloatArray:
         normal += weight[:, None] * gradient
     size = np.sqrt((normal**2).sum(axis=1))
     step = np.minimum(np.maximum(signed, -sdf.resolution), sdf.resolution)
-    return points - (step / np.maximum(size, 0.1))[:, None] * normal  # where gradients cancel, less
+    return points - (step / np.maximum(size, 0.1))[:, None] * normal  # less if gradients cancel
 
 
 def _zero_level(sdf: SdfGrid) -> FloatArray:
@@ -107,16 +102,16 @@ def _zero_level(sdf: SdfGrid) -> FloatArray:
 def _triangles(
     sdf: SdfGrid, nodes: IntArray, inside: int, triangles: tuple[tuple[tuple[int, int], ...], ...]
 ) -> FloatArray:
-    """The triangles (T, 3, 3) in those of tetrahedra (P, 4, 3) with so many corners inside."""
+    """Triangles (T, 3, 3) in the tetrahedra (P, 4, 3) that have `inside` corners inside."""
     values = sdf.values[nodes[..., 0], nodes[..., 1], nodes[..., 2]]
-    mine = (values < 0.0).sum(axis=1) == inside
-    nodes, values = nodes[mine], values[mine]
+    chosen = (values < 0.0).sum(axis=1) == inside
+    nodes, values = nodes[chosen], values[chosen]
     order = np.argsort(values >= 0.0, axis=1, kind="stable")
     values = np.take_along_axis(values, order, axis=1)
     places = sdf.origin + np.take_along_axis(nodes, order[..., None], axis=1) * sdf.resolution
-    made = np.empty((len(nodes), len(triangles), 3, 3))
+    corners = np.empty((len(nodes), len(triangles), 3, 3))
     for t, edges in enumerate(triangles):
         for e, (a, b) in enumerate(edges):
             share = values[:, a] / (values[:, a] - values[:, b])
-            made[:, t, e] = places[:, a] + share[:, None] * (places[:, b] - places[:, a])
-    return made.reshape(-1, 3, 3)
+            corners[:, t, e] = places[:, a] + share[:, None] * (places[:, b] - places[:, a])
+    return corners.reshape(-1, 3, 3)

@@ -14,7 +14,7 @@ from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Regi
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SearchSpace, origin_bounds
 from chsel.problem.settings import Presets
-from chsel.problem.subset import evenly, representative
+from chsel.problem.subset import evenly_spaced, representative_poses
 from chsel.problem.surface import has_surface
 from chsel.qd.archive import GridArchive
 from chsel.qd.measures import MEASURES, Measure
@@ -194,10 +194,10 @@ def _representatives(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
 
     Of many, those that are considered, and of many wanted, those beyond, are taken evenly.
     """
-    pool = evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
-    chosen = pool[representative(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
+    pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+    chosen = pool[representative_poses(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
     others = np.setdiff1d(np.arange(len(poses)), chosen)
-    more = others[evenly(len(others), count - len(chosen))]
+    more = others[evenly_spaced(len(others), count - len(chosen))]
     return np.sort(np.concatenate([chosen, more]))
 
 

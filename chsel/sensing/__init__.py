@@ -1,1 +1,1 @@
-"""What cameras, tactile pads and a moving hand tell of free space and of the surface."""
+"""Free space and surface points from cameras, tactile pads and a moving hand."""

@@ -16,8 +16,8 @@ def deformation(
 ) -> FloatArray:
     """How far (H, W), in metres, a membrane is pressed towards its camera.
 
-    reference (H, W): depths of the untouched membrane; depth (H, W): now. 0 where either was not
-    measured (0, negative, not finite) or is not `valid` (H, W). Raises PointsError for shapes that
+    reference (H, W): depths of the untouched membrane. depth (H, W): depths now. 0 where either is
+    missing (0, negative, not finite) or is not `valid` (H, W). Raises PointsError for shapes that
     differ.
     """
     reference, depth = np.asarray(reference, np.float64), np.asarray(depth, np.float64)
@@ -33,10 +33,10 @@ def deformation(
 
 
 def smooth(image: FloatArray, side: int) -> FloatArray:
-    """The image (H, W), each pixel the mean of side x side around it; borders are reflected.
+    """The image (H, W) under a mean filter of side x side pixels; borders are reflected.
 
-    An even side reaches one pixel further up and left than down and right. What is not finite
-    counts as 0, or it would reach all of its row and column.
+    An even side reaches one pixel further up and left than down and right. Values that are not
+    finite count as 0; otherwise they would spread over their row and column.
     """
     require_positive("side of the filter", side)
     image = np.asarray(image, np.float64)
@@ -50,7 +50,7 @@ def contact_mask(
     threshold: float,
     valid: BoolArray | None = None,
 ) -> BoolArray:
-    """Pixels (H, W) in contact: deformed by more than a quantile of all, and than `threshold` m.
+    """Pixels (H, W) in contact: deformed by more than a quantile of all and by over `threshold` m.
 
     valid (H, W): pixels that count; None: all.
     """
@@ -62,9 +62,9 @@ def contact_mask(
 
 
 def contact_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
-    """Ascending indices of at most `most` out of `count` pixels, any subset as likely as another.
+    """Ascending indices of at most `most` out of `count` pixels, every subset equally likely.
 
-    All of them, and no number drawn, if there are no more.
+    All of them, without drawing from the stream, if there are no more than that.
     """
     if count <= most:
         return np.arange(count)
@@ -74,14 +74,14 @@ def contact_subset(count: int, most: int, stream: np.random.Generator) -> IntArr
 def share(counts: Sequence[int], most: int) -> list[int]:
     """How many of at most `most` points each camera gets, in proportion to its count.
 
-    They sum to `most`, or to all there are if these are fewer. What proportions leave over goes
-    where it is missed most, to the first among equals.
+    They sum to `most`, or to all points if these are fewer. The remainders of the division go to
+    the cameras with the largest fractions, to the first among equals.
     """
     total = sum(counts)
     if total <= most:
         return list(counts)
     shares = [count * most // total for count in counts]
-    missed = sorted(range(len(counts)), key=lambda n: -(counts[n] * most % total))
-    for n in missed[: most - sum(shares)]:
+    by_remainder = sorted(range(len(counts)), key=lambda n: -(counts[n] * most % total))
+    for n in by_remainder[: most - sum(shares)]:
         shares[n] += 1
     return shares

@@ -1,4 +1,4 @@
-"""Which pixels of a depth image can be believed."""
+"""Pinhole cameras, and which pixels of a depth image are reliable."""
 
 from __future__ import annotations
 
@@ -9,24 +9,22 @@ import numpy as np
 
 from chsel.errors import PointsError, SettingError, require_at_most, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.sensing.ray_kernels import window_minimum
 
 MOST_PIXELS = 100_000  # on a side
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Size of the image, focal lengths and principal point, all in pixels.
+    """A camera without distortion; its frame has x right, y down, z forward.
 
-    The centre of the first pixel is at (0, 0). Camera frame: x right, y down, z forward.
-    Raises SettingError for what no camera has.
+    The centre of the first pixel is at (0, 0). Raises SettingError for impossible values.
     """
 
-    width: int
+    width: int  # of the image, pixels
     height: int
-    fx: float
+    fx: float  # focal lengths, pixels
     fy: float
-    cx: float
+    cx: float  # principal point, pixels
     cy: float
 
     def __post_init__(self) -> None:
@@ -36,11 +34,10 @@ class PinholeCamera:
             require_at_most(f"camera {name}", value, MOST_PIXELS)
             if int(value) != value:
                 raise SettingError(f"camera {name} is {value}; accepted: a whole number")
-        for name in ("fx", "fy"):
-            require_positive(f"camera {name}", getattr(self, name))
-        for name in ("cx", "cy"):
-            if not np.isfinite(getattr(self, name)):
-                value = getattr(self, name)
+        require_positive("camera fx", self.fx)
+        require_positive("camera fy", self.fy)
+        for name, value in (("cx", self.cx), ("cy", self.cy)):
+            if not np.isfinite(value):
                 raise SettingError(f"camera {name} is {value}; accepted: a finite number")
 
     @property
@@ -60,7 +57,7 @@ class PinholeCamera:
     def back_project(self, depth: Any) -> FloatArray:
         """Points (H, W, 3) in the camera frame, metres, of depths (H, W) along z.
 
-        Depths that are not finite give points that are not. Raises PointsError for another shape.
+        Depths that are not finite give such points. Raises PointsError for another shape.
         """
         depth = self.image("depth", depth)
         with np.errstate(invalid="ignore"):  # 0 times infinity
@@ -68,7 +65,7 @@ class PinholeCamera:
         return np.stack([x, y, depth], axis=-1)
 
     def image(self, name: str, values: Any, dtype: Any = np.float64) -> np.ndarray:
-        """Values (H, W) as they are, one a pixel. Raises PointsError for another shape."""
+        """Values (H, W) as an array. Raises PointsError for another shape."""
         values = np.asarray(values, dtype=dtype)
         if values.shape != (self.height, self.width):
             raise PointsError(
@@ -81,7 +78,7 @@ class PinholeCamera:
 def valid_pixels(depth: FloatArray, *, nearest: float, furthest: float) -> BoolArray:
     """Whether pixels (H, W) have a depth from nearest to furthest, metres.
 
-    A camera tells that it could not measure by 0, nan, infinity or a negative number.
+    Cameras mark pixels without a measurement by 0, NaN, infinity or a negative number.
     """
     depth = np.asarray(depth)
     return np.isfinite(depth) & (depth > 0.0) & (depth >= nearest) & (depth <= furthest)
@@ -90,22 +87,25 @@ def valid_pixels(depth: FloatArray, *, nearest: float, furthest: float) -> BoolA
 def occlusion_edges(
     depth: FloatArray, valid: BoolArray, jump: float, *, reach: int = 1
 ) -> BoolArray:
-    """Pixels (H, W) that a jump of more than `jump` metres parts from one of their neighbours.
+    """Pixels (H, W) that differ by more than `jump` metres from one of their neighbours.
 
-    On both sides of the jump, as either may have been measured across it. depth (H, W): metres.
-    valid (H, W): pixels that count, and that can be edges. reach: how many pixels away, along rows
-    and columns, a neighbour may be; 2 also finds jumps where one pixel between them is invalid.
+    On both sides of the jump, as either may be wrong. depth (H, W): metres. valid (H, W): pixels
+    that count, all finite. reach: the distance in pixels, along rows and columns, up to which a
+    pixel is a neighbour; 2 also finds jumps across one invalid pixel.
     """
-    own = np.where(valid, depth, 0.0)
+    depth = np.where(valid, np.asarray(depth, np.float64), 0.0)
     nearest = _least_around(np.where(valid, depth, np.inf), reach)
-    furthest = -_least_around(np.where(valid, -own, np.inf), reach)
-    return valid & ((furthest - own > jump) | (own - nearest > jump))
+    furthest = -_least_around(np.where(valid, -depth, np.inf), reach)
+    return valid & ((furthest - depth > jump) | (depth - nearest > jump))
 
 
 def _least_around(image: FloatArray, reach: int) -> FloatArray:
     """The least (H, W) of the pixels up to `reach` away from each, along rows and columns."""
-    height, width = image.shape
-    padded = np.full((height + 2 * reach, width + 2 * reach), np.inf)
-    padded[reach : reach + height, reach : reach + width] = image
-    window_minimum(padded, 2 * reach + 1)
-    return padded[:height, :width]
+    least = np.pad(image, reach, constant_values=np.inf)
+    side, size = 1, 2 * reach + 1
+    while side < size:
+        step = min(side, size - side)
+        least = np.minimum(least[step:], least[:-step])
+        least = np.minimum(least[:, step:], least[:, :-step])
+        side += step
+    return least

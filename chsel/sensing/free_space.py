@@ -1,7 +1,8 @@
-"""Free space as a dense grid over the workspace: where rays passed, and where solids have been."""
+"""Free space as a dense grid over the workspace: where rays passed, and where solids were."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,35 +11,41 @@ from chsel.errors import PointsError, PoseError, SettingError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, frozen
 from chsel.numerics.threads import spread
 from chsel.problem.points import Lattice, Workspace
-from chsel.problem.poses import check_rigid
+from chsel.problem.poses import SENSOR_TOLERANCE, check_rigid
 from chsel.sensing.depth_camera import PinholeCamera
-from chsel.sensing.ray_kernels import mark_image, mark_points, mark_segments, settle
+from chsel.sensing.ray_kernels import (
+    RayImage,
+    VoxelGrid,
+    mark_image,
+    mark_points,
+    mark_segments,
+    settle,
+)
 
 MOST_VOXELS = 200_000_000  # two bytes each
 MOST_VIEWS = 250
-SCALES = np.linspace(0.95, 0.40, 20)  # the reference's, of depth
-_RIGID = 1e-3  # as poses from sensors are rounded
-_TOLD = 255  # more than any number of views
+SCALES = np.linspace(0.95, 0.40, 20)  # of depth, as the reference implementation has them
+_REPORTED = 255  # more than any number of views
 _RAYS_PER_THREAD = 20_000
 _POINTS_PER_THREAD = 100_000
 _STAY = np.eye(4)[None]
 
 
 class FreeGrid:
-    """Which voxels of a workspace are known to be free, and which of them became so last.
+    """Which voxels of a workspace are known to be free, and which of them became free last.
 
-    The centre of the first voxel is the workspace's lower corner, and the last ones are those
-    nearest to its upper corner; what is outside of all voxels is left out, as are rays and points
-    that are not finite.
+    The centre of the first voxel is the workspace's lower corner, and the last voxels are those
+    nearest to its upper corner. What lies outside of all voxels is ignored, and so are rays and
+    points that are not finite.
 
-    A ray passes a voxel if more than a point of it is inside, so none counts that is met at an edge
-    or a corner alone, as far as rounding can tell. A ray within the face between two voxels is in
-    the upper one, the one of the greater index; its ends are in voxels by the same rule. A point of
-    `at` is in the voxel whose centre is nearest, ties to even, as Lattice has it.
+    A ray passes a voxel if more than one point of it is inside: touching an edge or a corner does
+    not count, as far as rounding allows. A ray within the face between two voxels is in the voxel
+    of the greater index; so are its ends. A point of `at` is in the voxel whose centre is nearest,
+    ties to even, as in Lattice.
     """
 
     def __init__(self, workspace: Workspace, spacing: float, *, views: int = 1) -> None:
-        """spacing: side of a voxel, metres. views: voxels are free if so many of them saw them.
+        """spacing: side of a voxel, metres. views: how many views make a voxel free.
 
         A view is one call of along_rays, from_depth or scaled_images. Raises SettingError for a
         grid that is too large.
@@ -52,23 +59,19 @@ class FreeGrid:
         self._views = int(views)
         voxels = int(np.prod(self.shape))
         self._words = np.zeros(-(-voxels // 8), dtype=np.uint64)
-        self._met = self._words.view(np.uint8)[:voxels]  # in the view at hand
-        self._seen = np.zeros(voxels, dtype=np.uint8)  # in how many views, then _TOLD
-        self._grid = self._met, self.shape, np.array(workspace.lower), float(spacing)
+        marks = self._words.view(np.uint8)[:voxels]  # in the current view
+        self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views, then _REPORTED
+        self._grid = VoxelGrid(marks, self.shape, np.array(workspace.lower), float(spacing))
 
     def along_rays(self, origin: Any, ends: Any) -> int:
         """One view: mark what segments from origin (3,) or (N, 3) to ends (N, 3) pass, ends too.
 
-        How many voxels became free.
+        Returns the number of voxels that became free.
         """
         origins, ends = _rows("origin", origin), _rows("ends", ends)
         if len(origins) not in (1, len(ends)):
             raise PointsError(f"origin has {len(origins)} points; accepted: 1, or {len(ends)}")
-
-        def run(first: int, last: int, _: None) -> None:
-            mark_segments(*self._grid, origins, ends, first, last)
-
-        spread(run, len(ends), _nothing, least=_RAYS_PER_THREAD)
+        self._mark(mark_segments, origins, ends, count=len(ends), least=_RAYS_PER_THREAD)
         return self._settle(1)
 
     def from_depth(
@@ -82,20 +85,16 @@ class FreeGrid:
     ) -> int:
         """One view: mark along the rays of the masked pixels up to `fraction` of their depth.
 
-        depth (H, W): metres along z. mask (H, W). How many voxels became free. Raises PointsError
-        for another shape than the camera's, PoseError for a pose that is not rigid.
+        depth (H, W): metres along z. mask (H, W). Returns the number of voxels that became free.
+        Raises PointsError for another shape than the camera's, PoseError for a pose that is not
+        rigid.
         """
         require_positive("fraction", fraction)
         move, mask = _pose(world_from_camera), camera.image("mask", mask, bool)
-        image = tuple(
-            np.require(part, requirements=("C", "W"))
-            for part in (camera.image("depth", depth), mask, camera.columns, camera.rows)
-        )
-
-        def run(first: int, last: int, _: None) -> None:
-            mark_image(*self._grid, image, move[:3], float(fraction), first, last)
-
-        spread(run, camera.height, _nothing, least=-(-_RAYS_PER_THREAD // camera.width))
+        parts = camera.image("depth", depth), mask, camera.columns, camera.rows
+        image = RayImage(*(np.require(part, requirements=("C", "W")) for part in parts))
+        least = -(-_RAYS_PER_THREAD // camera.width)
+        self._mark(mark_image, image, move[:3], float(fraction), count=camera.height, least=least)
         return self._settle(1)
 
     def scaled_images(
@@ -108,41 +107,48 @@ class FreeGrid:
     ) -> int:
         """One view: mark the points of images whose depth is scaled by each of the factors (F,).
 
-        The reference's way, which leaves gaps between the images and in front of all. Otherwise
-        as from_depth.
+        As in the reference implementation, which leaves gaps between the images and in front of
+        all. Otherwise as from_depth.
         """
         move, mask = _pose(world_from_camera), camera.image("mask", mask, bool)
         factors = frozen("factors", factors, (None,), error=SettingError)
         moves = np.repeat(move[None], len(factors), axis=0)
         moves[:, :3, :3] *= factors[:, None, None]  # about the camera
-        self._mark(camera.back_project(depth)[mask], moves)
+        self._mark_points(camera.back_project(depth)[mask], moves)
         return self._settle(1)
 
     def at(self, points: Any, *, poses: FloatArray = _STAY) -> int:
         """Mark the voxels that points (N, 3) are in when moved by each of poses (P, 4, 4).
 
-        These are free whatever the number of views. How many became so.
+        These are free whatever the number of views. Returns the number of voxels that became free.
+        Raises PoseError for poses that are not finite.
         """
-        self._mark(_rows("points", points), np.array(poses, dtype=np.float64).reshape(-1, 4, 4))
+        poses = frozen("poses", np.reshape(poses, (-1, 4, 4)), (None, 4, 4), error=PoseError)
+        self._mark_points(_rows("points", points), np.array(poses))
         return self._settle(self._views)
 
     def new(self) -> FloatArray:
         """Centres (M, 3) of the voxels that became free since the last call, in order of index."""
         voxels = np.flatnonzero(self._seen == self._views)
-        self._seen[voxels] = _TOLD
+        self._seen[voxels] = _REPORTED
         return self.lattice.centres(np.stack(np.unravel_index(voxels, self.shape), axis=1))
 
-    def _mark(self, points: FloatArray, moves: FloatArray) -> None:
+    def _mark_points(self, points: FloatArray, moves: FloatArray) -> None:
         moves = np.ascontiguousarray(moves[:, :3])
+        least = -(-_POINTS_PER_THREAD // max(len(moves), 1))
+        self._mark(mark_points, points, moves, count=len(points), least=least)
+
+    def _mark(self, kernel: Callable[..., None], *arguments: Any, count: int, least: int) -> None:
+        """Run a kernel on pieces of range(count), of at least `least`, on several threads."""
 
         def run(first: int, last: int, _: None) -> None:
-            mark_points(*self._grid, points, moves, first, last)
+            kernel(self._grid, *arguments, first, last)
 
-        spread(run, len(points), _nothing, least=-(-_POINTS_PER_THREAD // max(len(moves), 1)))
+        spread(run, count, lambda: None, least=least)
 
     def _settle(self, views: int) -> int:
-        """Count what was met as seen in so many views, and how many voxels that made free."""
-        fresh = int(settle(self._words, self._met, self._seen, views, self._views))
+        """Count the marked voxels as seen in `views` more views; how many became free."""
+        fresh = int(settle(self._words, self._grid.marks, self._seen, views, self._views))
         self.count += fresh
         return fresh
 
@@ -163,21 +169,17 @@ def _shape(workspace: Workspace, spacing: float) -> tuple[int, int, int]:
 
 
 def _rows(name: str, points: Any) -> FloatArray:
-    """Points (N, 3), whatever their numbers; one point (3,) is a row."""
+    """Points (N, 3), finite or not; one point (3,) is a row."""
     rows = np.asarray(points, dtype=np.float64)
     rows = rows[None] if rows.shape == (3,) else rows
     rows = np.zeros((0, 3)) if rows.size == 0 else rows
     if rows.ndim != 2 or rows.shape[1] != 3:
         raise PointsError(f"{name} has shape {rows.shape}; accepted: (any, 3)")
-    return np.require(rows, requirements=("C", "W"))  # one type of array, compiled once
+    return np.require(rows, requirements=("C", "W"))  # one type of array, so one compilation
 
 
 def _pose(world_from_camera: FloatArray) -> FloatArray:
-    """A copy, checked."""
+    """A checked copy."""
     pose = frozen("world_from_camera", world_from_camera, (4, 4), error=PoseError)
-    check_rigid("world_from_camera", pose[None], _RIGID)
+    check_rigid("world_from_camera", pose[None], SENSOR_TOLERANCE)
     return np.array(pose)
-
-
-def _nothing() -> None:
-    return None

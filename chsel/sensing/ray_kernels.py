@@ -1,76 +1,68 @@
-"""Marks voxels of a dense grid: those that line segments pass, and those that points lie in.
-
-A grid is the bytes `met` of its voxels in C order, its voxels per axis `counts`, the centre of the
-first voxel `lower` and the `spacing` of the centres in metres. Threads may mark the same grid at
-once, as all they ever do is to set a byte to 1.
-"""
+"""Marking voxels of a dense grid: those that line segments pass, and those that points lie in."""
 
 from __future__ import annotations
 
 from math import floor, inf
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
 
-
-@compiled
-def window_minimum(image, size):
-    """Replace each pixel of image (H, W) by the least of the size x size right of and below it.
-
-    Those of the last size - 1 rows and columns, whose windows are not whole, are of no use. Windows
-    grow to twice their side each time, until they have the size.
-    """
-    rows, columns = image.shape
-    side = 1
-    while side < size:
-        step = min(side, size - side)
-        for row in range(rows - step):
-            line, below = image[row], image[row + step]
-            for column in range(columns):
-                line[column] = min(line[column], below[column])
-        for row in range(rows):
-            line = image[row]
-            for column in range(columns - step):
-                line[column] = min(line[column], line[column + step])
-        side += step
-
-
 _FARTHEST = 2.0**52  # voxels from the first: beyond, neighbours are the same number
-_SHORTEST = 1e-100  # voxels: a shorter way along an axis is none
+_SHORTEST = 1e-100  # voxels: shorter moves along an axis count as none
+
+
+class VoxelGrid(NamedTuple):
+    """Marks of V voxels. Threads may mark one grid at once: all they ever do is write ones."""
+
+    marks: NDArray[np.uint8]  # (V,) in C order, 1 for a marked voxel
+    counts: tuple[int, int, int]  # voxels per axis
+    lower: FloatArray  # (3,): centre of the first voxel, metres
+    spacing: float  # of the centres, metres
+
+
+class RayImage(NamedTuple):
+    """Depths of a camera, and which of its rays count."""
+
+    depth: FloatArray  # (H, W), metres along z
+    mask: BoolArray  # (H, W)
+    columns: FloatArray  # (W,): x / z of the pixels
+    rows: FloatArray  # (H,): y / z of the pixels
 
 
 @compiled
-def mark_segments(met, counts, lower, spacing, origins, ends, first, last):
-    """Mark what the segments first to last from origins (1 or N, 3) to ends (N, 3) pass."""
+def mark_segments(grid, origins, ends, first, last):
+    """Mark the voxels on segments first to last, from origins (1 or N, 3) to ends (N, 3)."""
     for n in range(first, last):
         o = n if len(origins) > 1 else 0
-        a = _place(lower, spacing, origins[o, 0], origins[o, 1], origins[o, 2])
-        b = _place(lower, spacing, ends[n, 0], ends[n, 1], ends[n, 2])
-        _walk(met, counts, a, b)
+        a = _place(grid, origins[o, 0], origins[o, 1], origins[o, 2])
+        b = _place(grid, ends[n, 0], ends[n, 1], ends[n, 2])
+        _walk(grid, a, b)
 
 
 @compiled
-def mark_image(met, counts, lower, spacing, image, move, fraction, first, last):
-    """Mark what the rays of the masked pixels of rows first to last pass.
+def mark_image(grid, image, move, fraction, first, last):
+    """Mark the voxels on the rays of the masked pixels of rows first to last of a RayImage.
 
-    image: depth (H, W), mask (H, W), and x / z (W,) and y / z (H,) of the pixels. move (3, 4): from
-    the camera's frame. Rays end at `fraction` of their depth.
+    move (3, 4): from the camera's frame. Rays end at `fraction` of their depth.
     """
-    depth, mask, columns, rows = image
-    a = _place(lower, spacing, move[0, 3], move[1, 3], move[2, 3])
+    a = _place(grid, move[0, 3], move[1, 3], move[2, 3])
     for row in range(first, last):
-        for column in range(len(columns)):
-            if mask[row, column]:
-                z = fraction * depth[row, column]
-                x, y, z = _moved(move, columns[column] * z, rows[row] * z, z)
-                _walk(met, counts, a, _place(lower, spacing, x, y, z))
+        for column in range(len(image.columns)):
+            if image.mask[row, column]:
+                z = fraction * image.depth[row, column]
+                x, y, z = _moved(move, image.columns[column] * z, image.rows[row] * z, z)
+                _walk(grid, a, _place(grid, x, y, z))
 
 
 @compiled
-def mark_points(met, counts, lower, spacing, points, moves, first, last):
-    """Mark where points (N, 3) first to last come to lie by each of the moves (P, 3, 4)."""
-    nx, ny, nz = counts
+def mark_points(grid, points, moves, first, last):
+    """Mark the voxels of points (N, 3) first to last, moved by each of the moves (P, 3, 4)."""
+    nx, ny, nz = grid.counts
+    lower, spacing = grid.lower, grid.spacing
     for n in range(first, last):
         for p in range(len(moves)):
             x, y, z = _moved(moves[p], points[n, 0], points[n, 1], points[n, 2])
@@ -78,22 +70,22 @@ def mark_points(met, counts, lower, spacing, points, moves, first, last):
             j = np.rint((y - lower[1]) / spacing)
             k = np.rint((z - lower[2]) / spacing)
             if 0.0 <= i < nx and 0.0 <= j < ny and 0.0 <= k < nz:
-                met[(int(i) * ny + int(j)) * nz + int(k)] = 1
+                grid.marks[(int(i) * ny + int(j)) * nz + int(k)] = 1
 
 
 @compiled
-def settle(words, met, seen, gain, enough):
-    """Add `gain` to how often (V,) marked voxels were seen, up to `enough`, and unmark all.
+def settle(words, marks, seen, gain, enough):
+    """Add `gain` to the views `seen` (V,) of marked voxels, up to `enough`, and unmark them.
 
-    words: the bytes of `met` by eights, the last ones filled up, as most voxels are not marked. How
-    many of them now have enough. Those with more than enough stay as they are.
+    words: the bytes of `marks` (V,) by eights, as most voxels are not marked. Returns the number of
+    voxels that reached `enough`. Voxels with more than enough views stay as they are.
     """
     fresh = 0
     for word in range(len(words)):
         if words[word]:
-            for n in range(8 * word, min(8 * word + 8, len(met))):
-                if met[n]:
-                    met[n] = 0
+            for n in range(8 * word, min(8 * word + 8, len(marks))):
+                if marks[n]:
+                    marks[n] = 0
                     if seen[n] < enough:
                         seen[n] = min(seen[n] + gain, enough)
                         fresh += 1 if seen[n] == enough else 0
@@ -110,8 +102,9 @@ def _moved(move, x, y, z):
 
 
 @leaf
-def _place(lower, spacing, x, y, z):
-    """Where a point is, in voxels: voxel k is from k to k + 1."""
+def _place(grid, x, y, z):
+    """A point in units of voxels: voxel k is from k to k + 1."""
+    lower, spacing = grid.lower, grid.spacing
     return (
         (x - lower[0]) / spacing + 0.5,
         (y - lower[1]) / spacing + 0.5,
@@ -120,18 +113,18 @@ def _place(lower, spacing, x, y, z):
 
 
 @inner
-def _walk(met, counts, a, b):
-    """Mark the voxels from place a to place b, one after the other (Amanatides and Woo).
+def _walk(grid, a, b):
+    """Mark the voxels from place a to place b, one after the other (Amanatides and Woo, 1987).
 
-    The voxels of both ends are found first, so that along each axis it is known how many faces are
-    crossed, and no rounding leads out of the grid or past the end. Crossings are not summed up but
-    follow from their faces. Two at once lead over an edge, to a voxel across it.
+    The voxels of both ends are computed first, so the number of faces crossed along each axis is
+    known, and rounding cannot lead out of the grid or past the end. Crossings are not summed up but
+    computed from their faces. Two crossings at once lead over an edge, to the voxel across it.
     """
-    if not (_near(a) and _near(b)):  # nor is what is no number
+    if not (_near(a) and _near(b)):  # nor for NaN
         return
     ax, ay, az = a
     dx, dy, dz = b[0] - ax, b[1] - ay, b[2] - az
-    nx, ny, nz = counts
+    nx, ny, nz = grid.counts
     enters, leaves = _clipped(ax, dx, nx, 0.0, 1.0)
     enters, leaves = _clipped(ay, dy, ny, enters, leaves)
     enters, leaves = _clipped(az, dz, nz, enters, leaves)
@@ -140,17 +133,17 @@ def _walk(met, counts, a, b):
     i, far_i = _voxel(ax, dx, enters, nx), _voxel(ax, dx, leaves, nx)
     j, far_j = _voxel(ay, dy, enters, ny), _voxel(ay, dy, leaves, ny)
     k, far_k = _voxel(az, dz, enters, nz), _voxel(az, dz, leaves, nz)
-    if leaves == 1.0:  # as exactly as the end was given
+    if leaves == 1.0:  # the end itself, without rounding
         far_i, far_j, far_k = _within(b[0], nx), _within(b[1], ny), _within(b[2], nz)
-    step_i, face_i, left_i, inverse_x = _way(i, far_i, dx)
-    step_j, face_j, left_j, inverse_y = _way(j, far_j, dy)
-    step_k, face_k, left_k, inverse_z = _way(k, far_k, dz)
+    step_i, face_i, left_i, inverse_x = _crossings(i, far_i, dx)
+    step_j, face_j, left_j, inverse_y = _crossings(j, far_j, dy)
+    step_k, face_k, left_k, inverse_z = _crossings(k, far_k, dz)
     at_x = (face_i - ax) * inverse_x if left_i > 0 else inf
     at_y = (face_j - ay) * inverse_y if left_j > 0 else inf
     at_z = (face_k - az) * inverse_z if left_k > 0 else inf
     voxel, last = (i * ny + j) * nz + k, (far_i * ny + far_j) * nz + far_k
     stride_i, stride_j = step_i * ny * nz, step_j * nz
-    _mark(met, voxel)
+    _mark(grid.marks, voxel)
     while voxel != last:
         at = min(at_x, at_y, at_z)
         if at_x == at:
@@ -168,13 +161,13 @@ def _walk(met, counts, a, b):
             left_k -= 1
             face_k += step_k
             at_z = (face_k - az) * inverse_z if left_k > 0 else inf
-        _mark(met, voxel)
+        _mark(grid.marks, voxel)
 
 
 @leaf
-def _mark(met, voxel):
-    if met[voxel] == 0:  # most are marked already, and threads wait for each other's writes
-        met[voxel] = 1
+def _mark(marks, voxel):
+    if marks[voxel] == 0:  # most are marked already, and concurrent writes are slow
+        marks[voxel] = 1
 
 
 @leaf
@@ -185,7 +178,7 @@ def _near(place):
 
 @leaf
 def _clipped(a, d, count, enters, leaves):
-    """The part of a way a + t d that is within one axis of the grid; none if it enters last."""
+    """The part of a + t d that is within one axis of the grid; empty if enters >= leaves."""
     if abs(d) < _SHORTEST:
         return (enters, leaves) if 0.0 <= a < count else (1.0, 0.0)
     low, high = -a / d, (count - a) / d
@@ -204,8 +197,8 @@ def _within(place, count):
 
 
 @leaf
-def _way(voxel, last, d):
-    """Step along an axis, its first face, how many there are, and 1 / d."""
+def _crossings(voxel, last, d):
+    """Step along an axis, first face to cross, number of faces to cross, and 1 / d."""
     step = 1 if last > voxel else -1
     face = float(voxel + 1 if last > voxel else voxel)
     inverse = 1.0 / d if abs(d) >= _SHORTEST else 0.0

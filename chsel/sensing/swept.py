@@ -1,4 +1,4 @@
-"""What solids pass as they move: nodes inside of them, and poses close enough to miss no voxel."""
+"""The space that moving solids pass: nodes inside them, and poses close enough together."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ import numpy as np
 
 from chsel.errors import PoseError, SettingError, require_positive
 from chsel.numerics.arrays import FloatArray, frozen
-from chsel.problem.poses import check_rigid, interpolated, product, rotation_angle
+from chsel.problem.poses import (
+    SENSOR_TOLERANCE,
+    check_rigid,
+    interpolated,
+    product,
+    rotation_angle,
+)
 from chsel.problem.sdf_grid import mesh_sdf
-from chsel.sensing.free_space import FreeGrid
 
 if TYPE_CHECKING:
     import trimesh
@@ -20,7 +25,6 @@ MOST_NODES = 2_000_000
 MOST_POSES = 1_000_000
 _DEEPEST_ON_SURFACE = 1e-9  # m: a node on the surface is not inside, however it is rounded
 _ROUNDING = 1e-9  # steps: a move of one step is not two
-_RIGID = 1e-3  # as poses from sensors are rounded
 
 
 def interior_lattice(
@@ -28,8 +32,8 @@ def interior_lattice(
 ) -> FloatArray:
     """Nodes (M, 3) inside one closed mesh or inside any of several, in their common frame, metres.
 
-    Each mesh has a lattice of its own, around the centre of its bounding box, so that thin parts
-    have nodes, too. No voxel inside a solid is missed if `spacing` is at most its side / sqrt(3).
+    Each mesh has its own lattice around the centre of its bounding box, so that thin parts have
+    nodes too. No voxel inside a solid is missed if `spacing` is at most the voxel's side / sqrt(3).
     Raises SettingError for a spacing that makes too many nodes.
     """
     import trimesh
@@ -40,19 +44,19 @@ def interior_lattice(
 
 
 def between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
-    """Poses (Q, 4, 4) along the way through poses (P, 4, 4), neither too far apart nor too close.
+    """Poses (Q, 4, 4) on the path through poses (P, 4, 4), about one step apart.
 
     Nothing within `radius` metres of the frame's origin moves by more than `step` metres from one
-    to the next. Longer moves are filled in with straight lines and shortest turns; of poses
-    closer together, few are kept, the first and the last among them. Raises PoseError for poses
-    that are not rigid, or so far apart that they need more than a million.
+    pose to the next. Longer moves are interpolated along straight lines and shortest turns; poses
+    closer together are thinned out, but the first and the last are kept. Raises PoseError for poses
+    that are not rigid, or so far apart that more than a million are needed.
     """
     require_positive("step", step)
     require_positive("radius", radius, zero=True)
     poses = np.array(frozen("poses", poses, (None, 4, 4), error=PoseError))
     if len(poses) == 0:
         return poses
-    check_rigid("poses", poses, _RIGID)
+    check_rigid("poses", poses, SENSOR_TOLERANCE)
     moves = _motion(poses[:-1], poses[1:], radius)
     needed = len(poses) + float(moves.sum()) / step
     if not needed <= MOST_POSES:
@@ -65,19 +69,11 @@ def between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
     pieces = np.maximum(np.ceil(steps - _ROUNDING), 1.0).astype(np.int64)
     start = np.repeat(np.arange(len(pieces)), pieces)
     part = np.arange(len(start)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    way = kept[start]
-    filled = part > 0  # a pose that was given stays as it is
-    fraction = (part / np.repeat(pieces, pieces))[filled]
-    way[filled] = interpolated(kept[start[filled]], kept[start[filled] + 1], fraction)
-    return np.concatenate([way, kept[-1:]])
-
-
-def sweep(grid: FreeGrid, interior: FloatArray, poses: FloatArray) -> int:
-    """Mark what interior (M, 3) passes at poses (Q, 4, 4), world from its frame, as `at` does.
-
-    How many voxels became free.
-    """
-    return grid.at(interior, poses=frozen("poses", poses, (None, 4, 4), error=PoseError))
+    path = kept[start]
+    between = part > 0  # the given poses stay as they are
+    fraction = (part / np.repeat(pieces, pieces))[between]
+    path[between] = interpolated(kept[start[between]], kept[start[between] + 1], fraction)
+    return np.concatenate([path, kept[-1:]])
 
 
 def _inside(mesh: trimesh.Trimesh, spacing: float) -> FloatArray:
@@ -95,17 +91,17 @@ def _inside(mesh: trimesh.Trimesh, spacing: float) -> FloatArray:
 
 
 def _motion(first: FloatArray, second: FloatArray, radius: float) -> FloatArray:
-    """How far (N,) a point can move between poses (N, 4, 4): by the shift, and a turn's arc."""
+    """How far (N,) a point can move between poses (N, 4, 4): the shift plus the arc of the turn."""
     shift = second[:, :3, 3] - first[:, :3, 3]
     turn = product(np.swapaxes(first[:, :3, :3], 1, 2), second[:, :3, :3])
     return np.sqrt((shift**2).sum(axis=1)) + radius * rotation_angle(turn)
 
 
 def _thinned(moves: FloatArray, step: float) -> list[int]:
-    """Of the poses between moves (P - 1,): each next one is the last that `step` reaches."""
-    way = np.concatenate([[0.0], np.cumsum(moves)])
-    kept, last = [0], len(way) - 1
+    """Indices of P poses, given the P - 1 moves between them: each the last within one step."""
+    path = np.concatenate([[0.0], np.cumsum(moves)])
+    kept, last = [0], len(path) - 1
     while kept[-1] < last:
-        reached = int(np.searchsorted(way, way[kept[-1]] + step, side="right")) - 1
+        reached = int(np.searchsorted(path, path[kept[-1]] + step, side="right")) - 1
         kept.append(max(reached, kept[-1] + 1))
     return kept

@@ -10,7 +10,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse
-from chsel.sensing.swept import between, interior_lattice, sweep
+from chsel.sensing.swept import between, interior_lattice
 from runners.sensors.cell import Cell
 from runners.sensors.hand import HandModel
 from runners.sensors.joint_history import JointHistory
@@ -55,7 +55,7 @@ class HandPath:
                 dense = self._dense(poses, interior)
                 if self._rig.sweep == "path" and len(interior):
                     with self._cell.free.by(tally) as grid:
-                        sweep(grid, interior, dense)
+                        grid.at(interior, poses=dense)
                 shown.append(dense)
         path = np.concatenate(shown)
         count = min(len(path), MOST_POSES)

@@ -9,7 +9,7 @@ import numpy as np
 
 from chsel.errors import SessionError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.problem.poses import compose, inverse, rotations, slerp
+from chsel.problem.poses import compose, inverse, rotation_matrices, slerp
 from runners.sensors.messages import TransformMessage
 from runners.sensors.quaternions import unit_quaternion
 
@@ -176,7 +176,7 @@ class _Edge:
         known_at, numbers = self._sorted()
         if len(known_at) == 0:
             assert self._static is not None
-            poses = compose(rotations(self._static[1][None, 3:]), self._static[1][None, :3])
+            poses = compose(rotation_matrices(self._static[1][None, 3:]), self._static[1][None, :3])
             return np.repeat(poses, len(stamps), axis=0), np.ones(len(stamps), dtype=bool)
         after = np.searchsorted(known_at, stamps)
         left = np.clip(after - 1, 0, len(known_at) - 1)
@@ -188,7 +188,9 @@ class _Edge:
         first, second = numbers[left], numbers[right]
         fraction = np.where(span > 0.0, np.clip(to_left / np.where(span > 0.0, span, 1.0), 0, 1), 0)
         position = first[:, :3] + fraction[:, None] * (second[:, :3] - first[:, :3])
-        return compose(rotations(slerp(first[:, 3:], second[:, 3:], fraction)), position), near
+        return compose(
+            rotation_matrices(slerp(first[:, 3:], second[:, 3:], fraction)), position
+        ), near
 
     def nearest(self, stamp: int) -> float:
         """Seconds from a time to the nearest sample."""

@@ -20,7 +20,7 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE2Space, SearchSpace, origin_bounds
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.subset import far_apart
+from chsel.problem.subset import farthest_points
 from chsel.problem.surface import has_surface, surface_points
 
 MOST_CONTACTS = 32
@@ -74,7 +74,7 @@ def _values_and_depths(sdf: SdfGrid) -> tuple[Any, FloatArray, FloatArray]:
     deep = np.argwhere(sdf.values <= _DEEP * min(float(sdf.values.min()), 0.0))
     if len(deep) > _MOST_NODES:
         deep = deep[np.arange(_MOST_NODES) * len(deep) // _MOST_NODES]
-    nodes = deep[far_apart(deep.astype(np.float64), MOST_INSIDE)]
+    nodes = deep[farthest_points(deep.astype(np.float64), MOST_INSIDE)]
     depth = -sdf.values[tuple(nodes.T)]
     return sdf.values.astype(np.float32).reshape(-1), sdf.origin + nodes * sdf.resolution, depth
 
@@ -155,7 +155,7 @@ def in_telling_order(points: KnownPoints) -> KnownPoints:
 
     So poses that do not fit are found out early.
     """
-    first = far_apart(points.known, _TELLING)
+    first = farthest_points(points.known, _TELLING)
     order = np.concatenate([first, np.setdiff1d(np.arange(len(points.known)), first)])
     return replace(points, known=points.known[order], known_sdf=points.sdf[order])
 

@@ -23,7 +23,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
-from chsel.problem.subset import evenly, representative, spaced
+from chsel.problem.subset import evenly_spaced, farthest_poses, representative_poses
 from chsel.qd.emitters import update_cells
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import ArchiveSettings, ranked_hypotheses, repeated, sized_archive
@@ -282,7 +282,7 @@ class _Search:
         """States of chains below a limit, with their energies, from poses that are far apart."""
         below = energies <= limit
         poses, energies = poses[below], energies[below]
-        starts = np.resize(spaced(self._problem.sdf, poses, chains), chains)
+        starts = np.resize(farthest_poses(self._problem.sdf, poses, chains), chains)
         walked = self._energy.walked(
             poses[starts], energies[starts], limit, self._effort.moves, kept=_KEPT, index=index
         )
@@ -293,13 +293,13 @@ class _Search:
         """As many hypotheses as E_0 has poses, of candidates; all of these go into the archive."""
         problem, space, settings = self._problem, self._space, self._settings
         count = len(problem.initial_set)
-        pool = evenly(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
-        chosen = pool[representative(problem.sdf, poses[pool], min(count, _MOST_CHOSEN))]
+        pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
+        chosen = pool[representative_poses(problem.sdf, poses[pool], min(count, _MOST_CHOSEN))]
         if len(chosen) < count:
             others = np.setdiff1d(np.arange(len(poses)), chosen)
             new = ~repeated(poses[np.concatenate([chosen, others])])
             others = others[new[len(chosen) :]]
-            more = others[evenly(len(others), count - len(chosen))]
+            more = others[evenly_spaced(len(others), count - len(chosen))]
             chosen = np.resize(np.concatenate([chosen, more]), count)
         vectors, objective = space.encode(poses), self._energy.objective
         measure = measure_named(settings.archive.measure, planar=settings.plane is not None)

@@ -12,7 +12,7 @@ from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner
 from chsel.numerics.octree import Candidates, candidates_for, walk
 from chsel.numerics.pose_tuples import pose_at
-from chsel.problem.sdf_lookup import distance_at, value_in_cell
+from chsel.problem.sdf_lookup import distance_at, value_between_nodes
 
 
 def found_around(model: Model) -> Candidates:
@@ -49,7 +49,7 @@ def with_free(model, pose, total, limit, found, count):
     for n in range(count):
         at = places.cell[n]
         if clearance[at] < 0.0 and places.beyond[n] == 0.0:
-            s = value_in_cell(table, at, across, along, places.u[n], places.v[n], places.w[n])
+            s = value_between_nodes(table, at, across, along, places.u[n], places.v[n], places.w[n])
             total += model.free_scale * max(model.alpha - s, 0.0)
             if not total <= limit:
                 return np.inf

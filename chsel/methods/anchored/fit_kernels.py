@@ -17,7 +17,7 @@ from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
 from chsel.numerics.octree import Candidates, walk
 from chsel.numerics.pose_tuples import pose_at
-from chsel.problem.sdf_lookup import distance_with_gradient, sample
+from chsel.problem.sdf_lookup import distance_in_box, distance_with_gradient
 
 _SLACK = 0.04  # metres that a pose may move before they are gathered again
 _FIRST_DAMPING = 1e-2  # of the mean of the diagonal
@@ -130,7 +130,7 @@ def _squares(model, twists, pose, found, count, fit, with_normal):
     locate(pose, model.free.region.box, found.x, found.y, found.z, places, count)
     for n in range(count):
         if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
-            s, nx, ny, nz = sample(field.trilinear, box, table, places, n)
+            s, nx, ny, nz = distance_in_box(field.trilinear, box, table, places, n)
             residual = s - model.alpha
             if residual < 0.0:
                 total += residual * residual

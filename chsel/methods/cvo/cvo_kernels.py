@@ -14,7 +14,7 @@ from chsel.numerics.cell_set import Box, Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import sine_cosine
 from chsel.numerics.pose_tuples import composed, moved, pose_at, turned_back
-from chsel.problem.sdf_lookup import interpolated
+from chsel.problem.sdf_lookup import distance_between_nodes
 
 BLOCK = 512  # points that are located at once
 STEPS = 16
@@ -295,7 +295,7 @@ def _moments_at(term, pose, places):
         for n in range(end - start):
             if places.beyond[n] == 0.0:
                 at = places.cell[n]
-                s, nx, ny, nz = interpolated(box, term.table, at, u[n], v[n], w[n])
+                s, nx, ny, nz = distance_between_nodes(box, term.table, at, u[n], v[n], w[n])
                 a, b, c = moved(pose, xs[n], ys[n], zs[n])
                 value += s
                 gx, gy, gz = gx + nx, gy + ny, gz + nz

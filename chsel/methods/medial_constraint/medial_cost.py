@@ -21,7 +21,7 @@ from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
-from chsel.problem.sdf_lookup import field_of
+from chsel.problem.sdf_lookup import distance_field
 from chsel.problem.search_space import SE3Space, SearchSpace
 from chsel.problem.settings import Presets
 
@@ -75,7 +75,7 @@ class MedialCost:
         self.space_arrays = self.space.arrays
         self.balls = _balls_of(problem, settings) if balls is None else balls
         self.model = MedialModel(
-            field=field_of(problem.sdf, settings.lookup, settings.outside),
+            field=distance_field(problem.sdf, settings.lookup, settings.outside),
             least=_least_values(problem.sdf, settings.lookup),
             centres=self.balls.centres.T.copy(),
             radii=self.balls.radii,

@@ -10,7 +10,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.pose_tuples import decode, finite, moved, pose_at
-from chsel.problem.sdf_lookup import Field, continued, sample
+from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 from chsel.qd.archive import Batch, Cells, all_finite, insert, rank
 from chsel.qd.emitter_kernels import MeSearch, move_to_elite
 from chsel.qd.evolution_kernels import ask, reset, stopped, tell
@@ -20,7 +20,7 @@ from chsel.qd.measures import measures_of
 class MedialModel(NamedTuple):
     """All that determines the cost of a pose."""
 
-    field: Field
+    field: DistanceField
     least: FloatArray  # (nodes,), at most the least value that is read in the cell of each node
     centres: FloatArray  # (3, N_b), of the balls, world, metres
     radii: FloatArray  # (N_b,)
@@ -86,9 +86,9 @@ def _known_mean(model, pose, places):
 def _distance(field, pose, x, y, z, places, n):
     """Signed distance at the n-th of the places, that of a world point x, y, z."""
     if places.beyond[n] > 0.0:
-        inside = sample(field.trilinear, field.box, field.table, places, n)
-        return continued(field.box_distance, field.box, inside, *moved(pose, x, y, z))[0]
-    return sample(field.trilinear, field.box, field.table, places, n)[0]
+        inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
+        return distance_beyond_box(field.box_distance, field.box, inside, *moved(pose, x, y, z))[0]
+    return distance_in_box(field.trilinear, field.box, field.table, places, n)[0]
 
 
 @spliced

@@ -27,7 +27,6 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, compose, inverse, rotation_angle
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
-from chsel.problem.subset import far_apart
 from tests.chsel.plausible.scenes import OBJECTS, WORKSPACE, ball, box, scene
 
 SMALL = PoseGridSettings(
@@ -318,9 +317,3 @@ def test_a_true_pose_that_is_not_rigid_is_named() -> None:
     problem, truth = touched_box()
     with pytest.raises(PoseError, match="world_from_object"):
         plausible_set(problem, 2.0 * truth, BOX)
-
-
-def test_points_far_apart_are_each_the_farthest_from_those_before() -> None:
-    points = np.array([[0.0], [1.0], [10.0], [4.0]])
-    assert far_apart(points, 4).tolist() == [0, 2, 3, 1]
-    assert far_apart(points, 3, given=2).tolist() == [0, 1, 2]

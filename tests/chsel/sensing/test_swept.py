@@ -11,7 +11,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse, random_rotations
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.swept import between, interior_lattice, sweep
+from chsel.sensing.swept import between, interior_lattice
 
 SIZE = np.array([0.10, 0.04, 0.06])
 SPACING = 0.01
@@ -102,7 +102,7 @@ def test_a_box_that_moves_and_turns_frees_the_voxels_it_passes(turned: float) ->
     )
     interior = interior_lattice(trimesh.creation.box(SIZE), 0.005)
     grid = FreeGrid(WORKSPACE, SPACING)
-    fresh = sweep(grid, interior, between(given, step=0.005, radius=0.07))
+    fresh = grid.at(interior, poses=between(given, step=0.005, radius=0.07))
     centres = grid.new()
     assert len(centres) == fresh
 

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from chsel.errors import ChselError, PointsError
-from chsel.problem import file_checks as npz_file
+from chsel.problem import file_checks
 from runners.sessions.point_files import PointFile, read_points
 
 POINTS = np.arange(9.0).reshape(3, 3) / 100
@@ -105,7 +105,7 @@ def test_an_npz_that_unpacks_to_more_than_the_limit_is_refused_before_it_is_unpa
     assert path.stat().st_size < 20_000
     assert len(read_points(path).at(0).free) == 100_000
     with pytest.raises(PointsError, match=r"have 2 MiB unpacked; accepted: at most 1 MiB"):
-        npz_file.read_npz(path, most_bytes=2**20, error=PointsError)
+        file_checks.read_npz(path, most_bytes=2**20, error=PointsError)
 
 
 def test_the_limit_of_a_point_file_is_half_a_gibibyte(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Poses between poses."""
+"""Rigid transforms, and poses between poses."""
 
 from __future__ import annotations
 
@@ -6,21 +6,36 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from chsel.errors import PoseError
 from chsel.problem.poses import (
     axis_angle,
+    check_rigid,
     compose,
     interpolated,
+    nearest_rigid,
     quaternions,
     random_rotations,
-    rotations,
+    rotation_matrices,
 )
+
+
+def test_transforms_that_are_not_rigid_are_named() -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    check_rigid("poses", poses)
+    for row, column, value in ((0, 0, 1.1), (0, 0, -1.0), (3, 0, 0.5)):
+        broken = poses.copy()
+        broken[2, row, column] = value
+        with pytest.raises(PoseError, match=r"poses\[2\] is not a rigid transform"):
+            check_rigid("poses", broken)
+    rounded = np.round(poses + 1e-5 * np.arange(16).reshape(4, 4) * (np.arange(4)[:, None] < 3), 7)
+    check_rigid("poses", nearest_rigid("poses", rounded))
 
 
 def test_quaternions_and_rotations_are_each_others_inverse() -> None:
     r = random_rotations(np.random.default_rng(0), 100)
     axes = np.eye(3)
     r = np.concatenate([r, np.eye(3)[None], axis_angle(axes, np.full(3, np.pi))])
-    np.testing.assert_allclose(rotations(quaternions(r)), r, atol=1e-14)
+    np.testing.assert_allclose(rotation_matrices(quaternions(r)), r, atol=1e-14)
 
 
 def test_turns_are_those_of_scipy_and_positions_on_a_line() -> None:
