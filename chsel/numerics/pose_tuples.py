@@ -173,6 +173,54 @@ def pose_at(poses, n):
 
 
 @leaf
+def moved(pose, x, y, z):
+    """R p + t of a point p = x, y, z."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
+        pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
+        pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
+    )
+
+
+@leaf
+def turned(pose, x, y, z):
+    """R v of a vector v = x, y, z."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z,
+        pose[3] * x + pose[4] * y + pose[5] * z,
+        pose[6] * x + pose[7] * y + pose[8] * z,
+    )
+
+
+@leaf
+def turned_back(pose, x, y, z):
+    """R^T v of a vector v = x, y, z."""
+    return (
+        pose[0] * x + pose[3] * y + pose[6] * z,
+        pose[1] * x + pose[4] * y + pose[7] * z,
+        pose[2] * x + pose[5] * y + pose[8] * z,
+    )
+
+
+@leaf
+def composed(left, right):
+    """The pose that moves by `right`, then by `left`."""
+    a, d, g = turned(left, right[0], right[3], right[6])
+    b, e, h = turned(left, right[1], right[4], right[7])
+    c, f, i = turned(left, right[2], right[5], right[8])
+    x, y, z = moved(left, right[9], right[10], right[11])
+    return a, b, c, d, e, f, g, h, i, x, y, z
+
+
+@leaf
+def inverted(pose):
+    """The inverse of a rigid pose: R^T, -R^T t."""
+    a, b, c, d, e, f, g, h, i, x, y, z = pose
+    u, v, w = turned_back(pose, x, y, z)
+    return a, d, g, b, e, h, c, f, i, -u, -v, -w
+
+
+@leaf
 def origin_within(pose, low, high):
     """Whether a pose has the object's origin, -R^T t in the world, in a box."""
     x = -(pose[0] * pose[9] + pose[3] * pose[10] + pose[6] * pose[11])

@@ -10,7 +10,7 @@ from chsel.methods.medial_constraint.medial_kernels import cost_of
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.qd.archive import all_finite, rank
-from chsel.qd.evolution_kernels import SIGMA, Strategy, ask, strategy_around, tell
+from chsel.qd.evolution_kernels import Strategy, ask, strategy_around, tell
 
 BEST, GENERATIONS, STOPPED, FLAT = range(4)
 
@@ -160,7 +160,7 @@ def _spread(costs: FloatArray, first: int, last: int) -> float:
 @inner
 def _step_ends(strategy: Strategy, rules: StopRules) -> bool:
     """Whether every coordinate's step is below tolx, or any above tolfacupx."""
-    sigma, smallest = strategy.numbers[SIGMA], True
+    sigma, smallest = strategy.sigma[0], True
     for j in range(len(strategy.mean)):
         deviation = sigma * np.sqrt(strategy.covariance[j, j])
         if not deviation <= rules.tolfacupx * strategy.sigma0:
