@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from chsel.cost.torch_cost import RelaxedCost
     from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
     from chsel.problem.mesh import load_mesh
+    from chsel.problem.online_registration import OnlineRegistration
     from chsel.problem.points import KnownPoints, Workspace
     from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
     from chsel.problem.sdf_grid import SdfGrid
@@ -35,6 +36,7 @@ __all__ = [
     "InputWarning",
     "KnownPoints",
     "MeshWarning",
+    "OnlineRegistration",
     "PointsWarning",
     "RegistrationProblem",
     "RelaxedCost",
@@ -53,6 +55,7 @@ _PLACES = {
     "InputWarning": "errors",
     "KnownPoints": "problem.points",
     "MeshWarning": "errors",
+    "OnlineRegistration": "problem.online_registration",
     "PointsWarning": "errors",
     "RegistrationProblem": "problem.registration_problem",
     "RelaxedCost": "cost.torch_cost",

@@ -17,12 +17,11 @@ from chsel.methods import build_method, noise_of, preset_settings
 from chsel.numerics.arrays import frozen
 from chsel.problem.input_checks import check_contacts, check_fit, check_points
 from chsel.problem.mesh import clean_mesh
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.settings import settings_mapping
-from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
+from chsel.problem.settings import changed_settings
 
 _VOXELS_PER_EXTENT = 20
 
@@ -77,8 +76,16 @@ def register(
     sdf = _grid(target, resolution)
     _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
     workspace = workspace or Workspace.around(points.all_points(), sdf.diameter)
-    key = StreamKey(seed, step)
-    problem = pose_problem(sdf, points, workspace, free_resolution, key, solver.online, previous)
+    online = OnlineRegistration(
+        sdf,
+        workspace,
+        free_resolution,
+        solver.online,
+        seed=seed,
+        points=points,
+        previous=previous,
+    )
+    problem = online.pose(step)
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
     result = solver.register(problem, observer)
@@ -132,22 +139,15 @@ def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGri
     return SdfGrid.from_mesh(mesh, resolution)
 
 
-def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> dict[str, Any]:
-    """The preset's settings with changes laid over them, as a mapping."""
-    settings = settings_mapping(preset_settings(method, preset))
+def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> Any:
+    """The preset's settings with changes laid over them."""
+    chosen = preset_settings(method, preset)
     if dataclasses.is_dataclass(changes) and not isinstance(changes, type):
-        settings = settings_mapping(changes)
+        chosen = changes
     elif changes is not None:
         require_instance("settings", changes, Mapping, "a mapping, or the settings of the method")
-        settings = _merged(settings, changes)
+        chosen = changed_settings(chosen, changes, "method")
     if hypotheses is not None:
-        settings = _merged(settings, {"online": {"hypotheses": hypotheses}})
-    return settings
-
-
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for name, value in changes.items():
-        both = isinstance(value, Mapping) and isinstance(base.get(name), Mapping)
-        merged[name] = _merged(base[name], value) if both else value
-    return merged
+        online = {"online": {"hypotheses": hypotheses}}
+        chosen = changed_settings(chosen, online, "method")
+    return chosen

@@ -10,11 +10,9 @@ import numpy as np
 
 from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import result_numbers
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 
@@ -57,20 +55,18 @@ def warm_up_sensing() -> None:
 
 
 def _register_twice(method: Method) -> None:
-    ball = _ball()
     surface = _RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
     free = 0.02 * np.argwhere(np.ones((6, 6, 6))) - 0.05
     free = free[(free**2).sum(axis=1) > 0.035**2]
     touched = KnownPoints(free, known=surface[:3])
-    known = np.concatenate([surface, 1.2 * surface])
-    known_sdf = np.concatenate([np.zeros(6), np.full(6, 0.2 * _RADIUS)])
-    every = KnownPoints(free, np.zeros((1, 3)), known, known_sdf)
-    previous: Hypotheses | None = None
-    for step, points in enumerate((touched, every)):
-        key = StreamKey(0, step)
-        problem = pose_problem(ball, points, _WORKSPACE, 0.02, key, method.online, previous)
-        previous = method.register(problem)
-        result_numbers(previous, problem, np.eye(4), None)
+    known = np.concatenate([surface[3:], 1.2 * surface])
+    known_sdf = np.concatenate([np.zeros(3), np.full(6, 0.2 * _RADIUS)])
+    others = KnownPoints(occupied=np.zeros((1, 3)), known=known, known_sdf=known_sdf)
+    online = OnlineRegistration(_ball(), _WORKSPACE, 0.02, method.online)
+    for step in online.steps(enumerate((touched, others)), method.register):
+        assert step.hypotheses is not None
+        assert step.problem is not None
+        result_numbers(step.hypotheses, step.problem, np.eye(4), None)
 
 
 def _ball() -> SdfGrid:

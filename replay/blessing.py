@@ -12,17 +12,18 @@ from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
-from chsel.problem.registration_problem import Hypotheses
-from chsel.problem.warm_start import pose_problem
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.comparing.plausible import PlausibleSets
 from replay.differences import apart
 from replay.environment import environment
 from replay.events import (
-    Event,
     HypothesesFound,
     Measured,
+    Probe,
     ProblemPosed,
+    Recorder,
     SessionStarted,
     SnapshotTaken,
     Timed,
@@ -34,6 +35,7 @@ from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
 from replay.registration import (
     recorded_method,
+    recorded_online,
     recorded_symmetry,
     register_recorded,
     symmetry_for_errors,
@@ -77,10 +79,7 @@ def write_blessed(recording: Recording, path: Path) -> Recording:
         raise RecordingError(f"recording {recording.path} has lost events; accepted: whole ones")
     recorder = McapRecorder(path)
     try:
-        for event in _todays_events(recording):
-            recorder.record(event)
-            if isinstance(event, HypothesesFound):
-                recorder.flush()
+        _register_again(recording, recorder)
         recorder.close()
         return read_recording(path)
     except BaseException:
@@ -123,41 +122,46 @@ def _outputs(recording: Recording) -> dict[int, list[object]]:
     return outputs
 
 
-def _todays_events(recording: Recording) -> Iterator[Event]:
-    """The events of a recording, every registration run again; E_0 and E_l follow anew."""
-    method, start = recorded_method(recording), recording.start
-    previous: Hypotheses | None = None
-    again: int | None = None  # the step whose recorded results are left out
-    for event in recording.events():
-        if isinstance(event, SessionStarted):
-            yield dataclasses.replace(event, environment=environment())
-        elif isinstance(event, ProblemPosed) and recording.has_result(event.step):
-            again, kept = event.step, ListRecorder()
-            problem = event.problem
-            if not start.source:
-                problem = pose_problem(
-                    problem.sdf,
-                    problem.points,
-                    problem.workspace,
-                    problem.free_resolution,
-                    problem.key,
-                    method.method.online,
-                    previous,
-                )
-            registered = register_recorded(
-                ProblemPosed(event.step, problem),
-                method.method,
-                kept,
-                start.world_from_object,
-                symmetry_for_errors(start),
-                snapshot_interval=snapshot_interval(recording.snapshots(event.step)),
-            )
-            previous = registered.hypotheses
-            yield from kept.events
-            if recording.has_timings:
-                yield Timed(event.step, registered.seconds)
-        elif not (isinstance(event, _RESULTS) and event.step == again):
-            yield event
+def _register_again(recording: Recording, recorder: Recorder) -> None:
+    """Record a session with every registration run again; E_0 and E_l follow anew."""
+    method, start = recorded_method(recording).method, recording.start
+
+    def perceived() -> Iterator[tuple[int, KnownPoints]]:
+        """Record what comes from no registration; new points of each step with a result."""
+        new: list[KnownPoints] = []
+        again: int | None = None  # the step whose recorded results are left out
+        for event in recording.events():
+            if isinstance(event, Probe):
+                new.append(event.new_points)
+            if isinstance(event, SessionStarted):
+                recorder.record(dataclasses.replace(event, environment=environment()))
+            elif isinstance(event, ProblemPosed) and recording.has_result(event.step):
+                again = event.step
+                yield again, KnownPoints.joined([KnownPoints(), *new])
+                new.clear()
+            elif not (isinstance(event, _RESULTS) and event.step == again):
+                recorder.record(event)
+
+    def register(problem: RegistrationProblem) -> Hypotheses | None:
+        step, kept = problem.key.step, ListRecorder()
+        registered = register_recorded(
+            ProblemPosed(step, recording.problem(step) if start.source else problem),
+            method,
+            kept,
+            start.world_from_object,
+            symmetry_for_errors(start),
+            snapshot_interval=snapshot_interval(recording.snapshots(step)),
+        )
+        for event in kept.events:
+            recorder.record(event)
+            if isinstance(event, HypothesesFound):
+                recorder.flush()
+        if recording.has_timings:
+            recorder.record(Timed(step, registered.seconds))
+        return None if start.source else registered.hypotheses  # problems of another method stay
+
+    for _ in recorded_online(recording, method).steps(perceived(), register):
+        pass
 
 
 def _change(

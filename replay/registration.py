@@ -15,12 +15,13 @@ from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
-from chsel.presets import PRESETS
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.registration_problem import Hypotheses
-from chsel.problem.settings import settings_mapping
+from chsel.problem.settings import PRESETS, changed_settings, settings_mapping
 from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder, SessionStarted
 from replay.lost_attachment import is_lost
 from replay.mcap.reader import Recording
+from replay.settings_migration import completed
 from replay.step_observer import StepObserver
 
 
@@ -54,13 +55,12 @@ class Registered:
 
 def recorded_method(recording: Recording) -> NamedMethod:
     """The method of a recording, with its settings; RecordingError if it does not tell them."""
-    config = recording.start.config.get("method")
-    if not isinstance(config, Mapping) or config.get("name") != recording.start.method:
-        raise RecordingError(
-            f"recording {recording.path} does not tell the settings of {recording.start.method}"
-        )
+    name, config = recording.start.method, recording.start.config.get("method")
+    if not isinstance(config, Mapping) or config.get("name") != name:
+        raise RecordingError(f"recording {recording.path} does not tell the settings of {name}")
     try:
-        return _named(recording.start.method, {k: v for k, v in config.items() if k != "name"})
+        settings = {key: value for key, value in config.items() if key != "name"}
+        return _named(name, completed(settings, preset_settings(name)))
     except SettingError as error:
         raise RecordingError(f"recording {recording.path}: {error}") from error
 
@@ -76,15 +76,29 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
     preset = next((value for key, value in pairs if key == "preset"), None)
     recorded = recording.start.method
     if name in (None, recorded) and preset is None:
-        settings: dict[str, Any] = dict(recorded_method(recording).settings)
-        name = recorded
+        settings = recorded_method(recording).method.settings
     else:
         preset = preset or _recorded_preset(recording)
-        settings = settings_mapping(preset_settings(name or recorded, str(preset)))
+        settings = preset_settings(name or recorded, str(preset))
     for key, value in pairs:
         if key != "preset":
-            settings = _changed(settings, key.removeprefix("method.").split("."), value, key)
+            for part in reversed(key.removeprefix("method.").split(".")):
+                value = {part: value}
+            settings = changed_settings(settings, value, "method")
     return _named(name or recorded, settings)
+
+
+def recorded_online(recording: Recording, method: Method) -> OnlineRegistration:
+    """The loop that a recorded session walks with a method, before its first step."""
+    start = recording.start
+    return OnlineRegistration(
+        start.sdf,
+        start.workspace,
+        start.free_resolution,
+        method.online,
+        seed=recording.seed,
+        points=start.initial_points,
+    )
 
 
 def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
@@ -124,7 +138,7 @@ def register_recorded(
     return Registered(hypotheses, numbers, seconds)
 
 
-def _named(name: str, settings: Mapping[str, Any]) -> NamedMethod:
+def _named(name: str, settings: Any) -> NamedMethod:
     method = build_method(name, settings)
     return NamedMethod(name, settings_mapping(method.settings), method)
 
@@ -143,16 +157,3 @@ def _pair(change: str) -> tuple[str, Any]:
         return key, yaml.safe_load(value)
     except yaml.YAMLError:
         raise SettingError(f"{change!r} has no value; accepted: KEY=VALUE, as in YAML") from None
-
-
-def _changed(settings: Mapping[str, Any], path: list[str], value: Any, key: str) -> dict[str, Any]:
-    """The settings with another value at a path; the path must exist."""
-    name, *rest = path
-    if name not in settings:
-        raise SettingError(f"{key} does not exist; accepted: {', '.join(sorted(settings))}")
-    inner = settings[name]
-    if rest:
-        if not isinstance(inner, Mapping):
-            raise SettingError(f"{key} does not exist; {name} is {inner!r}")
-        value = _changed(inner, rest, value, key)
-    return {**settings, name: value}

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from itertools import tee
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chsel.errors import ChselError, RecordingError
+from chsel.problem.online_registration import OnlineStep
+from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.warm_start import pose_problem
 from replay.differences import apart, difference
 from replay.environment import environment
 from replay.events import (
     Event,
     HypothesesFound,
     Measured,
+    Probe,
     ProblemPosed,
     SessionStarted,
     SnapshotTaken,
@@ -32,13 +34,12 @@ from replay.recorder import ListRecorder
 from replay.registration import (
     NamedMethod,
     recorded_method,
+    recorded_online,
     register_recorded,
     symmetry_for_errors,
 )
 
 EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
-LOST: Literal["lost"] = "lost"  # of a result that a damaged recording does not tell
-Previous = Hypotheses | Literal["lost"] | None
 _PATIENCE = 10  # times the recorded iterations of a stage; more are not worth waiting for
 _ARCHIVE = ("lower", "upper", "cells", "solutions", "objectives", "measures")
 _HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell", "elites")
@@ -88,18 +89,15 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
     if isinstance(recording.start.sdf, LostAttachment):
         raise RecordingError(f"recording {recording.path}: {recording.start.sdf.error()}")
     differing = environment_differences(recording.start)
-    events = recording.events(images=False)
-    before, posed = _until_next_problem(events)
-    previous = _previous(before, None)
-    while posed is not None:
-        of_step, following = _until_next_problem(events)
-        if posed.step in wanted:
-            measured = recording.version >= SEALED_SINCE
-            yield _verified(
-                recording.start, posed, of_step, method, previous, differing, measured=measured
-            )
-        previous = _previous(of_step, previous)
-        posed = following
+    registrations, again = tee(_registrations(recording))
+    perceived = ((one.posed.step, one.new_points) for one in again)
+    online = recorded_online(recording, method.method)
+    walked = online.steps(perceived, catch=ChselError)
+    for recorded, step in zip(registrations, walked, strict=True):
+        if step.step in wanted:
+            yield _verified(recording, recorded, step, method, differing)
+        if recorded.last_result is not None:
+            online.remember(recorded.last_result)
 
 
 def environment_differences(start: SessionStarted) -> tuple[str, ...]:
@@ -118,6 +116,35 @@ def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
     return iterations[1] if len(iterations) > 2 else 0
 
 
+@dataclass(frozen=True, eq=False)
+class _Registration:
+    """A recorded problem with the events up to the next one."""
+
+    posed: ProblemPosed
+    new_points: KnownPoints  # since the problem before
+    follows: bool  # whether E_0 and E_l are of results in this recording, none of them lost
+    events: list[Event]
+
+    @property
+    def last_result(self) -> Hypotheses | None:
+        """The result that is known when the next problem is posed."""
+        return _result(self.events[::-1])
+
+
+def _registrations(recording: Recording) -> Iterator[_Registration]:
+    events = recording.events(images=False)
+    before, posed = _until_next_problem(events)
+    lost = False
+    while posed is not None:
+        for event in before:
+            lost = tells_loss(event) or (lost and not isinstance(event, HypothesesFound))
+        new = [event.new_points for event in before if isinstance(event, Probe)]
+        of_step, following = _until_next_problem(events)
+        follows = not recording.start.source and not lost
+        yield _Registration(posed, KnownPoints.joined([KnownPoints(), *new]), follows, of_step)
+        before, posed = of_step, following
+
+
 def _until_next_problem(events: Iterator[Event]) -> tuple[list[Event], ProblemPosed | None]:
     of_step: list[Event] = []
     for event in events:
@@ -125,16 +152,6 @@ def _until_next_problem(events: Iterator[Event]) -> tuple[list[Event], ProblemPo
             return of_step, event
         of_step.append(event)
     return of_step, None
-
-
-def _previous(events: Sequence[Event], previous: Previous) -> Previous:
-    """The last result after these events, LOST if it may have been lost."""
-    for event in events:
-        if isinstance(event, HypothesesFound):
-            previous = event.hypotheses
-        elif tells_loss(event):
-            previous = LOST
-    return previous
 
 
 def _events_of(step: int, events: Sequence[Event]) -> tuple[list[Event], bool]:
@@ -149,27 +166,22 @@ def _events_of(step: int, events: Sequence[Event]) -> tuple[list[Event], bool]:
 
 
 def _verified(
-    start: SessionStarted,
-    posed: ProblemPosed,
-    events: Sequence[Event],
+    recording: Recording,
+    registration: _Registration,
+    again: OnlineStep,
     method: NamedMethod,
-    previous: Previous,
     environment: tuple[str, ...],
-    *,
-    measured: bool,
 ) -> Verdict:
-    """Run the registration of a step again, and compare; measured: also numbers about the result.
-
-    Before format version 3 those may be others than the ones computed today.
-    """
+    """Register a recorded problem again, and compare; again: the problem, posed today."""
+    start, posed, events = recording.start, registration.posed, registration.events
     step = posed.step
     recorded, whole = _events_of(step, events)
     expected = _result(recorded)
     if expected is None:
         return Verdict(step, method.name, NO_RESULT)
     comparison = _Comparison()
-    if not start.source and previous != LOST:  # else the sets are of what is not in this recording
-        _compare_sets(comparison, posed.problem, method, previous)
+    if registration.follows:
+        _compare_sets(comparison, posed.problem, again)
     watching = _Watching(recorded) if whole else ListRecorder()
     snapshots = [event.archive for event in recorded if isinstance(event, SnapshotTaken)]
     found, failure, seconds = None, "", 0.0
@@ -192,6 +204,7 @@ def _verified(
         comparison.stage_is("the end of the registration", equal=False)
         comparison.differences.append(f"today's registration does not end: {failure}")
     numbers = [event for event in recorded if isinstance(event, Measured)]
+    measured = recording.version >= SEALED_SINCE  # before, numbers may be others than today's
     if measured and (numbers or not any(map(tells_loss, events))):
         lines = measured_differences(start, posed.problem, expected, numbers)
         comparison.stage_is("the measured values", equal=not lines)
@@ -267,29 +280,14 @@ class _Watching(ListRecorder):
         super().record(event)
 
 
-def _compare_sets(
-    comparison: _Comparison,
-    problem: RegistrationProblem,
-    method: NamedMethod,
-    previous: Hypotheses | None,
-) -> None:
+def _compare_sets(comparison: _Comparison, problem: RegistrationProblem, again: OnlineStep) -> None:
     """Whether E_0 and E_l follow from the step before as recorded (CHSEL, Alg. 2)."""
-    try:
-        again = pose_problem(
-            problem.sdf,
-            problem.points,
-            problem.workspace,
-            problem.free_resolution,
-            problem.key,
-            method.method.online,
-            previous,
-        )
-    except ChselError as error:  # such as elites that are no poses
+    if again.problem is None:  # such as after a result whose poses are not finite
         comparison.stage_is("making E_0", equal=False)
-        comparison.differences.append(f"E_0 and E_l cannot be made again: {error}")
+        comparison.differences.append(f"E_0 and E_l cannot be made again: {again.failure}")
         return
     for name, field_name in (("E_0", "initial_set"), ("E_l", "low_cost_set")):
-        pair = (getattr(problem, field_name), getattr(again, field_name))
+        pair = (getattr(problem, field_name), getattr(again.problem, field_name))
         comparison.stage_is(f"making {name}", equal=comparison.arrays({name: pair}))
 
 

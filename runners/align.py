@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ from runners.align_view import save_view
 from runners.alignment_fit import Fit, fit_of
 from runners.cli import command, plain
 from runners.objects.scans import AssetsConfig
-from runners.plausible import named_arguments
 from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
 
@@ -38,25 +36,25 @@ _VIEW = ".pose.rrd"
 
 @dataclass(frozen=True)
 class AlignConfig:
-    """conf/align.yaml, checked. object, session: checked where they are used.
+    """conf/align.yaml, which has all defaults, checked.
 
-    position: of the object's frame in the world, metres. rotation: roll, pitch, yaw, radians, about
-    the world's x, y, z in this order. pose: a pose file in place of both. out: folder of what is
-    written; None: beside the file.
+    object, session: checked where they are used. position: of the object's frame in the world,
+    metres. rotation: roll, pitch, yaw, radians, about the world's x, y, z in this order. pose: a
+    pose file in place of both. out: folder of what is written; None: beside the file.
     """
 
     object: Any
     session: Any
     assets: AssetsConfig
-    search: TruePoseSettings = field(default_factory=TruePoseSettings)
-    file: str | None = None
-    position: Triple | None = None
-    rotation: Triple | None = None
-    pose: str | None = None
-    out: str | None = None
-    overwrite: bool = False
-    seed: int = 0
-    threads: int = 1
+    search: TruePoseSettings
+    file: str | None
+    position: Triple | None
+    rotation: Triple | None
+    pose: str | None
+    out: str | None
+    overwrite: bool
+    seed: int
+    threads: int
 
     def __post_init__(self) -> None:
         if not self.file:
@@ -219,11 +217,5 @@ def _about(
     }
 
 
-def program() -> None:
-    """The command, from the arguments of this process."""
-    sys.argv[1:] = named_arguments(sys.argv[1:])
-    main()
-
-
 if __name__ == "__main__":
-    program()
+    main()

@@ -32,7 +32,7 @@ from runners.recording import make_run_folder, write_in_run_folder
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
-    """conf/benchmark.yaml, checked.
+    """conf/benchmark.yaml, which has all defaults, checked.
 
     problems: which to register. alone: what else to measure of this library. free_points,
     hypotheses: the sizes that show how the time grows. device: where evaluation takes many poses,
@@ -46,10 +46,10 @@ class BenchmarkConfig:
     package: PackageConfig
     steps: Steps
     logs: str
-    device: str = "auto"
-    repeats: int = 5
-    seed: int = 0
-    quick: bool = False
+    device: str
+    repeats: int
+    seed: int
+    quick: bool
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)

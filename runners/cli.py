@@ -5,10 +5,9 @@ from __future__ import annotations
 import difflib
 import multiprocessing
 import os
-import re
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -23,20 +22,18 @@ from hydra.errors import (
     MissingConfigException,
     OverrideParseException,
 )
-from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from chsel.errors import ChselError
 from replay.console import print_error, print_page, print_warning
 from replay.startup import ready
+from runners.arguments import TRACEBACK, hydra_arguments
 from runners.command_help import asked_for, help_text
-from runners.path_values import literal_paths
-from runners.presets import store_presets
+from runners.presets import store_choices
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-TRACEBACK = "--traceback"
 _NESTED_GROUPS = ("session/rig",)  # choices of their own, not options of the group around them
-_OPEN_GROUPS = {"evaluate": ("settings.", "outside.")}  # of a command, groups that have any key
 _USER_ERRORS = (ChselError, HydraException, OmegaConfBaseException, OSError)
 
 
@@ -53,16 +50,8 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
             show_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1" or TRACEBACK in sys.argv
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
             warnings.showwarning = print_warning
-            sys.argv[1:] = prepared(config_name, sys.argv[1:])
-            if asked_for(sys.argv[1:]):
-                words = sys.argv[1:]
-                show_help = partial(_print_help, config_name, words)
-                _exit_on_error(show_help, config_name, show_traceback)
-                return
-
             job = _Job(_importable(main), config_name, show_traceback)
-            run = hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)
-            _exit_on_error(run(job), config_name, show_traceback)
+            _exit_on_error(partial(_start, job), config_name, show_traceback)
 
         program.main = main  # type: ignore[attr-defined]
         return program
@@ -71,17 +60,20 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
 
 
 def prepared(config_name: str, words: list[str]) -> list[str]:
-    """The arguments of a command as Hydra takes them, which has all presets to choose from."""
-    store_presets()
-    _register_resolvers()
-    words = [word for word in words if word != TRACEBACK]
-    open_groups = _OPEN_GROUPS.get(config_name, ())
-    words = [f"++{word}" if word.startswith(open_groups) else word for word in words]
-    return literal_paths(words)
+    """The arguments of a command as Hydra takes them, which has all choices to choose from."""
+    store_choices()
+    OmegaConf.register_new_resolver("options", _options, replace=True)
+    return hydra_arguments(config_name, words)
 
 
-def _print_help(config_name: str, words: list[str]) -> None:
-    print_page(help_text(config_name, words))
+def _start(job: _Job) -> None:
+    """Print the help of a command, or have Hydra run it once or, as a sweep, many times."""
+    words = prepared(job.config_name, sys.argv[1:])
+    if asked_for(words):
+        print_page(help_text(job.config_name, words))
+        return
+    sys.argv[1:] = words  # where hydra.main takes them from; no other call of it runs sweeps
+    hydra.main(version_base="1.3", config_path=str(CONF), config_name=job.config_name)(job)()
 
 
 @dataclass(frozen=True)
@@ -118,15 +110,26 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def choices(group: str) -> list[str]:
-    """The options of a group, those of conf/ first, of nested folders with their path."""
+    """The options of a group: the files of conf/, of nested folders with their path, and more.
+
+    These are what `store_choices` offers, such as methods.
+    """
     folder = CONF / group
-    files = sorted(folder.rglob("*.yaml"), key=lambda file: (len(file.parts), file))
     nested = [CONF / name for name in _NESTED_GROUPS if name != group]
-    files = [file for file in files if not any(file.is_relative_to(other) for other in nested)]
-    names = [str(file.relative_to(folder).with_suffix("")) for file in files]
-    stored = ConfigStore.instance().repo.get(group, {})  # such as methods of installed packages
-    more = sorted(Path(name).stem for name in stored if name.endswith(".yaml"))
-    return list(dict.fromkeys([*names, *more]))
+    files = [file.relative_to(folder) for file in folder.rglob("*.yaml")]
+    names = [
+        str(file.with_suffix(""))
+        for file in files
+        if not any((folder / file).is_relative_to(other) for other in nested)
+    ]
+    stored = ConfigStore.instance().repo.get(group, {})
+    names += [Path(name).stem for name in stored if name.endswith(".yaml")]
+    return sorted(names, key=lambda name: (name.count("/"), name))
+
+
+def _options(*groups: str) -> str:
+    """What the help texts in conf/ use: ${options:object,session} lists the options of groups."""
+    return "\n".join(f"  {group}={'|'.join(choices(group))}" for group in groups)
 
 
 def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bool) -> None:
@@ -144,23 +147,44 @@ def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bo
         sys.exit(2)
 
 
-def _message(error: Exception, config_name: str) -> str:
+def _message(error: BaseException, config_name: str) -> str:
     """One line: what was wrong, and what is accepted."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        group, choice = _group_and_choice(str(error.missing_cfg_file))
-        if (CONF / group).is_dir():
-            return _not_accepted(group, f"has no option {choice!r}", choice, choices(group))
-    unknown = re.match(r"Could not override '([^']+)'", str(error))
-    if unknown and isinstance(error, ConfigCompositionException):
-        return _unknown_key(unknown.group(1), config_name)
-    text = str(error)
+        return _missing(str(error.missing_cfg_file))
     if isinstance(error, OverrideParseException):
-        text = f"{error.override!r} is no setting ({text}"
-        text = text.split("\n")[0] + "); accepted: KEY=VALUE"
-    if isinstance(error, HydraException) and error.__cause__ is not None:
-        text = f"{text}: {error.__cause__}"
-    text = re.split(r"\nConfig search path:|\nSee https?://|\n\s*full_key:", text)[0]
-    return re.sub(r"\s*\n\s*", " ", text).strip()
+        what = error.message.splitlines()[0]
+        return f"{error.override!r} is no setting ({what}); accepted: KEY=VALUE"
+    cause = error.__cause__ if isinstance(error, HydraException) else None
+    if isinstance(cause, ConfigKeyError | ConfigAttributeError):
+        return _unknown_key(cause, config_name)
+    if isinstance(error, ConfigCompositionException) and not cause:
+        unknown = _unknown_group(config_name)
+        if unknown is not None:
+            return unknown
+    lines = str(error).splitlines()
+    if isinstance(error, OmegaConfBaseException):
+        lines = lines[:1]  # the others name its own types
+    text = " ".join(" ".join(lines).split())
+    if isinstance(cause, OmegaConfBaseException):
+        text = ": ".join(part for part in (text, _message(cause, config_name)) if part)
+    return text
+
+
+def _missing(name: str) -> str:
+    """A file that is not there: GROUP/CHOICE, or the configuration that --config-name names."""
+    group, choice = _group_and_choice(name)
+    if accepted := choices(group):
+        return _not_accepted(group, f"has no option {choice!r}", choice, accepted)
+    return f"configuration {name!r} does not exist; accepted: a file of {CONF} or --config-dir"
+
+
+def _unknown_group(config_name: str) -> str | None:
+    """What is wrong with an argument that chooses an option of a group of another command."""
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        config = hydra.compose(config_name)
+    groups = [word.partition("=")[0] for word in sys.argv[1:]]
+    unknown = (key for key in groups if choices(key) and key.split("/")[0] not in config)
+    return next((_no_key(config_name, key, config) for key in unknown), None)
 
 
 def _group_and_choice(name: str) -> tuple[str, str]:
@@ -172,42 +196,21 @@ def _group_and_choice(name: str) -> tuple[str, str]:
     return group, choice
 
 
-def _unknown_key(key: str, config_name: str) -> str:
+def _unknown_key(error: ConfigKeyError | ConfigAttributeError, config_name: str) -> str:
     """Where the path of an override leaves the configuration, and what stands there."""
-    groups = [argument for argument in sys.argv[1:] if argument.split("=")[0] in _groups()]
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        node: Any = hydra.compose(config_name, groups)
-    parts = key.split("@")[0].split(".")
-    for depth, part in enumerate(parts):
-        where = ".".join(parts[:depth]) or config_name
-        if isinstance(node, ListConfig) and part.isdecimal() and int(part) < len(node):
-            node = node[int(part)]
-            continue
-        if not isinstance(node, DictConfig) or part not in node:
-            if any(part.isdecimal() for part in parts[:depth]):
-                return f"{where} does not give {part!r}; accepted: +{key}=VALUE to add it"
-            names = [str(name) for name in node] if isinstance(node, DictConfig) else []
-            return _not_accepted(where, f"has no key {part!r}", part, names)
-        node = OmegaConf.select(node, part)
-    return f"{key} is not a key"
+    key = str(error.full_key).replace("[", ".").replace("]", "")
+    where, _, name = key.rpartition(".")
+    if any(part.isdecimal() for part in where.split(".")):  # an entry of a list lacks defaults
+        return f"{where} does not give {name!r}; accepted: +{key}=VALUE to add it"
+    return _no_key(where or config_name, name, error.parent_node or {})
+
+
+def _no_key(where: str, name: str, node: Iterable[Any]) -> str:
+    accepted = [str(known) for known in node if known != "hydra"]
+    return _not_accepted(where, f"has no key {name!r}", name, accepted)
 
 
 def _not_accepted(where: str, what: str, value: str, accepted: list[str]) -> str:
     close = difflib.get_close_matches(value, accepted, n=1, cutoff=0.5)
     hint = f"; did you mean {close[0]}?" if close else ";"
     return f"{where} {what}{hint} accepted: {', '.join(accepted) or 'no key below it'}"
-
-
-def _groups() -> list[str]:
-    return sorted(
-        folder.name for folder in CONF.iterdir() if folder.is_dir() and choices(folder.name)
-    )
-
-
-def _register_resolvers() -> None:
-    """What the help texts in conf/ use: ${options:object,session} lists the options of groups."""
-
-    def options(*groups: str) -> str:
-        return "\n".join(f"  {group}={'|'.join(choices(group))}" for group in groups)
-
-    OmegaConf.register_new_resolver("options", options, replace=True)

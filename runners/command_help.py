@@ -23,8 +23,8 @@ def help_text(config_name: str, words: list[str]) -> str:
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf, open_dict
 
+    from runners.arguments import is_setting
     from runners.cli import CONF
-    from runners.path_values import is_setting
 
     settings = [word for word in words if is_setting(word)]
     with initialize_config_dir(str(CONF), version_base="1.3"):

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ _OF_TRIAL = ("configuration", "logs")
 class IterationsConfig:
     """every: iterations of the search between measures of it; None: none but of the result."""
 
-    every: int | None = None
+    every: int | None
 
     def __post_init__(self) -> None:
         if self.every is not None:
@@ -54,7 +54,10 @@ class IterationsConfig:
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """conf/evaluate.yaml, checked. What is Any is checked by whoever it concerns."""
+    """conf/evaluate.yaml, which has all defaults, checked.
+
+    What is Any is checked by whoever it concerns.
+    """
 
     name: str
     out: str
@@ -69,13 +72,13 @@ class EvaluateConfig:
     metrics: MetricsConfig
     iterations: IterationsConfig
     assets: AssetsConfig
-    truth: TruePoseSettings = field(default_factory=TruePoseSettings)
-    objects: str = "models"
-    steps: str | None = None
-    starts: str = OWN
-    draws: int = 1
-    recordings: bool = True
-    workers: int | None = None
+    truth: TruePoseSettings
+    objects: str
+    steps: str | None
+    starts: str
+    draws: int
+    recordings: bool
+    workers: int | None
 
     def __post_init__(self) -> None:
         if self.workers is not None:
@@ -209,10 +212,5 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def program() -> None:
-    """The command, from the arguments of this process."""
-    main()
-
-
 if __name__ == "__main__":
-    program()
+    main()

@@ -30,29 +30,30 @@ from runners.cli import command, plain
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig
-from runners.path_values import is_setting, quoted
 from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import beside, read_pose
 
-_TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class PlausibleConfig:
-    """conf/plausible.yaml, checked. object, session, definition: checked where they are used."""
+    """conf/plausible.yaml, which has all defaults, checked.
+
+    object, session, definition: checked where they are used.
+    """
 
     object: Any
     session: Any
     definition: Any
     metrics: MetricsConfig
     assets: AssetsConfig
-    file: str | None = None
-    steps: str | None = None
-    guess: tuple[tuple[float, ...], ...] | None = None
-    out: str | None = None
-    seed: int = 0
-    threads: int = 1
+    file: str | None
+    steps: str | None
+    guess: tuple[tuple[float, ...], ...] | None
+    out: str | None
+    seed: int
+    threads: int
 
     def __post_init__(self) -> None:
         if not self.file:
@@ -220,33 +221,5 @@ def _cell(row: Row, key: str) -> str:
     return format(row[key], _COLUMNS[key][1]) if row.get(key) is not None else ""
 
 
-def named_arguments(arguments: list[str]) -> list[str]:
-    """Arguments as Hydra takes them: the file, and the steps after it, may stand without a name."""
-    kept: list[str] = []
-    files: list[str] = []
-    steps: list[str] = []
-    rest = iter(arguments)
-    for argument in rest:
-        if argument == "--steps":
-            steps.append(next(rest, ""))
-        elif argument.startswith("--steps="):
-            steps.append(argument.partition("=")[2])
-        elif argument in _TAKES_VALUE or argument.startswith("--config-"):
-            kept.append(argument)
-            kept += [] if "=" in argument else [value for value in [next(rest, None)] if value]
-        elif argument.startswith("-") or is_setting(argument):
-            kept.append(argument)
-        else:
-            (steps if files else files).append(argument)
-    kept += [f"file={quoted(path)}" for path in files]
-    return [*kept, f"steps={quoted(','.join(steps))}"] if steps else kept
-
-
-def program() -> None:
-    """The command, from the arguments of this process."""
-    sys.argv[1:] = named_arguments(sys.argv[1:])
-    main()
-
-
 if __name__ == "__main__":
-    program()
+    main()

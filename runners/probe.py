@@ -18,6 +18,7 @@ from chsel.errors import InputWarning, RecordingError
 from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.numerics.threads import require_threads
+from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
@@ -65,7 +66,10 @@ class PresetName:
 
 @dataclass(frozen=True)
 class ProbeConfig:
-    """conf/probe.yaml, checked. session and method: checked by whoever they name."""
+    """conf/probe.yaml, which has all defaults, checked.
+
+    session and method: checked by whoever they name.
+    """
 
     object: ObjectConfig
     session: Any
@@ -74,9 +78,9 @@ class ProbeConfig:
     recording: RecordingConfig
     assets: AssetsConfig
     logs: str
-    seed: int = 0
-    threads: int = 1
-    configuration: str | None = None
+    seed: int
+    threads: int
+    configuration: str | None
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
@@ -105,7 +109,7 @@ class Scene:
     object_name: str
     mesh: trimesh.Trimesh
     sdf: SdfGrid
-    start: tuple[int, int]
+    start: Start
     watcher: Watcher = field(default_factory=Watcher)
     warnings: tuple[InputWarning, ...] = ()
 
@@ -114,6 +118,18 @@ class Scene:
         """What became of sensors' images, once they are read."""
         session = self.session
         return session.report if isinstance(session, SensorsSession | DepthFrameSession) else None
+
+    def online(self, settings: OnlineSettings, seed: int) -> OnlineRegistration:
+        """The loop of the session, before its first step; see `OnlineRegistration`."""
+        return OnlineRegistration(
+            self.sdf,
+            self.session.workspace,
+            self.session.free_resolution,
+            settings,
+            seed=seed,
+            points=self.session.initial_points,
+            start=self.start,
+        )
 
 
 @command("probe")
@@ -170,7 +186,7 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
         padding=settings.object_padding,
         progress=lambda done, total: watcher("signed distance grid, nodes", done, total),
     )
-    start = (settings.start_contacts, settings.start_probe)
+    start = Start(settings.start_contacts, settings.start_probe)
     if kind in _OF_REAL_OBJECTS:
         found += check_size(object_model, session.workspace)
     name, mesh = object_model.name, object_model.mesh
@@ -235,12 +251,10 @@ def run(
     recorder = open_recorder(folder, config.recording)
     session_run = SessionRun(
         scene.session,
+        scene.online(method.online, config.seed),
         method,
-        scene.sdf,
         recorder,
         symmetry=symmetry_for_errors(started),
-        seed=config.seed,
-        start=scene.start,
         recording=config.recording,
         show=show,
         opening=scene.warnings,

@@ -31,14 +31,17 @@ _SEED = re.compile(r"seed_(\d{1,19})")
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """conf/published.yaml, checked. What is Any is checked by whoever it concerns."""
+    """conf/published.yaml, which has all defaults, checked.
+
+    What is Any is checked by whoever it concerns.
+    """
 
     configurations: Any
     seeds: Any
     package: PackageConfig
-    dir: str | None = None
-    out: str | None = None
-    draws: int = 1
+    dir: str | None
+    out: str | None
+    draws: int
 
     def __post_init__(self) -> None:
         require_draws(self.draws)

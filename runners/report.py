@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +11,8 @@ from omegaconf import DictConfig
 
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings, settings_mapping
-from replay.console import Console, print_error
+from replay.console import Console
 from runners.cli import command, plain
-from runners.path_values import is_setting, quoted
 from runners.reporting.against_baseline import section_against
 from runners.reporting.completeness import planned_methods
 from runners.reporting.console_table import print_table
@@ -26,17 +23,16 @@ from runners.reporting.sections import SequenceConfig, sections_of
 from runners.whole_file import whole_file
 
 HTML, MARKDOWN = "report.html", "report.md"
-_TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 
 
 @dataclass(frozen=True)
 class ReportConfig:
-    """conf/report.yaml, checked."""
+    """conf/report.yaml, which has all defaults, checked."""
 
     sequence: SequenceConfig
-    dir: str | None = None
-    baseline: str | None = None
-    out: str | None = None
+    dir: str | None
+    baseline: str | None
+    out: str | None
 
     def __post_init__(self) -> None:
         if not self.dir:
@@ -70,27 +66,6 @@ def main(config: DictConfig) -> None:
         console.print(str(out / name), soft_wrap=True)
 
 
-def named_arguments(arguments: Sequence[str]) -> list[str]:
-    """Arguments as Hydra takes them: the folder may stand without a name.
-
-    Raises SettingError for a second folder.
-    """
-    kept: list[str] = []
-    folders: list[str] = []
-    rest = iter(arguments)
-    for argument in rest:
-        if argument in _TAKES_VALUE or argument.startswith("--config-"):
-            kept.append(argument)
-            kept += [] if "=" in argument else [value for value in [next(rest, None)] if value]
-        elif argument.startswith("-") or is_setting(argument):
-            kept.append(argument)
-        else:
-            folders.append(argument)
-    if len(folders) > 1:
-        raise SettingError(f"{folders[1]!r} is one folder too many; accepted: DIR KEY=VALUE ...")
-    return [*kept, *(f"dir={quoted(path)}" for path in folders)]
-
-
 def _write(out: Path, page: Page) -> None:
     """The files, each in the place of that of an earlier report."""
     for section in page.sections:
@@ -117,15 +92,5 @@ def _value(value: Any) -> str:
     return f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else str(value)
 
 
-def program() -> None:
-    """The command, from the arguments of this process."""
-    try:
-        sys.argv[1:] = named_arguments(sys.argv[1:])
-    except SettingError as error:
-        print_error(str(error))
-        sys.exit(2)
-    main()
-
-
 if __name__ == "__main__":
-    program()
+    main()

@@ -1,4 +1,4 @@
-"""A session from its first probe to its last: probe, register, record."""
+"""A session from its first probe to its last: Algorithm 2, recorded."""
 
 from __future__ import annotations
 
@@ -6,24 +6,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from chsel.errors import InputWarning
+from chsel.errors import ChselError, InputWarning
 from chsel.methods import noise_of
 from chsel.methods.method import Method
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.input_checks import check_contacts, check_fit, check_points
-from chsel.problem.points import GrowingPoints
+from chsel.problem.online_registration import OnlineRegistration, OnlineStep
+from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
-from replay.events import (
-    Logged,
-    Probe,
-    ProblemPosed,
-    Recorder,
-    Timed,
-)
-from replay.registration import register_recorded
+from replay.events import Logged, Probe, ProblemPosed, Recorder, Timed
+from replay.registration import Registered, register_recorded
 from runners.recording import RecordingConfig
 from runners.sessions.session import Session
 from runners.step_warning import FROM_SESSION, StepWarning
@@ -32,100 +24,112 @@ Row = dict[str, Any]
 
 
 class SessionRun:
-    """Registers after every probe for which there is enough to go by (CHSEL, Alg. 2)."""
+    """Walks the loop of an `OnlineRegistration` over a session, and records every step.
+
+    step: of the last probe. warnings: so far. registered: what the method gave in that step, None
+    without a registration. failure: why it gave nothing, "" if nothing failed.
+    """
 
     def __init__(
         self,
         session: Session,
+        online: OnlineRegistration,
         method: Method,
-        sdf: SdfGrid,
         recorder: Recorder,
         *,
         symmetry: ObjectSymmetry | None,
-        seed: int,
-        start: tuple[int, int],
         recording: RecordingConfig,
         show: Callable[[str, int, int], None],
         opening: Iterable[InputWarning] = (),
     ) -> None:
         """symmetry: of the object, for errors to the true pose; None where that is not known.
 
-        start: a registration needs so many contacts, and this probe index. opening: warnings about
-        what was opened, which are recorded with the first probe.
+        opening: warnings about what was opened, which are recorded with the first probe.
         """
-        self._session, self._method, self._sdf, self._recorder = session, method, sdf, recorder
-        self._symmetry, self._seed = symmetry, seed
-        self._start = start
-        self._snapshot_interval = recording.snapshot_interval
-        self._timings = recording.timings
-        self._show = show
-        self._points = GrowingPoints(session.initial_points)
-        self.previous: Hypotheses | None = None
+        self._session, self._online, self._method = session, online, method
+        self._recorder, self._recording = recorder, recording
+        self._symmetry, self._show = symmetry, show
+        self._opening = tuple(opening)
         self.step = 0
         self.warnings: list[StepWarning] = []
-        self._opening = tuple(opening)
+        self.registered: Registered | None = None
+        self.failure = ""
 
-    def steps(self) -> Iterator[tuple[Probe, Row]]:
-        """Each probe with the row of numbers that is shown and summarised about it."""
+    def steps(
+        self,
+        register: Callable[[RegistrationProblem], Hypotheses | None] | None = None,
+        catch: type[Exception] | tuple[type[Exception], ...] = (),
+    ) -> Iterator[tuple[OnlineStep, Row]]:
+        """Each step with the row of numbers that is shown and summarised about it.
+
+        register: by default `register` of this run. catch: see `OnlineRegistration.steps`.
+        """
+        for step in self._online.steps(self._perceived(), register or self.register, catch):
+            if step.failure is not None:
+                self.failed(step.step, step.failure)
+            row: Row = {
+                "step": step.step,
+                "outcome": self._outcome,
+                "contacts": self._online.points.contacts,
+                "free_points": self._online.points.free,
+            }
+            if step.problem is not None and self.registered is not None:
+                found = self.registered.hypotheses
+                if len(found.cost) > 0:
+                    self._warn(check_fit(step.problem, found, noise_of(self._method)))
+                    row["best_cost"] = float(found.cost[0])
+                row |= {"distinct": found.distinct, "digest": found.digest}
+                row |= self.registered.numbers
+            self._recorder.record(Logged(step.step, "info", _line(row)))
+            if self._recording.timings:
+                self._recorder.record(Timed(step.step, self._seconds))
+            self._recorder.flush()
+            row |= {"seconds": sum(self._seconds.values()), "seconds_by_stage": self._seconds}
+            yield step, row
+        self._check_points()
+        self._warn(check_contacts(self._online.points.all()))
+        self._recorder.flush()
+
+    def register(self, problem: RegistrationProblem) -> Hypotheses:
+        """Check the points, register the problem by the run's method, and record it."""
+        self._check_points()
+        self.registered = register_recorded(
+            ProblemPosed(problem.key.step, problem),
+            self._method,
+            self._recorder,
+            self._session.world_from_object,
+            self._symmetry,
+            snapshot_interval=self._recording.snapshot_interval,
+            show=self._show,
+        )
+        self._seconds |= self.registered.seconds
+        return self.registered.hypotheses
+
+    def failed(self, step: int, error: Exception) -> None:
+        """Record why a step has no result."""
+        self.failure = one_line(error)
+        self._recorder.record(Logged(step, "warning", f"no result: {self.failure}"))
+
+    def _perceived(self) -> Iterator[tuple[int, KnownPoints]]:
+        """Record what the session yields, and hand on the new points of its probes."""
         begun = time.perf_counter()
         for event in self._session.probes():
             self._recorder.record(event)
             if isinstance(event, Logged) and event.level == "warning":
                 self.warnings.append(StepWarning(event.step, FROM_SESSION, event.text))
-            if not isinstance(event, Probe):
-                continue
-            probe = event
-            self.step = probe.step
-            self._warn(self._opening)
-            seconds = {"probe": time.perf_counter() - begun}
-            self._points.add(probe.new_points)
-            row: Row = {
-                "step": probe.step,
-                "outcome": probe.outcome,
-                "contacts": self._points.contacts,
-                "free_points": self._points.free,
-            }
-            if self._enough(probe):
-                row |= self._register(probe.step, seconds)
-            self._recorder.record(Logged(probe.step, "info", _line(row)))
-            if self._timings:
-                self._recorder.record(Timed(probe.step, seconds))
-            self._recorder.flush()
-            row |= {"seconds": sum(seconds.values()), "seconds_by_stage": seconds}
-            yield probe, row
-            begun = time.perf_counter()
-        self._check_points()
-        self._warn(check_contacts(self._points.all()))
-        self._recorder.flush()
-
-    def _enough(self, probe: Probe) -> bool:
-        contacts, index = self._start
-        known = self._points
-        return known.contacts >= contacts and probe.step >= index and known.count > 0
-
-    def _register(self, step: int, seconds: dict[str, float]) -> Row:
-        """Check the points, pose the problem, register, and record; numbers about the result."""
-        self._check_points()
-        problem = self._pose(step, self.previous)
-        registered = register_recorded(
-            ProblemPosed(step, problem),
-            self._method,
-            self._recorder,
-            self._session.world_from_object,
-            self._symmetry,
-            snapshot_interval=self._snapshot_interval,
-            show=self._show,
-        )
-        seconds |= registered.seconds
-        found = self.previous = registered.hypotheses
-        self._warn(check_fit(problem, found, noise_of(self._method)))
-        row = {"best_cost": float(found.cost[0]), "distinct": found.distinct}
-        return row | {"digest": found.digest} | dict(registered.numbers)
+            if isinstance(event, Probe):
+                self.step, self._outcome = event.step, event.outcome
+                self.registered, self.failure = None, ""
+                self._warn(self._opening)
+                self._seconds = {"probe": time.perf_counter() - begun}
+                yield event.step, event.new_points
+                begun = time.perf_counter()
 
     def _check_points(self) -> None:
         """Warn about points known so far; PointsError if they cannot be the object's."""
         workspace, resolution = self._session.workspace, self._session.free_resolution
-        self._warn(check_points(self._points.all(), self._sdf.diameter, resolution, workspace))
+        points, diameter = self._online.points.all(), self._online.sdf.diameter
+        self._warn(check_points(points, diameter, resolution, workspace))
 
     def _warn(self, found: Iterable[InputWarning]) -> None:
         """Record warnings, each kind once a session."""
@@ -134,20 +138,14 @@ class SessionRun:
                 self.warnings.append(StepWarning(self.step, warning.code, warning.text))
                 self._recorder.record(Logged(self.step, "warning", warning.text))
 
-    def _pose(self, step: int, previous: Hypotheses | None) -> RegistrationProblem:
-        """What is to be registered at a step, after the result of the one before."""
-        return pose_problem(
-            self._sdf,
-            self._points.all(),
-            self._session.workspace,
-            self._session.free_resolution,
-            StreamKey(self._seed, step),
-            self._method.online,
-            previous,
-        )
+
+def one_line(error: BaseException) -> str:
+    """The text of an error, with its class if it is none of ours."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"
 
 
 def _line(row: Row) -> str:
     """What the recording's log says about a probe; results speak for themselves."""
     text = f"probe {row['step']}: {row['outcome']}, {row['contacts']} contacts"
-    return text if "best_cost" in row else f"{text}, too little for a registration"
+    return text if "digest" in row else f"{text}, too little for a registration"

@@ -34,9 +34,9 @@ class SimulateRigConfig:
     configuration: str
     object: Any
     assets: AssetsConfig
-    out: str | None = None
-    overwrite: bool = False
-    seed: int = 0
+    out: str | None
+    overwrite: bool
+    seed: int
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)

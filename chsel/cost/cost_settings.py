@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from chsel.errors import SettingError, require_choice, require_positive
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
+from chsel.problem.settings import Presets
 
 FREE_TERMS = ("direct", "interior")
 GRADIENTS = ("defined", "exact")
@@ -36,6 +38,16 @@ class CostSettings:
     lookup: str = "trilinear"
     outside: str = "surface_point"
     gradient: str = "defined"
+
+    presets: ClassVar[Presets] = {
+        "paper": {"lookup": "nearest"},
+        "reference": {
+            "free_term": "interior",
+            "occupied_scale": 0.0,
+            "lookup": "nearest",
+            "outside": "bounding_box",
+        },
+    }
 
     def __post_init__(self) -> None:
         if not -10.0 < self.penetration_tolerance <= 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_star
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -22,8 +24,8 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, normals
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.archive import GridArchive, evaluated
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
 from chsel.qd.measures import measure_named
@@ -53,8 +55,10 @@ class ChselSettings:
     emitter: EmitterSettings = field(default_factory=EmitterSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    starts: AnchoredStarts | None = None  # beside E_0
+    starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)  # beside E_0
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
+
+    presets: ClassVar[Presets] = {"paper": {"starts": None}, "reference": {"starts": None}}
 
     def __post_init__(self) -> None:
         require_choice("search", self.search, SEARCHES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most, require_positive
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -20,7 +22,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.warm_start import OnlineSettings
+from chsel.problem.settings import Presets
 from chsel.qd.selection import ranked_hypotheses
 
 MOST_ITERATIONS = 1_000_000
@@ -36,6 +38,8 @@ class DescentSettings:
     # End when a block lowers the costs by no more than this fraction on average over the starts;
     # None: never end early.
     stop_below: float | None = 1e-6
+
+    presets: ClassVar[Presets] = {"paper": {"stop_below": None}, "reference": {}}
 
     def __post_init__(self) -> None:
         require_positive("restarts", self.restarts, zero=True)
@@ -83,6 +87,8 @@ class GradientDescentSettings:
     descent: DescentSettings = field(default_factory=DescentSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
+
+    presets: ClassVar[Presets] = {}  # those of its groups
 
 
 class GradientDescent(ConfiguredMethod[GradientDescentSettings]):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Generic, Protocol, TypeVar
 
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
-from chsel.problem.warm_start import OnlineSettings
 
 
 class Method(Protocol):

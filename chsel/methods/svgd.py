@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel import presets
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import MOST_SLACK, Model, Neighbours, evaluate, neighbours_of
 from chsel.cost.cost_settings import CostSettings
@@ -20,6 +19,7 @@ from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.octree import Found
 from chsel.numerics.pose_tuples import decode, pull_back
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -28,7 +28,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.warm_start import OnlineSettings
+from chsel.problem.settings import Presets
 from chsel.qd.selection import ranked_hypotheses
 
 _LEAST = 1e-8  # of 2 h^2, which keeps gamma finite
@@ -210,7 +210,12 @@ _BLOCK = 50  # iterations between two calls of the observer
 
 @dataclass(frozen=True)
 class SvgdSettings:
-    """All settings of Stein variational gradient descent (Liu and Wang, 2016)."""
+    """All settings of Stein variational gradient descent (Liu and Wang, 2016).
+
+    All presets keep the fixed kernel: by the median heuristic, whose reach is that of the entire
+    set, particles push each other off the object (farther from the true surface on 16 of 17
+    simulated configurations).
+    """
 
     sharpness: float = 5.0  # beta of p = exp(-beta C)
     kernel: str = "reference"  # of fixed scale, or "median": the median heuristic, every iteration
@@ -223,22 +228,14 @@ class SvgdSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
+    presets: ClassVar[Presets] = {}  # those of its groups
+
     def __post_init__(self) -> None:
         require_choice("kernel", self.kernel, ("reference", "median"))
         for name in ("sharpness", "scale", "rate"):
             require_positive(name, getattr(self, name))
         require_positive("iterations", self.iterations, zero=True)
         require_at_most("iterations", self.iterations, MOST_ITERATIONS)
-
-
-def preset_svgd(preset: str) -> SvgdSettings:
-    """The settings of SVGD in a preset.
-
-    Ours keep the fixed kernel: by the median heuristic, whose reach is that of the whole set,
-    particles push each other off the object (farther from the true surface on 16 of 17
-    simulated configurations).
-    """
-    return SvgdSettings(cost=presets.COST[preset], online=presets.ONLINE[preset])
 
 
 class Svgd(ConfiguredMethod[SvgdSettings]):

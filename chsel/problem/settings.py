@@ -1,4 +1,9 @@
-"""Frozen settings from plain mappings, with errors that name what would be accepted."""
+"""Frozen settings from plain mappings and presets, with errors that name what is accepted.
+
+The defaults of a settings class are the preset `default`. Its class variable `presets` has what
+differs from them in the others: `paper`, as printed, and `reference`, as the paper's authors ran
+it. docs/presets.md has all differences with their reasons.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +14,56 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
-from chsel.errors import SettingError, quoted
+from chsel.errors import SettingError, quoted, require_choice
 
 Settings = TypeVar("Settings")
+Presets = Mapping[str, Mapping[str, Any]]
+PRESETS = ("default", "paper", "reference")
 
 
 def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) -> Settings:
     """Make the dataclass `cls` from a plain mapping; nested mappings make nested dataclasses.
 
-    `where` is the name of the mapping in messages ("method.cost"). Raises SettingError for
-    names that `cls` does not have, for names that are missing, and for values of another type.
+    `where` is the name of the mapping in messages ("method.cost"). What the mapping leaves out has
+    its default. Raises SettingError for names that `cls` does not have, for names that are missing,
+    and for values of another type.
     """
+    return _built(cls, mapping, where, None)
+
+
+def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str) -> Settings:
+    """`settings` with changes laid over them, group by group; nothing else changes.
+
+    Raises SettingError as `build_settings` does.
+    """
+    return _built(type(settings), changes, where, settings)
+
+
+def in_preset(settings: Settings, preset: str) -> Settings:
+    """Settings of the preset `default` as another one of `PRESETS` has them.
+
+    Each group of settings changes as its own class says, then what `presets` of this class names.
+    A class without `presets` is the same in all of them, with its groups.
+    """
+    require_choice("preset", preset, PRESETS)
+    presets = getattr(settings, "presets", None)
+    if presets is None:
+        return settings
+    values = vars(settings).items()
+    groups = {n: in_preset(v, preset) for n, v in values if dataclasses.is_dataclass(v)}
+    settings = dataclasses.replace(settings, **groups)  # type: ignore[type-var]
+    return changed_settings(settings, presets.get(preset, {}), f"preset {preset}")
+
+
+def settings_mapping(settings: Any) -> dict[str, Any]:
+    """The plain nested mapping that `build_settings` turns back into equal settings."""
+    return dataclasses.asdict(settings)
+
+
+def _built(
+    cls: type[Settings], mapping: Mapping[str, Any], where: str, base: Settings | None
+) -> Settings:
+    """`base` with the values of a mapping; without a base, an instance of `cls` of these."""
     if not isinstance(mapping, Mapping):
         raise SettingError(f"{where} is {quoted(mapping)}; accepted: a group of settings")
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
@@ -27,10 +71,15 @@ def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) 
         if name not in fields:
             raise SettingError(_unknown(where, str(name), list(fields)))
     hints = typing.get_type_hints(cls)
-    values = {
-        name: _convert(hints[name], value, f"{where}.{name}") for name, value in mapping.items()
+    if base is None:
+        before = {name: _default(field) for name, field in fields.items()}
+    else:
+        before = {name: getattr(base, name) for name in fields}
+    values = before | {
+        name: _convert(hints[name], value, f"{where}.{name}", before[name])
+        for name, value in mapping.items()
     }
-    missing = [name for name, field in fields.items() if name not in values and _required(field)]
+    missing = [name for name, value in values.items() if value is dataclasses.MISSING]
     if missing:
         raise SettingError(f"{where} lacks {', '.join(missing)}")
     try:
@@ -39,14 +88,11 @@ def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) 
         raise SettingError(f"{where}: {error}") from None
 
 
-def settings_mapping(settings: Any) -> dict[str, Any]:
-    """The plain nested mapping that `build_settings` turns back into equal settings."""
-    return dataclasses.asdict(settings)
-
-
-def _required(field: dataclasses.Field[Any]) -> bool:
-    missing = dataclasses.MISSING
-    return field.default is missing and field.default_factory is missing
+def _default(field: dataclasses.Field[Any]) -> Any:
+    """The default of a field, MISSING if it has none."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
 
 
 def _unknown(where: str, name: str, accepted: list[str]) -> str:
@@ -55,16 +101,17 @@ def _unknown(where: str, name: str, accepted: list[str]) -> str:
     return f"{where}.{name} does not exist; {hint}accepted: {', '.join(sorted(accepted))}"
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """`value` as the annotated type `hint`, or SettingError."""
+def _convert(hint: Any, value: Any, where: str, before: Any = None) -> Any:
+    """`value` as the annotated type `hint`, or SettingError; a group is laid over `before`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
         inner = [argument for argument in arguments if argument is not type(None)]
-        return _convert(inner[0], value, where)
+        return _convert(inner[0], value, where, before)
     if dataclasses.is_dataclass(hint):
-        return build_settings(typing.cast(type, hint), value, where)
+        base = before if isinstance(before, hint) else None  # type: ignore[arg-type]
+        return _built(typing.cast(type, hint), value, where, base)
     if origin is tuple:
         return _convert_tuple(arguments, value, where)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):

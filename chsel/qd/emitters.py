@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from chsel.cost.objective_kernels import EPSILON
 from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import Observer
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd import emitter_kernels as kernels
 from chsel.qd.archive import GridArchive, SearchObjective, batch_of
@@ -27,10 +29,15 @@ class EmitterSettings:
     """Settings of a search."""
 
     iterations: int = 100  # n_o
-    sigma0: float = 1.0  # first step size, CMA-MEGA: of gradient coefficients, CMA-ME: of vectors
-    rate: float = 0.05  # of the Adam ascent of CMA-MEGA
+    sigma0: float = 0.005  # first step size, of gradient coefficients or (CMA-ME) vectors
+    rate: float = 0.01  # of the Adam ascent of CMA-MEGA
     start: str = "best"  # the first solution: "best" of E' and E_l, or "initial", the first of E_0
     ribs_parity: bool = False  # see chsel.qd.evolution_kernels.Strategy
+
+    presets: ClassVar[Presets] = {
+        "paper": {"sigma0": 1.0, "rate": 0.05, "start": "initial"},
+        "reference": {"sigma0": 1.0, "rate": 0.05, "start": "initial", "ribs_parity": True},
+    }
 
     def __post_init__(self) -> None:
         require_positive("iterations", self.iterations, zero=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SearchSpace, origin_bounds
+from chsel.problem.settings import Presets
 from chsel.problem.subset import evenly, representative
 from chsel.problem.surface import has_surface
 from chsel.qd.archive import Evaluated, GridArchive, SearchObjective
@@ -27,8 +29,8 @@ _MOST_REPRESENTATIVE = 300  # by facility location; more of them are taken evenl
 class ArchiveSettings:
     """The grid of the archive: mean +- range_sigmas standard deviations of the measures of E'."""
 
-    measure: str = "position_2"  # of chsel.qd.measures
-    bins: int = 40  # cells per measure
+    measure: str = "object_xy"  # of chsel.qd.measures
+    bins: int = 56  # cells per measure
     range_sigmas: float = 3.0  # b_sigma of the paper
     least_deviation: float = 0.005  # floor of the standard deviation, metres or radians
     # Which of E' are left out of mean and deviation: "ratio" those above
@@ -37,6 +39,22 @@ class ArchiveSettings:
     ratio: float = 5.0
     tolerance_per_point: float = 1e-3  # tolerance per known point
     tolerance: float = 1e-6  # its floor
+
+    presets: ClassVar[Presets] = {
+        "paper": {
+            "measure": "position_2",
+            "bins": 40,
+            "least_deviation": 1e-4,
+            "outliers": "none",
+        },
+        "reference": {
+            "measure": "position_2",
+            "bins": 40,
+            "least_deviation": 1e-4,
+            "tolerance_per_point": 0.0,
+            "tolerance": 0.1,
+        },
+    }
 
     def __post_init__(self) -> None:
         require_choice("outliers", self.outliers, ("ratio", "quantile", "none"))
@@ -56,21 +74,33 @@ class OutputSettings:
 
     # "lowest" for the lowest costs, "representative" for those below the limit that all others
     # below it are near to; it is "lowest" where no more than wanted are below.
-    choice: str = "lowest"
+    choice: str = "representative"
     # "none" for the cells of lowest cost whatever it is, "ratio" for those below
     # ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
     # and lowest cost + tolerance_per_point x known points + free_tolerance.
     limit: str = "noise"
-    ratio: float = 5.0
+    ratio: float = 1.3
     tolerance: float = 1e-6
-    tolerance_per_point: float = 2e-3
-    free_tolerance: float = 0.2
+    tolerance_per_point: float = 5e-4
+    free_tolerance: float = 0.01
     # What fills a set of too few: "next_best" the next cells, then copies; "resample" copies drawn
     # with replacement; "fewer" nothing.
     shortage: str = "next_best"
     # Metres by which the object's origin may be beside the workspace, as long as any pose is
     # within; None: it may be anywhere.
-    margin: float | None = None
+    margin: float | None = 0.15
+
+    _OTHERS: ClassVar = {  # of both other presets
+        "choice": "lowest",
+        "ratio": 5.0,
+        "tolerance_per_point": 2e-3,
+        "free_tolerance": 0.2,
+        "margin": None,
+    }
+    presets: ClassVar[Presets] = {
+        "paper": _OTHERS | {"limit": "none", "shortage": "fewer"},
+        "reference": _OTHERS | {"limit": "ratio", "shortage": "resample"},
+    }
 
     def __post_init__(self) -> None:
         require_choice("choice", self.choice, ("lowest", "representative"))

@@ -11,8 +11,8 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import ChselError
 from chsel.plausible.pose_metrics import pose_errors
-from chsel.presets import COST
 from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.settings import PRESETS, in_preset
 from replay.comparing.contenders import Contender, recorded_or_none
 from replay.comparing.plausible import PlausibleSets
 from replay.events import ProblemPosed, SessionStarted
@@ -51,10 +51,10 @@ def common_cost(recording: Recording) -> CommonCost:
     recorded = recorded_or_none(recording)
     settings = getattr(recorded.method.settings, "cost", None) if recorded else None
     if not isinstance(settings, CostSettings):
-        return CommonCost(COST["default"], "preset default")
+        return CommonCost(CostSettings(), "preset default")
     assert recorded is not None
-    for preset, cost in COST.items():
-        if settings == cost:
+    for preset in PRESETS:
+        if settings == in_preset(CostSettings(), preset):
             return CommonCost(settings, f"preset {preset}, as recorded")
     return CommonCost(settings, f"{recorded.name}'s, as recorded")
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from chsel.errors import RecordingError, SettingError, require_choice
 from chsel.methods import METHODS
-from chsel.presets import PRESETS
+from chsel.problem.settings import PRESETS
 from replay.mcap.reader import Recording
 from replay.registration import NamedMethod, other_method, recorded_method
 

@@ -123,6 +123,12 @@ class Recording:
         """Whether the registration of a step ended with hypotheses."""
         return step in self._results
 
+    @property
+    def seed(self) -> int:
+        """Of the random streams of its registrations; without any that of the session."""
+        keys = (entry.key for entry in self._entries if isinstance(entry, RecordedProblem))
+        return next((key.seed for key in keys), self.start.seed)
+
     @cached_property
     def has_timings(self) -> bool:
         """Whether wall-clock times were recorded."""

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads as use_threads
-from chsel.presets import COST
+from chsel.problem.online_registration import OnlineSettings, first_initial_set
+from chsel.problem.settings import in_preset
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from runners.benchmarks.depth_images import depth_images
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
 from runners.benchmarks.methods import methods
@@ -98,9 +99,10 @@ def evaluation(scope: Scope) -> Iterator[Row]:
     settings = OnlineSettings(hypotheses=_POSES)
     poses = first_initial_set(posed.workspace, problem.points, StreamKey(scope.seed, 1), settings)
     for preset in PRESETS:
+        cost = in_preset(CostSettings(), preset)
         costs = {
-            "compiled": CompiledCost.of(problem, COST[preset]).evaluate,
-            "torch": RelaxedCost.of(problem, COST[preset]).evaluate,
+            "compiled": CompiledCost.of(problem, cost).evaluate,
+            "torch": RelaxedCost.of(problem, cost).evaluate,
         }
         for case, evaluate in costs.items():
             evaluate(poses[:_POSES_AT_ONCE])
@@ -108,7 +110,7 @@ def evaluation(scope: Scope) -> Iterator[Row]:
             yield Row("evaluation", case, preset, "poses/s", rates)
         for count in _POSES_ON_GPU if scope.gpu else ():
             many = np.resize(poses, (count, 4, 4))
-            on_gpu = RelaxedCost.of(problem, COST[preset], device="cuda").evaluate
+            on_gpu = RelaxedCost.of(problem, cost, device="cuda").evaluate
             on_gpu(many[:_POSES])
             rates = tuple(count / _seconds(on_gpu, many) for _ in range(scope.repeats))
             case = f"torch, GPU, {count} poses"

@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import require_positive
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
-from chsel.presets import COST
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Observer
+from chsel.problem.settings import in_preset
 from runners.benchmarks.problems import PosedProblem
 
 PRESETS = ("reference", "paper", "default")
@@ -65,7 +66,8 @@ def register(
 
 def common_costs(posed: PosedProblem, poses: FloatArray) -> FloatArray:
     """Costs (B,) of poses (B, 4, 4) under the paper's equation: the same measure for everyone."""
-    return RelaxedCost.of(posed.registration_problem(), COST["paper"]).evaluate(poses)
+    paper = in_preset(CostSettings(), "paper")
+    return RelaxedCost.of(posed.registration_problem(), paper).evaluate(poses)
 
 
 class StageTimer:

@@ -11,9 +11,9 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads as use_threads
 from chsel.plausible.plausible_set import grid_around, plausible_set, rotation_seed
 from chsel.plausible.plausible_settings import plausible_settings
+from chsel.problem.online_registration import OnlineSettings, first_initial_set
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from replay.events import Probe
 from runners.benchmarks.problems import PROBLEMS, drill, pose
 from runners.benchmarks.scope import Scope

@@ -10,12 +10,12 @@ import numpy as np
 import trimesh
 
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings, first_initial_set
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings, first_initial_set
 from runners.objects.loader import ObjectConfig, load_object
 
 SDF_RESOLUTION = 0.01

@@ -10,8 +10,7 @@ from typing import Any
 from chsel.errors import SettingError, require_choice
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
-from chsel.presets import PRESETS
-from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.settings import build_settings, changed_settings, settings_mapping
 from replay.comparing.contenders import METHODS_HELP
 from runners.evaluation.draws import draw_label, require_draws
 
@@ -130,25 +129,9 @@ def _entry(value: Any) -> _Entry:
 
 def _contender(entry: _Entry, label: str, settings: Mapping[str, Any], preset: str) -> Contender:
     preset = entry.preset or preset
-    require_choice("method", entry.name, METHODS)
-    require_choice("preset", preset, PRESETS)
-    chosen: Mapping[str, Any] = settings_mapping(preset_settings(entry.name, preset))
+    chosen = preset_settings(entry.name, preset)
     for key in dict.fromkeys([entry.name, label]):
-        chosen = _changed(chosen, settings.get(key) or {}, f"settings.{key}")
-    chosen = _changed(chosen, entry.settings or {}, f"methods: settings of {label}")
+        chosen = changed_settings(chosen, settings.get(key) or {}, f"settings.{key}")
+    chosen = changed_settings(chosen, entry.settings or {}, f"methods: settings of {label}")
     method = build_method(entry.name, chosen)
     return Contender(label, entry.name, preset, settings_mapping(method.settings))
-
-
-def _changed(settings: Mapping[str, Any], changes: Any, where: str) -> dict[str, Any]:
-    """Settings with changes, group by group."""
-    if not isinstance(changes, Mapping):
-        raise SettingError(f"{where} is {changes!r}; accepted: a group of settings")
-    changed = dict(settings)
-    for key, value in changes.items():
-        if key not in changed:
-            raise SettingError(f"{where}.{key} does not exist; accepted: {', '.join(settings)}")
-        inner = changed[key]
-        both = isinstance(inner, Mapping) and isinstance(value, Mapping)
-        changed[key] = _changed(inner, value, f"{where}.{key}") if both else value
-    return changed

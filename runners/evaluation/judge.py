@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from chsel.errors import ChselError
 from chsel.plausible.plausible_set import PlausibleSet
 from chsel.plausible.pose_metrics import EvaluationError, pose_errors
 from chsel.plausible.scan import EvaluationCost
@@ -18,6 +17,7 @@ from runners.evaluation.measure import Measure
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.table import Row
 from runners.evaluation.trial_session import load_members, plausible_settings_of, read_session
+from runners.session_run import one_line
 from runners.sessions.recorded import RecordedSession
 
 
@@ -135,9 +135,3 @@ class Judge:
                 "qd_score": snapshot.qd_score,
                 **metrics,
             }
-
-
-def one_line(error: BaseException) -> str:
-    """What an error says, with its kind if it is none of ours."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"

@@ -12,16 +12,16 @@ import trimesh
 
 from chsel.errors import PoseError
 from chsel.numerics.arrays import FloatArray
-from chsel.presets import ONLINE
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, inverse, nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
-from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.warm_start import pose_problem
+from chsel.problem.settings import in_preset
+from chsel.problem.streams import Purpose
 from chsel.qd.selection import repeated
 from runners.benchmarks.published import PublishedPackage, RefusedError
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
-HOW = replace(ONLINE["reference"], initial="so3")
+HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")
 """E_0 and E_l as the package's authors make them, but first from the starts that all others get."""
 
 
@@ -58,24 +58,21 @@ class PackageSession:
 
     def sets(self, path: Path, steps: Collection[int]) -> Iterator[tuple[int, PackageSet | str]]:
         """What is found at each of the steps, or why nothing is. path: of the recording."""
-        session = RecordedSession(RecordedSettings(str(path)))
-        of, points = session.recorded, session.initial_points
-        previous: Hypotheses | None = None
-        for probe in session.probes():
-            points = points.merged(probe.new_points)
-            if probe.step not in steps:
-                continue
-            key, resolution = StreamKey(self.seed, probe.step), session.free_resolution
-            problem = pose_problem(
-                of.sdf, points, session.workspace, resolution, key, HOW, previous
-            )
-            try:
-                found = self._registered(problem, of.mesh)
-            except (RefusedError, PoseError) as error:
-                yield probe.step, " ".join(str(error).split())
-            else:
-                previous = found.hypotheses
-                yield probe.step, found
+        session = RecordedSession(RecordedSettings(str(path), start_contacts=0, start_probe=0))
+        found: PackageSet | None = None
+
+        def register(problem: RegistrationProblem) -> Hypotheses:
+            nonlocal found
+            found = self._registered(problem, session.recorded.mesh)
+            return found.hypotheses
+
+        online = session.online(HOW, self.seed, only=steps)
+        for step in online.steps(session.perceived(), register, (RefusedError, PoseError)):
+            if step.failure is not None:
+                yield step.step, " ".join(str(step.failure).split())
+            elif step.problem is not None:
+                assert found is not None
+                yield step.step, found
 
     def _registered(self, problem: RegistrationProblem, mesh: trimesh.Trimesh) -> PackageSet:
         with TemporaryDirectory() as folder:

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
-from typing import Any
 
-from chsel.methods.method import Method
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.registration_problem import (
-    ArchiveSnapshot,
-    Hypotheses,
-    Observer,
-    RegistrationProblem,
-)
-from chsel.problem.warm_start import OnlineSettings
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.environment import environment
 from replay.events import (
     Event,
-    HypothesesFound,
     Logged,
-    Probe,
-    ProblemPosed,
     Recorder,
     SessionEnded,
     SessionStarted,
@@ -33,7 +21,7 @@ from replay.mcap.writer import McapRecorder
 from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender
 from runners.evaluation.draws import draw_seed
-from runners.evaluation.judge import Judge, one_line
+from runners.evaluation.judge import Judge
 from runners.evaluation.plan import OWN, Plan, Trial
 from runners.evaluation.table import ITERATIONS, RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded
@@ -50,9 +38,8 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
     no time holds the loading of compiled kernels.
     """
     folder = trial.folder(plan)
-    session = open_recorded(plan, trial)
-    method = _TimedMethod(contender.method(), plan.leader(), warm=contender.label in warm)
-    warm.add(contender.label)
+    session, chosen = open_recorded(plan, trial), plan.steps_of(trial.configuration)
+    method, leader = contender.method(), plan.leader()
     rows: list[Row] = []
     iterations: list[Row] = []
     with ExitStack() as stack:
@@ -61,22 +48,53 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
             beside = stack.enter_context(whole_file(folder / f"{contender.label}.mcap"))
             recorder = McapRecorder(beside)
         recorder.record(_started(plan, trial, contender, session))
-        following = _Following(recorder)
-        seed = draw_seed(trial.seed, contender.draw)
-        run = _EvaluatedRun(plan, trial, session, method, following, seed)
+        by_step = _ByStep(recorder)
+        run = SessionRun(
+            session,
+            session.online(
+                (leader or method).online,
+                draw_seed(trial.seed, contender.draw),
+                only=chosen if leader is None else None,
+            ),
+            method,
+            by_step,
+            symmetry=object_symmetry(session.recorded.mesh),
+            recording=RecordingConfig(snapshot_interval=plan.every or 0),
+            show=lambda *_: None,
+        )
+
+        def register(problem: RegistrationProblem) -> Hypotheses:
+            if contender.label not in warm:
+                warm.add(contender.label)
+                with suppress(Exception):  # it fails again when it is recorded
+                    method.register(problem)
+            return run.register(problem)
+
+        def register_and_lead(problem: RegistrationProblem) -> Hypotheses:
+            """The leader's result, which the next problem follows from."""
+            assert leader is not None
+            if problem.key.step in chosen:
+                try:
+                    register(problem)
+                except Exception as error:
+                    run.failed(problem.key.step, error)
+            return leader.register(problem)
+
+        steps = run.steps(register, Exception) if leader is None else run.steps(register_and_lead)
         judge = Judge(plan, trial, session, contender.label, contender.preset)
-        for _ in run.steps():
-            if following.posed is not None:
-                problem, found = following.posed.problem, following.found
-                members, missing = judge.members(problem)
-                row = judge.row(problem, found, members, run.failure or missing)
-                if found is not None:
-                    row["seconds"] = method.seconds
-                rows.append(row)
-                if found is not None and members is not None and plan.every is not None:
-                    taken = following.snapshots
-                    iterations += judge.iterations(problem, taken, method.settings, members)
-            following.forget()
+        for step, _ in steps:
+            problem = step.problem
+            if problem is None or step.step not in chosen:
+                continue
+            found = None if run.registered is None else run.registered.hypotheses
+            members, missing = judge.members(problem)
+            row = judge.row(problem, found, members, run.failure or missing)
+            if run.registered is not None:
+                row["seconds"] = run.registered.total_seconds
+            rows.append(row)
+            if found is not None and members is not None and plan.every is not None:
+                taken = by_step.snapshots
+                iterations += judge.iterations(problem, taken, method.settings, members)
         recorder.record(Logged(run.step, "info", "session finished"))
         recorder.record(SessionEnded(run.step, "finished"))
         recorder.close()
@@ -85,63 +103,25 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
     write_part(folder / f"{contender.label}.parquet", rows, RESULTS)
 
 
-class _TimedMethod:
-    """A method whose last registration is timed; the first of all runs twice unless warm."""
-
-    def __init__(self, method: Method, leader: Method | None, *, warm: bool) -> None:
-        """leader: the method whose problems are posed to this one, if they are not its own."""
-        self.inner, self.leader, self._warm = method, leader, warm
-        self.settings: Any = method.settings
-        self.seconds: float | None = None
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return (self.leader or self.inner).online
-
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """What the method finds."""
-        if not self._warm:
-            self._warm = True
-            self.inner.register(problem)
-        self.seconds = None
-        begun = time.perf_counter()
-        found = self.inner.register(problem, observer)
-        self.seconds = time.perf_counter() - begun
-        return found
-
-
-class _Following(Recorder):
-    """Keeps the events of a step, and records them when it ends, so that no writing is timed.
+class _ByStep(Recorder):
+    """Records the events of a step when it ends, so that no writing is timed.
 
     Of the snapshots that measuring takes, the first and the last of a search are recorded.
+    snapshots: all that were taken in the last step.
     """
 
     def __init__(self, recorder: Recorder) -> None:
+        self.snapshots: list[ArchiveSnapshot] = []
         self._recorder = recorder
         self._waiting: list[Event] = []
-        self.forget()
-
-    def forget(self) -> None:
-        """A new step begins."""
-        self.posed: ProblemPosed | None = None
-        self.found: Hypotheses | None = None
-        self.snapshots: list[ArchiveSnapshot] = []
 
     def record(self, event: Event) -> None:
-        """Keep it."""
+        """Keep it until the step ends."""
         self._waiting.append(event)
-        if isinstance(event, ProblemPosed):
-            self.posed = event
-        elif isinstance(event, HypothesesFound):
-            self.found = event.hypotheses
-        elif isinstance(event, SnapshotTaken):
-            self.snapshots.append(event.archive)
 
     def flush(self) -> None:
         """Record what was kept."""
+        self.snapshots = [e.archive for e in self._waiting if isinstance(e, SnapshotTaken)]
         for index, event in enumerate(self._waiting):
             if not isinstance(event, SnapshotTaken) or self._ends(index):
                 self._recorder.record(event)
@@ -160,51 +140,6 @@ class _Following(Recorder):
         ]
         before, after = passes[:index], passes[index + 1 :]
         return passes[index] not in before or passes[index] not in after
-
-
-class _EvaluatedRun(SessionRun):
-    """A session that registers at chosen steps, and goes on where a registration fails."""
-
-    def __init__(
-        self,
-        plan: Plan,
-        trial: Trial,
-        session: RecordedSession,
-        method: _TimedMethod,
-        recorder: Recorder,
-        seed: int,
-    ) -> None:
-        super().__init__(
-            session,
-            method,
-            session.recorded.sdf,
-            recorder,
-            symmetry=object_symmetry(session.recorded.mesh),
-            seed=seed,
-            start=session.start,
-            recording=RecordingConfig(snapshot_interval=plan.every or 0),
-            show=lambda *_: None,
-        )
-        self._chosen = frozenset(plan.steps_of(trial.configuration))
-        self._leader = method.leader
-        self.failure = ""
-
-    def _enough(self, probe: Probe) -> bool:
-        taking_part = self._leader is not None or probe.step in self._chosen
-        return taking_part and super()._enough(probe)
-
-    def _register(self, step: int, seconds: dict[str, float]) -> dict[str, Any]:
-        self.failure = ""
-        before, row = self.previous, {}
-        try:
-            if step in self._chosen:
-                row = super()._register(step, seconds)
-        except Exception as error:
-            self.failure = one_line(error)
-            self._recorder.record(Logged(step, "warning", f"no result: {self.failure}"))
-        if self._leader is not None:
-            self.previous = self._leader.register(self._pose(step, before))
-        return row
 
 
 def _started(

@@ -13,9 +13,8 @@ from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.pose_metrics import EvaluationError
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings, pose_problem
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.session_recording import TRUTH, record_session
@@ -109,16 +108,9 @@ def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSett
 
 def problems(plan: Plan, trial: Trial, session: RecordedSession) -> Iterator[RegistrationProblem]:
     """What is known at every step with a registration; E_0 is one pose that stands for any."""
-    contacts, first = session.start
-    chosen = plan.steps_of(trial.configuration)
-    points = session.initial_points
-    for probe in session.probes():
-        points = points.merged(probe.new_points)
-        enough = len(points.contacts) >= contacts and probe.step >= first and points.count > 0
-        if enough and probe.step in chosen:
-            key = StreamKey(trial.seed, probe.step)
-            sdf, resolution = session.recorded.sdf, session.free_resolution
-            yield pose_problem(sdf, points, session.workspace, resolution, key, _ONE, None)
+    online = session.online(_ONE, trial.seed, only=plan.steps_of(trial.configuration))
+    steps = online.steps(session.perceived())
+    return (step.problem for step in steps if step.problem is not None)
 
 
 def load_members(

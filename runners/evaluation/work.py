@@ -13,12 +13,12 @@ from multiprocessing.connection import Connection
 import torch
 
 from runners.evaluation.claims import ClaimedError, claimed
-from runners.evaluation.judge import one_line
 from runners.evaluation.outside import outside_digest, outside_file, rank_outside
 from runners.evaluation.plan import Plan, Unit
 from runners.evaluation.registering import register_trial
 from runners.evaluation.table import about_part, is_part
 from runners.evaluation.trial_session import has_session, make_session
+from runners.session_run import one_line
 from runners.whole_file import WritingError
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")

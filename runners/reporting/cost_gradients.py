@@ -21,6 +21,7 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings
 from replay.mcap.reader import read_recording
+from replay.settings_migration import completed
 from runners.reporting.panels import drawn, new_figure
 from runners.reporting.section import NotDrawn, Picture
 
@@ -55,7 +56,7 @@ def recorded_cost(config: Mapping[str, object], method: str) -> CostSettings:
     if not isinstance(cost, Mapping):
         raise NotDrawn(f"the recorded method, {method}, has no relaxed cost")
     try:
-        return build_settings(CostSettings, cost, "method.cost")
+        return build_settings(CostSettings, completed(cost, CostSettings()), "method.cost")
     except ChselError as error:
         raise NotDrawn(f"the cost that the recording tells is none: {error}") from None
 

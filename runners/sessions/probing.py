@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey
 from replay.events import Probe
 from runners.sessions import hand
@@ -71,6 +72,16 @@ class ProbingSettings:
     max_force: float = 30.0
     noise: float = 0.005
 
+    presets: ClassVar[Presets] = {
+        "paper": {
+            "boundary": "box_shell",
+            "workspace": "paper",
+            "start_contacts": 0,
+            "start_probe": 0,
+        },
+        "reference": {"sweep": "control_steps", "collision_mesh": "vhacd"},
+    }
+
     def __post_init__(self) -> None:
         require_choice("boundary", self.boundary, BOUNDARIES)
         require_choice("workspace", self.workspace, WORKSPACES)
@@ -90,15 +101,6 @@ class ProbingSettings:
             require_positive(name, getattr(self, name))
         for name in ("start_contacts", "start_probe", "noise"):
             require_positive(name, getattr(self, name), zero=True)
-
-
-PROBING_PRESETS = {
-    "default": ProbingSettings(),
-    "paper": ProbingSettings(
-        boundary="box_shell", workspace="paper", start_contacts=0, start_probe=0
-    ),
-    "reference": ProbingSettings(sweep="control_steps", collision_mesh="vhacd"),
-}
 
 
 @dataclass(frozen=True, eq=False)

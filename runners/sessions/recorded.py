@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from functools import reduce
 
 from chsel.errors import PointsError, SettingError
 from chsel.problem.input_checks import check_points
+from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.points import KnownPoints
 from replay.events import Probe
 from replay.mcap.reader import read_recording
@@ -48,7 +49,7 @@ class RecordedSession:
         self._probes = recording.probes
         self.count = len(self._probes)
         self._check(settings.path)
-        self.start = (
+        self.start = Start(
             self._rule("start_contacts", settings.start_contacts),
             self._rule("start_probe", settings.start_probe),
         )
@@ -66,6 +67,25 @@ class RecordedSession:
     def probes(self) -> Iterator[Probe]:
         """The recorded probes in their order."""
         yield from self._probes
+
+    def online(
+        self, settings: OnlineSettings, seed: int, *, only: Container[int] | None = None
+    ) -> OnlineRegistration:
+        """The loop of this session, before its first step; see `OnlineRegistration`."""
+        return OnlineRegistration(
+            self.recorded.sdf,
+            self.workspace,
+            self.free_resolution,
+            settings,
+            seed=seed,
+            points=self.initial_points,
+            start=self.start,
+            only=only,
+        )
+
+    def perceived(self) -> Iterator[tuple[int, KnownPoints]]:
+        """The steps of the session with the points that are new in each."""
+        return ((probe.step, probe.new_points) for probe in self._probes)
 
     def _rule(self, name: str, chosen: int | None) -> int:
         """What was chosen, or else what the recording says; 0 if it says nothing sensible."""

@@ -14,10 +14,10 @@ import chsel
 from chsel.methods import build_method, preset_settings
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.4)), np.array([0.3, 0.1, 0.2]))
@@ -283,7 +283,8 @@ def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
     readme = (Path(__file__).parents[2] / "README.md").read_text()
     examples = re.findall(r"```python\n(import chsel.*?)```", readme, re.DOTALL)
     examples += re.findall(r"```python\n(cost = chsel.*?)```", readme, re.DOTALL)
-    assert len(examples) == 2
+    examples += re.findall(r"```python\n(method = build_method.*?)```", readme, re.DOTALL)
+    assert len(examples) == 3
     BOX.export(tmp_path / "drill.obj")
     names = {
         "contacts": SURFACE,
@@ -292,8 +293,16 @@ def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
         "mesh": BOX,
         "rotation": torch.eye(3, dtype=torch.float64)[None].requires_grad_(),
         "translation": torch.full((1, 3), 0.01, dtype=torch.float64).requires_grad_(),
+        "build_method": build_method,
+        "preset_settings": preset_settings,
+        "grid": chsel.SdfGrid.from_mesh(BOX, 0.002),
+        "workspace": chsel.Workspace((0.0, -0.2, 0.0), (0.6, 0.4, 0.4)),
+        "probes": [chsel.KnownPoints(known=part) for part in np.split(SURFACE, 2)],
     }
     for example in examples:
         exec(example.replace('"drill.obj"', repr(str(tmp_path / "drill.obj"))), names)
     assert names["best"].shape == (4, 4)
+    assert np.abs(inverse(names["best"])[:3, 3] - POSE[:3, 3]).max() < 0.005
+    assert names["online"].previous is names["step"].hypotheses
+    assert names["step"].problem.points.count == len(SURFACE)
     assert float(names["translation"].grad.abs().sum()) > 0.0

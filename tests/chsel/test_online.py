@@ -6,15 +6,15 @@ import trimesh
 
 from chsel import KnownPoints, SdfGrid, Workspace
 from chsel.errors import SettingError
-from chsel.problem.poses import axis_angle, compose, inverse, rotation_angle
-from chsel.problem.registration_problem import Hypotheses
-from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import (
+from chsel.problem.online_registration import (
     OnlineSettings,
     first_initial_set,
     pose_problem,
     updated_initial_set,
 )
+from chsel.problem.poses import axis_angle, compose, inverse, rotation_angle
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.streams import StreamKey
 
 WORKSPACE = Workspace((-0.1, -0.3, 0.0), (0.5, 0.3, 0.6))
 KEY = StreamKey(5, 2)

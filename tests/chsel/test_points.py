@@ -7,10 +7,9 @@ import torch
 from chsel import KnownPoints, Workspace
 from chsel.errors import PointsError, PoseError, SettingError
 from chsel.methods import METHODS, ChselSettings, build_method, preset_settings
-from chsel.presets import PRESETS
 from chsel.problem.points import FreeVoxels, Lattice
 from chsel.problem.poses import check_rigid, nearest_rigid
-from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.settings import PRESETS, build_settings, settings_mapping
 from chsel.problem.streams import Purpose, StreamKey
 
 

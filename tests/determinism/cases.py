@@ -7,8 +7,7 @@ from typing import Any
 
 from chsel.methods import OURS, build_method, preset_settings
 from chsel.methods.method import Method
-from chsel.presets import PRESETS
-from chsel.problem.settings import settings_mapping
+from chsel.problem.settings import PRESETS, settings_mapping
 
 ALL_CLASSES = ("contacts", "free", "felt", "occupied")
 ON_TABLE = {"plane_height": 0.3}

@@ -12,6 +12,7 @@ from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     ArchiveSnapshot,
@@ -23,7 +24,6 @@ from chsel.problem.registration_problem import (
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import search_space
 from chsel.problem.streams import Purpose, StreamKey, normals
-from chsel.problem.warm_start import pose_problem
 from chsel.qd.emitters import SEARCHES
 from chsel.qd.measures import MEASURES
 from tests.determinism.cases import Case

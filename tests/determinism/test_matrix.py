@@ -11,8 +11,8 @@ import pytest
 from chsel.cost.cost_settings import FREE_TERMS, GRADIENTS, CostSettings
 from chsel.methods import OURS
 from chsel.methods.chsel import ChselSettings
-from chsel.presets import PRESETS
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
+from chsel.problem.settings import PRESETS
 from chsel.qd.emitters import SEARCHES
 from chsel.qd.measures import MEASURES
 from replay.differences import ulps

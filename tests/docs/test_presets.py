@@ -13,7 +13,8 @@ import yaml
 
 from chsel.methods import OURS, preset_settings
 from chsel.plausible.plausible_settings import plausible_settings
-from runners.sessions.probing import PROBING_PRESETS
+from chsel.problem.settings import in_preset
+from runners.sessions.probing import ProbingSettings
 from tests.docs.page import DOCS
 
 ORDER = ("paper", "reference", "default")
@@ -27,7 +28,7 @@ PRINTED = re.compile(r"^\| [^|]+ \| `(?P<setting>[\w.]+)` \| (?P<value>[-\d.]+) 
 def settings_of(name: str) -> list[Any]:
     """The settings of a method, a session or a definition in each preset."""
     if name == "session":
-        return [PROBING_PRESETS[preset] for preset in ORDER]
+        return [in_preset(ProbingSettings(), preset) for preset in ORDER]
     if name == "definition":
         return [plausible_settings(preset, 0.001) for preset in ORDER]
     return [preset_settings(name, preset) for preset in ORDER]

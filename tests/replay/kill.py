@@ -35,7 +35,7 @@ from replay.mcap.recovery import recover, tells_loss
 from runners.cli import CONF, plain
 from runners.display import Display
 from runners.interrupt import Interrupt
-from runners.presets import store_presets
+from runners.presets import store_choices
 from runners.probe import ProbeConfig, open_scene, run, session_started
 from runners.recording import make_run_folder
 from tests.replay.conftest import same_bits
@@ -158,7 +158,7 @@ def _timed(folder: Path, reference: Reference) -> Reference:
 
 def quick_session(folder: Path, method_name: str) -> Callable[[Path], None]:
     """What the command does, into the logs it is given, once its scene is open."""
-    store_presets()
+    store_choices()
     chsel = _CHSEL if method_name == "chsel" else ()
     overrides = [*points_session(folder), f"method={method_name}", *_QUICK, *chsel]
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):

@@ -15,6 +15,7 @@ import trimesh
 from rerun.chunk import RrdReader
 
 from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.cost_settings import CostSettings
 from chsel.errors import EngineError, RecordingError, SettingError
 from chsel.methods import build_method
 from chsel.plausible.plausible_file import save_plausible
@@ -22,11 +23,10 @@ from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import plausible_diversity
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
-from chsel.presets import COST
+from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from replay.__main__ import main
 from replay.comparing.columns import COLUMNS
 from replay.comparing.comparison import common_cost, compared, medians, recorded_label
@@ -41,8 +41,16 @@ REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 SETTINGS = {
     "cost": {"free_scale": 30.0},
     "descent": {"restarts": 2, "iterations": 6},
-    "emitter": {"iterations": 12},
-    "archive": {"bins": 10},
+    "emitter": {"iterations": 12, "sigma0": 1.0, "rate": 0.05},
+    "archive": {"measure": "position_2", "bins": 10},
+    "output": {
+        "choice": "lowest",
+        "ratio": 5.0,
+        "tolerance_per_point": 2e-3,
+        "free_tolerance": 0.2,
+        "margin": None,
+    },
+    "starts": None,
     "online": {"hypotheses": 6},
 }
 OFFSET = (0.02, 0.0, 0.15)
@@ -76,41 +84,27 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     recorder = McapRecorder(path)
     recorder.record(start)
-    points, previous = KnownPoints(), None
-    for step in range(3):
-        contacts = np.asarray(trimesh.sample.sample_surface(mesh, 4, seed=step)[0]) + OFFSET
-        free = random.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.11), (30, 3))
-        new = KnownPoints(free=free, known=contacts, known_sdf=np.zeros(4))
-        points = points.merged(new)
-        recorder.record(Probe(step, "contact", new))
-        problem = pose_problem(
-            start.sdf,
-            points,
-            start.workspace,
-            start.free_resolution,
-            StreamKey(start.seed, step),
-            method.online,
-            previous,
-        )
-        found = _Last(recorder)
-        posed, truth = ProblemPosed(step, problem), start.world_from_object
-        register_recorded(posed, method, found, truth, symmetry_for_errors(start))
-        previous = found.last.hypotheses
+    online = OnlineRegistration(
+        start.sdf, start.workspace, start.free_resolution, method.online, seed=start.seed
+    )
+
+    def probes():
+        for step in range(3):
+            contacts = np.asarray(trimesh.sample.sample_surface(mesh, 4, seed=step)[0]) + OFFSET
+            free = random.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.11), (30, 3))
+            new = KnownPoints(free=free, known=contacts, known_sdf=np.zeros(4))
+            recorder.record(Probe(step, "contact", new))
+            yield step, new
+
+    def register(problem):
+        posed, truth = ProblemPosed(problem.key.step, problem), start.world_from_object
+        symmetry = symmetry_for_errors(start)
+        return register_recorded(posed, method, recorder, truth, symmetry).hypotheses
+
+    assert len([*online.steps(probes(), register)]) == 3
     recorder.record(SessionEnded(2, "finished"))
     recorder.close()
     return path
-
-
-class _Last:
-    """Hands events on and keeps the last one with hypotheses."""
-
-    def __init__(self, recorder) -> None:
-        self._recorder = recorder
-
-    def record(self, event) -> None:
-        self._recorder.record(event)
-        if hasattr(event, "hypotheses"):
-            self.last = event
 
 
 def rows_of(text: str) -> dict[str, list[str]]:
@@ -182,7 +176,7 @@ def test_tables_fit_the_terminal(path, capsys, monkeypatch, columns):
 def test_all_sets_are_judged_by_the_recorded_cost(path):
     recording = read_recording(path)
     cost = common_cost(recording)
-    assert cost.settings == dataclasses.replace(COST["default"], free_scale=30.0)
+    assert cost.settings == dataclasses.replace(CostSettings(), free_scale=30.0)
     methods = contenders(recording, ["chsel", "chsel@reference"])
     outcomes = list(compared(recording, methods, recording.steps, cost))
     assert [o.step for o in outcomes] == [0, 0, 0, 1, 1, 1, 2, 2, 2]
@@ -365,7 +359,7 @@ def test_a_method_that_fails_leaves_the_others_alone(path, tmp_path, capsys, mon
 def test_a_recording_that_tells_no_method_is_judged_by_the_default_preset(make_events, write):
     recording = read_recording(write(make_events()))
     cost = common_cost(recording)
-    assert (cost.settings, cost.name) == (COST["default"], "preset default")
+    assert (cost.settings, cost.name) == (CostSettings(), "preset default")
     with pytest.raises(RecordingError, match="does not tell the settings of chsel"):
         contenders(recording, ["chsel"])
     methods = contenders(recording, ["gradient_descent"], ["descent.iterations=2"])

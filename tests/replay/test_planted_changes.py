@@ -63,7 +63,7 @@ PLANTS = {
         "cma_mega, iteration 10",
     ),
     "one draw of E_0": Plant(
-        "chsel/problem/warm_start.py",
+        "chsel/problem/online_registration.py",
         "shift = settings.translation_noise * normals(stream, (count, 3))",
         "shift = settings.translation_noise * normals(stream, (count, 3))[::-1]",
         "cracker_box_chsel",

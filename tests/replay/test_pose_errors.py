@@ -9,12 +9,12 @@ import pytest
 import trimesh
 
 from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import OnlineSettings
 from replay.blessing import _change
 from replay.comparing.comparison import numbers_under
 from replay.events import Measured, ProblemPosed, SessionStarted

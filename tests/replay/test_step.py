@@ -12,12 +12,12 @@ import trimesh
 
 from chsel.errors import RecordingError, SettingError
 from chsel.methods import build_method, preset_settings
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from replay import step_again
 from replay.__main__ import main
 from replay.environment import environment

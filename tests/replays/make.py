@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.presets import PRESETS
 from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import PRESETS
 from runners.objects.loader import ObjectConfig, load_object
 
 FOLDER = Path(__file__).parent

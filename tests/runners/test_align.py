@@ -68,7 +68,7 @@ def path(recorded: Path, tmp_path: Path) -> Path:
 
 
 def aligned(path: Path, *arguments: str) -> Done:
-    return run(align.program, str(path), *SEARCH, *arguments)
+    return run(align.main, str(path), *SEARCH, *arguments)
 
 
 def test_the_pose_is_found_near_a_guess_and_written_with_a_picture(path: Path) -> None:
@@ -120,12 +120,12 @@ def test_a_pose_at_the_edge_of_the_search_is_a_warning(path: Path) -> None:
 
 
 def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path: Path) -> None:
-    refused = run(plausible.program, str(path), *SETS)
+    refused = run(plausible.main, str(path), *SETS)
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert f"python -m runners.align {path} position=[x,y,z]" in refused.stderr
     assert aligned(path, *NEAR).returncode == 0
-    done = run(plausible.program, str(path), *SETS)
+    done = run(plausible.main, str(path), *SETS)
     assert (done.returncode, done.stderr) == (0, "")
     assert f"true pose: that of {path.with_name('session.pose.yaml')}" in done.stdout
     x, y, z = read_pose(path.with_name("session.pose.yaml"))[:3, 3]
@@ -151,7 +151,7 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
     assert found.about["cost"] < found.about["guess_cost"]
     assert found.about["mean_distance"] < 0.004
     assert found.about["source"] == file_digest(log)
-    refused = run(plausible.program, str(log), "object=mustard")
+    refused = run(plausible.main, str(log), "object=mustard")
     assert refused.returncode == 2
     assert "accepted for a raw log: session=sensors session/rig=NAME object=NAME" in refused.stderr
 
@@ -172,7 +172,7 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
 def test_what_cannot_be_searched_is_one_line(
     path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
-    done = run(align.program, str(path), *arguments)
+    done = run(align.main, str(path), *arguments)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

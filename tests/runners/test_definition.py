@@ -89,7 +89,7 @@ def test_a_report_refuses_a_table_of_two_definitions(tmp_path: Path) -> None:
         row("can", seed, "icp", 4, diversity=1.0) | {"definition": name}
         for seed, name in enumerate(("wide_sums", "wide_means", "wide_sums"))
     ]
-    done = run(report.program, str(write_evaluation(tmp_path, rows)))
+    done = run(report.main, str(write_evaluation(tmp_path, rows)))
     assert done.returncode == 2
     assert done.stderr == (
         f"error: {tmp_path} has numbers by 2 definitions of plausible sets, wide_means, wide_sums; "
@@ -107,7 +107,7 @@ def test_a_report_says_by_which_definition_its_numbers_are(tmp_path: Path) -> No
         for method in ("chsel", "icp")
     ]
     folder = write_evaluation(tmp_path, rows, definition=definition("wide_sums"))
-    done = run(report.program, str(folder), "baseline=icp")
+    done = run(report.main, str(folder), "baseline=icp")
     assert (done.returncode, done.stderr) == (0, "")
     assert "PD and its ratios over all registrations, by wide_sums" in done.stdout
     text = (folder / "report" / "report.md").read_text().replace("\\", "")

@@ -42,6 +42,9 @@ def test_the_object_of_a_session_shows_its_size_and_how_far_its_grid_is(
         RecordingConfig(),
         AssetsConfig(str(tmp_path), "https://nowhere.example"),
         str(tmp_path),
+        seed=0,
+        threads=1,
+        configuration=None,
     )
     told: list[tuple[str, int, int]] = []
     message = r"mesh file .*ball\.ply has 1,280 faces: making its signed distance grid takes"

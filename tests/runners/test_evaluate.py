@@ -61,7 +61,7 @@ def evaluated(folder: Path, *arguments: str) -> Done:
     """Run the command in this process, with one worker."""
     switches = [word for word in arguments if word.startswith("-")]
     rest = [word for word in arguments if word not in switches]
-    return run(evaluate.program, *switches, *SMALL, f"out={folder}", "workers=1", *rest)
+    return run(evaluate.main, *switches, *SMALL, f"out={folder}", "workers=1", *rest)
 
 
 def table(folder: Path, name: str = "results") -> list[dict[str, object]]:
@@ -79,7 +79,7 @@ def test_every_experiment_can_be_planned(
         return False
 
     monkeypatch.setattr(evaluate, "evaluate", instead)
-    done = run(evaluate.program, f"experiment={path.stem}", f"out={tmp_path}")
+    done = run(evaluate.main, f"experiment={path.stem}", f"out={tmp_path}")
     assert (done.returncode, done.stderr) == (0, "")
     ((plan, trials),) = planned
     assert plan.contenders
@@ -133,7 +133,7 @@ def test_csv_and_parquet_are_the_same_table(folder: Path) -> None:
 
 def test_metrics_are_those_of_runners_plausible(folder: Path) -> None:
     small = [word for word in SMALL if word.startswith(("definition", "metrics"))]
-    done = run(plausible.program, str(folder / TRIAL / "icp.mcap"), *small)
+    done = run(plausible.main, str(folder / TRIAL / "icp.mcap"), *small)
     assert (done.returncode, done.stderr) == (0, "")
     mine = [row for row in table(folder) if row["method"] == "icp"]
     for cells, row in zip(rows(done.stdout), mine, strict=True):
@@ -212,7 +212,7 @@ def stamps(folder: Path) -> dict[str, int]:
 )
 def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
     before = stamps(folder)
-    done = run(evaluate.program, *SMALL, METHODS, f"out={folder}", *arguments)
+    done = run(evaluate.main, *SMALL, METHODS, f"out={folder}", *arguments)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.startswith("error: ")

@@ -38,7 +38,7 @@ from runners.evaluation.schedule import Schedule
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.evaluation.work import do_unit
-from runners.sessions.probing import PROBING_PRESETS
+from runners.sessions.probing import ProbingSettings
 from runners.whole_file import WritingError, whole_file
 
 TRIAL = Trial(0, "mustard")
@@ -53,7 +53,7 @@ def plan_in(folder: Path, methods: Any = ("icp",), **changes: Any) -> Plan:
     plan = Plan(
         folder=folder,
         preset="default",
-        session={"kind": "kinematic", **settings_mapping(PROBING_PRESETS["default"])},
+        session={"kind": "kinematic", **settings_mapping(ProbingSettings())},
         objects="models",
         definition={**definition, "epsilon": None},
         metrics=MetricsConfig(points=50),

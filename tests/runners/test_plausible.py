@@ -16,7 +16,7 @@ from chsel.plausible.plausible_set import plausible_set
 from chsel.problem.poses import apply, axis_angle, compose, inverse, rotation_vector
 from replay.mcap.reader import read_recording
 from runners import plausible, probe
-from runners.plausible import named_arguments
+from runners.arguments import hydra_arguments
 from tests.runners.in_process import run
 
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
@@ -87,12 +87,12 @@ def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder: Path)
         assert float(cells[9]) == pytest.approx(float(cells[7]) + float(cells[8]), abs=0.11)
         assert float(cells[10]) == pytest.approx(float(cells[9]) ** 0.5, abs=0.06)
     before = [file.stat().st_mtime_ns for file in files]
-    again = run(plausible.program, str(path), "--steps", "1", *SMALL, "threads=2")
+    again = run(plausible.main, str(path), "--steps", "1", *SMALL, "threads=2")
     assert [row[-1] for row in rows(again.stdout)] == ["found"]
     assert rows(again.stdout)[0][:-1] == rows(done.stdout)[1][:-1]
     assert [file.stat().st_mtime_ns for file in files] == before
     os.replace(files[0], files[1])
-    refused = run(plausible.program, str(path), *SMALL)
+    refused = run(plausible.main, str(path), *SMALL)
     assert refused.returncode == 2
     assert "belongs to another known points" in refused.stderr
     assert refused.stderr.count("\n") == 1
@@ -100,19 +100,19 @@ def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder: Path)
 
 def test_a_points_file_needs_its_object_and_the_true_pose_or_a_guess(folder: Path) -> None:
     thing = ("object=mesh", f"object.path={folder / 'box.ply'}", f"out={folder / 'sets'}", *SMALL)
-    done = run(plausible.program, str(folder / "box.npz"), "1", *thing, "definition=paper")
+    done = run(plausible.main, str(folder / "box.npz"), "1", *thing, "definition=paper")
     assert (done.returncode, done.stderr) == (0, "")
     assert "definition paper" in done.stdout
     assert len(rows(done.stdout)) == 1
     (path,) = (folder / "sets").iterdir()
     assert read_plausible(path).settings.cost.combine == "sums"
     np.testing.assert_array_equal(read_plausible(path).truth, POSE)
-    unknown = run(plausible.program, str(folder / "unknown.npz"), *thing)
+    unknown = run(plausible.main, str(folder / "unknown.npz"), *thing)
     assert unknown.returncode == 2
     assert "has no true pose" in unknown.stderr
     off = compose(rotation_vector(np.array([0.0, 0.0, 0.01])), np.array([0.02, -0.01, 0.01]))
     guess = compose(off[:3, :3] @ POSE[:3, :3], POSE[:3, 3] + off[:3, 3])
-    found = run(plausible.program, str(folder / "unknown.npz"), *thing, f"guess={guess.tolist()}")
+    found = run(plausible.main, str(folder / "unknown.npz"), *thing, f"guess={guess.tolist()}")
     assert (found.returncode, found.stderr) == (0, "")
     sets = [read_plausible(file) for file in (folder / "sets").iterdir() if file != path]
     assert len(sets) == 2
@@ -127,7 +127,7 @@ def test_a_points_file_needs_its_object_and_the_true_pose_or_a_guess(folder: Pat
         (["nothing.mcap"], "recording nothing.mcap"),
         ([], "file is missing"),
         (["{recording}", "--steps", "7"], "there is no step 7; accepted: 0, 1"),
-        (["{recording}", "definition=mine"], "definition/mine"),
+        (["{recording}", "definition=mine"], "definition has no option 'mine'"),
         (["{recording}", "definition.epsilon=-1"], "epsilon is -1.0"),
         (["{recording}", "metrics.quantile=2"], "quantile is 2.0"),
         (["{recording}", "definition.cost.lookup=cubic"], "lookup is 'cubic'"),
@@ -137,7 +137,7 @@ def test_a_points_file_needs_its_object_and_the_true_pose_or_a_guess(folder: Pat
 )
 def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
     given = [word.format(recording=folder / "recording.mcap") for word in arguments]
-    done = run(plausible.program, *given)
+    done = run(plausible.main, *given)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.startswith("error: ")
@@ -145,15 +145,15 @@ def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], mes
 
 
 def test_arguments_may_stand_without_a_name() -> None:
-    assert named_arguments(["a b.mcap", "4..6", "9", "definition=paper"]) == [
+    assert hydra_arguments("plausible", ["a b.mcap", "4..6", "9", "definition=paper"]) == [
         "definition=paper",
         "file='a b.mcap'",
         "steps='4..6,9'",
     ]
-    assert named_arguments(["file=x.mcap", "--steps=2", "--cfg", "job"]) == [
-        "file=x.mcap",
+    assert hydra_arguments("plausible", ["file=x.mcap", "--steps=2", "--cfg", "job"]) == [
+        "file='x.mcap'",
         "--cfg",
         "job",
         "steps='2'",
     ]
-    assert named_arguments(["it's"]) == ["file='it\\'s'"]
+    assert hydra_arguments("plausible", ["it's"]) == ["file='it\\'s'"]

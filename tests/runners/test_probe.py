@@ -258,6 +258,13 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
         ("+method.typo=3", "method.typo does not exist; accepted: archive"),
         ("method.cst.alpha=1", "method has no key 'cst'; did you mean cost? accepted: "),
         ("methd=chsel", "probe has no key 'methd'; did you mean method? accepted: "),
+        (
+            "definition=paper",
+            "probe has no key 'definition'; did you mean configuration? accepted: ",
+        ),
+        ("seed.x=1", "seed has no key 'x'; accepted: no key below it"),
+        ("seed=${nothing}", "Interpolation key 'nothing' not found"),
+        ("--config-name=nothing", "configuration 'nothing' does not exist; accepted: a file of "),
         ("method=chsl", "method has no option 'chsl'; did you mean chsel? accepted: anchored, "),
         ("object=ycb/dril", "object has no option 'ycb/dril'; did you mean ycb/drill? accepted: "),
         ("preset=papr", "preset has no option 'papr'; did you mean paper?"),

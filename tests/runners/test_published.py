@@ -76,7 +76,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def evaluated(folder: Path, *more: str) -> Done:
     """Run the evaluation, or go on with it."""
     arguments = (f"out={folder}", "workers=1", "methods=[icp]", "draws=2", *more)
-    return run(evaluate.program, *SMALL, *arguments)
+    return run(evaluate.main, *SMALL, *arguments)
 
 
 def register(folder: Path, out: Path, *more: str) -> Done:

@@ -86,7 +86,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_evaluation(folder, rows, moments, **planned, methods=methods)
     for method in ("chsel", "icp", "medial_constraint"):
         add_recording(folder, "clamp", 1, method, f"clamp_{method}")
-    done = run(report.program, str(folder))
+    done = run(report.main, str(folder))
     assert (done.returncode, done.stderr) == (0, "")
     assert "no picture" not in done.stdout
     return folder
@@ -131,7 +131,7 @@ def test_the_markdown_links_its_pictures_and_has_the_same_numbers(whole: Path) -
 
 
 def test_the_same_evaluation_gives_the_same_bytes(whole: Path, tmp_path: Path) -> None:
-    assert run(report.program, str(whole), f"out={tmp_path / 'again'}").returncode == 0
+    assert run(report.main, str(whole), f"out={tmp_path / 'again'}").returncode == 0
     for path in (whole / "report").iterdir():
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
 
@@ -145,7 +145,7 @@ def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_pa
         for step, value in zip((4, 5, 6), found, strict=True)
     ]
     write_evaluation(tmp_path, rows)
-    assert run(report.program, str(tmp_path)).returncode == 0
+    assert run(report.main, str(tmp_path)).returncode == 0
     tables = page_of(tmp_path / "report").tables
     # 10, 20, 30, 60: the middle step of three is of the last half
     expected = ["can", "4", "25 [17.5, 37.5]", "50 [35, 75]"]
@@ -170,7 +170,7 @@ def test_what_has_no_number_is_left_out_and_said(tmp_path: Path) -> None:
     ]
     methods = {"chsel": {}, "icp": {}, "svgd": {}}
     write_evaluation(tmp_path, rows, configurations=["can"], seeds=[0, 1, 2], methods=methods)
-    assert run(report.program, str(tmp_path)).returncode == 0
+    assert run(report.main, str(tmp_path)).returncode == 0
     tables = page_of(tmp_path / "report").tables
     assert tables["PD in mm² by object"][1] == [
         "can",
@@ -209,7 +209,7 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
         ("icp", 3.0),
         ("svgd", 4.0),
     ]
-    assert run(report.program, str(tmp_path)).returncode == 0
+    assert run(report.main, str(tmp_path)).returncode == 0
     assert "no table of the whole" in (tmp_path / "report" / "report.md").read_text("utf-8")
 
 
@@ -228,7 +228,7 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
 )
 def test_pictures_that_cannot_be_drawn_say_why(tmp_path: Path, rows: list, drawn: list) -> None:
     write_evaluation(tmp_path, rows)
-    done = run(report.program, str(tmp_path))
+    done = run(report.main, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     found = {path.name for path in (tmp_path / "report").glob("*.png")}
     assert found == set(drawn)
@@ -245,14 +245,14 @@ def test_settings_of_the_sequence_choose_trial_methods_and_steps(
 ) -> None:
     out = f"out={tmp_path}"
     some = ["sequence.methods=[icp]", "sequence.steps=[11]", "sequence.view=xy"]
-    assert run(report.program, str(whole), out, "sequence.trial=clamp/1", *some).returncode == 0
+    assert run(report.main, str(whole), out, "sequence.trial=clamp/1", *some).returncode == 0
     text = (tmp_path / "report.md").read_text("utf-8")
     assert "seen from above" in text
     assert "sequence.trial=clamp/1 'sequence.methods=[icp]' 'sequence.steps=[11]'" in text
     assert "that ICP hold" in text
-    done = run(report.program, str(whole), out, "sequence.steps=[3]")
+    done = run(report.main, str(whole), out, "sequence.steps=[3]")
     assert "step 3 has no result of every method shown; accepted: 10, 11" in done.stdout
-    done = run(report.program, str(whole), out, "sequence.trial=mustard/seed_0")
+    done = run(report.main, str(whole), out, "sequence.trial=mustard/seed_0")
     assert "there is no recording of mustard, seed 0" in done.stdout
 
 
@@ -269,7 +269,7 @@ def test_settings_of_the_sequence_choose_trial_methods_and_steps(
         (["{}/good", "sequence.view=zz"], "view is 'zz'; accepted: xz, xy, yz"),
         (["{}/good", "sequence.steps=[]"], "steps is empty"),
         (["{}/good", "colour=red"], "has no key 'colour'"),
-        (["{}/good", "{}/empty"], "one folder too many"),
+        (["{}/good", "{}/empty"], "one argument too many; accepted: DIR KEY=VALUE"),
         (["{}/good", "out={}/good/experiment.json/x"], "cannot be written"),
     ],
 )
@@ -282,7 +282,7 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: st
     (tmp_path / "empty").mkdir()
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "experiment.json").write_text("{")
-    done = run(report.program, *(argument.format(tmp_path) for argument in arguments))
+    done = run(report.main, *(argument.format(tmp_path) for argument in arguments))
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
@@ -303,7 +303,7 @@ def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -
         folder = tmp_path / "trials" / name / f"seed_{seed}"
         folder.mkdir(parents=True)
         (folder / "session.json").write_text(json.dumps({"truth": truth}))
-    done = run(report.program, str(tmp_path))
+    done = run(report.main, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     table = page_of(tmp_path / "report").tables["True poses found"]
     assert [line[:2] for line in table[1:]] == [[names[0], "2"], [names[1], "1"], ["all", "3"]]

@@ -40,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
 def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draws(
     folder: Path,
 ) -> None:
-    done = run(report.program, str(folder), "baseline=package")
+    done = run(report.main, str(folder), "baseline=package")
     assert (done.returncode, done.stderr) == (0, "")
     tables = page_of(folder / "report").tables
     header, own, package = tables[SUMMARY]
@@ -67,7 +67,7 @@ def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draw
 
 
 def test_they_are_on_the_terminal_and_in_the_command_that_makes_them_again(folder: Path) -> None:
-    done = run(report.program, str(folder), "baseline=package", columns=40)
+    done = run(report.main, str(folder), "baseline=package", columns=40)
     (line,) = (line for line in done.stdout.splitlines() if line.startswith("own"))
     expected = "own 3 (1 left out) 20 [10, 210] 20 0.126 33.3 % 60.0 % 30 [30] 33.3 % 0.1 0.1"
     assert line.split() == expected.split()
@@ -75,7 +75,7 @@ def test_they_are_on_the_terminal_and_in_the_command_that_makes_them_again(folde
     text = (folder / "report" / "report.md").read_text()
     assert f"runners.report {folder} baseline=package" in text
     assert SUMMARY in text
-    run(report.program, str(folder))
+    run(report.main, str(folder))
     assert SUMMARY not in (folder / "report" / "report.md").read_text()
 
 
@@ -89,6 +89,6 @@ def test_draws_are_told_apart_by_their_column_alone(folder: Path) -> None:
 
 
 def test_a_baseline_without_pd_is_told(folder: Path) -> None:
-    done = run(report.program, str(folder), "baseline=icp")
+    done = run(report.main, str(folder), "baseline=icp")
     assert done.returncode == 2
     assert done.stderr == "error: baseline icp has no PD; accepted: own, package\n"

@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if entry["step"] == 4:
             entry |= {"rank": 1.0, "exact_members": 0.0}
     write_evaluation(folder, rows)
-    assert run(report.program, str(folder)).returncode == 0
+    assert run(report.main, str(folder)).returncode == 0
     return folder
 
 

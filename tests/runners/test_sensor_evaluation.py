@@ -171,7 +171,7 @@ def test_an_evaluation_of_logs_that_cannot_be_is_one_line(
 ) -> None:
     logs = own_logs(tmp_path / "logs", shelf={"name": "mustard"})
     words = [word.replace("LOGS", str(logs)) for word in arguments]
-    done = run(evaluate.program, *words, f"out={tmp_path / 'out'}")
+    done = run(evaluate.main, *words, f"out={tmp_path / 'out'}")
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

@@ -16,6 +16,7 @@ from chsel.methods.anchored.anchor_sampling import (
 from chsel.methods.anchored.energy import Energy
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -25,7 +26,6 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.subset import evenly, spaced
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.archive import evaluated
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
@@ -43,7 +43,7 @@ MOST_MOVES = 100_000
 MOST_WORK = 1_000_000_000  # of the two
 _KEPT = 6  # states of a chain
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
-_ARCHIVE = ArchiveSettings(measure="object_xy", outliers="none")
+_ARCHIVE = ArchiveSettings(bins=40, outliers="none")
 _ONLINE = OnlineSettings(update="own")
 
 
@@ -117,7 +117,10 @@ EFFORTS = {
 
 @dataclass(frozen=True)
 class AnchoredSettings:
-    """All settings of the contact-anchored search."""
+    """All settings of the contact-anchored search, the same in all presets.
+
+    The method is neither in the paper nor in its authors' code.
+    """
 
     size: str = "medium"  # an effort, of EFFORTS
     effort: Effort | None = None  # another one in its place
@@ -143,11 +146,6 @@ class AnchoredSettings:
             require_positive(name, getattr(self, name), zero=True)
         require_at_most("outer_share", self.outer_share, 1.0)
         measure_named(self.archive.measure, planar=self.plane is not None)
-
-
-def preset_anchored(preset: str) -> AnchoredSettings:
-    """The settings of any preset: the method is neither in the paper nor in its code."""
-    return AnchoredSettings()
 
 
 class Candidates(NamedTuple):

@@ -6,12 +6,12 @@ space and surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
-from chsel import presets
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.methods.cvo.cvo_kernels import (
     DONE,
@@ -35,6 +35,7 @@ from chsel.methods.cvo.rkhs_fields import (
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -43,7 +44,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.sdf_grid import COARSEST, FINEST
-from chsel.problem.warm_start import OnlineSettings
+from chsel.problem.settings import Presets
 from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000
@@ -68,25 +69,45 @@ class CvoSettings:
     max_step: the least and the greatest length of a step that is tried first. stop_below: a start
     ends when its inner product grew by no more than this fraction in 5 iterations in a row; null:
     never.
+
+    Preset paper: the authors' parameters, no threshold, and the paper's labels of the object's
+    cloud. reference: their parameter file with its threshold, and the labels of their simulation
+    (2 mm on real data); but without the cap of 512 neighbours in the order of their index, which
+    drops 97 % of the kernel, and with the search for a step where they take a root that may lead
+    downhill. default: the same model, made stronger: the flow turns about the workspace's centre,
+    a turn by 1 rad counts as a shift by 0.1 m instead of 1 m, which is nearer to what it does to
+    points of an object, and ell falls from 10 cm to 2.5 cm, as a smooth F is easy to climb and a
+    sharp one tells where contacts are. Each of these ascents has the authors' iterations.
     """
 
     free_space: bool = True
     balanced: bool = False
     ell: float = 0.1
-    ell_min: float = 0.1
+    ell_min: float = 0.025
     ell_decay: float = 0.5
     sigma: float = 0.1
     s_sigma: float = 0.8
     sp_thres: float = 0.0
     surface_band: float | None = None
-    c: float = 7.0
+    c: float = 0.07
     d: float = 7.0
-    origin: str = "world"
+    origin: str = "workspace"
     max_iterations: int = 100
     min_step: float = 1e-4
     max_step: float = 0.8
     stop_below: float | None = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
+
+    _AUTHORS: ClassVar = {"ell_min": 0.1, "c": 7.0, "origin": "world", "stop_below": None}
+    presets: ClassVar[Presets] = {
+        "paper": _AUTHORS,
+        "reference": {
+            **_AUTHORS,
+            "sp_thres": 6e-4,
+            "surface_band": 0.005,
+            "online": {"update": "own"},
+        },
+    }
 
     def __post_init__(self) -> None:
         for name in ("ell", "ell_min", "ell_decay", "sigma", "s_sigma", "c", "d"):
@@ -134,32 +155,6 @@ class CvoSettings:
         while levels[-1] > self.ell_min * (1.0 + 1e-9) and len(levels) <= MOST_LEVELS:
             levels.append(max(levels[-1] * self.ell_decay, self.ell_min))
         return levels
-
-
-def preset_cvo(preset: str) -> CvoSettings:
-    """CVO as a preset has it.
-
-    paper: the authors' parameters, no threshold, and the paper's labels of the object's cloud.
-    reference: their parameter file with its threshold, and the labels of their simulation (2 mm on
-    real data); but without the cap of 512 neighbours in the order of their index, which drops 97 %
-    of the kernel, and with the search for a step where they take a root that may lead downhill.
-    default: the same model, made stronger: the flow turns about the workspace's
-    centre, a turn by 1 rad counts as a shift by 0.1 m instead of 1 m, which is nearer to what it
-    does to points of an object, and ell falls from 10 cm to 2.5 cm, as a smooth F is easy to climb
-    and a sharp one tells where contacts are. Each of these ascents has the authors' iterations.
-    """
-    if preset == "default":
-        return CvoSettings(ell_min=0.025, c=0.07, origin="workspace", online=presets.ONLINE[preset])
-    fixed = CvoSettings(stop_below=None, online=presets.ONLINE[preset])
-    if preset == "reference":
-        own = replace(presets.ONLINE[preset], update="own")
-        return replace(fixed, sp_thres=6e-4, surface_band=0.005, online=own)
-    return fixed
-
-
-def preset_cvo_no_free_space(preset: str) -> CvoSettings:
-    """CVO on contacts and the surface alone, as a preset has it."""
-    return replace(preset_cvo(preset), free_space=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from chsel import presets
 from chsel.errors import (
     SettingError,
     require_at_most,
@@ -17,6 +16,7 @@ from chsel.errors import (
 from chsel.methods.icp.icp_kernels import Matches, iterate, matches_for, rms_distances
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -25,9 +25,9 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000
@@ -43,6 +43,10 @@ class IcpSettings:
     every "registration", or the same all "session", as its seed has them. iterations: at most.
     stop_below: end when the rms distance of no start falls by more than this fraction in an
     iteration; None: never end early.
+
+    The paper's surface points are redrawn, those of its authors' code are not. Ours stay for a
+    session, so that a change of the result comes from a new contact and not from new points; on
+    51 simulated sessions neither choice came out ahead.
     """
 
     surface_points: int = 500
@@ -50,6 +54,8 @@ class IcpSettings:
     iterations: int = 100
     stop_below: float | None = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
+
+    presets: ClassVar[Presets] = {"paper": {"redraw": "registration"}}
 
     def __post_init__(self) -> None:
         require_positive("surface_points", self.surface_points)
@@ -61,17 +67,6 @@ class IcpSettings:
             raise SettingError(
                 f"stop_below is {self.stop_below}; accepted: from 0 to less than 1, or null"
             )
-
-
-def preset_icp(preset: str) -> IcpSettings:
-    """The settings of ICP in a preset.
-
-    The paper's surface points are redrawn, those of its authors' code are not. Ours stay for a
-    session, so that a change of the result comes from a new contact and not from new points; on
-    51 simulated sessions neither choice came out ahead.
-    """
-    redraw = "registration" if preset == "paper" else "session"
-    return IcpSettings(redraw=redraw, online=presets.ONLINE[preset])
 
 
 class Icp:

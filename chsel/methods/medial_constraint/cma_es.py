@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from chsel.numerics.elementary import logs
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Observer
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey, normals
 
 MOST_GENERATIONS = 20_000
@@ -56,6 +57,11 @@ class CmaEsSettings:
     tolfun: float = 1e-8
     tolfunhist: float = 1e-9
     tolx: float = 1e-11
+
+    presets: ClassVar[Presets] = {
+        "paper": {"tolfun": 1e-5, "tolfunhist": 1e-6},
+        "reference": {"starts": "single", "tolfun": 1e-5, "tolfunhist": 1e-6},
+    }
 
     def __post_init__(self) -> None:
         require_choice("starts", self.starts, ("per_start", "single"))

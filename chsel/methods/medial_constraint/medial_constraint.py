@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import ClassVar
 
-from chsel import presets
 from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved
 from chsel.methods.medial_constraint.medial_cost import (
     MedialCost,
@@ -13,6 +13,7 @@ from chsel.methods.medial_constraint.medial_cost import (
 )
 from chsel.methods.medial_constraint.medial_kernels import medial_cma_me
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -21,8 +22,8 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
+from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.archive import GridArchive, evaluated
 from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me
 from chsel.qd.measures import measure_named
@@ -35,17 +36,6 @@ from chsel.qd.selection import (
     sized_archive,
 )
 
-MEDIAL_COST = {
-    "default": MedialCostSettings(),
-    "paper": MedialCostSettings(lookup="nearest"),
-    "reference": MedialCostSettings(ball_scale=0.0, lookup="nearest", outside="bounding_box"),
-}
-CMA_ES = {
-    "default": CmaEsSettings(),
-    "paper": CmaEsSettings(tolfun=1e-5, tolfunhist=1e-6),
-    "reference": CmaEsSettings(starts="single", tolfun=1e-5, tolfunhist=1e-6),
-}
-
 
 @dataclass(frozen=True)
 class MedialConstraintSettings:
@@ -56,12 +46,7 @@ class MedialConstraintSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None
 
-
-def preset_medial_constraint(preset: str) -> MedialConstraintSettings:
-    """The settings of a preset, one of chsel.presets.PRESETS."""
-    return MedialConstraintSettings(
-        MEDIAL_COST[preset], CMA_ES[preset], presets.ONLINE[preset], plane=None
-    )
+    presets: ClassVar[Presets] = {}  # those of its groups
 
 
 class MedialConstraint:
@@ -89,12 +74,15 @@ class MedialConstraint:
         return ranked_hypotheses(objective, estimates, elites=estimates)
 
 
-ITERATIONS = 500
 TOLERANCE = 1e-5  # m^2, of a mean square: that of 3 mm
 
-_ARCHIVE = ArchiveSettings(tolerance_per_point=0.0, tolerance=TOLERANCE)
-_EMITTER = EmitterSettings(iterations=ITERATIONS)
-_OUTPUT = OutputSettings(tolerance_per_point=0.0, free_tolerance=TOLERANCE)
+_ARCHIVE = ArchiveSettings(
+    measure="position_2", bins=40, tolerance_per_point=0.0, tolerance=TOLERANCE
+)
+_EMITTER = EmitterSettings(iterations=500, sigma0=1.0, rate=0.05)
+_OUTPUT = OutputSettings(
+    choice="lowest", ratio=5.0, tolerance_per_point=0.0, free_tolerance=TOLERANCE, margin=None
+)
 
 
 @dataclass(frozen=True)
@@ -112,21 +100,15 @@ class MedialConstraintCmaMeSettings:
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None
 
+    presets: ClassVar[Presets] = {
+        "paper": {  # without effect, as no estimate is left out
+            "archive": {"tolerance_per_point": 1e-3, "tolerance": 1e-6}
+        },
+        "reference": {},
+    }
+
     def __post_init__(self) -> None:
         measure_named(self.archive.measure, planar=self.plane is not None)
-
-
-def preset_medial_constraint_cma_me(preset: str) -> MedialConstraintCmaMeSettings:
-    """The settings of a preset, one of chsel.presets.PRESETS."""
-    ours = preset == "default"
-    return MedialConstraintCmaMeSettings(
-        cost=MEDIAL_COST[preset],
-        cma_es=CMA_ES[preset],
-        archive=_ARCHIVE if ours else presets.ARCHIVE[preset],
-        emitter=_EMITTER if ours else replace(presets.EMITTER[preset], iterations=ITERATIONS),
-        output=_OUTPUT if ours else presets.OUTPUT[preset],
-        online=presets.ONLINE[preset],
-    )
 
 
 class MedialConstraintCmaMe:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
 from chsel.problem.sdf_lookup import field_of
 from chsel.problem.search_space import SearchSpace
+from chsel.problem.settings import Presets
 
 MOST_VOXELS = 30_000_000
 
@@ -124,6 +125,11 @@ class MedialCostSettings:
     known_scale: float = 1.0
     lookup: str = "trilinear"
     outside: str = "surface_point"
+
+    presets: ClassVar[Presets] = {
+        "paper": {"lookup": "nearest"},
+        "reference": {"ball_scale": 0.0, "lookup": "nearest", "outside": "bounding_box"},
+    }
 
     def __post_init__(self) -> None:
         for name in ("inflation", "ball_scale", "known_scale"):

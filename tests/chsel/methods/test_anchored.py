@@ -17,6 +17,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, apply, check_rigid, inverse
 from chsel.problem.registration_problem import Hypotheses, NullObserver, RegistrationProblem
@@ -24,7 +25,6 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
 EFFORT = Effort(

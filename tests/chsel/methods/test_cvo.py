@@ -9,8 +9,9 @@ import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.errors import SettingError
+from chsel.methods import preset_settings
 from chsel.methods.cvo import cvo_kernels as kernels
-from chsel.methods.cvo.cvo import Cvo, CvoSettings, preset_cvo, preset_cvo_no_free_space
+from chsel.methods.cvo.cvo import Cvo, CvoSettings
 from chsel.methods.cvo.cvo_kernels import DONE, VALUE, Ascent, Product, climb, products, scratch
 from chsel.methods.cvo.rkhs_fields import Kernel, free_field, surface_field
 from chsel.methods.method import Method
@@ -18,10 +19,9 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.presets import PRESETS
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import NullObserver
-from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.settings import PRESETS, build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from tests.chsel.dense_cvo import DenseClouds, along, flows, nearby
 
@@ -30,7 +30,7 @@ SDF = SdfGrid.from_mesh(MESH, 0.01, padding=0.03)
 WORKSPACE = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
 KERNEL = Kernel(0.1, 0.0064)
 ASCENT = Ascent(np.array([1e-4 * 8000.0 ** (k / 15) for k in range(16)]), 7.0, 7.0, -1.0)
-QUICK = CvoSettings(max_iterations=12)
+QUICK = CvoSettings(ell_min=0.1, c=7.0, origin="world", max_iterations=12)
 
 
 def scene(count: int = 60) -> KnownPoints:
@@ -142,7 +142,7 @@ def test_the_inner_product_never_falls_and_is_that_of_the_pose() -> None:
 
 @pytest.mark.parametrize("name", ["default", "paper", "reference"])
 def test_a_cloud_matches_itself(name: str) -> None:
-    settings = replace(preset_cvo(name), max_iterations=3)
+    settings = replace(preset_settings("cvo", name), max_iterations=3)
     band = SDF.resolution if settings.surface_band is None else settings.surface_band
     nodes = SDF.origin + np.argwhere(SDF.values > -np.inf) * SDF.resolution
     signed = SDF.values.reshape(-1)
@@ -160,7 +160,9 @@ def test_a_cloud_matches_itself(name: str) -> None:
 
 def test_the_cost_is_one_minus_the_cosine_of_the_two_clouds() -> None:
     points, starts = scene(), nearby(3, 8)
-    found = Cvo(replace(preset_cvo("paper"), max_iterations=2)).register(problem(points, starts))
+    found = Cvo(replace(preset_settings("cvo", "paper"), max_iterations=2)).register(
+        problem(points, starts)
+    )
     dense = DenseClouds.of(SDF, points, 0.01)
     x = DenseClouds(dense.x, dense.x_labels, dense.x, dense.x_labels)
     z = [dense.z[dense.z_labels[:, side] > 0.5] for side in (0, 1)]
@@ -196,7 +198,7 @@ def around_truth(count: int) -> FloatArray:
 
 
 def test_without_free_space_contacts_all_over_place_the_object() -> None:
-    method = Cvo(preset_cvo_no_free_space("default"))
+    method = Cvo(preset_settings("cvo_no_free_space"))
     found = method.register(problem(touched_all_over(), around_truth(8)))
     position, _ = pose_errors(found.object_from_world, WORLD_FROM_OBJECT, ObjectSymmetry())
     assert position[0] < 0.004
@@ -204,7 +206,7 @@ def test_without_free_space_contacts_all_over_place_the_object() -> None:
 
 
 def test_an_object_in_a_hole_of_free_space_ends_up_there() -> None:
-    method: Method = Cvo(replace(preset_cvo("default"), balanced=True))
+    method: Method = Cvo(replace(preset_settings("cvo"), balanced=True))
     starts = around_truth(4)
     found = method.register(problem(touched_all_over(), starts))
     before, _ = pose_errors(starts, WORLD_FROM_OBJECT, ObjectSymmetry())
@@ -215,9 +217,9 @@ def test_an_object_in_a_hole_of_free_space_ends_up_there() -> None:
 @pytest.mark.parametrize(
     ("settings", "points"),
     [
-        (preset_cvo_no_free_space("default"), KnownPoints(free=[[0.0, 0.0, 0.0]])),
-        (preset_cvo_no_free_space("default"), KnownPoints(known=[[0, 0, 0]], known_sdf=[0.1])),
-        (preset_cvo("default"), KnownPoints(occupied=[[0.0, 0.0, 0.0]])),
+        (preset_settings("cvo_no_free_space"), KnownPoints(free=[[0.0, 0.0, 0.0]])),
+        (preset_settings("cvo_no_free_space"), KnownPoints(known=[[0, 0, 0]], known_sdf=[0.1])),
+        (preset_settings("cvo"), KnownPoints(occupied=[[0.0, 0.0, 0.0]])),
     ],
     ids=["free", "near", "occupied"],
 )
@@ -259,7 +261,7 @@ def test_a_start_that_meets_no_point_stays_where_it_is(origin: str) -> None:
 )
 @pytest.mark.parametrize("name", PRESETS)
 def test_few_points_and_odd_ones_make_finite_poses(name: str, points: KnownPoints) -> None:
-    settings = replace(preset_cvo(name), max_iterations=5)
+    settings = replace(preset_settings("cvo", name), max_iterations=5)
     found = Cvo(settings).register(problem(points, nearby(2, 12)))
     assert np.isfinite(found.object_from_world).all()
     assert ((found.cost > -2e-3) & (found.cost <= 1.0)).all()
@@ -345,14 +347,14 @@ def test_balanced_contacts_weigh_as_much_as_free_points() -> None:
     assert np.abs(plain.object_from_world - balanced.object_from_world).max() > 1e-3
 
 
-@pytest.mark.parametrize("preset", [preset_cvo, preset_cvo_no_free_space])
-def test_presets_are_plain_mappings_too(preset: object) -> None:
-    made = [preset(name) for name in PRESETS]  # type: ignore[operator]
+@pytest.mark.parametrize("name", ["cvo", "cvo_no_free_space"])
+def test_presets_are_plain_mappings_too(name: str) -> None:
+    made = [preset_settings(name, preset) for preset in PRESETS]
     assert len({repr(settings) for settings in made}) == 3
     for settings in made:
         assert build_settings(CvoSettings, settings_mapping(settings), "method") == settings
         assert Cvo(settings).online == settings.online
-        assert settings.free_space == (preset is preset_cvo)
+        assert settings.free_space == (name == "cvo")
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,15 @@ from scipy.spatial import cKDTree
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.errors import ChselError, SettingError
-from chsel.methods.icp.icp import Icp, IcpSettings, preset_icp
+from chsel.methods import preset_settings
+from chsel.methods.icp.icp import Icp, IcpSettings
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.presets import PRESETS
 from chsel.problem.poses import apply, axis_angle, compose, inverse, product, random_rotations
 from chsel.problem.registration_problem import NullObserver
+from chsel.problem.settings import PRESETS
 from chsel.problem.streams import StreamKey
 
 MESH = trimesh.boolean.union(
@@ -170,13 +171,16 @@ def test_nothing_but_the_problem_counts() -> None:
 def test_surface_points_stay_or_change_as_the_preset_says() -> None:
     first, later, other = (posed(key=StreamKey(*key)) for key in ((5, 2), (5, 3), (6, 2)))
     for preset, stays in (("default", True), ("paper", False), ("reference", True)):
-        method = Icp(preset_icp(preset))
+        method = Icp(preset_settings("icp", preset))
         points = method.surface(first)
         assert points.shape == (500, 3)
         assert np.array_equal(points, method.surface(first))
         assert np.array_equal(points, method.surface(later)) == stays
         assert not np.array_equal(points, method.surface(other))
-    assert {preset_icp(preset).online.initial for preset in PRESETS} == {"so3", "upright"}
+    assert {preset_settings("icp", preset).online.initial for preset in PRESETS} == {
+        "so3",
+        "upright",
+    }
 
 
 @pytest.mark.parametrize(

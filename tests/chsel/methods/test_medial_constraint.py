@@ -10,23 +10,21 @@ import numpy as np
 import pytest
 
 from chsel.errors import ChselError, SettingError
+from chsel.methods import preset_settings
 from chsel.methods.medial_constraint.cma_es import CmaEsSettings
 from chsel.methods.medial_constraint.medial_constraint import (
     MedialConstraint,
     MedialConstraintCmaMe,
-    preset_medial_constraint,
-    preset_medial_constraint_cma_me,
 )
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.presets import PRESETS
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings
-from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.settings import PRESETS, build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
 Maker = Callable[[str], Any]
@@ -34,11 +32,13 @@ POINTS = known_points(TRUTH, 60)
 
 
 def plain(preset: str = "default", **changes: Any) -> MedialConstraint:
-    return MedialConstraint(replace(preset_medial_constraint(preset), **changes))
+    return MedialConstraint(replace(preset_settings("medial_constraint", preset), **changes))
 
 
 def diverse(preset: str = "default", **changes: Any) -> MedialConstraintCmaMe:
-    return MedialConstraintCmaMe(replace(preset_medial_constraint_cma_me(preset), **changes))
+    return MedialConstraintCmaMe(
+        replace(preset_settings("medial_constraint_cma_me", preset), **changes)
+    )
 
 
 MAKERS: list[Any] = [plain, diverse]
@@ -169,12 +169,12 @@ def test_the_search_only_lowers_the_best_cost_of_cma_es() -> None:
 
 def test_presets_differ_where_paper_and_code_differ() -> None:
     paper, reference, ours = (
-        preset_medial_constraint(preset) for preset in ("paper", "reference", "default")
+        preset_settings("medial_constraint", preset) for preset in ("paper", "reference", "default")
     )
     assert (paper.cma_es.starts, reference.cma_es.starts) == ("per_start", "single")
     assert (paper.cost.ball_scale, reference.cost.ball_scale) == (1.0, 0.0)
     assert (paper.cost.lookup, ours.cost.lookup) == ("nearest", "trilinear")
-    assert preset_medial_constraint_cma_me("paper").output.shortage == "fewer"
+    assert preset_settings("medial_constraint_cma_me", "paper").output.shortage == "fewer"
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -185,6 +185,6 @@ def test_settings_survive_a_plain_mapping(make: Maker, preset: str) -> None:
 
 
 def test_a_measure_that_does_not_fit_the_space_is_refused() -> None:
-    archive = replace(preset_medial_constraint_cma_me("default").archive, measure="plane_angle")
+    archive = replace(preset_settings("medial_constraint_cma_me").archive, measure="plane_angle")
     with pytest.raises(SettingError, match="plane_angle exists only with plane"):
         diverse(archive=archive)

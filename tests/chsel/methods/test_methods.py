@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,17 +17,17 @@ from chsel import Hypotheses, KnownPoints, RegistrationProblem, SdfGrid, Workspa
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
-from chsel.methods import METHODS, build_method, preset_settings
+from chsel.methods import METHODS, OURS, build_method, preset_settings
+from chsel.methods.icp.icp import Icp, IcpSettings
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.presets import PRESETS
+from chsel.problem.online_registration import pose_problem
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import ArchiveSnapshot
-from chsel.problem.settings import settings_mapping
+from chsel.problem.settings import PRESETS, settings_mapping
 from chsel.problem.streams import StreamKey
-from chsel.problem.warm_start import pose_problem
 from tests.chsel.methods.l_shape import GRID, MESH, TRUTH
 
 WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
@@ -258,3 +261,76 @@ def test_presets_differ_where_paper_and_code_differ() -> None:
     assert (paper.online.keep_best, reference.online.keep_best) == (False, True)
     assert reference.cost.occupied_scale == 0.0
     assert (paper.output.shortage, reference.output.shortage) == ("fewer", "resample")
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_class_defaults_are_the_default_preset(name: str) -> None:
+    settings = preset_settings(name)
+    variant = {"chsel_cma_me": {"search": "cma_me"}, "cvo_no_free_space": {"free_space": False}}
+    assert settings == replace(type(settings)(), **variant.get(name, {}))
+    assert build_method(name).settings == build_method(name, {}).settings == settings
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_one_setting_changes_and_nothing_else(name: str) -> None:
+    """Also one of a group, whose other settings have another default in the group's own class."""
+    before = settings_mapping(preset_settings(name))
+    paths = list(_paths(before))
+    assert len(paths) > 5
+    for path in paths:
+        *groups, last = path
+        value = before
+        for group in path:
+            value = value[group]
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            continue
+        changes: dict[str, Any] = {last: value + 1 if isinstance(value, int) else 0.9 * value}
+        expected = deepcopy(before)
+        inner = expected
+        for group in groups:
+            inner = inner[group]
+        inner[last] = changes[last]
+        for group in reversed(groups):
+            changes = {group: changes}
+        assert settings_mapping(build_method(name, changes).settings) == expected, path
+
+
+def test_a_preset_names_what_differs_alone() -> None:
+    for name in OURS:
+        if name == "medial_constraint_cma_me":  # of CHSEL's presets; its defaults are its own
+            continue
+        default = settings_mapping(preset_settings(name))
+        for preset, changes in getattr(type(preset_settings(name)), "presets", {}).items():
+            assert preset in PRESETS[1:]
+            for path in _paths(changes):
+                here: Any = changes
+                ours: Any = default
+                for group in path:
+                    here, ours = here[group], ours[group]
+                assert here != ours, f"{name}, {preset}: {path}"
+
+
+def _paths(settings: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The paths of all settings that are no groups."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            yield from ((name, *path) for path in _paths(value))
+        elif not isinstance(value, Mapping):
+            yield (name,)
+
+
+def test_an_installed_class_may_give_the_settings_of_each_preset(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Theirs(Icp):
+        @staticmethod
+        def preset(name: str) -> IcpSettings:
+            return IcpSettings(iterations=PRESETS.index(name) + 7)
+
+    monkeypatch.setattr("chsel.methods.registry.METHODS", (*METHODS, "theirs"))
+    monkeypatch.setattr(
+        "chsel.methods.registry.installed_method", lambda _: (Theirs, IcpSettings())
+    )
+    assert [preset_settings("theirs", name).iterations for name in PRESETS] == [7, 8, 9]
+    changed = build_method("theirs", {"redraw": "registration"}).settings
+    assert changed == IcpSettings(iterations=7, redraw="registration")

@@ -12,16 +12,17 @@ from torch import Tensor
 
 from chsel import KnownPoints, RegistrationProblem, RelaxedCost, SdfGrid, Workspace
 from chsel.errors import ChselError, SettingError
+from chsel.methods import preset_settings
 from chsel.methods import svgd as kernels
-from chsel.methods.svgd import Particles, Svgd, SvgdSettings, direct, particles_at, preset_svgd
+from chsel.methods.svgd import Particles, Svgd, SvgdSettings, direct, particles_at
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.presets import PRESETS
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, product
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE3Space
+from chsel.problem.settings import PRESETS
 from chsel.problem.streams import StreamKey
 
 SIDES = np.array([0.2, 0.12, 0.08])
@@ -269,12 +270,12 @@ def test_on_a_plane_every_hypothesis_stands_on_it() -> None:
 
 def test_presets_have_the_values_that_were_published() -> None:
     for preset in PRESETS:
-        settings = preset_svgd(preset)
+        settings = preset_settings("svgd", preset)
         values: Any = (settings.sharpness, settings.kernel, settings.scale)
         assert values == (5.0, "reference", 0.01)
         assert (settings.iterations, settings.rate) == (300, 0.005)
-    assert preset_svgd("reference").cost.free_term == "interior"
-    assert preset_svgd("paper").online.rotation_law == "axis_gauss"
+    assert preset_settings("svgd", "reference").cost.free_term == "interior"
+    assert preset_settings("svgd", "paper").online.rotation_law == "axis_gauss"
 
 
 @pytest.mark.parametrize(

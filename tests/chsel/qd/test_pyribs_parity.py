@@ -94,7 +94,7 @@ def search(name: str, seed: int, **settings: Any) -> GridArchive:
     archive.add(START[None], -quadratic.costs(START[None]), START[None, 6:8])
     count = BATCH + 1 if name == "cma_mega" else BATCH
     draws = Draws(StreamKey(seed, 0))
-    options = EmitterSettings(iterations=ITERATIONS, **settings)
+    options = EmitterSettings(ITERATIONS, **{"sigma0": 1.0, "rate": 0.05, **settings})
     watch = ArchiveWatch(NullObserver(), 0, "search")
     SEARCHES[name](quadratic, archive, START, count, options, draws, watch)
     return archive

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,11 @@ def problem_of(count: int, sdf: SdfGrid | None = None) -> RegistrationProblem:
     )
 
 
+LOWEST = OutputSettings(
+    choice="lowest", ratio=5.0, tolerance_per_point=2e-3, free_tolerance=0.2, margin=None
+)
+
+
 def at(x: FloatArray) -> FloatArray:
     """Transforms (B, 4, 4) of an object at (x, 0.5, 0.5), x (B,)."""
     position = np.stack([x, np.full(len(x), 0.5), np.full(len(x), 0.5)], axis=1)
@@ -55,7 +61,7 @@ def selected(
     costs: FloatArray, x: FloatArray, count: int, *, sdf: SdfGrid | None = None, **changes: object
 ) -> list[int]:
     """Which elites with such costs (C,), at x (C,), are chosen."""
-    settings = OutputSettings(**changes)  # type: ignore[arg-type]
+    settings = replace(LOWEST, **changes)  # type: ignore[arg-type]
     problem, stream = problem_of(count, sdf), np.random.default_rng(0)
     space = search_space(None, problem.sdf)
     return select_elites(costs, Poses.of(at(x)), problem, space, settings, stream).tolist()

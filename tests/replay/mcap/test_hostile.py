@@ -20,11 +20,11 @@ from chsel.cost.interior_points import interior_points
 from chsel.errors import RecordingError, SdfError, SettingError
 from chsel.methods.chsel import ChselSettings
 from chsel.methods.gradient_descent import DescentSettings
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey, normals
-from chsel.problem.warm_start import OnlineSettings
 from chsel.qd.emitters import Draws, EmitterSettings
 from chsel.qd.selection import ArchiveSettings
 from replay.events import (

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from chsel.problem import points as points_module
+from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.points import GrowingPoints, KnownPoints
 from replay.events import Event, Logged, Probe, SessionEnded, SessionStarted
 from replay.mcap.reader import Recording, read_recording
@@ -110,13 +111,19 @@ def test_a_run_touches_every_point_once(long_session: list[Event], costs: Simple
         probes=lambda: iter(event for event in long_session if isinstance(event, Probe)),
     )
     never: Any = None
+    online = OnlineRegistration(
+        start.sdf,
+        start.workspace,
+        start.free_resolution,
+        OnlineSettings(),
+        points=start.initial_points,
+        start=Start(step=STEPS),
+    )
     run = SessionRun(
         session,
+        online,
         never,
-        start.sdf,
         ListRecorder(),
-        seed=0,
-        start=(0, STEPS),
         recording=RecordingConfig(),
         symmetry=None,
         show=lambda *_: None,

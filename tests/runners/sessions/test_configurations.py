@@ -9,7 +9,7 @@ import trimesh
 
 from chsel.errors import SessionError, SettingError
 from chsel.problem.poses import apply, axis_angle, compose, rotation_angle
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import build_settings, in_preset
 from runners.objects.models import MODELS
 from runners.sessions.configurations import (
     CONFIGURATIONS,
@@ -17,9 +17,10 @@ from runners.sessions.configurations import (
     fitting_configurations,
 )
 from runners.sessions.placement import laid_down, lowest, roll_to_rest
-from runners.sessions.probing import PROBING_PRESETS, ProbingSettings, choose_workspace
+from runners.sessions.probing import ProbingSettings, choose_workspace
 
 PI = np.pi
+PAPER, REFERENCE = (in_preset(ProbingSettings(), name) for name in ("paper", "reference"))
 DRILL_Y = (0.0, 0.2, 0.3, -0.2, -0.3)
 COMMON = ((-0.1, -0.3, -0.075), (0.5, 0.3, 0.625))  # workspace: lower and upper corner, metres
 HAMMER = ((-0.1, -0.3, -0.075), (0.5, 0.5, 0.4))
@@ -165,12 +166,12 @@ def test_an_object_without_configurations_takes_any() -> None:
 
 def test_the_hammer_has_a_larger_workspace_but_in_the_paper() -> None:
     hammer = find_configuration("hammer")
-    assert choose_workspace(hammer, PROBING_PRESETS["reference"]).upper == (0.5, 0.5, 0.4)
-    assert choose_workspace(hammer, PROBING_PRESETS["paper"]).upper == (0.5, 0.3, 0.625)
+    assert choose_workspace(hammer, REFERENCE).upper == (0.5, 0.5, 0.4)
+    assert choose_workspace(hammer, PAPER).upper == (0.5, 0.3, 0.625)
 
 
 def test_presets_differ_where_paper_and_reference_do() -> None:
-    paper, reference = PROBING_PRESETS["paper"], PROBING_PRESETS["reference"]
+    paper, reference = PAPER, REFERENCE
     assert (paper.boundary, reference.boundary) == ("box_shell", "floor_slab")
     assert (paper.sweep, reference.sweep) == ("mini_steps", "control_steps")
     assert (paper.start_contacts, paper.start_probe) == (0, 0)

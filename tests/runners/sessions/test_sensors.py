@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
 from chsel.methods import build_method
+from chsel.problem.online_registration import OnlineRegistration, Start
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from chsel.problem.settings import build_settings, settings_mapping
@@ -625,14 +626,21 @@ def test_recordings_of_such_sessions_can_be_read_and_registered_again(
         initial_points=session.initial_points,
     )
     recorder.record(started)
+    method = build_method("icp", {})
+    online = OnlineRegistration(
+        sdf,
+        session.workspace,
+        session.free_resolution,
+        method.online,
+        points=session.initial_points,
+        start=Start(contacts=4),
+    )
     run = SessionRun(
         session,
-        build_method("icp", {}),
-        sdf,
+        online,
+        method,
         recorder,
         symmetry=None,
-        seed=0,
-        start=(4, 0),
         recording=RecordingConfig(),
         show=lambda *_: None,
     )

@@ -12,9 +12,10 @@ import trimesh
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from chsel.errors import SettingError
 from replay.__main__ import main as replay
-from runners import plausible, probe, report
-from runners.path_values import is_setting, literal_paths, quoted
+from runners import plausible, probe
+from runners.arguments import hydra_arguments, is_setting, quoted
 from tests.runners.in_process import run
 
 NAMES = (
@@ -65,7 +66,7 @@ def value_of(word: str) -> object:
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("key", ["object.path", "++session.path", "+outside.x", "logs", "out"])
 def test_a_path_reaches_the_configuration_as_typed(key: str, name: str) -> None:
-    (word,) = literal_paths([f"{key}={name}"])
+    (word,) = hydra_arguments("probe", [f"{key}={name}"])
     assert word.startswith(f"{key}=")
     assert value_of(word) == name
     assert value_of(f"x={quoted(name)}") == name
@@ -76,14 +77,14 @@ def test_the_home_folder_is_put_in_and_what_is_quoted_stays(
 ) -> None:
     monkeypatch.setenv("HOME", "/home/somebody")
     words = ["object.path=~/x.obj", "assets.dir=~", "session.rig.hand.urdf=~/a b.urdf"]
-    assert [value_of(word) for word in literal_paths(words)] == [
+    assert [value_of(word) for word in hydra_arguments("probe", words)] == [
         "/home/somebody/x.obj",
         "/home/somebody",
         "/home/somebody/a b.urdf",
     ]
     unchanged = ['session.path="a,b"', "session.path='a,b'", "out=null", "out=", "object=drill"]
     unchanged += ['session.path="a","b"', "name=~/x", "seed=1,2", "~object.path", "-m"]
-    assert literal_paths(unchanged) == unchanged
+    assert hydra_arguments("probe", unchanged) == unchanged
 
 
 def test_a_word_that_is_a_file_is_no_setting(
@@ -93,8 +94,8 @@ def test_a_word_that_is_a_file_is_no_setting(
     assert is_setting("seed=1")
     Path("seed=1").touch()
     assert not is_setting("seed=1")
-    assert plausible.named_arguments(["seed=1"]) == ["file='seed=1'"]
-    assert report.named_arguments(["seed=1"]) == ["dir='seed=1'"]
+    assert hydra_arguments("plausible", ["seed=1"]) == ["file='seed=1'"]
+    assert hydra_arguments("report", ["seed=1"]) == ["dir='seed=1'"]
 
 
 @pytest.fixture
@@ -131,7 +132,7 @@ def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(
     assert drawn.stat().st_size > 10_000
 
     recording = shutil.copy(folder / "recording.mcap", home / "x=1,[2].mcap")
-    done = run(plausible.program, Path(recording).name, *COARSE, "out=~/s,1")
+    done = run(plausible.main, Path(recording).name, *COARSE, "out=~/s,1")
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert list((home / "s,1").iterdir())
 
@@ -157,3 +158,20 @@ def test_a_missing_file_of_a_strange_name_is_named(home: Path) -> None:
     assert done.returncode == 2
     assert f"{home}/ä,=[.obj" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_words_without_a_key_get_that_of_the_command() -> None:
+    assert hydra_arguments("report", ["a b", "out=x", "--traceback"]) == ["out='x'", "dir='a b'"]
+    assert hydra_arguments("align", ["-cd", "x", "f.mcap"]) == ["-cd", "x", "file='f.mcap'"]
+    with pytest.raises(SettingError, match="'g' is one argument too many; accepted: FILE KEY"):
+        hydra_arguments("align", ["f", "g"])
+    assert hydra_arguments("probe", ["f", "-m"]) == ["f", "-m"]  # Hydra's to refuse
+
+
+def test_any_key_of_an_open_group_is_taken() -> None:
+    words = ["settings.icp.iterations=3", "outside.mine=~x", "seeds=0"]
+    assert hydra_arguments("evaluate", words) == [
+        "++settings.icp.iterations=3",
+        "++outside.mine='~x'",
+        "seeds=0",
+    ]

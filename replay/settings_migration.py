@@ -1,0 +1,37 @@
+"""What recordings leave out of the settings of their method, and what they mean by it.
+
+A recording holds all settings that there were when it was made. Those that came later have the
+value here, with which the library does what it did then; today's default may be another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import is_dataclass
+from typing import Any
+
+from chsel.methods.anchored.anchored import AnchoredSettings
+from chsel.methods.chsel import ChselSettings
+from chsel.problem.online_registration import OnlineSettings
+from chsel.qd.selection import OutputSettings
+
+LEFT_OUT: Mapping[type, Mapping[str, Any]] = {
+    OnlineSettings: {"update": "noise"},
+    OutputSettings: {"choice": "lowest", "margin": None},
+    ChselSettings: {"starts": None},
+    # The search changed with these; recordings without them were accepted anew at these values.
+    AnchoredSettings: {"outer_share": 0.25, "outer_noise": 1.0},
+}
+
+
+def completed(recorded: Mapping[str, Any], default: Any) -> dict[str, Any]:
+    """A recorded mapping of settings with what it leaves out, groups in it included.
+
+    default: settings of the same class, which tell the classes of the groups.
+    """
+    groups = {
+        name: completed(value, getattr(default, name))
+        for name, value in recorded.items()
+        if isinstance(value, Mapping) and is_dataclass(getattr(default, name, None))
+    }
+    return {**LEFT_OUT.get(type(default), {}), **recorded, **groups}

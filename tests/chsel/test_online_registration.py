@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel import Hypotheses, KnownPoints, OnlineRegistration, SdfGrid, Workspace
+from chsel.errors import ChselError, PoseError
+from chsel.problem.online_registration import OnlineSettings, Start, pose_problem
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import StreamKey
+
+GRID = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.06, 0.04)), 0.02)
+WORKSPACE = Workspace((-0.1, -0.3, 0.0), (0.5, 0.3, 0.6))
+SETTINGS = OnlineSettings(hypotheses=4)
+PROBES = [KnownPoints(known=[[0.1 * step, 0.0, 0.1]]) for step in range(4)]
+
+
+def starts_as_found(problem: RegistrationProblem) -> Hypotheses:
+    """E_0 at ascending costs, the last pose first."""
+    poses, count = problem.initial_set[::-1], len(problem.initial_set)
+    none = np.full(count, -1)
+    return Hypotheses(poses, np.arange(float(count)), np.zeros(count, bool), none, poses)
+
+
+class FailsAt:
+    def __init__(self, step: int, error: Exception) -> None:
+        self.step, self.error = step, error
+
+    def __call__(self, problem: RegistrationProblem) -> Hypotheses:
+        if problem.key.step == self.step:
+            raise self.error
+        return starts_as_found(problem)
+
+
+def test_every_problem_has_all_points_and_follows_from_the_result_before() -> None:
+    first = KnownPoints(free=[[0.3, 0.3, 0.3]])
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS, seed=7, points=first)
+    previous, points = None, first
+    for step in online.steps(enumerate(PROBES), starts_as_found):
+        points = points.merged(PROBES[step.step])
+        key = StreamKey(7, step.step)
+        expected = pose_problem(GRID, points, WORKSPACE, 0.01, key, SETTINGS, previous)
+        assert step.problem is not None
+        assert step.problem.digest == expected.digest
+        assert step.hypotheses is online.previous
+        assert step.failure is None
+        previous = step.hypotheses
+    assert points.count == 5
+
+
+@pytest.mark.parametrize(
+    ("start", "only", "registered"),
+    [
+        (Start(), None, [0, 1, 2, 3]),
+        (Start(contacts=2), None, [1, 2, 3]),
+        (Start(step=3), None, [3]),
+        (Start(), {0, 2}, [0, 2]),
+        (Start(contacts=3), {0, 2}, [2]),
+    ],
+)
+def test_steps_before_the_start_and_those_not_chosen_register_nothing(
+    start: Start, only: set[int] | None, registered: list[int]
+) -> None:
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS, start=start, only=only)
+    steps = list(online.steps(enumerate(PROBES), starts_as_found))
+    assert [step.step for step in steps] == [0, 1, 2, 3]
+    assert [step.step for step in steps if step.problem is not None] == registered
+    assert [step.step for step in steps if step.hypotheses is not None] == registered
+    problem = steps[registered[-1]].problem
+    assert problem is not None
+    assert problem.points.count == registered[-1] + 1  # those of skipped steps, too
+
+
+def test_nothing_is_registered_while_no_point_is_known() -> None:
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS)
+    steps = online.steps(enumerate([KnownPoints(), PROBES[1]]), starts_as_found)
+    assert [step.problem is not None for step in steps] == [False, True]
+
+
+def test_an_error_ends_the_loop_unless_it_is_to_be_caught() -> None:
+    failing = FailsAt(1, ChselError("nothing"))
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS)
+    with pytest.raises(ChselError, match="nothing"):
+        list(online.steps(enumerate(PROBES), failing))
+    with pytest.raises(ChselError, match="nothing"):
+        list(online.steps(enumerate(PROBES), failing, PoseError))
+
+
+def test_after_a_failure_the_next_problem_follows_from_the_last_result() -> None:
+    error = ChselError("nothing")
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS)
+    steps = list(online.steps(enumerate(PROBES), FailsAt(1, error), ChselError))
+    assert [step.failure for step in steps] == [None, error, None, None]
+    assert steps[1].problem is not None
+    assert steps[1].hypotheses is None
+    first, third = steps[0].hypotheses, steps[2].problem
+    assert first is not None
+    assert third is not None
+    assert third.low_cost_set.tobytes() == first.elites.tobytes()
+
+
+def test_without_a_method_problems_follow_from_what_is_remembered() -> None:
+    found = starts_as_found(
+        pose_problem(GRID, PROBES[0], WORKSPACE, 0.01, StreamKey(0, 0), SETTINGS, None)
+    )
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS)
+    sets = []
+    for step in online.steps(enumerate(PROBES[:3])):
+        assert step.problem is not None
+        assert step.hypotheses is None
+        sets.append(len(step.problem.low_cost_set))
+        if step.step == 1:
+            online.remember(found)
+    assert sets == [0, 0, len(found.elites)]
+
+
+def test_a_result_without_poses_cannot_be_followed() -> None:
+    empty = np.zeros((0, 4, 4))
+    nothing = Hypotheses(empty, np.zeros(0), np.zeros(0, bool), np.zeros(0, int), empty)
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS, points=PROBES[0], previous=nothing)
+    with pytest.raises(PoseError, match="has no hypotheses; accepted: at least one"):
+        online.pose(1)
+    (step,) = online.steps([(1, PROBES[1])], starts_as_found, PoseError)
+    assert step.problem is None
+    assert isinstance(step.failure, PoseError)
