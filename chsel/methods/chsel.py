@@ -13,7 +13,8 @@ from chsel.cost.objective import Objective
 from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.gradient_descent import DescentSettings, descend
-from chsel.numerics.arrays import FloatArray
+from chsel.methods.method import ConfiguredMethod
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
@@ -22,62 +23,40 @@ from chsel.problem.registration_problem import (
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import PlaneSettings, SearchSpace, search_space
+from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, normals
-from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, update_cells
+from chsel.qd.archive import GridArchive, evaluated
+from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
+    measure_range,
     ranked_hypotheses,
     select_elites,
     sized_archive,
     within_workspace,
 )
 
-_BEST = 0.2
-
-
-def resampled_around_best(
-    estimates: Poses, costs: FloatArray, space: SearchSpace, stream: np.random.Generator
-) -> Poses:
-    """Poses drawn around the best fifth of B estimates with costs (B,).
-
-    Mean and deviation (ddof 1) of each coordinate of the search vectors; the best fifth itself
-    comes first, unchanged.
-    """
-    count = len(estimates)
-    best = np.argsort(costs, kind="stable")[: max(1, int(_BEST * count))]
-    vectors = space.encode(estimates[best])
-    deviation = vectors.std(axis=0, ddof=1) if len(best) > 1 else np.zeros(space.dimension)
-    drawn = vectors.mean(axis=0) + deviation * normals(stream, (count, space.dimension))
-    drawn[: len(best)] = vectors
-    return space.poses(drawn)
-
-
 MOST_PASSES = 10_000
+_BEST = 0.2  # of the estimates: those that the next pass starts around
 
 
 @dataclass(frozen=True)
 class ChselSettings:
-    """All settings of CHSEL.
+    """All settings of CHSEL."""
 
-    search: "cma_mega" or "cma_me". passes: repetitions of the whole, each from a Gaussian around
-    the best members of the one before. starts: those beside E_0. plane: restricts the poses to
-    SE(2).
-    """
-
-    search: str = "cma_mega"
-    passes: int = 1
+    search: str = "cma_mega"  # or "cma_me"
+    passes: int = 1  # of Algorithm 1, each from a Gaussian around the best of the one before
     cost: CostSettings = field(default_factory=CostSettings)
     descent: DescentSettings = field(default_factory=DescentSettings)
     archive: ArchiveSettings = field(default_factory=ArchiveSettings)
     emitter: EmitterSettings = field(default_factory=EmitterSettings)
     output: OutputSettings = field(default_factory=OutputSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)
-    plane: PlaneSettings | None = None
+    starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)  # beside E_0
+    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
     presets: ClassVar[Presets] = {"paper": {"starts": None}, "reference": {"starts": None}}
 
@@ -88,87 +67,102 @@ class ChselSettings:
         measure_named(self.archive.measure, planar=self.plane is not None)
 
 
-class Chsel:
+class Chsel(ConfiguredMethod[ChselSettings]):
     """Registers by Algorithm 1 of the paper."""
 
-    def __init__(self, settings: ChselSettings | None = None) -> None:
-        self.settings = settings or ChselSettings()
-        planar = self.settings.plane is not None
-        self._measure = measure_named(self.settings.archive.measure, planar=planar)
-        self._search = SEARCHES[self.settings.search]
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = ChselSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
         """Hypotheses for the known points of a problem, best first."""
-        observer = observer or NullObserver()
-        space = search_space(self.settings.plane, problem.sdf)
-        objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
-        estimates = self._algorithm_1(
-            problem,
-            objective,
-            Poses.of(problem.initial_set),
-            Poses.of(problem.low_cost_set),
-            0,
-            observer,
-        )
+        algorithm = _Algorithm1(problem, self.settings, observer or NullObserver())
+        initial_set, low_cost_set = Poses.of(problem.initial_set), Poses.of(problem.low_cost_set)
+        hypotheses = algorithm.run(initial_set, low_cost_set, 0)
         for index in range(1, self.settings.passes):
-            stream = problem.key.stream(Purpose.REFINEMENT, index)
-            poses = Poses.of(estimates.object_from_world)
-            initial_set = resampled_around_best(poses, estimates.cost, space, stream)
-            low_cost_set = Poses.of(estimates.elites)
-            estimates = self._algorithm_1(
-                problem, objective, initial_set, low_cost_set, index, observer
-            )
-        return estimates
+            initial_set = algorithm.resampled_around_best(hypotheses, index)
+            hypotheses = algorithm.run(initial_set, Poses.of(hypotheses.elites), index)
+        return hypotheses
 
-    def _algorithm_1(
-        self,
-        problem: RegistrationProblem,
-        objective: Objective,
-        initial_set: Poses,
-        low_cost_set: Poses,
-        index: int,
-        observer: Observer,
-    ) -> Hypotheses:
-        """Algorithm 1, line by line."""
-        settings, space, measure = self.settings, objective.space, self._measure
-        known_count, count = len(problem.points.known), len(initial_set)
-        starts = initial_set
-        if settings.starts is not None:
-            more = anchored_starts(problem, space, settings.starts, index)
-            starts = Poses.joined([initial_set, more])
-        # 1: E' <- SGD on E_0, and on further starts if there are any, with C^
-        estimates, costs = descend(objective, starts, settings.descent, observer)
-        inside = within_workspace(estimates, problem, space, settings.output.margin)
-        estimates, costs = estimates[inside], costs[inside]
+
+class _Algorithm1:
+    """Algorithm 1 of the paper on one problem. index: of the pass."""
+
+    def __init__(
+        self, problem: RegistrationProblem, settings: ChselSettings, observer: Observer
+    ) -> None:
+        self.problem, self.settings, self.observer = problem, settings, observer
+        self.space = search_space(settings.plane, problem.sdf)
+        self.objective = Objective(CompiledCost.of(problem, settings.cost), self.space)
+        self.measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
+
+    def run(self, initial_set: Poses, low_cost_set: Poses, index: int) -> Hypotheses:
+        """Hypotheses from E_0 and E_l, line by line."""
+        objective, space, measure = self.objective, self.space, self.measure
+        settings, known_count = self.settings.archive, len(self.problem.points.known)
+        # 1: E' <- SGD on E_0 with C^
+        vectors, costs = self.sgd(initial_set, index)
         # 2: P <- m(E')
-        vectors = space.encode(estimates)
-        measures = measure.values(space, vectors)
-        # 3, 4: M <- grid with dimensions mean(P) +- b_sigma std(P)
-        archive = sized_archive(
-            measure, measures, costs, settings.archive, known_count, space.dimension
-        )
+        estimates = evaluated(objective, measure, vectors, costs)
+        # 3: mu, sigma <- mean and standard deviation of P
+        mean, deviation = measure_range(estimates, measure, settings, known_count)
+        # 4: M <- grid with dimensions mu +- b_sigma sigma
+        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
         # 5: M <- UpdateCells(M, E' and E_l)
-        update_cells(archive, objective, vectors, costs)
-        update_cells(archive, objective, space.encode(low_cost_set))
+        archive.update_cells(estimates, evaluated(objective, measure, space.encode(low_cost_set)))
         # 6: M <- CMA-MEGA(M, C^, n_o)
-        first = space.encode(initial_set[:1])[0]
-        best = archive.best_solution
-        start = first if settings.emitter.start == "initial" else best
-        draws, watch = Draws(problem.key, index), ArchiveWatch(observer, index, settings.search)
-        watch.start(archive)
-        self._search(objective, archive, start, count, settings.emitter, draws, watch)
+        self.cma_mega(archive, initial_set, index)
         # 7: E <- |E_0| of the cells of M with the lowest costs
-        stream = problem.key.stream(Purpose.RESAMPLE, index)
+        return self.lowest_cost_cells(archive, index)
+
+    def sgd(self, initial_set: Poses, index: int) -> tuple[FloatArray, FloatArray]:
+        """Line 1, on further starts too if there are any: vectors (B, d) and costs (B,)."""
+        settings, starts = self.settings, initial_set
+        if settings.starts is not None:
+            anchored = anchored_starts(self.problem, self.space, settings.starts, index)
+            starts = Poses.joined([initial_set, anchored])
+        estimates, costs = descend(self.objective, starts, settings.descent, self.observer)
+        inside = self.within_workspace(estimates)
+        return self.space.encode(estimates[inside]), costs[inside]
+
+    def cma_mega(self, archive: GridArchive, initial_set: Poses, index: int) -> None:
+        """Line 6, or CMA-ME in its place."""
+        settings, start = self.settings.emitter, archive.best_solution
+        if settings.start == "initial":
+            start = self.space.encode(initial_set[:1])[0]
+        search, count = self.settings.search, len(initial_set)
+        draws, watch = Draws(self.problem.key, index), ArchiveWatch(self.observer, index, search)
+        SEARCHES[search](self.objective, archive, start, count, settings, draws, watch)
+
+    def lowest_cost_cells(self, archive: GridArchive, index: int) -> Hypotheses:
+        """Line 7."""
+        problem, space, output = self.problem, self.space, self.settings.output
         elites = space.poses(archive.solutions)
-        chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)
-        snapshot = archive.snapshot(settings.emitter.iterations, index)
-        cells = archive.occupied[chosen]
-        kept = elites[within_workspace(elites, problem, space, settings.output.margin)]
-        return ranked_hypotheses(objective, elites[chosen], cells, kept, snapshot)
+        stream = problem.key.stream(Purpose.RESAMPLE, index)
+        chosen = select_elites(archive.costs, elites, problem, space, output, stream)
+        return ranked_hypotheses(
+            self.objective,
+            elites[chosen],
+            archive.occupied[chosen],
+            elites[self.within_workspace(elites)],
+            archive.snapshot(self.settings.emitter.iterations, index),
+        )
+
+    def within_workspace(self, poses: Poses) -> BoolArray:
+        """True (B,) for the poses to keep."""
+        return within_workspace(poses, self.problem, self.space, self.settings.output.margin)
+
+    def resampled_around_best(self, estimates: Hypotheses, index: int) -> Poses:
+        """E_0 of a further pass, drawn around the best fifth of B estimates.
+
+        By mean and deviation (ddof 1) of each coordinate of the search vectors; the best fifth
+        itself comes first, unchanged.
+        """
+        count, space = len(estimates.cost), self.space
+        best = np.argsort(estimates.cost, kind="stable")[: max(1, int(_BEST * count))]
+        vectors = space.encode(Poses.of(estimates.object_from_world[best]))
+        deviation = vectors.std(axis=0, ddof=1) if len(best) > 1 else np.zeros(space.dimension)
+        stream = self.problem.key.stream(Purpose.REFINEMENT, index)
+        drawn = vectors.mean(axis=0) + deviation * normals(stream, (count, space.dimension))
+        drawn[: len(best)] = vectors
+        return space.poses(drawn)

@@ -11,6 +11,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most, require_positive
+from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
@@ -29,16 +30,13 @@ MOST_ITERATIONS = 1_000_000
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """Adam on all starts at once.
+    """Adam on all starts at once."""
 
-    restarts x iterations: after each block of iterations Adam starts afresh and the rotations are
-    made orthonormal again. rate: Adam's step size. stop_below: end when a block lowers the costs
-    by no more than this fraction in the mean over the starts; None: never end early.
-    """
-
-    restarts: int = 10
-    iterations: int = 50
-    rate: float = 0.01
+    restarts: int = 10  # blocks; Adam starts anew in each, rotations are made orthonormal again
+    iterations: int = 50  # of a block
+    rate: float = 0.01  # Adam's step size
+    # End when a block lowers the costs by no more than this fraction on average over the starts;
+    # None: never end early.
     stop_below: float | None = 1e-6
 
     presets: ClassVar[Presets] = {"paper": {"stop_below": None}, "reference": {}}
@@ -55,34 +53,24 @@ class DescentSettings:
 
 
 def descend(
-    objective: Objective,
-    starts: Poses,
-    settings: DescentSettings,
-    observer: Observer,
+    objective: Objective, starts: Poses, settings: DescentSettings, observer: Observer
 ) -> tuple[Poses, FloatArray]:
-    """Estimates E' with their costs (B,), from B starts: those of E_0, and others.
-
-    Each start runs on its own; the costs are those of the returned poses.
-    """
-    estimates = starts
-    vectors = objective.space.encode(estimates)
-    costs = previous = objective.costs(vectors)
+    """Estimates E' with their costs (B,), from B starts, each of which descends on its own."""
+    space, total = objective.space, settings.restarts * settings.iterations
+    vectors = space.encode(starts)
+    costs = objective.costs(vectors)
     observer.trace("descent", 0, vectors.copy(), costs.copy())
-    count = len(estimates)
     for restart in range(settings.restarts):
-        vectors = objective.space.encode(estimates)
-        vectors = objective.descended(vectors, count, settings.rate, settings.iterations)
-        estimates = objective.space.poses(vectors)
-        vectors = objective.space.encode(estimates)
+        before = costs
+        moved = objective.descended(vectors, len(starts), settings.rate, settings.iterations)
+        vectors = space.encode(space.poses(moved))
         costs = objective.costs(vectors)
         done = (restart + 1) * settings.iterations
         observer.trace("descent", done, vectors.copy(), costs.copy())
-        observer.progress("descent", done, settings.restarts * settings.iterations)
-        stop_below = settings.stop_below
-        if stop_below is not None and _mean_gain(previous, costs) <= stop_below:
+        observer.progress("descent", done, total)
+        if settings.stop_below is not None and _mean_gain(before, costs) <= settings.stop_below:
             break
-        previous = costs
-    return objective.space.poses(objective.space.encode(estimates)), costs
+    return space.poses(vectors), costs
 
 
 def _mean_gain(before: FloatArray, after: FloatArray) -> float:
@@ -93,35 +81,27 @@ def _mean_gain(before: FloatArray, after: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class GradientDescentSettings:
-    """All settings of gradient descent; plane restricts the poses to SE(2)."""
+    """All settings of gradient descent."""
 
     cost: CostSettings = field(default_factory=CostSettings)
     descent: DescentSettings = field(default_factory=DescentSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    plane: PlaneSettings | None = None
+    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
     presets: ClassVar[Presets] = {}  # those of its groups
 
 
-class GradientDescent:
+class GradientDescent(ConfiguredMethod[GradientDescentSettings]):
     """Descends from every pose of E_0 and returns where each arrives; E_l is not used."""
 
-    def __init__(self, settings: GradientDescentSettings | None = None) -> None:
-        self.settings = settings or GradientDescentSettings()
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = GradientDescentSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
         """Hypotheses for the known points of a problem, best first."""
-        observer = observer or NullObserver()
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
-        estimates, _ = descend(
-            objective, Poses.of(problem.initial_set), self.settings.descent, observer
-        )
+        starts = Poses.of(problem.initial_set)
+        estimates, _ = descend(objective, starts, self.settings.descent, observer or NullObserver())
         return ranked_hypotheses(objective, estimates, elites=estimates)

@@ -1,15 +1,15 @@
-"""What every registration method offers."""
+"""What every registration method offers, and the part of it that those of this package share."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 
 
 class Method(Protocol):
-    """A pure function of a problem, with settings of its own."""
+    """A pure function of a problem and of its settings."""
 
     settings: Any
     """A frozen dataclass."""
@@ -21,4 +21,29 @@ class Method(Protocol):
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
-        """Hypotheses, best first. The observer sees the way there and changes nothing."""
+        """Hypotheses, best first. The observer sees intermediate results and changes nothing."""
+
+
+class MethodSettings(Protocol):
+    """Settings of a method with those of Algorithm 2 in their field `online`."""
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem."""
+
+
+Settings = TypeVar("Settings", bound=MethodSettings)
+
+
+class ConfiguredMethod(Generic[Settings]):
+    """Base of a method whose settings have a field `online`; `settings_class` makes the default."""
+
+    settings_class: type[Settings]
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self.settings = settings or self.settings_class()
+
+    @property
+    def online(self) -> OnlineSettings:
+        """How a session makes the next problem for this method."""
+        return self.settings.online

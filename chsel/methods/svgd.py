@@ -12,6 +12,7 @@ from chsel.cost.cost_kernels import MOST_SLACK, Model, Neighbours, evaluate, nei
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective, adam_step
 from chsel.errors import require_at_most, require_choice, require_positive
+from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import exp, log
@@ -34,23 +35,19 @@ _MOST_REMEMBERED = 20_000_000  # points around all particles, 28 bytes each
 
 
 class Particles(NamedTuple):
-    """State of the particles: vectors (B, d), and moments (B, 2, d) and powers (2,) of Adam.
+    """State of the particles, and scratch."""
 
-    Scratch: scores (B, d), gradients of log p; directions phi (B, d); squares (B (B - 1) / 2,),
-    squared distances of pairs; selected, of that size: where their median is found.
-    """
-
-    vectors: FloatArray
-    moments: FloatArray
-    powers: FloatArray
-    scores: FloatArray
-    directions: FloatArray
-    squares: FloatArray
-    selected: FloatArray
+    vectors: FloatArray  # (B, d)
+    moments: FloatArray  # (B, 2, d), of Adam
+    powers: FloatArray  # (2,), of Adam
+    scores: FloatArray  # (B, d), gradients of log p
+    directions: FloatArray  # (B, d), phi
+    squares: FloatArray  # (B (B - 1) / 2,), squared distances of pairs
+    selected: FloatArray  # of that size, where their median is computed
 
 
 def particles_at(vectors: FloatArray) -> Particles:
-    """Particles at search vectors (B, d), which stay the caller's."""
+    """Particles at search vectors (B, d), which are copied."""
     count, dimension = vectors.shape
     pairs = count * (count - 1) // 2
     return Particles(
@@ -81,6 +78,15 @@ class Surroundings(NamedTuple):
     scratch: Candidates  # of all particles
 
 
+class SteinStep(NamedTuple):
+    """How particles move in an iteration."""
+
+    sharpness: float  # beta
+    scale: float  # h of the kernel
+    median: bool  # h follows from the particles instead
+    rate: float  # of Adam
+
+
 def surroundings_of(model: Model, count: int) -> Surroundings:
     """Those of so many particles, met for the first time."""
     scratch = neighbours_of(model).candidates
@@ -102,39 +108,28 @@ def surroundings_of(model: Model, count: int) -> Surroundings:
 
 @compiled
 def svgd(
-    model: Any,
-    space: Any,
-    particles: Any,
-    sharpness: Any,
-    scale: Any,
-    median: Any,
-    rate: Any,
-    iterations: Any,
-    around: Any,
+    model: Any, space: Any, particles: Any, around: Any, settings: Any, iterations: Any
 ) -> None:
-    """Move particles up log p = -beta C, and apart, by so many steps of Adam.
-
-    sharpness: beta. scale: h of the kernel; median: it follows from the particles instead. around:
-    their surroundings.
-    """
+    """Move particles up log p = -beta C, and apart, by so many steps (SteinStep) of Adam."""
     vectors, powers = particles.vectors, particles.powers
     for _ in range(iterations):
         for n in range(len(vectors)):
-            _score(model, space, vectors[n], sharpness, around, n, particles.scores[n])
-        direct(particles, scale, median)
+            _fill_score(model, space, particles, around, n, settings.sharpness)
+        direct(particles, settings.scale, settings.median)
         powers[0] *= BETA1
         powers[1] *= BETA2
         for n in range(len(vectors)):
             moments, vector, direction = particles.moments[n], vectors[n], particles.directions[n]
             for j in range(len(vector)):
-                vector[j] += adam_step(direction[j], moments, j, powers, rate, EPSILON)
+                vector[j] += adam_step(direction[j], moments, j, powers, settings.rate, EPSILON)
 
 
 @spliced
-def _score(
-    model: Any, space: Any, vector: Any, sharpness: Any, around: Any, n: Any, score: Any
+def _fill_score(
+    model: Any, space: Any, particles: Any, around: Any, n: Any, sharpness: Any
 ) -> None:
-    """Fill the gradient (d,) of log p by the n-th vector."""
+    """Fill the gradient (d,) of log p at the n-th particle."""
+    vector, score = particles.vectors[n], particles.scores[n]
     row = n if len(around.x) > 1 else 0
     most_slack = MOST_SLACK if len(around.x) > 1 else 0.0
     x, y, z, kept, scratch = around.x, around.y, around.z, around.kept, around.scratch
@@ -154,8 +149,7 @@ def direct(particles: Any, scale: Any, median: Any) -> None:
     """Fill phi_i = 1/B sum_j k(X_j, X_i) score_j + 2 gamma k(X_j, X_i) (X_i - X_j).
 
     k(a, b) = exp(-gamma |a - b|^2), gamma = 1 / (2 h^2 + 1e-8), h = scale or, if median, from
-    h^2 = median |X_i - X_j|^2 / (2 ln(B + 1)) over pairs (Liu and Wang, 2016, Sec. 5). A pair out
-    of reach adds nothing.
+    h^2 = median |X_i - X_j|^2 / (2 ln(B + 1)) over pairs (Liu and Wang, 2016, Sec. 5).
     """
     vectors, scores, directions = particles.vectors, particles.scores, particles.directions
     count, dimension = vectors.shape
@@ -186,7 +180,7 @@ def direct(particles: Any, scale: Any, median: Any) -> None:
 
 @inner
 def _measure(vectors: Any, squares: Any) -> None:
-    """Fill squares with the squared distances of vectors (B, d), pair i, j < i after pair."""
+    """Fill squares with the squared distances of vectors (B, d), by i, then by j < i."""
     pair = 0
     for i in range(len(vectors)):
         for j in range(i):
@@ -199,7 +193,7 @@ def _measure(vectors: Any, squares: Any) -> None:
 
 @inner
 def _median(values: Any) -> Any:
-    """The median of values (S,), S > 0, whose order changes; of an even count, the middle mean."""
+    """The median of values (S,), S > 0, which are reordered."""
     middle = len(values) // 2
     first, last = 0, len(values) - 1
     while first < last:  # quickselect (Hoare, 1961): values of [first, last] hold the middle one
@@ -224,32 +218,29 @@ def _median(values: Any) -> Any:
 
 
 MOST_ITERATIONS = 1_000_000
-MOST_PARTICLES = 10_000  # every pair of them is held
-_BLOCK = 50  # iterations between words to the observer
+MOST_PARTICLES = 10_000  # numbers are kept for every pair
+_BLOCK = 50  # iterations between two calls of the observer
 
 
 @dataclass(frozen=True)
 class SvgdSettings:
     """All settings of Stein variational gradient descent (Liu and Wang, 2016).
 
-    sharpness: beta of p = exp(-beta C). kernel: "reference" of fixed scale, "median" with that of
-    the median heuristic at every iteration. scale: h of k(a, b) = exp(-|a - b|^2 / (2 h^2)) of
-    search vectors, and of the median heuristic where there is no pair. iterations, rate: of Adam.
-    plane: restricts the poses to SE(2).
-
-    All presets keep the fixed kernel: by the median heuristic, whose reach is that of the whole
+    All presets keep the fixed kernel: by the median heuristic, whose reach is that of the entire
     set, particles push each other off the object (farther from the true surface on 16 of 17
     simulated configurations).
     """
 
-    sharpness: float = 5.0
-    kernel: str = "reference"
+    sharpness: float = 5.0  # beta of p = exp(-beta C)
+    kernel: str = "reference"  # of fixed scale, or "median": the median heuristic, every iteration
+    # h of k(a, b) = exp(-|a - b|^2 / (2 h^2)) of search vectors; of the median heuristic where
+    # there is no pair.
     scale: float = 0.01
     iterations: int = 300
-    rate: float = 0.005
+    rate: float = 0.005  # of Adam
     cost: CostSettings = field(default_factory=CostSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
-    plane: PlaneSettings | None = None
+    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
     presets: ClassVar[Presets] = {}  # those of its groups
 
@@ -261,23 +252,17 @@ class SvgdSettings:
         require_at_most("iterations", self.iterations, MOST_ITERATIONS)
 
 
-class Svgd:
+class Svgd(ConfiguredMethod[SvgdSettings]):
     """Moves a particle from every pose of E_0 and returns where they arrive; E_l is not used."""
 
-    def __init__(self, settings: SvgdSettings | None = None) -> None:
-        self.settings = settings or SvgdSettings()
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = SvgdSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
         """Hypotheses for the known points of a problem, best first.
 
-        Raises SettingError for so many poses in E_0 that their pairs are too many.
+        Raises SettingError for too many poses in E_0.
         """
         require_at_most("number of poses in E_0", len(problem.initial_set), MOST_PARTICLES)
         space = search_space(self.settings.plane, problem.sdf)
@@ -291,22 +276,15 @@ class Svgd:
     def _moved(self, objective: Objective, vectors: FloatArray, observer: Observer) -> FloatArray:
         """Search vectors (B, d) after all iterations."""
         settings, total = self.settings, self.settings.iterations
+        median = settings.kernel == "median"
+        step = SteinStep(settings.sharpness, settings.scale, median, settings.rate)
         particles = particles_at(vectors)
         around = surroundings_of(objective.model, len(vectors))
         observer.trace("svgd", 0, vectors.copy(), objective.costs(vectors))
         for first in range(0, total, _BLOCK):
             last = min(first + _BLOCK, total)
-            svgd(
-                objective.model,
-                objective.space_arrays,
-                particles,
-                settings.sharpness,
-                settings.scale,
-                settings.kernel == "median",
-                settings.rate,
-                last - first,
-                around,
-            )
+            space = objective.space_arrays
+            svgd(objective.model, space, particles, around, step, last - first)
             moved = particles.vectors
             observer.trace("svgd", last, moved.copy(), objective.costs(moved))
             observer.progress("svgd", last, total)

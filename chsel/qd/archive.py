@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -11,46 +11,72 @@ from chsel.errors import ChselError
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner
 from chsel.problem.registration_problem import ArchiveSnapshot
+from chsel.problem.search_space import SearchSpace
 from chsel.qd.measures import Measure
 
 _ROUNDING = 1e-6  # of a cell: a measure on a border belongs to the cell above it
 _TURN = 2.0 * np.pi
 
 
+class SearchObjective(Protocol):
+    """A cost of search vectors: what searches lower, and hypotheses are ranked by."""
+
+    space: SearchSpace
+    model: Any  # of the cost, and
+    space_arrays: Any  # of the space, as the kernels take them
+
+    def work(self) -> Any:
+        """Scratch for one thread."""
+
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        """Costs (B,) of vectors (B, d)."""
+
+
+class Evaluated(NamedTuple):
+    """Search vectors with their costs and measures."""
+
+    vectors: FloatArray  # (B, d)
+    costs: FloatArray  # (B,)
+    measures: FloatArray  # (B, k)
+
+
+def evaluated(
+    objective: SearchObjective,
+    measure: Measure,
+    vectors: FloatArray,
+    costs: FloatArray | None = None,
+) -> Evaluated:
+    """Vectors (B, d) with their measures, and their costs (B,) unless these are known already."""
+    costs = objective.costs(vectors) if costs is None else costs
+    return Evaluated(vectors, costs, measure.values(objective.space, vectors))
+
+
 class Cells(NamedTuple):
-    """The cells of a grid over k measures, `bins` along each, row-major, last measure fastest.
+    """The cells of a grid over k measures, row-major, last measure fastest."""
 
-    lower, upper (k,): the grid's range. circular: the measures are angles. objectives (cells,):
-    -inf where a cell is empty. solutions (cells, d). measures (cells, k).
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    bins: int
-    circular: bool
-    objectives: FloatArray
-    solutions: FloatArray
-    measures: FloatArray
+    lower: FloatArray  # (k,), of the grid's range
+    upper: FloatArray  # (k,)
+    bins: int  # along each measure
+    circular: bool  # the measures are angles
+    objectives: FloatArray  # (cells,), -inf where a cell is empty
+    solutions: FloatArray  # (cells, d)
+    measures: FloatArray  # (cells, k)
 
 
 class Batch(NamedTuple):
-    """Solutions that are offered to an archive at once, and what becomes of them.
+    """Solutions that are offered to an archive at once, and what becomes of them."""
 
-    vectors (B, d), objectives (B,) and measures (B, k) go in; cells (B,), status (B,), value (B,)
-    and order (B,), best first, come out.
-    """
-
-    vectors: FloatArray
-    objectives: FloatArray
-    measures: FloatArray
-    cells: IntArray
-    status: IntArray
-    value: FloatArray
-    order: IntArray
+    vectors: FloatArray  # (B, d)
+    objectives: FloatArray  # (B,)
+    measures: FloatArray  # (B, k)
+    cells: IntArray  # (B,), filled by `insert`, -1 for refused ones
+    status: IntArray  # (B,), filled by `insert`
+    value: FloatArray  # (B,), filled by `insert`
+    order: IntArray  # (B,), filled by `rank`, best first
 
 
 def batch_of(count: int, dimension: int, measures: int) -> Batch:
-    """Room for `count` solutions of `dimension` numbers with so many measures."""
+    """An empty batch of `count` solutions of `dimension` numbers."""
     return Batch(
         vectors=np.zeros((count, dimension)),
         objectives=np.full(count, -np.inf),
@@ -71,23 +97,6 @@ def all_finite(vector: FloatArray) -> bool:
     return finite
 
 
-@inner
-def cell_of(
-    lower: FloatArray, upper: FloatArray, bins: int, circular: bool, measures: FloatArray
-) -> int:
-    """Index of the cell of finite measures (k,); the nearest one for measures out of range."""
-    cell = 0
-    for i in range(len(measures)):
-        x = measures[i]
-        if circular:
-            x -= _TURN * np.rint((x - (lower[i] + upper[i]) / 2.0) / _TURN)
-        index = (bins * (x - lower[i]) + _ROUNDING) / (upper[i] - lower[i])
-        if not index > 0.0:  # written so that NaN, of an endless range, is below too
-            index = 0.0
-        cell = cell * bins + int(min(index, bins - 1.0))
-    return cell
-
-
 @compiled
 def cells_of(archive: Cells, measures: FloatArray, cells: IntArray) -> None:
     """Fill cells (B,) for measures (B, k); -1 for measures that are not finite."""
@@ -97,10 +106,22 @@ def cells_of(archive: Cells, measures: FloatArray, cells: IntArray) -> None:
 
 @inner
 def cell_for(archive: Cells, objective: float, vector: FloatArray, measures: FloatArray) -> int:
-    """The cell of a solution; -1 if any of its numbers is not finite, which no cell may hold."""
-    if np.isfinite(objective) and all_finite(measures) and all_finite(vector):
-        return cell_of(archive.lower, archive.upper, archive.bins, archive.circular, measures)
-    return -1
+    """The cell of a solution, the nearest one for measures (k,) out of range.
+
+    -1 if any of the numbers is not finite.
+    """
+    if not (np.isfinite(objective) and all_finite(measures) and all_finite(vector)):
+        return -1
+    lower, upper, bins, cell = archive.lower, archive.upper, archive.bins, 0
+    for i in range(len(measures)):
+        x = measures[i]
+        if archive.circular:
+            x -= _TURN * np.rint((x - (lower[i] + upper[i]) / 2.0) / _TURN)
+        index = (bins * (x - lower[i]) + _ROUNDING) / (upper[i] - lower[i])
+        if not index > 0.0:  # NaN, of an endless range, too
+            index = 0.0
+        cell = cell * bins + int(min(index, bins - 1.0))
+    return cell
 
 
 @inner
@@ -119,13 +140,7 @@ def keep_better(
 
 @compiled
 def insert(archive: Cells, batch: Batch) -> None:
-    """Offer a batch: status and value against the archive before it, then each cell's highest.
-
-    Status 2 for a cell that was empty, 1 for a better objective, 0 for neither. Value: the
-    objective where the cell was empty, else its gain over the cell's. Of a batch, each cell keeps
-    the first of the highest. A solution of which any number is not finite is refused: cell -1,
-    status 0, value -inf.
-    """
+    """Offer a batch; fills its cells, status and value, see GridArchive.add."""
     vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures
     cells, status, value = batch.cells, batch.status, batch.value
     for i in range(len(objectives)):
@@ -153,9 +168,9 @@ def _precedes(status: IntArray, value: FloatArray, i: int, j: int) -> bool:
 
 @inner
 def rank(status: IntArray, value: FloatArray, order: IntArray) -> int:
-    """Fill the order (B,): by status, then by value; ties the later first. How many improved.
+    """Fill the order (B,): by status, by value, the later first. Returns how many improved.
 
-    By Shell's sort: no two rank alike, so that any way of sorting gives one order.
+    By Shell's sort; the order is total, so that all sorting algorithms give the same.
     """
     count, improved = len(order), 0
     for i in range(count):
@@ -175,7 +190,7 @@ def rank(status: IntArray, value: FloatArray, order: IntArray) -> int:
 
 @inner
 def sampled_cell(objectives: FloatArray, uniform: float) -> int:
-    """A cell of objectives (cells,) that is occupied, chosen by a number from [0, 1), or -1."""
+    """An occupied cell of objectives (cells,), chosen by a number from [0, 1); -1 if none is."""
     occupied = 0
     for objective in objectives:
         occupied += int(objective > -np.inf)
@@ -240,6 +255,11 @@ class GridArchive:
         batch.vectors[:], batch.objectives[:], batch.measures[:] = solutions, objectives, measures
         insert(self.cells, batch)
         return batch.status, batch.value
+
+    def update_cells(self, *offered: Evaluated) -> None:
+        """Offer one batch of solutions after the other (CHSEL, Alg. 1, line 5)."""
+        for batch in offered:
+            self.add(batch.vectors, -batch.costs, batch.measures)
 
     @property
     def occupied(self) -> IntArray:

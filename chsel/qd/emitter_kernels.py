@@ -9,55 +9,65 @@ import numpy as np
 from chsel.cost.objective import (
     BETA1,
     BETA2,
-    EPSILON,
     adam_step,
     cost_and_gradient_of,
     cost_of,
 )
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.qd.archive import (
     Batch,
     Cells,
     all_finite,
-    batch_of,
     cell_for,
     insert,
     keep_better,
     rank,
     sampled_cell,
 )
-from chsel.qd.evolution_kernels import Strategy, ask, reset, stopped, strategy_around, tell
+from chsel.qd.evolution_kernels import Strategy, ask, reset, stopped, tell
 from chsel.qd.measures import measure_gradients_of, measures_of
 
 _EPSILON = 1e-8  # keeps the normalisation of a zero gradient finite
 
 
+class Landscape(NamedTuple):
+    """What search vectors are evaluated by, see SearchObjective."""
+
+    model: Any
+    space: Any
+    measure: Any  # MeasureCode
+    work: Any  # scratch
+
+
+class SearchDraws(NamedTuple):
+    """Random numbers of some iterations."""
+
+    normals: FloatArray  # (iterations, L, n), standard normal, for the strategy
+    elites: FloatArray  # (iterations,), uniform, each chooses an elite for a restart
+
+
 class Adam(NamedTuple):
-    """State of Adam (see adam_step): moments (2, d); powers (2,) of the two betas."""
+    """State of Adam, see adam_step."""
 
     rate: float
     epsilon: float
-    moments: FloatArray
-    powers: FloatArray
+    moments: FloatArray  # (2, d)
+    powers: FloatArray  # (2,), of the two betas
 
 
 class MegaSearch(NamedTuple):
-    """State of CMA-MEGA: theta (d,) with its measures (k,), and the branches around it.
+    """State of CMA-MEGA: theta, and the branches around it."""
 
-    gradient (d,) of the cost at theta and measure_gradients (k, d) give directions (k + 1, d), of
-    the objective first, whose coefficients (L, k + 1) the strategy adapts. adam moves theta.
-    """
-
-    theta: FloatArray
-    measures: FloatArray
-    gradient: FloatArray
-    measure_gradients: FloatArray
-    directions: FloatArray
-    coefficients: FloatArray
+    theta: FloatArray  # (d,)
+    measures: FloatArray  # (k,), at theta
+    gradient: FloatArray  # (d,), of the cost at theta
+    measure_gradients: FloatArray  # (k, d), at theta
+    directions: FloatArray  # (k + 1, d), normalised gradients, that of the objective first
+    coefficients: FloatArray  # (L, k + 1), of the directions, which the strategy adapts
     branches: Batch
     strategy: Strategy
-    adam: Adam
+    adam: Adam  # moves theta
 
 
 class MeSearch(NamedTuple):
@@ -67,56 +77,17 @@ class MeSearch(NamedTuple):
     strategy: Strategy
 
 
-def mega_search(
-    start: FloatArray,
-    measures: int,
-    batch: int,
-    *,
-    sigma0: float,
-    rate: float,
-    ribs_parity: bool = False,
-    epsilon: float = EPSILON,
-) -> MegaSearch:
-    """CMA-MEGA at theta = start (d,), with so many measures and branches; epsilon is Adam's."""
-    d, n = len(start), measures + 1
-    return MegaSearch(
-        theta=np.array(start, dtype=np.float64),
-        measures=np.zeros(measures),
-        gradient=np.zeros(d),
-        measure_gradients=np.zeros((measures, d)),
-        directions=np.zeros((n, d)),
-        coefficients=np.zeros((batch, n)),
-        branches=batch_of(batch, d, measures),
-        strategy=strategy_around(np.zeros(n), batch, sigma0, ribs_parity=ribs_parity),
-        adam=Adam(float(rate), float(epsilon), np.zeros((2, d)), np.ones(2)),
-    )
-
-
-def me_search(
-    start: FloatArray, measures: int, batch: int, *, sigma0: float, ribs_parity: bool = False
-) -> MeSearch:
-    """CMA-ME around start (d,), with so many measures and samples."""
-    strategy = strategy_around(start, batch, sigma0, ribs_parity=ribs_parity)
-    return MeSearch(batch_of(batch, len(start), measures), strategy)
-
-
 @compiled
 def cma_mega(
-    model: Any,
-    space: Any,
-    measure: Any,
-    work: Any,
+    landscape: Landscape,
     archive: Cells,
     search: MegaSearch,
-    normals: FloatArray,
-    elites: FloatArray,
+    draws: SearchDraws,
     first: int,
     last: int,
 ) -> None:
-    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`.
-
-    normals (iterations, L, k + 1); elites (iterations,): uniform numbers that choose one.
-    """
+    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`."""
+    model, space, measure, work = landscape
     theta, measures, gradient = search.theta, search.measures, search.gradient
     measure_gradients, directions = search.measure_gradients, search.directions
     coefficients, branches, strategy = search.coefficients, search.branches, search.strategy
@@ -130,54 +101,47 @@ def cma_mega(
         _normalise(gradient, -1.0, directions[0])
         for i in range(len(measures)):
             _normalise(measure_gradients[i], 1.0, directions[i + 1])
-        ask(strategy, normals[iteration], coefficients)
+        ask(strategy, draws.normals[iteration], coefficients)
         _branch(theta, directions, coefficients, branches.vectors)
-        _evaluate(model, space, measure, branches, work)
+        _evaluate(landscape, branches)
         insert(archive, branches)
         parents = rank(branches.status, branches.value, branches.order)
         tell(strategy, coefficients, branches.order, parents)
         if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
-            move_to_elite(archive, elites[iteration], theta)
+            move_to_elite(archive, draws.elites[iteration], theta)
             _forget(search.adam)
             reset(strategy)
             strategy.mean[:] = 0.0
         else:
-            weights = strategy.weights
-            _move_towards(theta, branches.vectors, branches.order, weights, parents, search.adam)
+            _move_towards(theta, branches, strategy.weights, parents, search.adam)
 
 
 @compiled
 def cma_me(
-    model: Any,
-    space: Any,
-    measure: Any,
-    work: Any,
+    landscape: Landscape,
     archive: Cells,
     search: MeSearch,
-    normals: FloatArray,
-    elites: FloatArray,
+    draws: SearchDraws,
     first: int,
     last: int,
 ) -> None:
-    """Iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`.
-
-    normals (iterations, L, d); elites (iterations,): uniform numbers that choose one.
-    """
+    """Iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`."""
     samples, strategy = search.samples, search.strategy
     for iteration in range(first, last):
-        ask(strategy, normals[iteration], samples.vectors)
-        _evaluate(model, space, measure, samples, work)
+        ask(strategy, draws.normals[iteration], samples.vectors)
+        _evaluate(landscape, samples)
         insert(archive, samples)
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            move_to_elite(archive, elites[iteration], strategy.mean)
+            move_to_elite(archive, draws.elites[iteration], strategy.mean)
             reset(strategy)
 
 
 @spliced
-def _evaluate(model: Any, space: Any, measure: Any, batch: Batch, work: Any) -> None:
+def _evaluate(landscape: Landscape, batch: Batch) -> None:
     """Fill objectives and measures; a vector that is not finite is not looked up anywhere."""
+    model, space, measure, work = landscape
     vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures
     for i in range(len(objectives)):
         vector = vectors[i]
@@ -223,14 +187,10 @@ def move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
 
 @inner
 def _move_towards(
-    theta: FloatArray,
-    vectors: FloatArray,
-    order: IntArray,
-    weights: FloatArray,
-    parents: int,
-    adam: Adam,
+    theta: FloatArray, branches: Batch, weights: FloatArray, parents: int, adam: Adam
 ) -> None:
-    """One step of Adam from theta to the weighted mean of the parents."""
+    """One step of Adam from theta to the weighted mean of the best branches, its parents."""
+    vectors, order = branches.vectors, branches.order
     moments, powers = adam.moments, adam.powers
     powers[0] *= BETA1
     powers[1] *= BETA2

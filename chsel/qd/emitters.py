@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
-from chsel.cost.objective import Objective
+from chsel.cost.objective import EPSILON, Objective
 from chsel.errors import require_at_most, require_choice, require_positive
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import Observer
-from chsel.problem.search_space import SearchSpace
 from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd import emitter_kernels as kernels
-from chsel.qd.archive import GridArchive
-from chsel.qd.emitter_kernels import me_search, mega_search
+from chsel.qd.archive import GridArchive, SearchObjective, batch_of
+from chsel.qd.emitter_kernels import Adam, Landscape, MegaSearch, MeSearch, SearchDraws
+from chsel.qd.evolution_kernels import strategy_around
 
 MOST_ITERATIONS = 1_000_000
 _MOST_DRAWN = 4_000_000  # normal draws held at once, 8 bytes each
@@ -25,19 +25,13 @@ _MOST_DRAWN = 4_000_000  # normal draws held at once, 8 bytes each
 
 @dataclass(frozen=True)
 class EmitterSettings:
-    """Settings of a search.
+    """Settings of a search."""
 
-    iterations: n_o. sigma0: first step size, of the gradient coefficients for CMA-MEGA, of the
-    search vector for CMA-ME. rate: of the Adam ascent of CMA-MEGA. start: the first solution,
-    "best" of E' and E_l, or "initial", the first element of E_0. ribs_parity: see
-    chsel.qd.evolution_kernels.Strategy.
-    """
-
-    iterations: int = 100
-    sigma0: float = 0.005
-    rate: float = 0.01
-    start: str = "best"
-    ribs_parity: bool = False
+    iterations: int = 100  # n_o
+    sigma0: float = 0.005  # first step size, of gradient coefficients or (CMA-ME) vectors
+    rate: float = 0.01  # of the Adam ascent of CMA-MEGA
+    start: str = "best"  # the first solution: "best" of E' and E_l, or "initial", the first of E_0
+    ribs_parity: bool = False  # see chsel.qd.evolution_kernels.Strategy
 
     presets: ClassVar[Presets] = {
         "paper": {"sigma0": 1.0, "rate": 0.05, "start": "initial"},
@@ -54,18 +48,16 @@ class EmitterSettings:
 
 @dataclass(frozen=True)
 class Draws:
-    """The random numbers of one search; none depends on what the search does with others."""
+    """The random numbers of one search; none depends on how others are used."""
 
     key: StreamKey
-    refinement: int = 0
-
-    def normals(self, iterations: int, batch: int, dimension: int) -> FloatArray:
-        """Standard normal draws (iterations, batch, dimension) for the evolution strategy."""
-        none = np.zeros((0, batch, dimension))
-        return np.concatenate([none, *self.blocks(iterations, batch, dimension)])
+    refinement: int = 0  # index of the pass
 
     def blocks(self, iterations: int, batch: int, dimension: int) -> Iterator[FloatArray]:
-        """The same draws, as many iterations at a time as `block` says."""
+        """Standard normal draws for the strategy, `block` iterations at a time.
+
+        Each has shape (iterations, batch, dimension).
+        """
         stream = self.key.stream(Purpose.EMITTER, self.refinement)
         size = self.block(batch, dimension)
         for first in range(0, iterations, size):
@@ -73,7 +65,7 @@ class Draws:
 
     @staticmethod
     def block(batch: int, dimension: int) -> int:
-        """Iterations that are drawn at a time: 10 or a multiple, so that no pair is torn."""
+        """Iterations that are drawn at a time: a multiple of 10, so that no pair is split."""
         step = ArchiveWatch.trace_interval
         return max(1, min(100, _MOST_DRAWN // (step * batch * dimension))) * step
 
@@ -82,32 +74,34 @@ class Draws:
         return self.key.stream(Purpose.RESTART, self.refinement).random(iterations)
 
 
-class Searched(Protocol):
-    """What a search minimises: the cost of the vectors of a search space."""
+def mega_search(
+    start: FloatArray,
+    measures: int,
+    batch: int,
+    settings: EmitterSettings,
+    epsilon: float = EPSILON,
+) -> MegaSearch:
+    """CMA-MEGA at theta = start (d,), with so many measures and branches; epsilon is Adam's."""
+    d, n = len(start), measures + 1
+    parity = settings.ribs_parity
+    return MegaSearch(
+        theta=np.array(start, dtype=np.float64),
+        measures=np.zeros(measures),
+        gradient=np.zeros(d),
+        measure_gradients=np.zeros((measures, d)),
+        directions=np.zeros((n, d)),
+        coefficients=np.zeros((batch, n)),
+        branches=batch_of(batch, d, measures),
+        strategy=strategy_around(np.zeros(n), batch, settings.sigma0, ribs_parity=parity),
+        adam=Adam(float(settings.rate), float(epsilon), np.zeros((2, d)), np.ones(2)),
+    )
 
-    space: SearchSpace
-    model: Any
-    space_arrays: Any
 
-    def work(self) -> Any:
-        """Scratch for one thread."""
-
-    def costs(self, vectors: FloatArray) -> FloatArray:
-        """Costs (B,) of vectors (B, d)."""
-
-
-def update_cells(
-    archive: GridArchive,
-    objective: Searched,
-    vectors: FloatArray,
-    costs: FloatArray | None = None,
-) -> tuple[IntArray, FloatArray]:
-    """Offer search vectors (B, d) to the archive; status and value (B,) as GridArchive.add gives.
-
-    costs (B,): theirs, where they are known already.
-    """
-    costs = objective.costs(vectors) if costs is None else costs
-    return archive.add(vectors, -costs, archive.measure.values(objective.space, vectors))
+def me_search(start: FloatArray, measures: int, batch: int, settings: EmitterSettings) -> MeSearch:
+    """CMA-ME around start (d,), with so many measures and samples."""
+    parity = settings.ribs_parity
+    strategy = strategy_around(start, batch, settings.sigma0, ribs_parity=parity)
+    return MeSearch(batch_of(batch, len(start), measures), strategy)
 
 
 def cma_mega(
@@ -124,69 +118,56 @@ def cma_mega(
     start (d,): the first theta. An iteration evaluates theta with its gradients, and count - 1
     branches around it.
     """
-    batch, measures = max(count - 1, 1), archive.measure.count
-    search = mega_search(
-        start,
-        measures,
-        batch,
-        sigma0=settings.sigma0,
-        rate=settings.rate,
-        ribs_parity=settings.ribs_parity,
-    )
-    shape = settings.iterations, batch, measures + 1
-    _iterate(kernels.cma_mega, objective, archive, search, shape, draws, watch)
+    search = mega_search(start, archive.measure.count, max(count - 1, 1), settings)
+    _iterate(kernels.cma_mega, objective, archive, search, settings.iterations, draws, watch)
 
 
 def cma_me(
-    objective: Searched,
+    objective: SearchObjective,
     archive: GridArchive,
     start: FloatArray,
     count: int,
     settings: EmitterSettings,
     draws: Draws,
     watch: ArchiveWatch,
-    iterations: Callable[..., None] | None = None,
+    kernel: Callable[..., None] | None = None,
 ) -> None:
     """Fill the archive by an evolution strategy on the search vectors (Fontaine et al., 2020).
 
-    start (d,): the first mean. An iteration evaluates count samples. iterations: the kernel, of
-    an objective that is not the relaxed cost.
+    start (d,): the first mean. An iteration evaluates count samples. kernel: runs the iterations
+    on an objective that is not the relaxed cost.
     """
-    search = me_search(
-        start,
-        archive.measure.count,
-        count,
-        sigma0=settings.sigma0,
-        ribs_parity=settings.ribs_parity,
-    )
-    shape = settings.iterations, count, len(start)
-    _iterate(iterations or kernels.cma_me, objective, archive, search, shape, draws, watch)
+    search = me_search(start, archive.measure.count, count, settings)
+    kernel = kernel or kernels.cma_me
+    _iterate(kernel, objective, archive, search, settings.iterations, draws, watch)
 
 
 def _iterate(
-    iterations: Callable[..., None],
-    objective: Searched,
+    kernel: Callable[..., None],
+    objective: SearchObjective,
     archive: GridArchive,
-    search: Any,
-    shape: tuple[int, int, int],
+    search: MegaSearch | MeSearch,
+    iterations: int,
     draws: Draws,
     watch: ArchiveWatch,
 ) -> None:
-    """Run the iterations of a kernel with normal draws of a shape, segment by segment."""
-    total, batch, dimension = shape
-    problem = objective.model, objective.space_arrays, archive.measure.code, objective.work()
-    normals, elites = draws.blocks(total, batch, dimension), draws.elites(total)
+    """Run the iterations of a kernel, segment by segment."""
+    batch, dimension = search.strategy.batch, len(search.strategy.mean)
+    measure = archive.measure.code
+    landscape = Landscape(objective.model, objective.space_arrays, measure, objective.work())
+    normals, elites = draws.blocks(iterations, batch, dimension), draws.elites(iterations)
     size = draws.block(batch, dimension)
-    for first, last in watch.segments(total):
+    watch.start(archive)
+    for first, last in watch.segments(iterations):
         if first % size == 0:
-            drawn, uniform = next(normals), elites[first : first + size]
-        place = first % size, last - first // size * size
-        iterations(*problem, archive.cells, search, drawn, uniform, *place)
-        watch.after(last, total, archive)
+            block = SearchDraws(next(normals), elites[first : first + size])
+        before = first - first % size
+        kernel(landscape, archive.cells, search, block, first - before, last - before)
+        watch.after(last, iterations, archive)
 
 
 class ArchiveWatch:
-    """Tells an observer of the archive: traces every 10 iterations, snapshots at its interval."""
+    """Shows an observer the archive: traces every 10 iterations, snapshots at its interval."""
 
     trace_interval = 10
 
@@ -196,12 +177,12 @@ class ArchiveWatch:
         self._stage = stage
 
     def start(self, archive: GridArchive) -> None:
-        """The archive is seeded."""
+        """Show the archive before the first iteration."""
         self._observer.trace(self._stage, 0, archive.solutions, archive.costs)
         self._observer.snapshot(archive.snapshot(0, self._refinement))
 
     def segments(self, total: int) -> Iterator[tuple[int, int]]:
-        """The iterations (first, last) to be run before each word to the observer, of `total`."""
+        """The iterations (first, last), of `total`, between two calls of the observer."""
         first = 0
         while first < total:
             last = min(self._next(first, self.trace_interval), total)
@@ -216,7 +197,7 @@ class ArchiveWatch:
         return (iteration // interval + 1) * interval
 
     def after(self, iteration: int, total: int, archive: GridArchive) -> None:
-        """An iteration has ended."""
+        """Show the archive after an iteration, where it is due."""
         interval = self._observer.snapshot_interval
         if iteration % self.trace_interval == 0 or iteration == total:
             self._observer.trace(self._stage, iteration, archive.solutions, archive.costs)

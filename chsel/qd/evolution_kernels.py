@@ -11,8 +11,6 @@ from chsel.numerics.compiler import inner
 from chsel.numerics.eigen import decompose
 from chsel.numerics.elementary import exp, logs
 
-SIGMA, EVALUATIONS, DECOMPOSED_AT, GAP = range(4)
-
 _MAX_CONDITION = 1e14
 _SMALLEST_STEP = 1e-11
 _SMALLEST_EIGENVALUE = 1e-300
@@ -22,30 +20,27 @@ _FLAT = 1e-12
 class Strategy(NamedTuple):
     """State of covariance matrix adaptation (Hansen, 2016, "The CMA Evolution Strategy").
 
-    Dimension n, batch L, first step size sigma0. Parents may be any number of the batch, as
-    quality diversity takes those that changed the archive (Fontaine et al., 2020).
-    ribs_parity: divide no evolution path by sigma and apply c1 twice, as pyribs does.
-    mean, path_c, path_s (n,); covariance (n, n); eigenvalues (n,) and eigenvectors (n, n), in
-    columns, of the covariance at the last decomposition. numbers (4,): step size sigma,
-    evaluations since the reset, those at the last decomposition, and how many must lie between.
-    logarithms (2, L): ln i and ln(i + 1/2), from i = 1. weights (L,): of the last parents.
-    scratch (2, n) and work (n, n) hold nothing between two calls.
+    Parents may be any number of the batch, as quality diversity takes those that changed the
+    archive (Fontaine et al., 2020).
     """
 
-    batch: int
-    sigma0: float
-    ribs_parity: bool
-    mean: FloatArray
-    path_c: FloatArray
-    path_s: FloatArray
-    covariance: FloatArray
-    eigenvalues: FloatArray
-    eigenvectors: FloatArray
-    numbers: FloatArray
-    logarithms: FloatArray
-    weights: FloatArray
-    scratch: FloatArray
-    work: FloatArray
+    batch: int  # L
+    sigma0: float  # first step size
+    ribs_parity: bool  # divide no evolution path by sigma and apply c1 twice, as pyribs does
+    mean: FloatArray  # (n,)
+    path_c: FloatArray  # (n,)
+    path_s: FloatArray  # (n,)
+    covariance: FloatArray  # (n, n)
+    eigenvalues: FloatArray  # (n,), of the covariance at the last decomposition
+    eigenvectors: FloatArray  # (n, n), in columns
+    sigma: FloatArray  # (1,), step size
+    evaluations: IntArray  # (1,), since the reset
+    decomposed_at: IntArray  # (1,), evaluations at the last decomposition
+    gap: FloatArray  # (1,), evaluations between two decompositions
+    logarithms: FloatArray  # (2, L), ln i and ln(i + 1/2), from i = 1
+    weights: FloatArray  # (L,), of the last parents
+    scratch: FloatArray  # (2, n)
+    work: FloatArray  # (n, n), scratch
 
 
 def strategy_around(
@@ -63,7 +58,10 @@ def strategy_around(
         covariance=np.eye(n),
         eigenvalues=np.ones(n),
         eigenvectors=np.eye(n),
-        numbers=np.array([sigma0, 0.0, 0.0, 0.0]),
+        sigma=np.array([float(sigma0)]),
+        evaluations=np.zeros(1, dtype=np.int64),
+        decomposed_at=np.zeros(1, dtype=np.int64),
+        gap=np.zeros(1),
         logarithms=np.stack([logs(ranks), logs(ranks + 0.5)]),
         weights=np.zeros(batch),
         scratch=np.zeros((2, n)),
@@ -74,34 +72,34 @@ def strategy_around(
 @inner
 def reset(strategy: Strategy) -> None:
     """Start again around the mean."""
-    n, numbers = len(strategy.mean), strategy.numbers
+    n = len(strategy.mean)
     for i in range(n):
         strategy.path_c[i] = strategy.path_s[i] = 0.0
         strategy.eigenvalues[i] = 1.0
         for j in range(n):
             entry = 1.0 if i == j else 0.0
             strategy.covariance[i, j] = strategy.eigenvectors[i, j] = entry
-    numbers[SIGMA] = strategy.sigma0
-    numbers[EVALUATIONS] = numbers[DECOMPOSED_AT] = 0.0
+    strategy.sigma[0] = strategy.sigma0
+    strategy.evaluations[0] = strategy.decomposed_at[0] = 0
 
 
 @inner
 def ask(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
     """Fill samples (L, n), m + sigma B D z, from standard normal draws z (L, n)."""
-    numbers, mean, vectors = strategy.numbers, strategy.mean, strategy.eigenvectors
-    values, n = strategy.eigenvalues, len(mean)
-    if numbers[EVALUATIONS] == 0.0:
-        numbers[GAP] = _gap(n, strategy.batch, strategy.logarithms, strategy.weights)
-    elif numbers[EVALUATIONS] > numbers[DECOMPOSED_AT] + numbers[GAP]:
+    mean, values, vectors = strategy.mean, strategy.eigenvalues, strategy.eigenvectors
+    n, evaluations = len(mean), strategy.evaluations[0]
+    if evaluations == 0:
+        strategy.gap[0] = _gap(n, strategy.batch, strategy.logarithms, strategy.weights)
+    elif evaluations > strategy.decomposed_at[0] + strategy.gap[0]:
         decompose(strategy.covariance, strategy.work, values, vectors)
         for e in range(n):
             values[e] = max(values[e], _SMALLEST_EIGENVALUE)
-        numbers[DECOMPOSED_AT] = numbers[EVALUATIONS]
+        strategy.decomposed_at[0] = evaluations
     for i in range(len(samples)):
         for j in range(n):
             samples[i, j] = mean[j]
         for e in range(n):
-            along = numbers[SIGMA] * np.sqrt(values[e]) * normals[i, e]
+            along = strategy.sigma[0] * np.sqrt(values[e]) * normals[i, e]
             for j in range(n):
                 samples[i, j] += along * vectors[j, e]
 
@@ -141,12 +139,12 @@ def _learning_rates(n: int, mueff: float) -> tuple[float, float, float, float, f
 @inner
 def tell(strategy: Strategy, samples: FloatArray, order: IntArray, parents: int) -> None:
     """Learn from samples (L, n) with their order (L,), of which the first `parents` succeeded."""
-    numbers, mean, weights = strategy.numbers, strategy.mean, strategy.weights
+    mean, weights = strategy.mean, strategy.weights
     path_c, path_s = strategy.path_c, strategy.path_s
-    numbers[EVALUATIONS] += strategy.batch
+    strategy.evaluations[0] += strategy.batch
     if parents == 0:
         return
-    n, sigma = len(mean), numbers[SIGMA]
+    n, sigma = len(mean), strategy.sigma[0]
     mueff = _weigh(strategy.logarithms, parents, weights)
     cc, cs, c1, cmu, damping = _learning_rates(n, mueff)
     step, whitened = strategy.scratch[0], strategy.scratch[1]
@@ -162,7 +160,7 @@ def tell(strategy: Strategy, samples: FloatArray, order: IntArray, parents: int)
         path_s[j] = (1.0 - cs) * path_s[j] + rate * whitened[j]
         length += path_s[j] * path_s[j]
     length /= n
-    generation = int(numbers[EVALUATIONS]) // strategy.batch
+    generation = strategy.evaluations[0] // strategy.batch
     steady = length / (1.0 - _power(1.0 - cs, 2 * generation)) < 2.0 + 4.0 / (n + 1.0)
     rate = np.sqrt(cc * (2.0 - cc) * mueff) if steady else 0.0
     if not strategy.ribs_parity:
@@ -178,7 +176,7 @@ def tell(strategy: Strategy, samples: FloatArray, order: IntArray, parents: int)
         _add_rank_one(strategy.covariance, 1.0, cmu * weights[i] / (sigma * sigma), whitened)
     for j in range(n):
         mean[j] += step[j]
-    numbers[SIGMA] = sigma * exp(min(1.0, (cs / damping) * (length - 1.0) / 2.0))
+    strategy.sigma[0] = sigma * exp(min(1.0, (cs / damping) * (length - 1.0) / 2.0))
 
 
 @inner
@@ -222,7 +220,7 @@ def stopped(strategy: Strategy, order: IntArray, status: IntArray, value: FloatA
     smallest, largest = values[0], values[len(values) - 1]
     if largest / smallest > _MAX_CONDITION:
         return True
-    if strategy.numbers[SIGMA] * np.sqrt(largest) < _SMALLEST_STEP:
+    if strategy.sigma[0] * np.sqrt(largest) < _SMALLEST_STEP:
         return True
     by_status = float(status[order[0]] - status[order[last]])
     by_value = value[order[0]] - value[order[last]]

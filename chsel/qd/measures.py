@@ -18,11 +18,11 @@ VECTOR, TRANSLATION, OBJECT_POSITION, OBJECT_YAW = range(4)
 
 
 class MeasureCode(NamedTuple):
-    """Which measure: its kind, its numbers k, and for kind VECTOR the first entry it takes."""
+    """A measure as kernels take it."""
 
     kind: int
-    size: int
-    first: int = 0
+    size: int  # k
+    first: int = 0  # of kind VECTOR: the first entry of the vector that it takes
 
 
 @leaf
@@ -93,14 +93,11 @@ def measure_gradients(space: Any, measure: Any, vector: Any, out: Any) -> None:
 
 @dataclass(frozen=True)
 class Measure:
-    """A map from search vectors to k numbers: axes names them with units.
+    """A map from search vectors to k numbers."""
 
-    code: how it is computed. A circular measure is an angle in radians.
-    """
-
-    axes: tuple[str, ...]
+    axes: tuple[str, ...]  # (k,), names with units
     code: MeasureCode
-    circular: bool = False
+    circular: bool = False  # an angle in radians
 
     @property
     def count(self) -> int:
@@ -152,7 +149,7 @@ MEASURES = {**_ANY, **_SE3_ONLY, **_SE2_ONLY}
 
 
 def measure_named(name: str, *, planar: bool) -> Measure:
-    """The measure of that name, or SettingError if it does not exist in this search space."""
+    """The measure of that name; SettingError if it does not exist in this search space."""
     require_choice("measure", name, MEASURES)
     refused, wanted = (_SE3_ONLY, "without plane") if planar else (_SE2_ONLY, "with plane")
     if name in refused:

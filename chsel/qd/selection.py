@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,34 +16,29 @@ from chsel.problem.search_space import SearchSpace, origin_bounds
 from chsel.problem.settings import Presets
 from chsel.problem.subset import evenly_spaced, representative_poses
 from chsel.problem.surface import has_surface
-from chsel.qd.archive import GridArchive
+from chsel.qd.archive import Evaluated, GridArchive, SearchObjective
 from chsel.qd.measures import MEASURES, Measure
 
 MOST_CELLS = 10_000_000
-_POOL = 400  # elites that are considered
-_MOST_POOL = 1200  # for many hypotheses
-_MOST_REPRESENTATIVE = 300
+_POOL = 400  # poses to choose representatives from
+_MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
+_MOST_REPRESENTATIVE = 300  # by facility location; more of them are taken evenly
 
 
 @dataclass(frozen=True)
 class ArchiveSettings:
-    """The grid of the archive: mean +- range_sigmas standard deviations of the measures of E'.
+    """The grid of the archive: mean +- range_sigmas standard deviations of the measures of E'."""
 
-    measure: see chsel.qd.measures. bins: cells per measure. range_sigmas: b_sigma of the paper.
-    least_deviation: floor of the standard deviation (metres or radians).
-    outliers: which of E' are left out of mean and deviation: "ratio" those above
-    ratio x lowest cost + tolerance, "quantile" those above the 80 % quantile, "none".
-    tolerance_per_point: tolerance per known point; tolerance: its floor.
-    """
-
-    measure: str = "object_xy"
-    bins: int = 56
-    range_sigmas: float = 3.0
-    least_deviation: float = 0.005
+    measure: str = "object_xy"  # of chsel.qd.measures
+    bins: int = 56  # cells per measure
+    range_sigmas: float = 3.0  # b_sigma of the paper
+    least_deviation: float = 0.005  # floor of the standard deviation, metres or radians
+    # Which of E' are left out of mean and deviation: "ratio" those above
+    # ratio x lowest cost + tolerance, "quantile" those above the 80 % quantile, "none".
     outliers: str = "ratio"
     ratio: float = 5.0
-    tolerance_per_point: float = 1e-3
-    tolerance: float = 1e-6
+    tolerance_per_point: float = 1e-3  # tolerance per known point
+    tolerance: float = 1e-6  # its floor
 
     presets: ClassVar[Presets] = {
         "paper": {
@@ -75,26 +70,24 @@ class ArchiveSettings:
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """How hypotheses are chosen from the archive.
+    """How hypotheses are chosen from the archive."""
 
-    choice: "lowest" for the lowest costs, "representative" for those below the limit that all
-    others below it are near to; it is "lowest" where no more than wanted are below.
-    limit: "none" for the cells of lowest cost whatever it is, "ratio" for those below
-    ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
-    and lowest cost + tolerance_per_point x known points + free_tolerance.
-    shortage: what fills a set of too few: "next_best" the next cells, then copies; "resample"
-    copies drawn with replacement; "fewer" nothing.
-    margin: metres by which the object's origin may be beside the workspace, as long as any pose
-    is in there; None: it may be anywhere.
-    """
-
+    # "lowest" for the lowest costs, "representative" for those below the limit that all others
+    # below it are near to; it is "lowest" where no more than wanted are below.
     choice: str = "representative"
+    # "none" for the cells of lowest cost whatever it is, "ratio" for those below
+    # ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
+    # and lowest cost + tolerance_per_point x known points + free_tolerance.
     limit: str = "noise"
     ratio: float = 1.3
     tolerance: float = 1e-6
     tolerance_per_point: float = 5e-4
     free_tolerance: float = 0.01
+    # What fills a set of too few: "next_best" the next cells, then copies; "resample" copies drawn
+    # with replacement; "fewer" nothing.
     shortage: str = "next_best"
+    # Metres by which the object's origin may be beside the workspace, as long as any pose is
+    # within; None: it may be anywhere.
     margin: float | None = 0.15
 
     _OTHERS: ClassVar = {  # of both other presets
@@ -120,17 +113,22 @@ class OutputSettings:
             require_positive("margin", self.margin, zero=True)
 
 
+def measure_range(
+    estimates: Evaluated, measure: Measure, settings: ArchiveSettings, known_count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation (k,) of the measures of estimates E' that are no outliers."""
+    kept = estimates.measures[_inliers(estimates.costs, settings, known_count)]
+    return measure.moments(kept if len(kept) >= 2 else estimates.measures)
+
+
 def sized_archive(
     measure: Measure,
-    measures: FloatArray,
-    costs: FloatArray,
+    mean: FloatArray,
+    deviation: FloatArray,
     settings: ArchiveSettings,
-    known_count: int,
     dimension: int,
 ) -> GridArchive:
-    """The empty archive whose range the measures (B, k) of E' with costs (B,) set."""
-    kept = measures[_inliers(costs, settings, known_count)]
-    mean, deviation = measure.moments(kept if len(kept) >= 2 else measures)
+    """An empty archive of vectors (d,) with the range mean +- b_sigma deviations (k,)."""
     half = settings.range_sigmas * np.maximum(deviation, settings.least_deviation)
     if measure.circular:
         half = np.minimum(half, np.pi)
@@ -154,16 +152,17 @@ def select_elites(
     settings: OutputSettings,
     stream: np.random.Generator,
 ) -> IntArray:
-    """Indices of as many elites as E_0 has, or fewer if so set, best first.
-
-    Of elites, C poses, with costs (C,).
-    """
+    """Indices of as many of C elites with costs (C,) as E_0 has, or fewer if so set, best first."""
     count, known_count = len(problem.initial_set), len(problem.points.known)
     order = np.argsort(costs, kind="stable")
     order = order[within_workspace(elites[order], problem, space, settings.margin)]
     good = order[costs[order] <= _limit(costs[order], settings, known_count)]
     if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
-        return good[_representatives(problem.sdf, elites[good], count)]
+        poses = elites[good]
+        chosen = representatives(problem.sdf, poses, count)
+        others = np.setdiff1d(np.arange(len(poses)), chosen)
+        others = others[evenly_spaced(len(others), count - len(chosen))]
+        return good[np.sort(np.concatenate([chosen, others]))]
     if len(good) >= count or settings.shortage == "fewer":
         return good[:count]
     if settings.shortage == "resample":
@@ -189,16 +188,13 @@ def within_workspace(
     return inside if inside.any() else everywhere
 
 
-def _representatives(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
-    """Places (count,) in ascending order, the first among them, of poses in order of cost.
+def representatives(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
+    """Which of poses to take, `count` at most, so that all are near to one; the first always is.
 
-    Of many, those that are considered, and of many wanted, those beyond, are taken evenly.
+    Of many poses, those to choose from are taken evenly.
     """
     pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
-    chosen = pool[representative_poses(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
-    others = np.setdiff1d(np.arange(len(poses)), chosen)
-    more = others[evenly_spaced(len(others), count - len(chosen))]
-    return np.sort(np.concatenate([chosen, more]))
+    return pool[representative_poses(sdf, poses[pool], min(count, _MOST_REPRESENTATIVE))]
 
 
 def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> float:
@@ -219,23 +215,14 @@ def repeated(poses: Poses) -> BoolArray:
     return flags
 
 
-class Judge(Protocol):
-    """What gives poses their costs, by way of its search space."""
-
-    space: SearchSpace
-
-    def costs(self, vectors: FloatArray) -> FloatArray:
-        """Costs (B,) of search vectors (B, d)."""
-
-
 def ranked_hypotheses(
-    objective: Judge,
+    objective: SearchObjective,
     poses: Poses,
     cells: IntArray | None = None,
     elites: Poses | None = None,
     archive: ArchiveSnapshot | None = None,
 ) -> Hypotheses:
-    """Poses, costed as they are and put in order of cost; the rest as `ranked` has it."""
+    """Poses in order of their costs, which are computed; otherwise as `ranked`."""
     cost = objective.costs(objective.space.encode(poses))
     kept = None if elites is None else elites.matrices
     return ranked(poses.matrices, cost, cells, kept, archive)
@@ -250,8 +237,8 @@ def ranked(
 ) -> Hypotheses:
     """Poses (B, 4, 4) in order of their costs (B,).
 
-    cells (B,): those of the archive that they come from; by default of none. elites (L, 4, 4): all
-    solutions kept; by default the poses in their order.
+    cells (B,): of the archive that they come from, by default none. elites (L, 4, 4): all
+    solutions kept, by default the poses in their order. Raises ChselError if no cost is finite.
     """
     if not np.isfinite(cost).any():
         raise ChselError(

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError
-from chsel.methods.anchored.anchor_sampling import anchored_poses, in_telling_order
+from chsel.methods.anchored.anchor_sampling import anchored_poses, most_informative_first
 from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings
 from chsel.methods.anchored.energy import Energy
 from chsel.numerics.arrays import FloatArray
@@ -64,7 +64,7 @@ def stages_of(problem: RegistrationProblem, settings: AnchoredSettings) -> list[
     """Sampled, fitted, spread and chosen poses of one registration."""
     effort = settings.effort or EFFORTS[settings.size]
     space = search_space(settings.plane, problem.sdf)
-    known, anchors = in_telling_order(problem.points), settings.anchors
+    known, anchors = most_informative_first(problem.points), settings.anchors
     sampled = anchored_poses(
         problem, known, space, anchors, samples=effort.samples, most=effort.kept
     )

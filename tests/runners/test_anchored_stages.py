@@ -17,7 +17,21 @@ from runners.reporting.anchored_stages import main, picture_of_stages, stages_of
 from tests.runners.drawn_figures import outlines_of
 from tests.runners.made_up_evaluations import REPLAYS
 
-SETTINGS = AnchoredSettings(effort=Effort(5_000, 40, 6, 20, 6, 8, 20, 8, 40, 4, 40))
+SETTINGS = AnchoredSettings(
+    effort=Effort(
+        samples=5_000,
+        kept=40,
+        first_steps=6,
+        refined=20,
+        steps=6,
+        descents=8,
+        descent_moves=20,
+        chains=8,
+        moves=40,
+        polished=4,
+        polish_moves=40,
+    )
+)
 
 
 def test_stages_are_those_of_the_registration_and_come_closer() -> None:

@@ -1,4 +1,4 @@
-"""Starts beside E_0: poses that put the object's surface onto contacts (for Alg. 1, line 1)."""
+"""Poses that put the object's surface onto contacts, as starts beside E_0 (Alg. 1, line 1)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ import numpy as np
 
 from chsel.cost.interior_points import VoxelGrid
 from chsel.errors import SettingError, require_at_most, require_positive
-from chsel.methods.anchored.sampling_kernels import DRAWS, Anchors, Best, Coarse, best_for, sample
+from chsel.methods.anchored.sampling_kernels import (
+    DRAWS,
+    Anchors,
+    Best,
+    Coarse,
+    DrawnRows,
+    best_for,
+    sample,
+)
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import box_of
 from chsel.numerics.threads import spread
@@ -23,25 +31,36 @@ from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import farthest_points
 from chsel.problem.surface import has_surface, surface_points
 
-MOST_CONTACTS = 32
+SURFACE_POINTS = 400
+MOST_CONTACTS = 32  # that poses are scored by
+MOST_ANCHORS = 48  # contacts that the surface is put onto
 MOST_INSIDE = 150
+MOST_SAMPLES = 100_000_000
+MOST_KEPT = 100_000
 _DEEP = 0.3  # of the greatest depth: points inside are at least so deep
 _MOST_NODES = 4000  # of which they are chosen
 _WEIGHT = 90.0  # of the mean depth of the points inside that are in free space
 _MOST_VOXELS = 20_000_000
+_MOST_ORDERED = 64  # known points that are put in order
+_BLOCK = 65_536  # poses that are drawn at a time
+_SAMPLES_PER_THREAD = 5_000
+_LENGTHS_ALIKE = 0.004  # metres
+_LEAST_LENGTH = 0.01  # metres between two contacts that give a direction
 
 
 def coarse_of(problem: RegistrationProblem, known: KnownPoints, margin: float) -> Coarse:
     """The score of poses: mean contact distance, and the depths of points inside in free space.
 
-    known: the problem's points, in the order in which they tell most. margin: metres by which the
-    object's origin may be beside the workspace; free space beyond its reach is left out, and all
-    of it if it needs more voxels than memory should hold.
+    known: the problem's points, see most_informative_first. margin: metres by which the object's
+    origin may be beside the workspace; free space beyond its reach is left out, and all of it if
+    it needs too many voxels.
     """
     sdf, resolution = problem.sdf, problem.free_resolution
     values, inside, depth = sdf.derived("coarse", lambda: _values_and_depths(sdf))
     count = min(len(known.known), MOST_CONTACTS)
-    free = _within_reach(problem, margin + sdf.diameter)
+    free, (lower, upper) = problem.points.free, problem.workspace.bounds
+    reach = margin + sdf.diameter
+    free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]
     box = voxels = box_of(sdf.origin, sdf.resolution, sdf.shape)
     flags = np.zeros(1, dtype=bool)
     if len(free) and math.prod((np.ptp(free, axis=0) / resolution + 3.0).tolist()) < _MOST_VOXELS:
@@ -51,22 +70,16 @@ def coarse_of(problem: RegistrationProblem, known: KnownPoints, margin: float) -
     else:
         inside, depth = inside[:0], depth[:0]
     return Coarse(
-        box,
-        values,
-        known.known[:count].T.copy(),
-        known.sdf[:count].copy(),
-        1.0 / max(count, 1),
-        inside.T.copy(),
-        depth * (_WEIGHT / max(len(depth), 1)),
-        voxels,
-        flags,
+        box=box,
+        values=values,
+        contacts=known.known[:count].T.copy(),
+        known_sdf=known.sdf[:count].copy(),
+        scale=1.0 / max(count, 1),
+        inside=inside.T.copy(),
+        weights=depth * (_WEIGHT / max(len(depth), 1)),
+        voxels=voxels,
+        flags=flags,
     )
-
-
-def _within_reach(problem: RegistrationProblem, reach: float) -> FloatArray:
-    """The free points that the object can meet."""
-    free, (lower, upper) = problem.points.free, problem.workspace.bounds
-    return free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]
 
 
 def _values_and_depths(sdf: SdfGrid) -> tuple[Any, FloatArray, FloatArray]:
@@ -79,27 +92,13 @@ def _values_and_depths(sdf: SdfGrid) -> tuple[Any, FloatArray, FloatArray]:
     return sdf.values.astype(np.float32).reshape(-1), sdf.origin + nodes * sdf.resolution, depth
 
 
-SURFACE_POINTS = 400
-MOST_ANCHORS = 48
-_TELLING = 64  # known points that are put in order
-_BLOCK = 65_536  # poses that are drawn at a time
-_SAMPLES_PER_THREAD = 5_000
-_LENGTHS_ALIKE = 0.004  # metres
-_LEAST_LENGTH = 0.01  # metres between two contacts that tell a direction
-
-
 @dataclass(frozen=True)
 class AnchorSettings:
-    """How poses are drawn.
+    """How poses are drawn: on pairs of contacts, on single ones, or uniform in the workspace."""
 
-    pairs: the share that puts two surface points onto the line of two contacts. contacts: the share
-    that puts one onto one. The rest is uniform in the workspace and SO(3). margin: metres by which
-    the workspace is widened for the object's origin.
-    """
-
-    pairs: float = 0.5
-    contacts: float = 0.4
-    margin: float = 0.15
+    pairs: float = 0.5  # share of poses with two surface points on the line of two contacts
+    contacts: float = 0.4  # share of poses with a surface point on a contact
+    margin: float = 0.15  # metres by which the workspace is widened for the object's origin
 
     def __post_init__(self) -> None:
         for name in ("pairs", "contacts", "margin"):
@@ -123,39 +122,38 @@ def anchored_poses(
 ) -> Poses:
     """The best of so many random poses by their coarse score: K poses, best first.
 
-    known: the problem's points, see `in_telling_order`. most: K at most; less where the object
-    is out of its bounds too often. index: of the stream.
+    known: the problem's points, see most_informative_first. most: K at most; fewer where the
+    object is out of its bounds too often. index: of the stream.
     """
-    margin = settings.margin
     anchors = _anchors(problem, known, space, settings)
-    coarse = coarse_of(problem, known, margin)
+    coarse = coarse_of(problem, known, settings.margin)
     stream = problem.key.stream(Purpose.ANCHORS, index)
-    made: list[Best] = []
+    bests: list[Best] = []
 
     def scratch() -> Best:
-        made.append(best_for(most))
-        return made[-1]
+        bests.append(best_for(most))
+        return bests[-1]
 
     def run(first: int, last: int, best: Best) -> None:
-        sample(coarse, space.arrays, anchors, draws, before, first, last, best)
+        sample(coarse, space.arrays, anchors, rows, first, last, best)
 
     for before in range(0, samples, _BLOCK):
         draws = stream.random((min(_BLOCK, samples - before), DRAWS), dtype=np.float32)
+        rows = DrawnRows(draws, before)
         spread(run, len(draws), scratch, least=_SAMPLES_PER_THREAD)
-    counts = [int(best.state[0]) for best in made]
-    parts = list(zip(made, counts, strict=True))
-    scores = np.concatenate([best.scores[:count] for best, count in parts])
-    numbers = np.concatenate([best.numbers[:count] for best, count in parts])
-    poses = np.concatenate([best.poses[:count] for best, count in parts])
+    scores, numbers, poses = (
+        np.concatenate([getattr(best, name)[: best.size[0]] for best in bests])
+        for name in ("scores", "numbers", "poses")
+    )
     return Poses(poses[np.lexsort([numbers, scores])[:most]])
 
 
-def in_telling_order(points: KnownPoints) -> KnownPoints:
-    """The points, with known ones in the order in which they tell most: each far from the others.
+def most_informative_first(points: KnownPoints) -> KnownPoints:
+    """The points, with known ones in the order of farthest points.
 
-    So poses that do not fit are found out early.
+    So sums over them rule out poses that do not fit after a few.
     """
-    first = farthest_points(points.known, _TELLING)
+    first = farthest_points(points.known, _MOST_ORDERED)
     order = np.concatenate([first, np.setdiff1d(np.arange(len(points.known)), first)])
     return replace(points, known=points.known[order], known_sdf=points.sdf[order])
 
@@ -163,29 +161,32 @@ def in_telling_order(points: KnownPoints) -> KnownPoints:
 def _anchors(
     problem: RegistrationProblem, known: KnownPoints, space: SearchSpace, settings: AnchorSettings
 ) -> Anchors:
-    """What can be put onto what."""
     sdf = problem.sdf
     surface, normals, lengths, by_distance = sdf.derived("anchors", lambda: _pairs_of(sdf))
     contacts, values = known.known[:MOST_ANCHORS], known.sdf[:MOST_ANCHORS]
-    allowed = np.arange(len(surface))
-    pairs = np.zeros((0, 4), dtype=np.int64)
     if isinstance(space, SE2Space):
-        allowed, singles = _at_heights(space, surface, contacts, values)
+        by_height, singles, single_spans = _at_heights(space, surface, contacts, values)
+        pairs = pair_spans = np.zeros((0, 2), dtype=np.int64)
     else:
-        whole = np.full(len(contacts), len(surface))
-        singles = np.stack([np.arange(len(contacts)), 0 * whole, whole], axis=1)
-        pairs = _matching(contacts, values, lengths)
+        by_height, singles = np.arange(len(surface)), np.arange(len(contacts))
+        single_spans = np.tile([0, len(surface)], (len(contacts), 1))
+        pairs, pair_spans = _matching(contacts, values, lengths)
+    lower, upper = origin_bounds(problem.workspace, space, settings.margin)
     return Anchors(
-        contacts.T.copy(),
-        values.copy(),
-        surface.T.copy(),
-        normals.T.copy(),
-        by_distance,
-        pairs,
-        singles,
-        allowed,
-        np.array([settings.pairs if len(pairs) else 0.0, settings.pairs + settings.contacts]),
-        *origin_bounds(problem.workspace, space, settings.margin),
+        contacts=contacts.T.copy(),
+        values=values.copy(),
+        surface=surface.T.copy(),
+        normals=normals.T.copy(),
+        by_distance=by_distance,
+        pairs=pairs,
+        pair_spans=pair_spans,
+        singles=singles,
+        single_spans=single_spans,
+        by_height=by_height,
+        pair_share=float(settings.pairs) if len(pairs) else 0.0,
+        anchored_share=float(settings.pairs + settings.contacts),
+        lower=lower,
+        upper=upper,
     )
 
 
@@ -201,44 +202,46 @@ def _pairs_of(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, IntArra
     return surface, normals, lengths[order], np.stack([i, j], axis=1)[order]
 
 
-def _matching(contacts: FloatArray, values: FloatArray, lengths: FloatArray) -> IntArray:
-    """Pairs of contacts with the range of surface pairs of their length (C, 4)."""
+def _matching(
+    contacts: FloatArray, values: FloatArray, lengths: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Pairs of contacts (C, 2), and the spans (C, 2) of surface pairs of their length."""
     touching = np.flatnonzero(values == 0.0)
-    i, j = (touching[part] for part in np.triu_indices(len(touching), 1))
-    apart = np.sqrt(((contacts[i] - contacts[j]) ** 2).sum(axis=1))
-    first = np.searchsorted(lengths, apart - _LENGTHS_ALIKE)
-    last = np.searchsorted(lengths, apart + _LENGTHS_ALIKE, side="right")
-    good = (apart >= _LEAST_LENGTH) & (last > first)
-    return np.stack([i, j, first, last], axis=1)[good].astype(np.int64)
+    pairs = touching[np.stack(np.triu_indices(len(touching), 1), axis=1)]
+    apart = np.sqrt(((contacts[pairs[:, 0]] - contacts[pairs[:, 1]]) ** 2).sum(axis=1))
+    spans = _spans(lengths, apart, _LENGTHS_ALIKE)
+    good = (apart >= _LEAST_LENGTH) & (spans[:, 1] > spans[:, 0])
+    return pairs[good], spans[good]
 
 
 def _at_heights(
-    space: SE2Space,
-    surface: FloatArray,
-    contacts: FloatArray,
-    values: FloatArray,
-) -> tuple[IntArray, IntArray]:
-    """Surface points in the order of their heights, and of each contact those that can meet it."""
+    space: SE2Space, surface: FloatArray, contacts: FloatArray, values: FloatArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Surface points in the order of their heights, and the contacts that some can meet.
+
+    With the spans (S, 2) of these points.
+    """
     heights = (surface * space.axis).sum(axis=1)
     order = np.argsort(heights, kind="stable")
     wanted = (contacts * space.upward).sum(axis=1) + space.offset
-    reach = _LENGTHS_ALIKE + np.abs(values)
-    first = np.searchsorted(heights[order], wanted - reach)
-    last = np.searchsorted(heights[order], wanted + reach, side="right")
-    singles = np.stack([np.arange(len(contacts)), first, last], axis=1)
-    return order, singles[last > first]
+    spans = _spans(heights[order], wanted, _LENGTHS_ALIKE + np.abs(values))
+    met = np.flatnonzero(spans[:, 1] > spans[:, 0])
+    return order, met, spans[met]
 
 
-MOST_SAMPLES = 100_000_000
-MOST_KEPT = 100_000
+def _spans(ascending: FloatArray, wanted: FloatArray, reach: FloatArray | float) -> IntArray:
+    """First and last + 1 (N, 2) of the ascending values that are near to wanted ones (N,)."""
+    first = np.searchsorted(ascending, wanted - reach)
+    last = np.searchsorted(ascending, wanted + reach, side="right")
+    return np.stack([first, last], axis=1)
 
 
 @dataclass(frozen=True)
 class AnchoredStarts:
-    """How many: samples, the poses drawn on contacts; kept, those of them that score best."""
+    """How many poses on contacts CHSEL descends from, beside E_0."""
 
-    samples: int = 10_000
-    kept: int = 30
+    samples: int = 10_000  # poses that are drawn
+    kept: int = 30  # those of them that score best
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
 
     def __post_init__(self) -> None:
@@ -259,7 +262,7 @@ def anchored_starts(
         return Poses(np.zeros((0, 12)))
     poses = anchored_poses(
         problem,
-        in_telling_order(problem.points),
+        most_informative_first(problem.points),
         space,
         settings.anchors,
         samples=settings.samples,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,9 +11,10 @@ from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.anchored.anchor_sampling import (
     AnchorSettings,
     anchored_poses,
-    in_telling_order,
+    most_informative_first,
 )
 from chsel.methods.anchored.energy import Energy
+from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
@@ -23,19 +25,23 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
-from chsel.problem.subset import evenly_spaced, farthest_poses, representative_poses
-from chsel.qd.emitters import update_cells
+from chsel.problem.subset import evenly_spaced, farthest_poses
+from chsel.qd.archive import evaluated
 from chsel.qd.measures import measure_named
-from chsel.qd.selection import ArchiveSettings, ranked_hypotheses, repeated, sized_archive
+from chsel.qd.selection import (
+    ArchiveSettings,
+    measure_range,
+    ranked_hypotheses,
+    repeated,
+    representatives,
+    sized_archive,
+)
 
 MOST_SAMPLES = 1_000_000_000
 MOST_POSES = 1_000_000
 MOST_MOVES = 100_000
 MOST_WORK = 1_000_000_000  # of the two
 _KEPT = 6  # states of a chain
-_POOL = 400  # candidates to choose from
-_MOST_POOL = 1200  # for many hypotheses; more of these are taken evenly
-_MOST_CHOSEN = 300  # by facility location; more of them are taken evenly
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
 _ARCHIVE = ArchiveSettings(bins=40, outliers="none")
 _ONLINE = OnlineSettings(update="own")
@@ -43,115 +49,137 @@ _ONLINE = OnlineSettings(update="own")
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is done.
+    """How much is computed."""
 
-    samples: poses drawn; kept: of them, those fitted by first_steps steps; refined: the better of
-    these, by steps more. descents, descent_moves: chains that come down to the limit, and their
-    moves. polished, polish_moves: the lowest, which come down as far as they can. chains, moves:
-    those that spread below the limit. evaluations: how many may be spent, in rounds of all but
-    the last stage, while the lowest energy is above `enough` noise levels; 0: one round.
-    """
-
-    samples: int = 60_000
-    kept: int = 200
-    first_steps: int = 6
-    refined: int = 100
-    steps: int = 15
-    descents: int = 96
+    samples: int = 60_000  # poses drawn
+    kept: int = 200  # of them, the best, which are fitted
+    first_steps: int = 6  # of these fits
+    refined: int = 100  # the better of these, which are fitted further
+    steps: int = 15  # of these fits
+    descents: int = 96  # chains that come down to the limit
     descent_moves: int = 266
-    chains: int = 96
+    chains: int = 96  # chains that spread below the limit
     moves: int = 300
-    polished: int = 16
+    polished: int = 16  # the lowest, which come down as far as they can
     polish_moves: int = 300
+    # How many evaluations may be spent, in rounds of all but the last stage, while the lowest
+    # energy is above `enough` noise levels; 0: one round.
     evaluations: int = 0
     enough: float = 4.0
 
     def __post_init__(self) -> None:
-        for name in ("samples", "kept", "refined", "descents", "chains", "enough"):
+        poses = ("kept", "refined", "descents", "chains")
+        moves = ("first_steps", "steps", "descent_moves", "moves", "polish_moves")
+        for name in ("samples", *poses, "enough"):
             require_positive(name, getattr(self, name))
-        for name in ("first_steps", "steps", "descent_moves", "moves", "polished", "polish_moves"):
+        for name in (*moves, "polished", "evaluations"):
             require_positive(name, getattr(self, name), zero=True)
-        require_positive("evaluations", self.evaluations, zero=True)
-        require_at_most("samples", self.samples, MOST_SAMPLES)
-        for name in ("kept", "refined", "descents", "chains", "polished"):
+        for name in ("samples", "evaluations"):
+            require_at_most(name, getattr(self, name), MOST_SAMPLES)
+        for name in (*poses, "polished"):
             require_at_most(name, getattr(self, name), MOST_POSES)
-        for name in ("first_steps", "steps", "descent_moves", "moves", "polish_moves"):
+        for name in moves:
             require_at_most(name, getattr(self, name), MOST_MOVES)
-        require_at_most("evaluations", self.evaluations, MOST_SAMPLES)
         require_at_most("descents x descent_moves", self.descents * self.descent_moves, MOST_WORK)
         require_at_most("polished x polish_moves", self.polished * self.polish_moves, MOST_WORK)
         require_at_most("chains x moves", self.chains * self.moves, MOST_WORK)
 
 
+_SMALL = Effort(
+    samples=40_000,
+    kept=64,
+    first_steps=12,
+    refined=40,
+    descents=24,
+    descent_moves=60,
+    chains=24,
+    moves=150,
+    polished=8,
+)
+_LARGE = Effort(
+    samples=250_000,
+    kept=504,
+    refined=150,
+    descents=120,
+    descent_moves=500,
+    chains=120,
+    moves=1000,
+    polished=32,
+    polish_moves=1000,
+)
 EFFORTS = {
-    "small": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 8, 300),
+    "small": _SMALL,
     "medium": Effort(),
-    "large": Effort(250_000, 504, 6, 150, 15, 120, 500, 120, 1000, 32, 1000),
-    "adaptive": Effort(40_000, 64, 12, 40, 15, 24, 60, 24, 150, 8, 300, 2_000_000),
+    "large": _LARGE,
+    "adaptive": replace(_SMALL, evaluations=2_000_000),
 }
 
 
 @dataclass(frozen=True)
 class AnchoredSettings:
-    """All settings of the contact-anchored search.
+    """All settings of the contact-anchored search, the same in all presets.
 
-    size: an effort, of EFFORTS; effort: another one in its place. noise: the standard deviation of
-    known points, metres. penetration_tolerance: tau, the depth that free points may have, metres.
-    limit_noise, limit_ratio, limit_slack: most candidates have energies below the larger of
-    limit_noise noise levels, and limit_ratio x lowest energy + limit_slack noise levels.
-    outer_share, outer_noise: that share of the chains may be so many noise levels above it.
-    plane: restricts the poses to SE(2).
-
-    They are the same in all presets: the method is neither in the paper nor in its authors' code.
+    The method is neither in the paper nor in its authors' code.
     """
 
-    size: str = "medium"
-    effort: Effort | None = None
-    noise: float = 0.0005
-    penetration_tolerance: float = 0.0
+    size: str = "medium"  # an effort, of EFFORTS
+    effort: Effort | None = None  # another one in its place
+    noise: float = 0.0005  # standard deviation of known points, metres: a noise level
+    penetration_tolerance: float = 0.0  # tau, the depth that free points may have, metres
+    # Most candidates have energies below the larger of limit_noise noise levels, and
+    # limit_ratio x lowest energy + limit_slack noise levels.
     limit_noise: float = 1.0
     limit_ratio: float = 1.3
     limit_slack: float = 0.5
-    outer_share: float = 0.25
+    outer_share: float = 0.25  # of the chains, whose limit is outer_noise noise levels higher
     outer_noise: float = 1.0
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
     archive: ArchiveSettings = _ARCHIVE
     online: OnlineSettings = _ONLINE
-    plane: PlaneSettings | None = None
+    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
     def __post_init__(self) -> None:
         require_choice("size", self.size, EFFORTS)
         require_positive("noise", self.noise)
-        for name in (
-            "penetration_tolerance",
-            "limit_noise",
-            "limit_ratio",
-            "limit_slack",
-            "outer_share",
-            "outer_noise",
-        ):
+        limits = ("limit_noise", "limit_ratio", "limit_slack", "outer_share", "outer_noise")
+        for name in ("penetration_tolerance", *limits):
             require_positive(name, getattr(self, name), zero=True)
         require_at_most("outer_share", self.outer_share, 1.0)
         measure_named(self.archive.measure, planar=self.plane is not None)
 
 
-class Anchored:
+class RatedPoses(NamedTuple):
+    """Poses with their energies."""
+
+    poses: Poses
+    energies: FloatArray  # (B,), metres
+
+    @classmethod
+    def joined(cls, *parts: RatedPoses) -> RatedPoses:
+        """Those of all parts, in their order."""
+        energies = np.concatenate([part.energies for part in parts])
+        return cls(Poses.joined([part.poses for part in parts]), energies)
+
+    def chosen(self, which: Any) -> RatedPoses:
+        """Some of them: a slice, flags (B,) or indices."""
+        return RatedPoses(self.poses[which], self.energies[which])
+
+    def ordered(self) -> RatedPoses:
+        """The lowest first."""
+        return self.chosen(np.argsort(self.energies, kind="stable"))
+
+
+class Anchored(ConfiguredMethod[AnchoredSettings]):
     """Samples anchored on contacts, fitted, spread below a limit, and a diverse choice of them."""
 
-    def __init__(self, settings: AnchoredSettings | None = None) -> None:
-        self.settings = settings or AnchoredSettings()
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = AnchoredSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
         """Hypotheses for the known points of a problem, best first; costs are energies."""
         search = _Search(problem, self.settings, observer or NullObserver())
-        return search.chosen(*search.spread(*search.found()))
+        return search.hypotheses(search.spread(search.minima()))
 
 
 class _Search:
@@ -163,13 +191,13 @@ class _Search:
         self._problem, self._settings, self._observer = problem, settings, observer
         self._effort = settings.effort or EFFORTS[settings.size]
         self._space = search_space(settings.plane, problem.sdf)
-        self._known = in_telling_order(problem.points)
+        self._known = most_informative_first(problem.points)
         bounds = origin_bounds(problem.workspace, self._space, settings.anchors.margin)
         tolerance = settings.penetration_tolerance
         self._energy = Energy(problem, self._known, self._space, tolerance, bounds)
 
-    def found(self) -> tuple[Poses, FloatArray]:
-        """Poses near minima with their energies, the lowest first, from as many rounds as it takes.
+    def minima(self) -> RatedPoses:
+        """Poses near minima, the lowest first, from as many rounds as needed.
 
         The best of E_0 and E_l join the first round.
         """
@@ -177,81 +205,63 @@ class _Search:
         given = Poses.of(np.concatenate([problem.initial_set, problem.low_cost_set]))
         if self._settings.plane is not None:  # moves keep to the plane, but do not lead onto it
             given = self._space.poses(self._space.encode(given))
-        given = given[np.argsort(self._energy.of(given), kind="stable")[:_MOST_GIVEN]]
-        poses, energies = given[:0], np.zeros(0)
-        spent = index = 0
+        given = self._costed(given).ordered().poses[:_MOST_GIVEN]
+        rounds: list[RatedPoses] = []
+        spent = 0
         while True:
-            drawn = self._drawn(index)
-            joined = drawn if index else Poses.joined([drawn, given])
-            more, more_energies = self._descended(*self._fitted(joined), index)
-            poses = Poses.joined([poses, more])
-            energies = np.concatenate([energies, more_energies])
+            index = len(rounds)
+            starts = anchored_poses(
+                problem,
+                self._known,
+                self._space,
+                self._settings.anchors,
+                samples=effort.samples,
+                most=effort.kept,
+                index=index,
+            )
+            self._observer.progress("sample", effort.samples, effort.samples)
+            starts = starts if index else Poses.joined([starts, given])
+            rounds.append(self._descended(self._fitted(starts), index))
             spent += effort.samples + effort.kept * effort.first_steps
             spent += effort.refined * effort.steps + effort.descents * effort.descent_moves
-            index += 1
             self._observer.progress("search", min(spent, effort.evaluations), effort.evaluations)
-            good = float(energies.min()) <= effort.enough * self._settings.noise
-            if good or spent >= effort.evaluations:
-                break
-        order = np.argsort(energies, kind="stable")
-        return poses[order], energies[order]
+            lowest = min(float(part.energies.min()) for part in rounds)
+            if lowest <= effort.enough * self._settings.noise or spent >= effort.evaluations:
+                return RatedPoses.joined(*rounds).ordered()
 
-    def _drawn(self, index: int) -> Poses:
-        effort, settings = self._effort, self._settings
-        poses = anchored_poses(
-            self._problem,
-            self._known,
-            self._space,
-            settings.anchors,
-            samples=effort.samples,
-            most=effort.kept,
-            index=index,
-        )
-        self._observer.progress("sample", effort.samples, effort.samples)
-        return poses
+    def _costed(self, poses: Poses) -> RatedPoses:
+        return RatedPoses(poses, self._energy.of(poses))
 
-    def _fitted(self, poses: Poses) -> tuple[Poses, FloatArray]:
-        """All fitted a little, and the better part of them some more; the lowest first."""
+    def _fitted(self, poses: Poses) -> RatedPoses:
+        """All fitted by a few steps, and the better part of them by more; the lowest first."""
         effort = self._effort
-        poses, _ = self._ordered(self._energy.fitted(poses, effort.first_steps))
+        poses = self._costed(self._energy.fitted(poses, effort.first_steps)).ordered().poses
         better = self._energy.fitted(poses[: effort.refined], effort.steps)
-        poses, energies = self._ordered(Poses.joined([better, poses[effort.refined :]]))
-        self._tell("fit", poses, energies)
-        return poses, energies
+        fitted = self._costed(Poses.joined([better, poses[effort.refined :]])).ordered()
+        self._show("fit", fitted)
+        return fitted
 
-    def _ordered(self, poses: Poses) -> tuple[Poses, FloatArray]:
-        energies = self._energy.of(poses)
-        order = np.argsort(energies, kind="stable")
-        return poses[order], energies[order]
-
-    def _descended(
-        self, poses: Poses, energies: FloatArray, index: int
-    ) -> tuple[Poses, FloatArray]:
+    def _descended(self, fitted: RatedPoses, index: int) -> RatedPoses:
         """The lowest walk down to the limit that holds so far, and the lowest of all further."""
-        effort, limit = self._effort, self._limit(energies)
-        amount = effort.descents, effort.descent_moves
-        found = self._walked_down(poses, energies, limit, *amount, 2 + 2 * index)
-        amount = effort.polished, effort.polish_moves
-        found = self._walked_down(*found, 0.0, *amount, 3 + 2 * index)
-        self._tell("descend", *found)
-        return found
+        effort, limit = self._effort, self._limit(fitted.energies)
+        lower = self._walked_down(
+            fitted, limit, effort.descents, effort.descent_moves, index=2 + 2 * index
+        )
+        lowest = self._walked_down(
+            lower, 0.0, effort.polished, effort.polish_moves, index=3 + 2 * index
+        )
+        self._show("descend", lowest)
+        return lowest
 
     def _walked_down(
-        self,
-        poses: Poses,
-        energies: FloatArray,
-        floor: float,
-        count: int,
-        moves: int,
-        index: int,
-    ) -> tuple[Poses, FloatArray]:
-        """Poses in order of their energies before the `count` lowest walked down to a floor."""
-        order = np.argsort(energies, kind="stable")
-        poses, energies = poses[order], energies[order]
-        first = poses[:count], energies[:count]
+        self, candidates: RatedPoses, floor: float, count: int, moves: int, *, index: int
+    ) -> RatedPoses:
+        """RatedPoses of which the `count` lowest walked down to a floor, these first."""
+        candidates = candidates.ordered()
+        first = candidates.chosen(slice(count))
         chains = self._energy.walked(*first, floor, moves, kept=0, index=index)
-        poses = Poses.joined([Poses(chains.poses), poses[count:]])
-        return poses, np.concatenate([chains.energies, energies[count:]])
+        walked = RatedPoses(Poses(chains.poses), chains.energies)
+        return RatedPoses.joined(walked, candidates.chosen(slice(count, None)))
 
     def _limit(self, energies: FloatArray) -> float:
         """The energy below which poses are candidates."""
@@ -259,67 +269,59 @@ class _Search:
         relative = settings.limit_ratio * least + settings.limit_slack * settings.noise
         return max(settings.limit_noise * settings.noise, relative, least)
 
-    def spread(self, poses: Poses, energies: FloatArray) -> tuple[Poses, FloatArray]:
-        """Candidates with their energies: poses below the limit, and walks there from these.
+    def spread(self, minima: RatedPoses) -> RatedPoses:
+        """Minima below the limit, walks from there below it, and others below a higher limit.
 
-        And walks below a higher one: which energies the contacts allow is not known that well.
+        The latter as it is not known that well which energies the contacts allow.
         """
-        settings, limit = self._settings, self._limit(energies)
+        settings, limit = self._settings, self._limit(minima.energies)
         outer_limit = limit + settings.outer_noise * settings.noise
-        wanted = max(self._effort.chains, -(-2 * len(self._problem.initial_set) // _KEPT))
-        outer = int(settings.outer_share * wanted)
-        inner = self._wandered(poses, energies, limit, wanted - outer, 0)
-        further = self._wandered(poses, energies, outer_limit, outer, 1)
-        below = energies <= limit
-        poses = Poses.joined([poses[below], inner[0], further[0]])
-        energies = np.concatenate([energies[below], inner[1], further[1]])
-        self._tell("spread", poses, energies)
-        return poses, energies
-
-    def _wandered(
-        self, poses: Poses, energies: FloatArray, limit: float, chains: int, index: int
-    ) -> tuple[Poses, FloatArray]:
-        """States of chains below a limit, with their energies, from poses that are far apart."""
-        below = energies <= limit
-        poses, energies = poses[below], energies[below]
-        starts = np.resize(farthest_poses(self._problem.sdf, poses, chains), chains)
-        walked = self._energy.walked(
-            poses[starts], energies[starts], limit, self._effort.moves, kept=_KEPT, index=index
+        chains = max(self._effort.chains, -(-2 * len(self._problem.initial_set) // _KEPT))
+        outer = int(settings.outer_share * chains)
+        candidates = RatedPoses.joined(
+            minima.chosen(minima.energies <= limit),
+            self._walked_below(minima, limit, chains - outer, index=0),
+            self._walked_below(minima, outer_limit, outer, index=1),
         )
-        kept = walked.kept_energies.reshape(-1) <= limit
-        return Poses(walked.kept.reshape(-1, 12)[kept]), walked.kept_energies.reshape(-1)[kept]
+        self._show("spread", candidates)
+        return candidates
 
-    def chosen(self, poses: Poses, energies: FloatArray) -> Hypotheses:
-        """As many hypotheses as E_0 has poses, of candidates; all of these go into the archive."""
-        problem, space, settings = self._problem, self._space, self._settings
-        count = len(problem.initial_set)
-        pool = evenly_spaced(len(poses), max(_POOL, min(2 * count, _MOST_POOL)))
-        chosen = pool[representative_poses(problem.sdf, poses[pool], min(count, _MOST_CHOSEN))]
+    def _walked_below(
+        self, minima: RatedPoses, limit: float, chains: int, *, index: int
+    ) -> RatedPoses:
+        """States below a limit of chains that start at minima far apart."""
+        minima = minima.chosen(minima.energies <= limit)
+        starts = np.resize(farthest_poses(self._problem.sdf, minima.poses, chains), chains)
+        walked = self._energy.walked(
+            *minima.chosen(starts), limit, self._effort.moves, kept=_KEPT, index=index
+        )
+        states = RatedPoses(Poses(walked.kept.reshape(-1, 12)), walked.kept_energies.reshape(-1))
+        return states.chosen(states.energies <= limit)
+
+    def hypotheses(self, candidates: RatedPoses) -> Hypotheses:
+        """As many hypotheses as E_0 has poses, and all candidates offered to the archive."""
+        problem, space, settings = self._problem, self._space, self._settings.archive
+        poses, count = candidates.poses, len(problem.initial_set)
+        chosen = representatives(problem.sdf, poses, count)
         if len(chosen) < count:
             others = np.setdiff1d(np.arange(len(poses)), chosen)
             new = ~repeated(poses[np.concatenate([chosen, others])])
             others = others[new[len(chosen) :]]
-            more = others[evenly_spaced(len(others), count - len(chosen))]
-            chosen = np.resize(np.concatenate([chosen, more]), count)
+            others = others[evenly_spaced(len(others), count - len(chosen))]
+            chosen = np.resize(np.concatenate([chosen, others]), count)
+        measure = measure_named(settings.measure, planar=self._settings.plane is not None)
         vectors, objective = space.encode(poses), self._energy.objective
-        measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
-        measures = measure.values(space, vectors)
-        archive = sized_archive(
-            measure,
-            measures,
-            energies,
-            settings.archive,
-            len(problem.points.known),
-            space.dimension,
-        )
-        update_cells(archive, objective, vectors, energies)
+        offered = evaluated(objective, measure, vectors, candidates.energies)
+        mean, deviation = measure_range(offered, measure, settings, len(problem.points.known))
+        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
+        archive.update_cells(offered)
         self._observer.snapshot(archive.snapshot(0, 0))
         elites = space.poses(archive.solutions)
-        cells = archive.cells_of(measures[chosen])
+        cells = archive.cells_of(offered.measures[chosen])
         hypotheses = space.poses(vectors[chosen])
         return ranked_hypotheses(objective, hypotheses, cells, elites, archive.snapshot(0, 0))
 
-    def _tell(self, stage: str, poses: Poses, energies: FloatArray) -> None:
-        vectors = self._space.encode(poses)
-        self._observer.trace(stage, 0, vectors.copy(), energies.copy())
+    def _show(self, stage: str, candidates: RatedPoses) -> None:
+        vectors = self._space.encode(candidates.poses)
+        self._observer.trace(stage, 0, vectors.copy(), candidates.energies.copy())
         self._observer.progress(stage, 1, 1)

@@ -1,4 +1,4 @@
-"""The energy of poses, and what lowers it or wanders below a limit."""
+"""The energy of poses, fits that lower it, and random walks below a limit."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
-from chsel.methods.anchored.energy_kernels import energies_below, found_around
-from chsel.methods.anchored.fit_kernels import Twists, fit_for, fit_poses
+from chsel.methods.anchored.fit_kernels import Twists, fit_for, fit_poses, surrounding_for
 from chsel.methods.anchored.walk_kernels import (
     DRAWS,
     Chains,
     Stride,
     chains_from,
-    steps_for,
+    energies_below,
     walk_below,
 )
 from chsel.numerics.arrays import FloatArray
@@ -31,16 +30,14 @@ from chsel.problem.surface import object_centre
 
 _FIT_LEVEL = -0.003  # metres: free points at less depth do not push
 _LEVER = 0.15  # metres that a radian counts for
-_MOST_SHIFT, _MOST_TURN = 0.08, 0.5  # of a step, metres and radians
 _BLOCK = 512  # chains whose moves are drawn at a time
-_AXIS_NONE = (0.0, 0.0, 0.0)
 
 
 class Energy:
     """E(X) = mean |s - v| over known points + sum max(0, -tau - s) over free ones, in metres.
 
     The same above tau for occupied points. It is the relaxed cost (CHSEL, Eq. 7) with other
-    weights and alpha = -tau, interpolated. known: the problem's points, see `in_telling_order`.
+    weights and alpha = -tau, interpolated.
     """
 
     def __init__(
@@ -51,7 +48,10 @@ class Energy:
         tolerance: float,
         bounds: tuple[FloatArray, FloatArray],
     ) -> None:
-        """tolerance: tau, metres. bounds: where walks keep the object's origin."""
+        """known: the problem's points, see most_informative_first. tolerance: tau, metres.
+
+        bounds: where walks keep the object's origin.
+        """
         sdf = problem.sdf
         settings = CostSettings(
             penetration_tolerance=-tolerance,
@@ -66,17 +66,16 @@ class Energy:
         self._model = cost.model
         self._fitting = cost.at_level(sdf, _FIT_LEVEL - tolerance)
         self._key = problem.key
-        planar = isinstance(space, SE2Space)
-        basis = np.eye(6)
+        basis, axis = np.eye(6), (0.0, 0.0, 0.0)
         if isinstance(space, SE2Space):
-            basis = np.zeros((3, 6))
+            basis, axis = np.zeros((3, 6)), triple(space.axis)
             basis[0, :3], basis[1, 3:], basis[2, 3:] = space.axis, space.e_u, space.e_v
         basis[:, :3] /= _LEVER
         centre = triple(object_centre(sdf))
-        self._twists = Twists(basis, centre, _MOST_SHIFT, _MOST_TURN)
+        self._twists = Twists(basis, centre)
         self._stride = Stride(
-            planar=planar,
-            axis=triple(space.axis) if isinstance(space, SE2Space) else _AXIS_NONE,
+            planar=isinstance(space, SE2Space),
+            axis=axis,
             pivot=centre,
             lower=triple(bounds[0]),
             upper=triple(bounds[1]),
@@ -86,10 +85,10 @@ class Energy:
         """Energies (B,) of poses."""
         energies = np.empty(len(poses))
 
-        def run(first: int, last: int, found: Any) -> None:
-            energies_below(self._model, poses.numbers, np.inf, energies, first, last, found)
+        def run(first: int, last: int, near: Any) -> None:
+            energies_below(self._model, poses.numbers, np.inf, energies, first, last, near)
 
-        spread(run, len(poses), lambda: found_around(self._model), least=50)
+        spread(run, len(poses), lambda: surrounding_for(self._model), least=50)
         return energies
 
     def fitted(self, poses: Poses, steps: int) -> Poses:
@@ -115,18 +114,17 @@ class Energy:
     ) -> Chains:
         """Chains from C poses with energies (C,), after so many moves.
 
-        floor: the limit that they stay below, or come down to. kept: states to keep on the way.
+        floor: the limit that they stay below, or come down to. kept: states of each to keep.
         index: of the stream.
         """
         chains = chains_from(poses.numbers, energies, kept)
         stream = self._key.stream(Purpose.WALKS, index)
 
-        def run(first: int, last: int, steps: Any) -> None:
-            stride, model = self._stride, self._model
-            walk_below(model, stride, floor, chains, draws, before, first, last, steps)
+        def run(first: int, last: int, near: Any) -> None:
+            walk_below(self._model, self._stride, floor, block, draws, first, last, near)
 
         for before in range(0, len(poses), _BLOCK):
-            count = min(_BLOCK, len(poses) - before)
-            draws = stream.random((count, moves, DRAWS), dtype=np.float32)
-            spread(run, count, lambda: steps_for(self._model), least=2)
+            block = Chains._make(part[before : before + _BLOCK] for part in chains)
+            draws = stream.random((len(block.poses), moves, DRAWS), dtype=np.float32)
+            spread(run, len(draws), lambda: surrounding_for(self._model), least=2)
         return chains

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt steps that fit poses to known points and out of free space.
 
-The residuals are s - v of every known point, the depth below a level of every free point that is
-deeper, and how far every occupied one is above it, all of the same weight.
+The residuals, all of the same weight, are s - v of every known point, the depth below a level of
+every free point that is deeper, and the height above it of every occupied point that is higher.
 """
 
 from __future__ import annotations
@@ -11,61 +11,70 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.cost.cost_kernels import Model, remember, travel
-from chsel.methods.anchored.energy_kernels import found_around
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
-from chsel.numerics.octree import Candidates, walk
-from chsel.numerics.pose_tuples import pose_at
+from chsel.numerics.octree import Candidates, candidates_for, walk
+from chsel.numerics.pose_tuples import composed, moved, pose_at
 from chsel.problem.sdf_lookup import distance_in_box, distance_with_gradient
 
+_MOST_SHIFT, _MOST_TURN = 0.08, 0.5  # of a step, metres and radians
 _SLACK = 0.04  # metres that a pose may move before they are gathered again
 _FIRST_DAMPING = 1e-2  # of the mean of the diagonal
-_LESS, _MORE = 0.3, 5.0  # damping, after a step that was good or bad
+_LESS, _MORE = 0.3, 5.0  # factors of the damping, after a step that was good or bad
 _MOST_DAMPING = 1e6
 _ENOUGH = 1e-4  # relative gain below which a pose has converged
 
 
 class Twists(NamedTuple):
-    """The ways that a pose may move: basis (d, 6), turns by radians in its first three columns.
+    """The ways that a pose may move."""
 
-    pivot: the point of the object about which it turns. most_shift, most_turn: of a step, metres
-    and radians.
-    """
+    basis: FloatArray  # (d, 6), turns in radians, then shifts in metres
+    pivot: tuple[float, float, float]  # the point of the object about which it turns
 
-    basis: FloatArray
-    pivot: tuple[float, float, float]
-    most_shift: float
-    most_turn: float
+
+class Surrounding(NamedTuple):
+    """The free points that can matter while a pose moves little: scratch of one thread."""
+
+    candidates: Candidates
+    memory: FloatArray  # (12,), where the object was when they were gathered, see remember
 
 
 class Fit(NamedTuple):
-    """Scratch of one thread.
+    """Scratch of one thread. Only the lower triangles of matrices are used."""
 
-    found: free points around a pose; memory (12,): which one. normal (d, d), right (d,): of the
-    normal equations, below the diagonal. solved (d, d), row (d,): of their solution. twist (6,).
-    """
-
-    found: Candidates
-    memory: FloatArray
-    normal: FloatArray
-    right: FloatArray
-    solved: FloatArray
-    twist: FloatArray
-    row: FloatArray
+    near: Surrounding
+    normal: FloatArray  # (d, d), of the normal equations
+    right: FloatArray  # (d,)
+    factor: FloatArray  # (d, d), of Cholesky
+    row: FloatArray  # (d,), of the Jacobian, then the solution
+    twist: FloatArray  # (6,)
 
 
-def fit_for(model: Model, dimension: int) -> Fit:
-    """Scratch for one thread, for twists of so many dimensions."""
-    return Fit(
-        found_around(model),
-        np.empty(12),
-        np.empty((dimension, dimension)),
-        np.empty(dimension),
-        np.empty((dimension, dimension)),
-        np.empty(6),
-        np.empty(dimension),
+def surrounding_for(model: Model) -> Surrounding:
+    """Scratch for one thread."""
+    return Surrounding(candidates_for(max(model.free.tree.spheres.shape[1], 1)), np.empty(12))
+
+
+def fit_for(model: Model, d: int) -> Fit:
+    """Scratch for one thread, for twists of d dimensions."""
+    normal, factor = np.empty((d, d)), np.empty((d, d))
+    return Fit(surrounding_for(model), normal, np.empty(d), factor, np.empty(d), np.empty(6))
+
+
+@spliced
+def gather(model, pose, slack, near):
+    """Gather the free points that can matter until the object moves by a slack; how many."""
+    remember(model.free, pose, near.memory)
+    return walk(
+        model.free.tree, model.free.region, pose, slack + model.free.margin, near.candidates
     )
+
+
+@spliced
+def travel_since_gathering(model, pose, near):
+    """How far in the world any point of the object moved at most, metres."""
+    return travel(model.free, pose, near.memory)
 
 
 @compiled
@@ -80,9 +89,8 @@ def fit_poses(model, twists, poses, iterations, first, last, fit):
 @inner
 def _fitted(model, twists, pose, iterations, fit):
     dimension = len(twists.basis)
-    memory, found = fit.memory, fit.found
-    count = _gather(model, pose, memory, found)
-    squares = _squares(model, twists, pose, found, count, fit, True)
+    count = gather(model, pose, _SLACK, fit.near)
+    squares = _squares(model, twists, pose, count, fit, True)
     damping = _FIRST_DAMPING
     for _ in range(iterations):
         if squares == 0.0:
@@ -93,13 +101,13 @@ def _fitted(model, twists, pose, iterations, fit):
         if not _solve(fit, damping * trace / dimension + 1e-12):
             break
         trial = _moved_by(twists, pose, fit)
-        if travel(model.free, trial, memory) > _SLACK:
-            count = _gather(model, trial, memory, found)
-        tried = _squares(model, twists, trial, found, count, fit, False)
+        if travel_since_gathering(model, trial, fit.near) > _SLACK:
+            count = gather(model, trial, _SLACK, fit.near)
+        tried = _squares(model, twists, trial, count, fit, False)
         if tried < squares:
             gain = squares - tried
             pose = trial
-            squares = _squares(model, twists, pose, found, count, fit, True)
+            squares = _squares(model, twists, pose, count, fit, True)
             damping *= _LESS
             if gain < _ENOUGH * tried:
                 break
@@ -110,14 +118,8 @@ def _fitted(model, twists, pose, iterations, fit):
     return pose
 
 
-@spliced
-def _gather(model, pose, memory, found):
-    remember(model.free, pose, memory)
-    return walk(model.free.tree, model.free.region, pose, _SLACK + model.free.margin, found)
-
-
 @inner
-def _squares(model, twists, pose, found, count, fit, with_normal):
+def _squares(model, twists, pose, count, fit, with_normal):
     """The sum of squared residuals; fills the normal equations, if wanted."""
     field, box, table = model.field, model.field.box, model.field.table
     total, dimension = 0.0, len(twists.basis)
@@ -126,42 +128,42 @@ def _squares(model, twists, pose, found, count, fit, with_normal):
             fit.right[i] = 0.0
             for j in range(i + 1):
                 fit.normal[i, j] = 0.0
-    clearance, places = model.free.region.clearance, found.places
-    locate(pose, model.free.region.box, found.x, found.y, found.z, places, count)
+    candidates = fit.near.candidates
+    clearance, places = model.free.region.clearance, candidates.places
+    locate(pose, model.free.region.box, candidates.x, candidates.y, candidates.z, places, count)
     for n in range(count):
         if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
-            s, nx, ny, nz = distance_in_box(field.trilinear, box, table, places, n)
-            residual = s - model.alpha
+            looked_up = distance_in_box(field.trilinear, box, table, places, n)
+            residual = looked_up[0] - model.alpha
             if residual < 0.0:
                 total += residual * residual
                 if with_normal:
-                    _add(
-                        twists, pose, found.x[n], found.y[n], found.z[n], nx, ny, nz, residual, fit
-                    )
+                    point = candidates.x[n], candidates.y[n], candidates.z[n]
+                    _add(fit, twists, pose, point, looked_up[1:], residual)
     for n in range(model.known.shape[1]):
-        x, y, z = model.known[0, n], model.known[1, n], model.known[2, n]
-        s, nx, ny, nz = distance_with_gradient(field, pose, x, y, z)
-        residual = s - model.known_sdf[n]
+        point = model.known[0, n], model.known[1, n], model.known[2, n]
+        looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
+        residual = looked_up[0] - model.known_sdf[n]
         total += residual * residual
         if with_normal:
-            _add(twists, pose, x, y, z, nx, ny, nz, residual, fit)
+            _add(fit, twists, pose, point, looked_up[1:], residual)
     for n in range(model.occupied.shape[1]):
-        x, y, z = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
-        s, nx, ny, nz = distance_with_gradient(field, pose, x, y, z)
-        residual = s + model.alpha
+        point = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
+        looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
+        residual = looked_up[0] + model.alpha
         if residual > 0.0:
             total += residual * residual
             if with_normal:
-                _add(twists, pose, x, y, z, nx, ny, nz, residual, fit)
+                _add(fit, twists, pose, point, looked_up[1:], residual)
     return total
 
 
 @inner
-def _add(twists, pose, x, y, z, nx, ny, nz, residual, fit):
-    """Add a residual at a world point with gradient n in the object frame."""
-    u = pose[0] * x + pose[1] * y + pose[2] * z + pose[9] - twists.pivot[0]
-    v = pose[3] * x + pose[4] * y + pose[5] * z + pose[10] - twists.pivot[1]
-    w = pose[6] * x + pose[7] * y + pose[8] * z + pose[11] - twists.pivot[2]
+def _add(fit, twists, pose, point, gradient, residual):
+    """Add a residual at a world point, with its gradient by the point in the object frame."""
+    u, v, w = moved(pose, point[0], point[1], point[2])
+    u, v, w = u - twists.pivot[0], v - twists.pivot[1], w - twists.pivot[2]
+    nx, ny, nz = gradient
     a, b, c = v * nz - w * ny, w * nx - u * nz, u * ny - v * nx
     basis, row = twists.basis, fit.row
     for i in range(len(basis)):
@@ -175,9 +177,9 @@ def _add(twists, pose, x, y, z, nx, ny, nz, residual, fit):
 
 @inner
 def _solve(fit, damping):
-    """Fill row with - (N + damping I)^-1 r by Cholesky; False if that is not positive definite."""
+    """Fill row with -(N + damping I)^-1 r by Cholesky; False if N is not positive definite so."""
     count = len(fit.right)
-    lower, row = fit.solved, fit.row
+    lower, row = fit.factor, fit.row
     for i in range(count):
         for j in range(i + 1):
             total = fit.normal[i, j] + (damping if i == j else 0.0)
@@ -205,7 +207,7 @@ def _solve(fit, damping):
 
 @inner
 def _moved_by(twists, pose, fit):
-    """The pose moved by the twist that was solved for, shortened to what a step may be."""
+    """The pose moved by the twist of the solution, shortened to what a step may be."""
     basis, twist = twists.basis, fit.twist
     for i in range(6):
         twist[i] = 0.0
@@ -213,7 +215,7 @@ def _moved_by(twists, pose, fit):
             twist[i] += fit.row[j] * basis[j, i]
     turn = np.sqrt(twist[0] * twist[0] + twist[1] * twist[1] + twist[2] * twist[2])
     shift = np.sqrt(twist[3] * twist[3] + twist[4] * twist[4] + twist[5] * twist[5])
-    part = min(1.0, twists.most_turn / max(turn, 1e-300), twists.most_shift / max(shift, 1e-300))
+    part = min(1.0, _MOST_TURN / max(turn, 1e-300), _MOST_SHIFT / max(shift, 1e-300))
     for i in range(6):
         twist[i] *= part
     return moved_about(
@@ -229,27 +231,12 @@ def moved_about(pose, pivot, turn, shift):
     """
     x, y, z = 0.5 * turn[0], 0.5 * turn[1], 0.5 * turn[2]
     factor = 2.0 / (1.0 + x * x + y * y + z * z)
-    a = 1.0 - factor * (y * y + z * z)
-    b = factor * (x * y - z)
-    c = factor * (x * z + y)
-    d = factor * (x * y + z)
-    e = 1.0 - factor * (x * x + z * z)
-    f = factor * (y * z - x)
-    g = factor * (x * z - y)
-    h = factor * (y * z + x)
-    i = 1.0 - factor * (x * x + y * y)
-    u, v, w = pose[9] - pivot[0], pose[10] - pivot[1], pose[11] - pivot[2]
-    return (
-        a * pose[0] + b * pose[3] + c * pose[6],
-        a * pose[1] + b * pose[4] + c * pose[7],
-        a * pose[2] + b * pose[5] + c * pose[8],
-        d * pose[0] + e * pose[3] + f * pose[6],
-        d * pose[1] + e * pose[4] + f * pose[7],
-        d * pose[2] + e * pose[5] + f * pose[8],
-        g * pose[0] + h * pose[3] + i * pose[6],
-        g * pose[1] + h * pose[4] + i * pose[7],
-        g * pose[2] + h * pose[5] + i * pose[8],
-        a * u + b * v + c * w + pivot[0] + shift[0],
-        d * u + e * v + f * w + pivot[1] + shift[1],
-        g * u + h * v + i * w + pivot[2] + shift[2],
-    )
+    turning = (
+        1.0 - factor * (y * y + z * z), factor * (x * y - z), factor * (x * z + y),
+        factor * (x * y + z), 1.0 - factor * (x * x + z * z), factor * (y * z - x),
+        factor * (x * z - y), factor * (y * z + x), 1.0 - factor * (x * x + y * y),
+    )  # fmt: skip
+    from_pivot = pose[9] - pivot[0], pose[10] - pivot[1], pose[11] - pivot[2]
+    result = composed(turning + pivot, pose[:9] + from_pivot)
+    translation = result[9] + shift[0], result[10] + shift[1], result[11] + shift[2]
+    return result[:9] + translation

@@ -10,134 +10,132 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import Box
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
 from chsel.numerics.elementary import sine_cosine
-from chsel.numerics.pose_tuples import decode, origin_within
+from chsel.numerics.pose_tuples import decode, moved, origin_within, turned, turned_back
+
+DRAWS = 8  # random numbers that a pose takes
+_TURN = 2.0 * np.pi
+_ALIKE = 1e-9  # squared lengths below which a vector has no direction
 
 
 class Coarse(NamedTuple):
-    """What poses are scored by.
+    """What poses are scored by: some known points, and points inside of the object."""
 
-    box, values (nodes,): the signed distance grid, read at the nearest node. contacts (3, A),
-    known_sdf (A,): some of the known points; scale: what a metre off costs. inside (3, P): points
-    inside of the object; weights (P,): what each costs in free space. voxels, flags (voxels,):
-    free space.
+    box: Box  # of the signed distance grid
+    values: Any  # (nodes,), read at the nearest node
+    contacts: FloatArray  # (3, A), world
+    known_sdf: FloatArray  # (A,)
+    scale: float  # cost of a metre of distance
+    inside: FloatArray  # (3, P), object frame
+    weights: FloatArray  # (P,), cost of each in free space
+    voxels: Box  # of the free space
+    flags: Any  # (voxels,), whether free
+
+
+class Anchors(NamedTuple):
+    """Contacts, and the points of the object's surface that can be put onto them.
+
+    A span is the first index and the last + 1.
     """
 
-    box: Box
-    values: Any
-    contacts: FloatArray
-    known_sdf: FloatArray
-    scale: float
-    inside: FloatArray
-    weights: FloatArray
-    voxels: Box
-    flags: Any
+    contacts: FloatArray  # (3, A), world
+    values: FloatArray  # (A,), signed distances at the contacts
+    surface: FloatArray  # (3, Q), object frame
+    normals: FloatArray  # (3, Q)
+    by_distance: IntArray  # (P, 2), pairs of surface points by their distance
+    pairs: IntArray  # (C, 2), two contacts
+    pair_spans: IntArray  # (C, 2), in by_distance, of the surface pairs as far apart
+    singles: IntArray  # (S,), a contact
+    single_spans: IntArray  # (S, 2), in by_height, of the surface points that can meet it
+    by_height: IntArray  # (Q,), surface points in the order of their heights over a plane
+    pair_share: float  # of all poses, those that are placed by pairs
+    anchored_share: float  # those that are placed by pairs or single contacts
+    lower: FloatArray  # (3,), where the object's origin may be in the world
+    upper: FloatArray  # (3,)
+
+
+class DrawnRows(NamedTuple):
+    """Random numbers of some of the poses."""
+
+    draws: Any  # (n, DRAWS), uniform
+    before: int  # how many poses were drawn before
+
+
+class Best(NamedTuple):
+    """The best poses so far, a heap with the worst first, and scratch of one thread."""
+
+    size: IntArray  # (1,), how many there are
+    scores: FloatArray  # (K,)
+    numbers: IntArray  # (K,), of each among all poses drawn
+    poses: FloatArray  # (K, 12)
+    vector: FloatArray  # (9,), scratch
+
+
+def best_for(most: int) -> Best:
+    """No poses yet, and room for `most`."""
+    size, numbers = np.zeros(1, dtype=np.int64), np.empty(most, dtype=np.int64)
+    return Best(size, np.empty(most), numbers, np.empty((most, 12)), np.zeros(9))
+
+
+@compiled
+def sample(coarse, space, anchors, rows, first, last, best):
+    """Keep the best of the poses that rows from `first` to `last` make.
+
+    Those of the lowest scores, and of equal ones the first, so that the result does not depend on
+    how the rows are split.
+    """
+    most = len(best.scores)
+    for n in range(first, last):
+        pose, fits = _pose_of(space, anchors, rows.draws[n], best.vector)
+        if fits:
+            full, number = best.size[0] == most, rows.before + n
+            limit = best.scores[0] if full else np.inf
+            score = score_below(coarse, pose, limit)
+            if score < limit or (full and score == limit and number < best.numbers[0]):
+                _put(best, score, number, pose, full)
 
 
 @inner
 def score_below(coarse, pose, limit):
-    """The score of a pose, less for a better fit; infinite if it is above the limit."""
-    a, b, c, d, e, f, g, h, i, x, y, z = pose
-    box, values, contacts, known_sdf = coarse.box, coarse.values, coarse.contacts, coarse.known_sdf
-    first, most, inverse = box.first, box.most, box.inverse
-    across, along = box.across, box.along
-    x0, y0, z0 = (x - first[0]) * inverse, (y - first[1]) * inverse, (z - first[2]) * inverse
+    """The score of a pose, lower for a better fit; infinite if it is above the limit."""
+    box, contacts = coarse.box, coarse.contacts
+    first, inverse = box.first, box.inverse
+    x, y, z = pose[9], pose[10], pose[11]
+    offset = (x - first[0]) * inverse, (y - first[1]) * inverse, (z - first[2]) * inverse
+    scaled = pose[:9] + offset
     total = 0.0
     for n in range(contacts.shape[1]):
         p, q, r = contacts[0, n] * inverse, contacts[1, n] * inverse, contacts[2, n] * inverse
-        u = a * p + b * q + c * r + x0
-        v = d * p + e * q + f * r + y0
-        w = g * p + h * q + i * r + z0
-        k, m, o = min(max(0.0, u), most[0]), min(max(0.0, v), most[1]), min(max(0.0, w), most[2])
+        u, v, w = moved(scaled, p, q, r)
+        k, m, o = _clamped(box, u, v, w)
         away = (abs(u - k) + abs(v - m) + abs(w - o)) / inverse
-        s = values[int(np.rint(k) * across + np.rint(m) * along + np.rint(o))]
-        total += coarse.scale * abs(s + away - known_sdf[n])
+        s = coarse.values[_nearest_node(box, k, m, o)]
+        total += coarse.scale * abs(s + away - coarse.known_sdf[n])
         if not total <= limit:
             return np.inf
-    inside, weights, voxels, flags = coarse.inside, coarse.weights, coarse.voxels, coarse.flags
-    first, most, inverse = voxels.first, voxels.most, voxels.inverse
-    across, along = voxels.across, voxels.along
+    inside, voxels = coarse.inside, coarse.voxels
+    first, inverse = voxels.first, voxels.inverse
     for n in range(inside.shape[1]):
-        u, v, w = inside[0, n] - x, inside[1, n] - y, inside[2, n] - z
-        k = (a * u + d * v + g * w - first[0]) * inverse
-        m = (b * u + e * v + h * w - first[1]) * inverse
-        o = (c * u + f * v + i * w - first[2]) * inverse
-        k, m, o = min(max(0.0, k), most[0]), min(max(0.0, m), most[1]), min(max(0.0, o), most[2])
-        if flags[int(np.rint(k) * across + np.rint(m) * along + np.rint(o))]:
-            total += weights[n]
+        u, v, w = turned_back(pose, inside[0, n] - x, inside[1, n] - y, inside[2, n] - z)
+        u, v, w = (u - first[0]) * inverse, (v - first[1]) * inverse, (w - first[2]) * inverse
+        k, m, o = _clamped(voxels, u, v, w)
+        if coarse.flags[_nearest_node(voxels, k, m, o)]:
+            total += coarse.weights[n]
             if not total <= limit:
                 return np.inf
     return total
 
 
-DRAWS = 8  # random numbers that a pose takes
-_TURN = 2.0 * np.pi
-_ALIKE = 1e-9  # of squared lengths, below which a direction is none
+@leaf
+def _clamped(box, u, v, w):
+    """Grid coordinates within the grid."""
+    most = box.most
+    return min(max(0.0, u), most[0]), min(max(0.0, v), most[1]), min(max(0.0, w), most[2])
 
 
-class Anchors(NamedTuple):
-    """What can be put onto what.
-
-    contacts (3, A), values (A,): of the world, with the signed distances there. surface,
-    normals (3, Q): of the object. by_distance (P, 2): pairs of surface points by their distance.
-    pairs (C, 4): two contacts, and the first and last + 1 of the surface pairs as far apart.
-    singles (S, 3): a contact, and the first and last + 1 of `allowed` (Q,), the numbers of the
-    surface points in the order of their heights over a plane. shares (2,): of all poses, those by
-    pairs, and those by either way. lower, upper (3,): where the object may be in the world.
-    """
-
-    contacts: FloatArray
-    values: FloatArray
-    surface: FloatArray
-    normals: FloatArray
-    by_distance: IntArray
-    pairs: IntArray
-    singles: IntArray
-    allowed: IntArray
-    shares: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-
-
-class Best(NamedTuple):
-    """The best poses so far, a heap with the worst first.
-
-    state (1,): how many there are. scores, numbers (K,), poses (K, 12): of each.
-    """
-
-    state: IntArray
-    scores: FloatArray
-    numbers: IntArray
-    poses: FloatArray
-    vector: FloatArray
-
-
-def best_for(most: int) -> Best:
-    """Room for so many, for one thread."""
-    return Best(
-        np.zeros(1, dtype=np.int64),
-        np.empty(most),
-        np.empty(most, dtype=np.int64),
-        np.empty((most, 12)),
-        np.zeros(9),
-    )
-
-
-@compiled
-def sample(coarse, space, anchors, draws, before, first, last, best):
-    """Keep the best of the poses that rows of draws (n, 8) from `first` to `last` make.
-
-    Those of the least scores, and of equal ones the first: which they are does not depend on
-    how the rows are split. before: the number of poses drawn before the first row.
-    """
-    most = len(best.scores)
-    for n in range(first, last):
-        pose, fits = _pose_of(space, anchors, draws[n], best.vector)
-        if fits:
-            full = best.state[0] == most
-            limit = best.scores[0] if full else np.inf
-            score = score_below(coarse, pose, limit)
-            if score < limit or (full and score == limit and before + n < best.numbers[0]):
-                _put(best, score, before + n, pose, full)
+@leaf
+def _nearest_node(box, u, v, w):
+    """Flat index of the node nearest to grid coordinates within the grid."""
+    return int(np.rint(u) * box.across + np.rint(v) * box.along + np.rint(w))
 
 
 @inner
@@ -150,15 +148,17 @@ def _put(best, score, number, pose, full):
             child = 2 * at + 1
             if child >= count:
                 break
-            if child + 1 < count and _worse(scores, numbers, child + 1, child):
+            if child + 1 < count and _precedes(
+                scores[child], numbers[child], scores[child + 1], numbers[child + 1]
+            ):
                 child += 1
             if not _precedes(score, number, scores[child], numbers[child]):
                 break
             _copy(best, child, at)
             at = child
     else:
-        at = best.state[0]
-        best.state[0] += 1
+        at = best.size[0]
+        best.size[0] += 1
         while at > 0:
             parent = (at - 1) // 2
             if _precedes(score, number, scores[parent], numbers[parent]):
@@ -175,11 +175,6 @@ def _precedes(score, number, other, other_number):
     return score < other or (score == other and number < other_number)
 
 
-@leaf
-def _worse(scores, numbers, i, j):
-    return _precedes(scores[j], numbers[j], scores[i], numbers[i])
-
-
 @spliced
 def _copy(best, source, target):
     best.scores[target], best.numbers[target] = best.scores[source], best.numbers[source]
@@ -189,23 +184,23 @@ def _copy(best, source, target):
 
 @inner
 def _pose_of(space, anchors, draw, vector):
-    """The pose of a row of draws, and whether it has the object where it may be."""
-    way = draw[0]
-    if way < anchors.shares[0] and len(anchors.pairs) > 0:
+    """The pose of a row of draws, and whether the object is where it may be."""
+    kind = draw[0]
+    if kind < anchors.pair_share and len(anchors.pairs) > 0:
         pose = _on_pair(anchors, draw)
     else:
-        r = _turned(space, draw, vector)
-        if way < anchors.shares[1] and len(anchors.singles) > 0:
+        r = _random_rotation(space, draw, vector)
+        if kind < anchors.anchored_share and len(anchors.singles) > 0:
             pose = _on_contact(anchors, draw, r)
         else:
-            pose = _placed(anchors, draw, r)
+            pose = _in_workspace(anchors, draw, r)
         if space.planar:
             pose = _on_plane(space, pose)
     return pose, origin_within(pose, anchors.lower, anchors.upper)
 
 
 @leaf
-def _turned(space, draw, vector):
+def _random_rotation(space, draw, vector):
     """A rotation, uniform on SO(3) (Shoemake, 1992), or about the plane's axis."""
     if space.planar:
         vector[0], vector[1], vector[2] = _TURN * draw[5], 0.0, 0.0
@@ -213,56 +208,42 @@ def _turned(space, draw, vector):
     s, c = sine_cosine(_TURN * draw[5])
     sine, cosine = sine_cosine(_TURN * draw[6])
     inner_root, outer_root = np.sqrt(1.0 - draw[7]), np.sqrt(1.0 * draw[7])
-    return matrix_of_quaternion(
-        inner_root * s, inner_root * c, outer_root * sine, outer_root * cosine
-    )
+    return _rotation_of(inner_root * s, inner_root * c, outer_root * sine, outer_root * cosine)
 
 
 @leaf
-def matrix_of_quaternion(w, x, y, z):
+def _rotation_of(w, x, y, z):
     """The rotation of a unit quaternion, row by row."""
     return (
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - w * z),
-        2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y),
-        2.0 * (y * z + w * x),
-        1.0 - 2.0 * (x * x + y * y),
-    )
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
 
 
 @leaf
-def _placed(anchors, draw, r):
-    """A pose with the object's origin uniform in the box: t = -R p."""
+def _in_workspace(anchors, draw, r):
+    """A pose with the object's origin p uniform in the box: t = -R p."""
     low, high = anchors.lower, anchors.upper
     x = low[0] + draw[1] * (high[0] - low[0])
     y = low[1] + draw[2] * (high[1] - low[1])
     z = low[2] + draw[3] * (high[2] - low[2])
-    u, v, w = _rotated(r, x, y, z)
-    return _joined(r, -u, -v, -w)
+    u, v, w = turned(r, x, y, z)
+    translation = -u, -v, -w
+    return r + translation
 
 
 @leaf
 def _on_contact(anchors, draw, r):
-    """A pose that puts a surface point, or one as far from it as is known, onto a contact."""
+    """A pose that puts a surface point, or one at the known distance from it, onto a contact."""
     single = int(draw[1] * len(anchors.singles))
-    contact = anchors.singles[single, 0]
-    first, last = anchors.singles[single, 1], anchors.singles[single, 2]
-    q = anchors.allowed[first + int(draw[2] * (last - first))]
-    away = anchors.values[contact]
-    x, y, z = (
-        anchors.contacts[0, contact],
-        anchors.contacts[1, contact],
-        anchors.contacts[2, contact],
-    )
-    u, v, w = _rotated(r, x, y, z)
-    u = anchors.surface[0, q] + away * anchors.normals[0, q] - u
-    v = anchors.surface[1, q] + away * anchors.normals[1, q] - v
-    w = anchors.surface[2, q] + away * anchors.normals[2, q] - w
-    return _joined(r, u, v, w)
+    contact = anchors.singles[single]
+    first, last = anchors.single_spans[single, 0], anchors.single_spans[single, 1]
+    q = anchors.by_height[first + int(draw[2] * (last - first))]
+    away, (a, b, c) = anchors.values[contact], _column(anchors.normals, q)
+    x, y, z = _column(anchors.surface, q)
+    onto = x + away * a, y + away * b, z + away * c
+    return _moving(r, _column(anchors.contacts, contact), onto)
 
 
 @leaf
@@ -270,63 +251,57 @@ def _on_plane(space, pose):
     """The pose moved along the plane's axis onto the plane: a . t = o."""
     a, b, c = space.axis
     off = space.offset - (a * pose[9] + b * pose[10] + c * pose[11])
-    return _joined(pose[:9], pose[9] + off * a, pose[10] + off * b, pose[11] + off * c)
+    translation = pose[9] + off * a, pose[10] + off * b, pose[11] + off * c
+    return pose[:9] + translation
 
 
 @leaf
 def _on_pair(anchors, draw):
     """A pose that puts two surface points onto the line of two contacts, turned about it."""
     pair = int(draw[1] * len(anchors.pairs))
-    i, j = anchors.pairs[pair, 0], anchors.pairs[pair, 1]
-    first, last = anchors.pairs[pair, 2], anchors.pairs[pair, 3]
+    first, last = anchors.pair_spans[pair, 0], anchors.pair_spans[pair, 1]
     at = first + int(draw[2] * (last - first))
-    swap = draw[3] < 0.5
     k, m = anchors.by_distance[at, 0], anchors.by_distance[at, 1]
-    if swap:
+    if draw[3] < 0.5:
         k, m = m, k
-    contacts, surface = anchors.contacts, anchors.surface
-    f = _frame(
-        contacts[0, j] - contacts[0, i],
-        contacts[1, j] - contacts[1, i],
-        contacts[2, j] - contacts[2, i],
-        1.0,
-        0.0,
-    )
+    start = _column(anchors.contacts, anchors.pairs[pair, 0])
+    end = _column(anchors.contacts, anchors.pairs[pair, 1])
+    surface_start, surface_end = _column(anchors.surface, k), _column(anchors.surface, m)
     sine, cosine = sine_cosine(_TURN * draw[4])
-    g = _frame(
-        surface[0, m] - surface[0, k],
-        surface[1, m] - surface[1, k],
-        surface[2, m] - surface[2, k],
-        cosine,
-        sine,
-    )
-    r = (  # the frames are columns of f and g: R = g f^T
-        g[0] * f[0] + g[3] * f[3] + g[6] * f[6],
-        g[0] * f[1] + g[3] * f[4] + g[6] * f[7],
-        g[0] * f[2] + g[3] * f[5] + g[6] * f[8],
-        g[1] * f[0] + g[4] * f[3] + g[7] * f[6],
-        g[1] * f[1] + g[4] * f[4] + g[7] * f[7],
-        g[1] * f[2] + g[4] * f[5] + g[7] * f[8],
-        g[2] * f[0] + g[5] * f[3] + g[8] * f[6],
-        g[2] * f[1] + g[5] * f[4] + g[8] * f[7],
-        g[2] * f[2] + g[5] * f[5] + g[8] * f[8],
-    )
-    x = 0.5 * (contacts[0, i] + contacts[0, j])
-    y = 0.5 * (contacts[1, i] + contacts[1, j])
-    z = 0.5 * (contacts[2, i] + contacts[2, j])
-    u, v, w = _rotated(r, x, y, z)
-    u = 0.5 * (surface[0, k] + surface[0, m]) - u
-    v = 0.5 * (surface[1, k] + surface[1, m]) - v
-    w = 0.5 * (surface[2, k] + surface[2, m]) - w
-    return _joined(r, u, v, w)
+    f = _frame(start, end, 1.0, 0.0)
+    g = _frame(surface_start, surface_end, cosine, sine)
+    a, d, u = turned_back(g, f[0], f[3], f[6])  # R = G^T F, with frames as rows
+    b, e, v = turned_back(g, f[1], f[4], f[7])
+    c, h, w = turned_back(g, f[2], f[5], f[8])
+    r = (a, b, c, d, e, h, u, v, w)
+    return _moving(r, _middle(start, end), _middle(surface_start, surface_end))
 
 
 @leaf
-def _frame(x, y, z, cosine, sine):
-    """Three orthonormal vectors, one after the other: along x, y, z, the others turned about it."""
+def _column(points, n):
+    return points[0, n], points[1, n], points[2, n]
+
+
+@leaf
+def _middle(p, q):
+    return 0.5 * (p[0] + q[0]), 0.5 * (p[1] + q[1]), 0.5 * (p[2] + q[2])
+
+
+@leaf
+def _moving(r, point, onto):
+    """The pose with rotation R that moves a point p onto another: t = q - R p."""
+    u, v, w = turned(r, point[0], point[1], point[2])
+    translation = onto[0] - u, onto[1] - v, onto[2] - w
+    return r + translation
+
+
+@leaf
+def _frame(start, end, cosine, sine):
+    """Three orthonormal vectors, one after the other: from start to end, others turned about it."""
+    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     length = np.sqrt(max(x * x + y * y + z * z, _ALIKE))
     x, y, z = x / length, y / length, z / length
-    if abs(x) < 0.6:  # with the axis that it is far from
+    if abs(x) < 0.6:  # cross product with an axis that it is far from
         a, b, c = 0.0, -z, y
     else:
         a, b, c = z, 0.0, -x
@@ -334,27 +309,7 @@ def _frame(x, y, z, cosine, sine):
     a, b, c = a / length, b / length, c / length
     d, e, f = y * c - z * b, z * a - x * c, x * b - y * a
     return (
-        x,
-        y,
-        z,
-        cosine * a + sine * d,
-        cosine * b + sine * e,
-        cosine * c + sine * f,
-        cosine * d - sine * a,
-        cosine * e - sine * b,
-        cosine * f - sine * c,
-    )
-
-
-@leaf
-def _rotated(r, x, y, z):
-    return (
-        r[0] * x + r[1] * y + r[2] * z,
-        r[3] * x + r[4] * y + r[5] * z,
-        r[6] * x + r[7] * y + r[8] * z,
-    )
-
-
-@leaf
-def _joined(r, u, v, w):
-    return r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], u, v, w
+        x, y, z,
+        cosine * a + sine * d, cosine * b + sine * e, cosine * c + sine * f,
+        cosine * d - sine * a, cosine * e - sine * b, cosine * f - sine * c,
+    )  # fmt: skip

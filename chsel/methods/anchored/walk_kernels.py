@@ -1,6 +1,7 @@
-"""Random walks of poses below a limit on their energy.
+"""The energy of a pose up to a limit, and random walks of poses below one.
 
-While the limit comes down: threshold accepting (Dueck and Scheuer, 1990).
+While the limit comes down: threshold accepting (Dueck and Scheuer, 1990). Known points come first,
+as they are the fewest and rule out most poses.
 """
 
 from __future__ import annotations
@@ -9,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.cost.cost_kernels import Model, remember, travel
-from chsel.methods.anchored.energy_kernels import found_around, known_below, with_free
-from chsel.methods.anchored.fit_kernels import moved_about
+from chsel.methods.anchored.fit_kernels import gather, moved_about, travel_since_gathering
 from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner
 from chsel.numerics.elementary import exp
-from chsel.numerics.octree import Candidates, walk
-from chsel.numerics.pose_tuples import origin_within, pose_at
+from chsel.numerics.octree import walk
+from chsel.numerics.pose_tuples import moved, origin_within, pose_at
+from chsel.problem.sdf_lookup import distance_at, value_between_nodes
 
 DRAWS = 9  # random numbers that a move takes
 _FIRST, _LEAST, _MOST = 0.01, 0.00005, 0.03  # metres: the size of moves
@@ -30,44 +31,23 @@ _LEAST_SLACK, _MOST_SLACK = 0.004, 0.04  # metres
 
 
 class Stride(NamedTuple):
-    """How poses move.
+    """How poses move."""
 
-    planar: turns are about the axis alone, and shifts across it. pivot: the point of the object
-    about which it turns where it does not turn about a contact. lower, upper (3,): where the
-    object's origin may be in the world.
-    """
-
-    planar: bool
+    planar: bool  # turns are about the axis alone, and shifts across it
     axis: tuple[float, float, float]
-    pivot: tuple[float, float, float]
-    lower: tuple[float, float, float]
+    pivot: tuple[float, float, float]  # of the object, where it does not turn about a contact
+    lower: tuple[float, float, float]  # where the object's origin may be in the world
     upper: tuple[float, float, float]
 
 
-class Steps(NamedTuple):
-    """Scratch of one thread."""
-
-    found: Candidates
-    memory: FloatArray  # (12,), the pose that they were gathered around, see remember
-
-
-def steps_for(model: Model) -> Steps:
-    """Scratch for one thread."""
-    return Steps(found_around(model), np.empty(12))
-
-
 class Chains(NamedTuple):
-    """Walks, one each from poses (C, 12) with energies (C,), which they leave where they end.
+    """Walks of C poses."""
 
-    kept (C, K, 12), kept_energies (C, K): states at even spaces, infinite for one above the floor.
-    moved (C,): accepted moves.
-    """
-
-    poses: FloatArray
-    energies: FloatArray
-    kept: FloatArray
-    kept_energies: FloatArray
-    moved: IntArray
+    poses: FloatArray  # (C, 12), at the start, then at the end
+    energies: FloatArray  # (C,), of these
+    kept: FloatArray  # (C, K, 12), poses at even spaces
+    kept_energies: FloatArray  # (C, K), infinite for one above the floor
+    moved: IntArray  # (C,), accepted moves
 
 
 def chains_from(poses: FloatArray, energies: FloatArray, kept: int) -> Chains:
@@ -82,27 +62,81 @@ def chains_from(poses: FloatArray, energies: FloatArray, kept: int) -> Chains:
     )
 
 
+@inner
+def _known_below(model, pose, limit):
+    """The cost of known and occupied points; infinite if it is above the limit."""
+    total = 0.0
+    known, field = model.known, model.field
+    for n in range(known.shape[1]):
+        s = distance_at(field, pose, known[0, n], known[1, n], known[2, n])
+        total += model.known_scale * max(abs(s - model.known_sdf[n]) - model.known_tolerance, 0.0)
+        if not total <= limit:
+            return np.inf
+    occupied = model.occupied
+    for n in range(occupied.shape[1]):
+        s = distance_at(field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
+        total += model.occupied_scale * max(model.alpha + s, 0.0)
+        if not total <= limit:
+            return np.inf
+    return total
+
+
+@inner
+def _with_free(model, pose, total, limit, candidates, count):
+    """A sum plus the cost of `count` free points; infinite if it is above the limit."""
+    free, box, table = model.free, model.field.box, model.field.table
+    across, along = int(box.across), int(box.along)
+    clearance, places = free.region.clearance, candidates.places
+    locate(pose, free.region.box, candidates.x, candidates.y, candidates.z, places, count)
+    for n in range(count):
+        at = places.cell[n]
+        if clearance[at] < 0.0 and places.beyond[n] == 0.0:
+            s = value_between_nodes(table, at, across, along, places.u[n], places.v[n], places.w[n])
+            total += model.free_scale * max(model.alpha - s, 0.0)
+            if not total <= limit:
+                return np.inf
+    return total
+
+
+@inner
+def _energy_below(model, pose, limit, candidates):
+    """The energy of a rigid pose; infinite if it is above the limit."""
+    total = _known_below(model, pose, limit)
+    if not total <= limit:
+        return np.inf
+    count = walk(model.free.tree, model.free.region, pose, 0.0, candidates)
+    return _with_free(model, pose, total, limit, candidates, count)
+
+
 @compiled
-def walk_below(model, stride, floor, chains, draws, before, first, last, steps):
-    """Move the chains after the first `before` once for each of their draws (C, M, 9).
+def energies_below(model, poses, limit, out, first, last, near):
+    """Fill out (B,) with the energies of poses (B, 12) up to a limit, from `first` to `last`."""
+    for n in range(first, last):
+        out[n] = _energy_below(model, pose_at(poses, n), limit, near.candidates)
+
+
+@compiled
+def walk_below(model, stride, floor, chains, draws, first, last, near):
+    """Move the chains from `first` to before `last` once for each of their draws (C, M, 9).
 
     A move is accepted if its energy is at most the limit of its chain: the energy of the chain
     where that is above the floor, so that the limit comes down with it, else the floor.
     """
     moves, keep = draws.shape[1], chains.kept.shape[1]
-    for row in range(first, last):
-        n = before + row
+    for n in range(first, last):
         pose, energy, size = pose_at(chains.poses, n), chains.energies[n], _FIRST
         slack, count, done = -1.0, 0, 0
         for m in range(moves):
             limit = max(energy, floor)
-            trial = _proposed(model, stride, pose, size, draws[row, m])
+            trial = _proposed(model, stride, pose, size, draws[n, m])
             accepted = False
             if origin_within(trial, stride.lower, stride.upper):
-                total = known_below(model, trial, limit)
+                total = _known_below(model, trial, limit)
                 if total <= limit:
-                    count, slack = _gathered(model, pose, trial, size, count, slack, steps)
-                    total = with_free(model, trial, total, limit, steps.found, count)
+                    if slack < 0.0 or travel_since_gathering(model, trial, near) > slack:
+                        slack = min(max(_SLACKS * size, _LEAST_SLACK), _MOST_SLACK)
+                        count = gather(model, trial, slack, near)
+                    total = _with_free(model, trial, total, limit, near.candidates, count)
                     accepted = total <= limit
             if accepted:
                 pose, energy = trial, total
@@ -122,17 +156,6 @@ def walk_below(model, stride, floor, chains, draws, before, first, last, steps):
 
 
 @inner
-def _gathered(model, pose, trial, size, count, slack, steps):
-    """How many points were gathered around the trial or one before, and with what slack."""
-    free, memory = model.free, steps.memory
-    if slack < 0.0 or travel(free, trial, memory) > slack:
-        slack = min(max(_SLACKS * size, _LEAST_SLACK), _MOST_SLACK)
-        remember(free, trial, memory)
-        count = walk(free.tree, free.region, trial, slack + free.margin, steps.found)
-    return count, slack
-
-
-@inner
 def _proposed(model, stride, pose, size, draw):
     """A pose near by. draw (9,): of a factor of the size, two choices, a turn, and a shift."""
     size *= _SMALLEST * exp(_RANGE * draw[0])
@@ -148,10 +171,5 @@ def _proposed(model, stride, pose, size, draw):
     pivot = stride.pivot
     if draw[1] < _ABOUT_CONTACT and known.shape[1] > 0:
         n = int(draw[2] * known.shape[1])
-        x, y, z = known[0, n], known[1, n], known[2, n]
-        pivot = (
-            pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
-            pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
-            pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
-        )
+        pivot = moved(pose, known[0, n], known[1, n], known[2, n])
     return moved_about(pose, pivot, (a, b, c), (u, v, w))

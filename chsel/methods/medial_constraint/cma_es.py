@@ -20,7 +20,7 @@ from chsel.problem.registration_problem import Observer
 from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import all_finite, rank
-from chsel.qd.evolution_kernels import SIGMA, Strategy, ask, strategy_around, tell
+from chsel.qd.evolution_kernels import Strategy, ask, strategy_around, tell
 
 MOST_GENERATIONS = 20_000
 MOST_SAMPLES = 100_000
@@ -289,7 +289,7 @@ def _ended(run: Run, rules: StopRules) -> bool:
 @inner
 def _step_ends(strategy: Strategy, rules: StopRules) -> bool:
     """Whether every coordinate's step is below tolx, or any above tolfacupx."""
-    sigma, smallest = strategy.numbers[SIGMA], True
+    sigma, smallest = strategy.sigma[0], True
     for j in range(len(strategy.mean)):
         deviation = sigma * np.sqrt(strategy.covariance[j, j])
         if not deviation <= rules.tolfacupx * strategy.sigma0:

@@ -20,12 +20,13 @@ from chsel.problem.registration_problem import (
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose
-from chsel.qd.archive import GridArchive
-from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me, update_cells
+from chsel.qd.archive import GridArchive, evaluated
+from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
+    measure_range,
     ranked_hypotheses,
     select_elites,
     sized_archive,
@@ -132,7 +133,6 @@ class MedialConstraintCmaMe:
         first, best = space.encode(initial_set[:1])[0], archive.best_solution
         start = first if settings.emitter.start == "initial" else best
         draws, watch = Draws(key), ArchiveWatch(observer, 0, "cma_me")
-        watch.start(archive)
         cma_me(objective, archive, start, count, settings.emitter, draws, watch, medial_cma_me)
         # E <- cells of M with the |E_0| lowest costs
         stream, elites = key.stream(Purpose.RESAMPLE), space.poses(archive.solutions)
@@ -146,9 +146,9 @@ class MedialConstraintCmaMe:
     ) -> GridArchive:
         """The archive that measures of E', vectors (B, d), size, holding E' and E_l."""
         settings, measure, space = self.settings.archive, self._measure, objective.space
-        costs, measures = objective.costs(vectors), measure.values(space, vectors)
-        known_count = len(problem.points.known)
-        archive = sized_archive(measure, measures, costs, settings, known_count, space.dimension)
-        update_cells(archive, objective, vectors, costs)
-        update_cells(archive, objective, space.encode(Poses.of(problem.low_cost_set)))
+        estimates = evaluated(objective, measure, vectors)
+        mean, deviation = measure_range(estimates, measure, settings, len(problem.points.known))
+        archive = sized_archive(measure, mean, deviation, settings, space.dimension)
+        low_cost_set = space.encode(Poses.of(problem.low_cost_set))
+        archive.update_cells(estimates, evaluated(objective, measure, low_cost_set))
         return archive

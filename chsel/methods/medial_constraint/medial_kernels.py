@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.pose_tuples import decode, finite, moved, pose_at
 from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
 from chsel.qd.archive import Batch, Cells, all_finite, insert, rank
-from chsel.qd.emitter_kernels import MeSearch, move_to_elite
+from chsel.qd.emitter_kernels import Landscape, MeSearch, SearchDraws, move_to_elite
 from chsel.qd.evolution_kernels import ask, reset, stopped, tell
 from chsel.qd.measures import measures_of
 
@@ -106,36 +106,30 @@ def medial_costs_of_poses(model, poses, out, first, last, places):
 
 @compiled
 def medial_cma_me(
-    model: Any,
-    space: Any,
-    measure: Any,
-    work: Any,
+    landscape: Landscape,
     archive: Cells,
     search: MeSearch,
-    normals: FloatArray,
-    elites: FloatArray,
+    draws: SearchDraws,
     first: int,
     last: int,
 ) -> None:
-    """Iterations of CMA-ME, as chsel.qd.emitter_kernels.cma_me has them, on another objective.
-
-    normals (iterations, L, d); elites (iterations,): uniform numbers that choose one.
-    """
+    """Iterations of CMA-ME, as chsel.qd.emitter_kernels.cma_me has them, on another objective."""
     samples, strategy = search.samples, search.strategy
     for iteration in range(first, last):
-        ask(strategy, normals[iteration], samples.vectors)
-        _evaluate(model, space, measure, samples, work)
+        ask(strategy, draws.normals[iteration], samples.vectors)
+        _evaluate(landscape, samples)
         insert(archive, samples)
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            move_to_elite(archive, elites[iteration], strategy.mean)
+            move_to_elite(archive, draws.elites[iteration], strategy.mean)
             reset(strategy)
 
 
 @spliced
-def _evaluate(model: Any, space: Any, measure: Any, batch: Batch, work: Any) -> None:
+def _evaluate(landscape: Landscape, batch: Batch) -> None:
     """Fill objectives and measures; a vector that is not finite is not looked up anywhere."""
+    model, space, measure, work = landscape
     vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures
     for i in range(len(objectives)):
         vector = vectors[i]

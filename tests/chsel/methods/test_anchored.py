@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from chsel.errors import ChselError, SettingError
-from chsel.methods.anchored.anchor_sampling import in_telling_order
+from chsel.methods.anchored.anchor_sampling import most_informative_first
 from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Effort
 from chsel.methods.anchored.energy import Energy
 from chsel.numerics.arrays import FloatArray
@@ -27,7 +27,19 @@ from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from tests.chsel.methods.l_shape import GRID, SIDE, STANDING, TRUTH, WORKSPACE, known_points
 
-EFFORT = Effort(4000, 24, 5, 12, 8, 8, 30, 12, 60, 4, 40)
+EFFORT = Effort(
+    samples=4000,
+    kept=24,
+    first_steps=5,
+    refined=12,
+    steps=8,
+    descents=8,
+    descent_moves=30,
+    chains=12,
+    moves=60,
+    polished=4,
+    polish_moves=40,
+)
 POINTS = known_points(TRUTH, 40)
 FEW = replace(POINTS, known=POINTS.known[:2], known_sdf=None)
 INEXACT = replace(  # by 2 mm
@@ -58,7 +70,7 @@ def energies_of(
     settings = method.settings
     space = search_space(settings.plane, problem.sdf)
     bounds = origin_bounds(problem.workspace, space, settings.anchors.margin)
-    known, tolerance = in_telling_order(problem.points), settings.penetration_tolerance
+    known, tolerance = most_informative_first(problem.points), settings.penetration_tolerance
     return Energy(problem, known, space, tolerance, bounds).of(Poses.of(object_from_world))
 
 

@@ -15,8 +15,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.streams import StreamKey
 from chsel.qd.archive import GridArchive
-from chsel.qd.emitter_kernels import mega_search
-from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, mega_search
 from chsel.qd.measures import VECTOR, Measure, MeasureCode
 
 ribs_archives = pytest.importorskip("ribs.archives", reason="pyribs is a test dependency")
@@ -154,7 +153,8 @@ def ribs_search(name: str, seed: int, *, sigma0: float = 1.0, shared: bool = Fal
     draws = Draws(StreamKey(seed, 0))
     iteration = 0
     if shared:
-        emitter._opt._rng = SharedNormals(emitter._opt, draws.normals(ITERATIONS, BATCH, dimension))
+        (block,) = draws.blocks(ITERATIONS, BATCH, dimension)
+        emitter._opt._rng = SharedNormals(emitter._opt, block)
         elites = draws.elites(ITERATIONS)
 
         def our_elite(count: int, **_: Any) -> dict[str, FloatArray]:

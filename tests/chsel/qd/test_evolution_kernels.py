@@ -8,7 +8,7 @@ import pytest
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.qd import evolution_kernels as evolution
-from chsel.qd.evolution_kernels import DECOMPOSED_AT, EVALUATIONS, SIGMA, Strategy, strategy_around
+from chsel.qd.evolution_kernels import Strategy, strategy_around
 
 
 class MatrixStrategy:
@@ -112,7 +112,7 @@ def test_samples_are_those_of_cma_es_with_matrices(n: int, batch: int, parity: b
         theirs.tell(samples[order[:parents]])
         np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-9, atol=1e-12)
         np.testing.assert_array_equal(ours.covariance, ours.covariance.T)
-        assert ours.numbers[SIGMA] == pytest.approx(theirs.sigma, rel=1e-10)
+        assert ours.sigma[0] == pytest.approx(theirs.sigma, rel=1e-10)
         steady += bool(np.abs(theirs.path_c).max() > 0.0)
     assert steady > 10
     assert theirs.decomposed_at > 0
@@ -141,11 +141,11 @@ def test_it_stops_at_a_degenerate_covariance_a_tiny_step_or_a_flat_ranking() -> 
     strategy.eigenvalues[:] = 1.0, 2.0, 1.01e14
     assert stopped(strategy, order, status, value)
     strategy.eigenvalues[:] = 1.0, 2.0, 4.0
-    strategy.numbers[SIGMA] = 0.51e-11
+    strategy.sigma[0] = 0.51e-11
     assert not stopped(strategy, order, status, value)
-    strategy.numbers[SIGMA] = 0.49e-11
+    strategy.sigma[0] = 0.49e-11
     assert stopped(strategy, order, status, value)
-    strategy.numbers[SIGMA] = 1.0
+    strategy.sigma[0] = 1.0
     flat = np.linspace(1e-13, 0.0, 4)
     assert stopped(strategy, order, status, flat)
     assert not stopped(strategy, order, np.array([2, 1, 1, 1]), flat)
@@ -163,8 +163,8 @@ def test_a_reset_strategy_is_a_new_one_around_its_mean() -> None:
     for _ in range(5):
         ask(strategy, random.standard_normal((6, 3)), samples)
         tell(strategy, samples, np.arange(6), 3)
-    assert strategy.numbers[EVALUATIONS] == 30
-    assert strategy.numbers[DECOMPOSED_AT] > 0
+    assert strategy.evaluations[0] == 30
+    assert strategy.decomposed_at[0] > 0
     strategy.mean[:] = 1.0
     reset(strategy)
     normals = random.standard_normal((5, 6, 3))
@@ -172,5 +172,5 @@ def test_a_reset_strategy_is_a_new_one_around_its_mean() -> None:
         for each in (strategy, new):
             ask(each, draws, samples)
             tell(each, samples, np.arange(6), 4)
-    for mine, other in zip(strategy[3:10], new[3:10], strict=True):
+    for mine, other in zip(strategy[3:13], new[3:13], strict=True):
         np.testing.assert_array_equal(mine, other)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.methods.anchored.anchor_sampling import in_telling_order
+from chsel.methods.anchored.anchor_sampling import most_informative_first
 from chsel.methods.anchored.energy import Energy
-from chsel.methods.anchored.energy_kernels import energies_below, found_around
-from chsel.methods.anchored.walk_kernels import Chains
+from chsel.methods.anchored.fit_kernels import surrounding_for
+from chsel.methods.anchored.walk_kernels import Chains, energies_below
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints, Workspace
@@ -44,7 +44,7 @@ def energy_of(
     problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
     space = search_space(plane, GRID)
     bounds = origin_bounds(problem.workspace, space, MARGIN)
-    return Energy(problem, in_telling_order(points), space, tolerance, bounds), bounds
+    return Energy(problem, most_informative_first(points), space, tolerance, bounds), bounds
 
 
 def around(count: int, shift: float, turn: float) -> Poses:
@@ -108,7 +108,7 @@ def test_energies_above_a_limit_are_infinite_and_others_as_they_are() -> None:
     model, poses = energy._model, Poses.joined([around(40, 0.02, 0.3), far_poses()])
     energies, limited = energy.of(poses), np.empty(len(poses))
     limit = float(np.sort(energies)[30])
-    energies_below(model, poses.numbers, limit, limited, 0, len(poses), found_around(model))
+    energies_below(model, poses.numbers, limit, limited, 0, len(poses), surrounding_for(model))
     np.testing.assert_array_equal(limited, np.where(energies <= limit, energies, np.inf))
 
 

@@ -10,7 +10,7 @@ from chsel.errors import SettingError
 from chsel.methods.anchored.anchor_sampling import (
     AnchorSettings,
     anchored_poses,
-    in_telling_order,
+    most_informative_first,
 )
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
@@ -40,7 +40,7 @@ def drawn(
 ) -> FloatArray:
     """The best poses (K, 12); all of them where most is as many."""
     problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
-    space, known = search_space(plane, GRID), in_telling_order(points)
+    space, known = search_space(plane, GRID), most_informative_first(points)
     return anchored_poses(
         problem, known, space, settings, samples=samples, most=most, index=index
     ).numbers
@@ -127,7 +127,7 @@ def test_on_a_plane_poses_stand_on_it_and_still_meet_contacts() -> None:
 def test_known_points_come_far_apart_first_and_none_is_lost() -> None:
     random = np.random.default_rng(2)
     known, values = random.standard_normal((200, 3)), random.standard_normal(200)
-    ordered = in_telling_order(KnownPoints(known=known, known_sdf=values))
+    ordered = most_informative_first(KnownPoints(known=known, known_sdf=values))
     rows = np.lexsort(known.T), np.lexsort(ordered.known.T)
     np.testing.assert_array_equal(known[rows[0]], ordered.known[rows[1]])
     np.testing.assert_array_equal(values[rows[0]], ordered.sdf[rows[1]])

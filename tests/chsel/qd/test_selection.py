@@ -12,10 +12,12 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses, compose, inverse
 from chsel.problem.search_space import search_space
 from chsel.problem.streams import StreamKey
+from chsel.qd.archive import Evaluated, GridArchive
 from chsel.qd.measures import MEASURES
 from chsel.qd.selection import (
     ArchiveSettings,
     OutputSettings,
+    measure_range,
     repeated,
     select_elites,
     sized_archive,
@@ -96,12 +98,19 @@ def test_noise_limit_is_lowest_plus_tolerance_where_that_is_larger() -> None:
     assert chosen(9, tolerance_per_point=0.5, **changes) == [1, 3, 4, 5, 0]
 
 
+def archive_of(values: FloatArray, costs: FloatArray, settings: ArchiveSettings) -> GridArchive:
+    """The archive that estimates of such measures (B, 2) and costs (B,) size."""
+    measure, estimates = MEASURES["position_2"], Evaluated(np.zeros((len(costs), 9)), costs, values)
+    mean, deviation = measure_range(estimates, measure, settings, known_count=5)
+    return sized_archive(measure, mean, deviation, settings, dimension=9)
+
+
 @pytest.mark.parametrize(("outliers", "kept"), [("none", 5), ("ratio", 3), ("quantile", 4)])
 def test_outliers_do_not_widen_the_archive(outliers: str, kept: int) -> None:
     costs = np.array([0.1, 0.2, 0.3, 0.9, 50.0])
     values = np.array([[0.0, 0.0], [0.2, 0.1], [0.4, -0.1], [1.0, 1.0], [30.0, 30.0]])
     settings = ArchiveSettings(outliers=outliers, tolerance_per_point=0.0, bins=10)
-    archive = sized_archive(MEASURES["position_2"], values, costs, settings, 5, 9)
+    archive = archive_of(values, costs, settings)
     mean, deviation = values[:kept].mean(axis=0), values[:kept].std(axis=0)
     np.testing.assert_allclose(archive.lower, mean - 3 * deviation)
     np.testing.assert_allclose(archive.upper, mean + 3 * deviation)
@@ -110,7 +119,7 @@ def test_outliers_do_not_widen_the_archive(outliers: str, kept: int) -> None:
 
 def test_equal_estimates_still_make_an_archive_of_some_width() -> None:
     values = np.tile([0.3, 0.2], (6, 1))
-    archive = sized_archive(MEASURES["position_2"], values, np.ones(6), ArchiveSettings(), 5, 9)
+    archive = archive_of(values, np.ones(6), ArchiveSettings())
     np.testing.assert_allclose(archive.upper - archive.lower, 2 * 3 * 0.005)
 
 

@@ -156,7 +156,7 @@ def test_watching_and_threads_change_no_bit(name: str, preset: str) -> None:
 def test_fresh_processes_give_the_same_bits_on_any_number_of_threads() -> None:
     code = (
         "import sys, torch; torch.set_num_threads(int(sys.argv[1]));"
-        "from tests.chsel.test_methods import METHODS, posed, quick;"
+        "from tests.chsel.methods.test_methods import METHODS, posed, quick;"
         "print([quick(n).register(posed(quick(n))).digest for n in METHODS])"
     )
     outputs = {
@@ -165,7 +165,7 @@ def test_fresh_processes_give_the_same_bits_on_any_number_of_threads() -> None:
             capture_output=True,
             text=True,
             check=True,
-            cwd=Path(__file__).resolve().parents[2],
+            cwd=Path(__file__).resolve().parents[3],
         ).stdout
         for threads in ("1", "2")
     }

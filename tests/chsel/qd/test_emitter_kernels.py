@@ -14,15 +14,22 @@ from chsel.problem.registration_problem import ArchiveSnapshot, NullObserver
 from chsel.problem.streams import StreamKey
 from chsel.qd import emitter_kernels as kernels
 from chsel.qd.archive import GridArchive
-from chsel.qd.emitter_kernels import MegaSearch, MeSearch, me_search, mega_search
-from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
-from chsel.qd.evolution_kernels import EVALUATIONS, SIGMA
+from chsel.qd.emitter_kernels import MegaSearch, MeSearch
+from chsel.qd.emitters import (
+    SEARCHES,
+    ArchiveWatch,
+    Draws,
+    EmitterSettings,
+    me_search,
+    mega_search,
+)
 from chsel.qd.measures import VECTOR, Measure, MeasureCode
 
 QUADRATIC, FLAT, NAN, INFINITE, NAN_BEYOND, NAN_GRADIENT = range(6)
 MEASURE = Measure(("x", "y"), MeasureCode(VECTOR, 2))
 START = np.array([0.3, -0.2, 0.1, 0.2])
 ITERATIONS, COUNT = 60, 12
+SETTINGS = EmitterSettings(iterations=ITERATIONS, sigma0=0.2, rate=0.05)
 
 
 class Landscape(NamedTuple):
@@ -108,8 +115,7 @@ def found(name: str, kind: int, interval: int = 0, count: int = COUNT) -> GridAr
     """The archive after a search."""
     archive = empty_archive()
     draws, watch = Draws(StreamKey(4, 0)), ArchiveWatch(Watcher(interval), 0, "search")
-    settings = EmitterSettings(iterations=ITERATIONS, sigma0=0.2, rate=0.05)
-    SEARCHES[name](LandscapeObjective(kind), archive, START, count, settings, draws, watch)  # type: ignore[arg-type]
+    SEARCHES[name](LandscapeObjective(kind), archive, START, count, SETTINGS, draws, watch)  # type: ignore[arg-type]
     return archive
 
 
@@ -119,9 +125,9 @@ class Stepper:
     def __init__(self, name: str) -> None:
         self.archive, self.iteration = empty_archive(), 0
         self.search: Any = (
-            mega_search(START, 2, COUNT, sigma0=0.2, rate=0.05)
+            mega_search(START, 2, COUNT, SETTINGS)
             if name == "cma_mega"
-            else me_search(START, 2, COUNT, sigma0=0.2)
+            else me_search(START, 2, COUNT, SETTINGS)
         )
         self._loop = getattr(kernels, name)
         random, n = np.random.default_rng(0), len(self.search.strategy.mean)
@@ -129,9 +135,10 @@ class Stepper:
         self.elites = random.random(ITERATIONS)
 
     def step(self, kind: int) -> None:
-        problem = Landscape(kind), 0, MEASURE.code, 0
-        draws = self._normals, self.elites, self.iteration, self.iteration + 1
-        self._loop(*problem, self.archive.cells, self.search, *draws)
+        landscape = kernels.Landscape(Landscape(kind), 0, MEASURE.code, 0)
+        draws = kernels.SearchDraws(self._normals, self.elites)
+        span = self.iteration, self.iteration + 1
+        self._loop(landscape, self.archive.cells, self.search, draws, *span)
         self.iteration += 1
 
 
@@ -204,14 +211,14 @@ def test_without_improvement_it_restarts_from_the_chosen_elite(name: str) -> Non
     for _ in range(8):
         stepper.step(QUADRATIC)
     strategy = stepper.search.strategy
-    assert strategy.numbers[SIGMA] != 0.2
+    assert strategy.sigma[0] != 0.2
     elite = int(stepper.elites[stepper.iteration] * len(stepper.archive.occupied))
     before = bytes_of(stepper.archive)
     stepper.step(NAN)
     assert bytes_of(stepper.archive) == before
     np.testing.assert_array_equal(center(stepper.search), stepper.archive.solutions[elite])
-    assert strategy.numbers[SIGMA] == 0.2
-    assert strategy.numbers[EVALUATIONS] == 0
+    assert strategy.sigma[0] == 0.2
+    assert strategy.evaluations[0] == 0
     np.testing.assert_array_equal(strategy.covariance, np.eye(len(strategy.mean)))
     if name == "cma_mega":
         np.testing.assert_array_equal(strategy.mean, np.zeros(3))
@@ -227,11 +234,11 @@ def test_a_degenerate_strategy_restarts_although_it_improved(name: str, degenera
     if degenerate == "covariance":
         strategy.eigenvalues[0] = 1e-20
     else:
-        strategy.numbers[SIGMA] = 1e-13
+        strategy.sigma[0] = 1e-13
     stepper.step(QUADRATIC)
     assert len(stepper.archive.occupied) > 0
-    assert strategy.numbers[EVALUATIONS] == 0
-    assert strategy.numbers[SIGMA] == 0.2
+    assert strategy.evaluations[0] == 0
+    assert strategy.sigma[0] == 0.2
     assert (stepper.archive.solutions == center(stepper.search)).all(axis=1).any()
 
 
@@ -239,9 +246,9 @@ def test_a_degenerate_strategy_restarts_although_it_improved(name: str, degenera
 def test_vectors_that_are_not_finite_are_not_evaluated(name: str) -> None:
     stepper = Stepper(name)
     stepper.step(QUADRATIC)
-    stepper.search.strategy.numbers[SIGMA] = np.inf
+    stepper.search.strategy.sigma[0] = np.inf
     stepper.step(QUADRATIC)  # a landscape raises where it is asked for such a vector
-    assert stepper.search.strategy.numbers[SIGMA] == 0.2
+    assert stepper.search.strategy.sigma[0] == 0.2
     assert np.isfinite(center(stepper.search)).all()
     assert np.isfinite(stepper.archive.solutions).all()
 
@@ -252,7 +259,7 @@ def test_on_a_flat_cost_it_restarts_as_soon_as_all_rank_alike(name: str) -> None
     restarts = 0
     for _ in range(30):
         stepper.step(FLAT)
-        restarts += int(stepper.search.strategy.numbers[EVALUATIONS] == 0)
+        restarts += int(stepper.search.strategy.evaluations[0] == 0)
     assert restarts > 5
     np.testing.assert_array_equal(stepper.archive.costs, 1.0)
 
