@@ -14,8 +14,8 @@ from chsel.problem.points import Lattice, Workspace
 from chsel.problem.poses import SENSOR_TOLERANCE, check_rigid
 from chsel.sensing.depth_camera import PinholeCamera
 from chsel.sensing.ray_kernels import (
+    MarkedVoxels,
     RayImage,
-    VoxelGrid,
     mark_image,
     mark_points,
     mark_segments,
@@ -61,7 +61,7 @@ class FreeGrid:
         self._words = np.zeros(-(-voxels // 8), dtype=np.uint64)
         marks = self._words.view(np.uint8)[:voxels]  # in the current view
         self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views, then _REPORTED
-        self._grid = VoxelGrid(marks, self.shape, np.array(workspace.lower), float(spacing))
+        self._grid = MarkedVoxels(marks, self.shape, np.array(workspace.lower), float(spacing))
 
     def along_rays(self, origin: Any, ends: Any) -> int:
         """One view: mark what segments from origin (3,) or (N, 3) to ends (N, 3) pass, ends too.

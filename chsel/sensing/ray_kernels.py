@@ -15,7 +15,7 @@ _FARTHEST = 2.0**52  # voxels from the first: beyond, neighbours are the same nu
 _SHORTEST = 1e-100  # voxels: shorter moves along an axis count as none
 
 
-class VoxelGrid(NamedTuple):
+class MarkedVoxels(NamedTuple):
     """Marks of V voxels. Threads may mark one grid at once: all they ever do is write ones."""
 
     marks: NDArray[np.uint8]  # (V,) in C order, 1 for a marked voxel

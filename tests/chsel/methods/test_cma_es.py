@@ -143,7 +143,7 @@ def test_tolfunhist_ends_a_run_when_recent_best_costs_are_level() -> None:
 
 def test_tolx_ends_a_run_when_steps_are_small() -> None:
     _, run = stopped_at(SPHERE, tolx=1e-3)
-    deviations = run.strategy.numbers[0] * np.sqrt(np.diag(run.strategy.covariance))
+    deviations = run.strategy.sigma[0] * np.sqrt(np.diag(run.strategy.covariance))
     assert 1e-5 < deviations.max() < 1e-3
 
 

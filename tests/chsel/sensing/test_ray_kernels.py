@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.sensing.ray_kernels import VoxelGrid, mark_segments
+from chsel.sensing.ray_kernels import MarkedVoxels, mark_segments
 
 COUNTS = (5, 4, 3)
 LOWER = np.full(3, 0.5)  # so that voxel k is from k to k + 1
@@ -20,7 +20,7 @@ Voxel = tuple[int, ...]
 
 def marked(a: Place, b: Place) -> set[Voxel]:
     met = np.zeros(COUNTS, dtype=np.uint8)
-    grid = VoxelGrid(met.reshape(-1), COUNTS, LOWER, 1.0)
+    grid = MarkedVoxels(met.reshape(-1), COUNTS, LOWER, 1.0)
     mark_segments(grid, np.array([a]), np.array([b]), 0, 1)
     assert met.max() <= 1
     return {tuple(voxel) for voxel in np.argwhere(met).tolist()}
