@@ -11,11 +11,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -28,12 +26,10 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from chsel.errors import ChselError
 from replay.console import print_error, print_page, print_warning
 from replay.startup import ready
-from runners.arguments import TRACEBACK, hydra_arguments
+from runners.arguments import TRACEBACK
+from runners.choices import CONF, NESTED_GROUPS, choices, prepared
 from runners.command_help import asked_for, help_text
-from runners.presets import store_choices
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
-_NESTED_GROUPS = ("session/rig",)  # choices of their own, not options of the group around them
 _USER_ERRORS = (ChselError, HydraException, OmegaConfBaseException, OSError)
 
 
@@ -57,13 +53,6 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
         return program
 
     return decorate
-
-
-def prepared(config_name: str, words: list[str]) -> list[str]:
-    """The arguments of a command as Hydra takes them, which has all choices to choose from."""
-    store_choices()
-    OmegaConf.register_new_resolver("options", _options, replace=True)
-    return hydra_arguments(config_name, words)
 
 
 def _start(job: _Job) -> None:
@@ -107,29 +96,6 @@ def plain(config: DictConfig) -> dict[str, Any]:
     container = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(container, dict)
     return {str(key): value for key, value in container.items()}
-
-
-def choices(group: str) -> list[str]:
-    """The options of a group: the files of conf/, of nested folders with their path, and more.
-
-    These are what `store_choices` offers, such as methods.
-    """
-    folder = CONF / group
-    nested = [CONF / name for name in _NESTED_GROUPS if name != group]
-    files = [file.relative_to(folder) for file in folder.rglob("*.yaml")]
-    names = [
-        str(file.with_suffix(""))
-        for file in files
-        if not any((folder / file).is_relative_to(other) for other in nested)
-    ]
-    stored = ConfigStore.instance().repo.get(group, {})
-    names += [Path(name).stem for name in stored if name.endswith(".yaml")]
-    return sorted(names, key=lambda name: (name.count("/"), name))
-
-
-def _options(*groups: str) -> str:
-    """What the help texts in conf/ use: ${options:object,session} lists the options of groups."""
-    return "\n".join(f"  {group}={'|'.join(choices(group))}" for group in groups)
 
 
 def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bool) -> None:
@@ -189,7 +155,7 @@ def _unknown_group(config_name: str) -> str | None:
 
 def _group_and_choice(name: str) -> tuple[str, str]:
     """The group that an option GROUP/CHOICE is of; both may have slashes."""
-    for group in _NESTED_GROUPS:
+    for group in NESTED_GROUPS:
         if name.startswith(f"{group}/"):
             return group, name.removeprefix(f"{group}/")
     group, _, choice = name.partition("/")

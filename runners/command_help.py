@@ -24,7 +24,7 @@ def help_text(config_name: str, words: list[str]) -> str:
     from omegaconf import OmegaConf, open_dict
 
     from runners.arguments import is_setting
-    from runners.cli import CONF
+    from runners.choices import CONF
 
     settings = [word for word in words if is_setting(word)]
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -47,7 +47,7 @@ def help_at_once() -> None:
     command = given[given.index("-m") + 1] if "-m" in given else ""
     package, _, name = command.partition(".")
     from replay.console import print_page
-    from runners.cli import CONF, prepared
+    from runners.choices import CONF, prepared
 
     if package != "runners" or not (CONF / f"{name}.yaml").is_file():
         return

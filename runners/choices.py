@@ -1,20 +1,33 @@
-"""What the code knows as choices for Hydra: the same as files in conf/ would be."""
+"""The choices of the commands: the files of conf/, and those that Hydra takes from the code."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 
 from chsel.errors import SettingError
 from chsel.methods import METHODS, preset_settings
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
+from runners.arguments import hydra_arguments
 from runners.sensors.rig import Rig
 from runners.sessions.probing import ProbingSettings
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+NESTED_GROUPS = ("session/rig",)  # choices of their own, not options of the group around them
+
+
+def prepared(config_name: str, words: list[str]) -> list[str]:
+    """The arguments of a command as Hydra takes them, which has all choices to choose from."""
+    store_choices()
+    OmegaConf.register_new_resolver("options", _options, replace=True)
+    return hydra_arguments(config_name, words)
 
 
 def store_choices() -> None:
@@ -52,3 +65,26 @@ def _store_with_presets(
 
 def _store(group: str, name: str, node: dict[str, Any]) -> None:
     ConfigStore.instance().store(group=group, name=name, node=node)
+
+
+def choices(group: str) -> list[str]:
+    """The options of a group: the files of conf/, of nested folders with their path, and more.
+
+    These are what `store_choices` offers, such as methods.
+    """
+    folder = CONF / group
+    nested = [CONF / name for name in NESTED_GROUPS if name != group]
+    files = [file.relative_to(folder) for file in folder.rglob("*.yaml")]
+    names = [
+        str(file.with_suffix(""))
+        for file in files
+        if not any((folder / file).is_relative_to(other) for other in nested)
+    ]
+    stored = ConfigStore.instance().repo.get(group, {})
+    names += [Path(name).stem for name in stored if name.endswith(".yaml")]
+    return sorted(names, key=lambda name: (name.count("/"), name))
+
+
+def _options(*groups: str) -> str:
+    """What the help texts in conf/ use: ${options:object,session} lists the options of groups."""
+    return "\n".join(f"  {group}={'|'.join(choices(group))}" for group in groups)
