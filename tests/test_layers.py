@@ -55,12 +55,12 @@ def imported(file: Path, root: Path) -> Iterator[str]:
             yield from (f"{source}.{alias.name}" for alias in node.names)
 
 
-def import_graph(root: Path) -> dict[str, set[str]]:
-    """The modules of the package chsel in `root`, and those of them that each imports."""
-    modules = {module_name(file, root): file for file in sorted((root / "chsel").rglob("*.py"))}
+def import_graph(root: Path, package: str = "chsel") -> dict[str, set[str]]:
+    """The modules of a package in `root`, and those of them that each imports."""
+    modules = {module_name(file, root): file for file in sorted((root / package).rglob("*.py"))}
     graph: dict[str, set[str]] = {}
     for module, file in modules.items():
-        names = (name for name in imported(file, root) if name.split(".")[0] == "chsel")
+        names = (name for name in imported(file, root) if name.split(".")[0] == package)
         ends = (name if name in modules else name.rpartition(".")[0] for name in names)
         graph[module] = {end for end in ends if end in modules and end != module}
     return graph
@@ -154,8 +154,9 @@ def test_no_folder_of_chsel_imports_one_above_it() -> None:
     assert forbidden_imports(graph) == []
 
 
-def test_no_circle_of_imports_in_chsel() -> None:
-    assert circles(import_graph(REPOSITORY)) == []
+@pytest.mark.parametrize("package", FORBIDDEN)
+def test_no_circle_of_imports(package: str) -> None:
+    assert circles(import_graph(REPOSITORY, package)) == []
 
 
 def test_no_name_of_a_file_or_class_of_chsel_means_two_things() -> None:
