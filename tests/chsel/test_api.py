@@ -294,7 +294,6 @@ def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
         "rotation": torch.eye(3, dtype=torch.float64)[None].requires_grad_(),
         "translation": torch.full((1, 3), 0.01, dtype=torch.float64).requires_grad_(),
         "build_method": build_method,
-        "preset_settings": preset_settings,
         "grid": chsel.SdfGrid.from_mesh(BOX, 0.002),
         "workspace": chsel.Workspace((0.0, -0.2, 0.0), (0.6, 0.4, 0.4)),
         "probes": [chsel.KnownPoints(known=part) for part in np.split(SURFACE, 2)],
