@@ -224,12 +224,7 @@ _BLOCK = 50  # iterations between two calls of the observer
 
 @dataclass(frozen=True)
 class SvgdSettings(CheckedSettings):
-    """All settings of Stein variational gradient descent (Liu and Wang, 2016).
-
-    All presets keep the fixed kernel: by the median heuristic, whose reach is that of the entire
-    set, particles push each other off the object (farther from the true surface on 16 of 17
-    simulated configurations).
-    """
+    """All settings of Stein variational gradient descent (Liu and Wang, 2016)."""
 
     sharpness: Annotated[float, positive] = 5.0  # beta of p = exp(-beta C)
     # "reference" of fixed scale, or "median": the median heuristic, every iteration.

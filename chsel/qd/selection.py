@@ -32,7 +32,7 @@ class ArchiveSettings(CheckedSettings):
     measure: Annotated[str, one_of(*MEASURES)] = "object_xy"  # of chsel.qd.measures
     bins: Annotated[int, positive, at_most(MOST_CELLS)] = 56  # cells per measure
     range_sigmas: Annotated[float, positive] = 3.0  # b_sigma of the paper
-    least_deviation: Annotated[float, positive] = 0.005  # its floor, metres or radians
+    least_deviation: Annotated[float, positive] = 0.005  # floor of the deviation, metres or radians
     # Which of E' are left out of mean and deviation: "ratio" those above
     # ratio x lowest cost + tolerance, "quantile" those above the 80 % quantile, "none".
     outliers: Annotated[str, one_of("ratio", "quantile", "none")] = "ratio"

@@ -62,17 +62,7 @@ _BLOCK = 10  # iterations between two traces
 
 @dataclass(frozen=True)
 class CvoSettings(CheckedSettings):
-    """All settings of CVO; names as in the authors' parameter file.
-
-    Preset paper: the authors' parameters, no threshold, and the paper's labels of the object's
-    cloud. reference: their parameter file with its threshold, and the labels of their simulation
-    (2 mm on real data); but without the cap of 512 neighbours in the order of their index, which
-    drops 97 % of the kernel, and with the search for a step where they take a root that may lead
-    downhill. default: the same model, made stronger: the flow turns about the workspace's centre,
-    a turn by 1 rad counts as a shift by 0.1 m instead of 1 m, which is nearer to what it does to
-    points of an object, and ell falls from 10 cm to 2.5 cm, as a smooth F is easy to climb and a
-    sharp one shows where contacts are. Each of these ascents has the authors' iterations.
-    """
+    """All settings of CVO; names as in the authors' parameter file."""
 
     free_space: bool = True  # use free points; else contacts and the object's surface alone
     balanced: bool = False  # weigh contacts by the number of free points per contact
