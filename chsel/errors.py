@@ -86,6 +86,12 @@ def require_at_most(name: str, value: float, most: float) -> None:
         raise SettingError(f"{name} is {value!r}; accepted: at most {most:_}")
 
 
+def require_between(name: str, value: float, low: float, high: float) -> None:
+    """Raise SettingError unless `value` is a length from `low` to `high`, metres."""
+    if not low <= value <= high:
+        raise SettingError(f"{name} is {value}; accepted: {low:g} to {high:g} (m)")
+
+
 def require_positive(name: str, value: float, *, zero: bool = False) -> None:
     """Raise SettingError unless `value` is a finite number above zero (or at zero, if `zero`)."""
     finite = isinstance(value, int | float) and value == value and abs(value) != float("inf")

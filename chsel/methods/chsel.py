@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
-from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.methods.method import ConfiguredMethod
@@ -24,7 +23,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, one_of, positive
 from chsel.problem.streams import Purpose, normals
 from chsel.qd.archive import GridArchive, evaluated
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
@@ -44,11 +43,11 @@ _BEST = 0.2  # of the estimates: those that the next pass starts around
 
 
 @dataclass(frozen=True)
-class ChselSettings:
+class ChselSettings(CheckedSettings):
     """All settings of CHSEL."""
 
-    search: str = "cma_mega"  # or "cma_me"
-    passes: int = 1  # of Algorithm 1, each from a Gaussian around the best of the one before
+    search: Annotated[str, one_of(*SEARCHES)] = "cma_mega"
+    passes: Annotated[int, positive, at_most(MOST_PASSES)] = 1  # each around the best of the last
     cost: CostSettings = field(default_factory=CostSettings)
     descent: DescentSettings = field(default_factory=DescentSettings)
     archive: ArchiveSettings = field(default_factory=ArchiveSettings)
@@ -61,9 +60,7 @@ class ChselSettings:
     presets: ClassVar[Presets] = {"paper": {"starts": None}, "reference": {"starts": None}}
 
     def __post_init__(self) -> None:
-        require_choice("search", self.search, SEARCHES)
-        require_positive("passes", self.passes)
-        require_at_most("passes", self.passes, MOST_PASSES)
+        super().__post_init__()
         measure_named(self.archive.measure, planar=self.plane is not None)
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
-from chsel.errors import SettingError, require_at_most, require_positive
+from chsel.errors import SettingError, require_at_most
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import OnlineSettings
@@ -22,19 +22,20 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, positive
 from chsel.qd.selection import ranked_hypotheses
 
 MOST_ITERATIONS = 1_000_000
 
 
 @dataclass(frozen=True)
-class DescentSettings:
+class DescentSettings(CheckedSettings):
     """Adam on all starts at once."""
 
-    restarts: int = 10  # blocks; Adam starts anew in each, rotations are made orthonormal again
-    iterations: int = 50  # of a block
-    rate: float = 0.01  # Adam's step size
+    # Blocks; Adam starts anew in each, rotations are made orthonormal again.
+    restarts: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 10
+    iterations: Annotated[int, positive, at_most(MOST_ITERATIONS)] = 50  # of a block
+    rate: Annotated[float, positive] = 0.01  # Adam's step size
     # End when a block lowers the costs by no more than this fraction on average over the starts;
     # None: never end early.
     stop_below: float | None = 1e-6
@@ -42,12 +43,8 @@ class DescentSettings:
     presets: ClassVar[Presets] = {"paper": {"stop_below": None}, "reference": {}}
 
     def __post_init__(self) -> None:
-        require_positive("restarts", self.restarts, zero=True)
-        require_positive("iterations", self.iterations)
-        for name in ("restarts", "iterations"):
-            require_at_most(name, getattr(self, name), MOST_ITERATIONS)
+        super().__post_init__()
         require_at_most("restarts x iterations", self.restarts * self.iterations, MOST_ITERATIONS)
-        require_positive("rate", self.rate)
         if self.stop_below is not None and not np.isfinite(self.stop_below):
             raise SettingError(f"stop_below is {self.stop_below}; accepted: a number, or null")
 

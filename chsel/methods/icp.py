@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel.errors import SettingError, require_at_most, require_choice, require_positive
+from chsel.errors import SettingError
+from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
@@ -22,7 +23,7 @@ from chsel.problem.registration_problem import (
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
 from chsel.qd.selection import ranked
@@ -35,17 +36,13 @@ _NO_SPREAD = 1e-20  # and so do those this much apart, m^2: points that differ b
 
 
 @dataclass(frozen=True)
-class IcpSettings:
-    """All settings of ICP.
+class IcpSettings(CheckedSettings):
+    """All settings of ICP."""
 
-    The paper's surface points are redrawn, those of its authors' code are not. Ours stay for a
-    session, so that a change of the result comes from a new contact and not from new points; on
-    51 simulated sessions neither choice came out ahead.
-    """
-
-    surface_points: int = 500  # Q, how many points stand for the object's surface
-    redraw: str = "session"  # new points for every "registration", or the same for a session
-    iterations: int = 100  # at most
+    surface_points: Annotated[int, positive, at_most(MOST_POINTS)] = 500  # Q, of the object
+    # New points for every "registration", or the same for a session.
+    redraw: Annotated[str, one_of("registration", "session")] = "session"
+    iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 100  # at most
     # End when the rms distance of no start falls by more than this fraction; None: never early.
     stop_below: float | None = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
@@ -53,18 +50,14 @@ class IcpSettings:
     presets: ClassVar[Presets] = {"paper": {"redraw": "registration"}}
 
     def __post_init__(self) -> None:
-        require_positive("surface_points", self.surface_points)
-        require_at_most("surface_points", self.surface_points, MOST_POINTS)
-        require_choice("redraw", self.redraw, ("registration", "session"))
-        require_positive("iterations", self.iterations, zero=True)
-        require_at_most("iterations", self.iterations, MOST_ITERATIONS)
+        super().__post_init__()
         if self.stop_below is not None and not 0.0 <= self.stop_below < 1.0:
             raise SettingError(
                 f"stop_below is {self.stop_below}; accepted: from 0 to less than 1, or null"
             )
 
 
-class Icp:
+class Icp(ConfiguredMethod[IcpSettings]):
     """Registers the contacts by point-to-point ICP from every pose of E_0; E_l is not used.
 
     Free and occupied points, and those of a known distance that is not 0, are not used. Costs are
@@ -72,13 +65,7 @@ class Icp:
     compared with those of the relaxed cost. Without any contact E_0 is returned, at cost 0.
     """
 
-    def __init__(self, settings: IcpSettings | None = None) -> None:
-        self.settings = settings or IcpSettings()
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = IcpSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None

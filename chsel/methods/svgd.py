@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import MOST_SLACK, Model, Neighbours, evaluate, neighbours_of
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective, adam_step
-from chsel.errors import require_at_most, require_choice, require_positive
+from chsel.errors import require_at_most
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
@@ -27,7 +27,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.qd.selection import ranked_hypotheses
 
 _LEAST = 1e-8  # of 2 h^2, which keeps gamma finite
@@ -223,33 +223,22 @@ _BLOCK = 50  # iterations between two calls of the observer
 
 
 @dataclass(frozen=True)
-class SvgdSettings:
-    """All settings of Stein variational gradient descent (Liu and Wang, 2016).
+class SvgdSettings(CheckedSettings):
+    """All settings of Stein variational gradient descent (Liu and Wang, 2016)."""
 
-    All presets keep the fixed kernel: by the median heuristic, whose reach is that of the entire
-    set, particles push each other off the object (farther from the true surface on 16 of 17
-    simulated configurations).
-    """
-
-    sharpness: float = 5.0  # beta of p = exp(-beta C)
-    kernel: str = "reference"  # of fixed scale, or "median": the median heuristic, every iteration
+    sharpness: Annotated[float, positive] = 5.0  # beta of p = exp(-beta C)
+    # "reference" of fixed scale, or "median": the median heuristic, every iteration.
+    kernel: Annotated[str, one_of("reference", "median")] = "reference"
     # h of k(a, b) = exp(-|a - b|^2 / (2 h^2)) of search vectors; of the median heuristic where
     # there is no pair.
-    scale: float = 0.01
-    iterations: int = 300
-    rate: float = 0.005  # of Adam
+    scale: Annotated[float, positive] = 0.01
+    iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 300
+    rate: Annotated[float, positive] = 0.005  # of Adam
     cost: CostSettings = field(default_factory=CostSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
     presets: ClassVar[Presets] = {}  # those of its groups
-
-    def __post_init__(self) -> None:
-        require_choice("kernel", self.kernel, ("reference", "median"))
-        for name in ("sharpness", "scale", "rate"):
-            require_positive(name, getattr(self, name))
-        require_positive("iterations", self.iterations, zero=True)
-        require_at_most("iterations", self.iterations, MOST_ITERATIONS)
 
 
 class Svgd(ConfiguredMethod[SvgdSettings]):

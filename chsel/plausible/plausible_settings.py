@@ -5,13 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
-from chsel.errors import SettingError, require_at_most, require_choice, require_positive
+from chsel.errors import SettingError, require_at_most, require_choice
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
-from chsel.problem.settings import settings_mapping
+from chsel.problem.settings import (
+    CheckedSettings,
+    at_most,
+    not_negative,
+    one_of,
+    positive,
+    settings_mapping,
+)
 from chsel.problem.streams import StreamKey
 
 DEFINITIONS = ("default", "paper", "reference", "wide_means", "wide_means_10mm", "wide_sums")
@@ -22,22 +30,17 @@ Axis = tuple[tuple[float, float, int], ...]
 
 
 @dataclass(frozen=True)
-class EvaluationCostSettings:
+class EvaluationCostSettings(CheckedSettings):
     """Settings of the cost C that only evaluation uses (CHSEL, Eq. 2)."""
 
-    combine: str = "means"  # "sums" over points (the paper), "means" over each class (its code)
-    violation: float = 1e5  # c_max, of a free or occupied point on the wrong side
-    tolerance: float = 0.01  # metres that a point may be on the wrong side; 0 in the paper
+    # "sums" over points (the paper), "means" over each class (its code).
+    combine: Annotated[str, one_of("means", "sums")] = "means"
+    violation: Annotated[float, positive] = 1e5  # c_max, of a point on the wrong side
+    # Metres that a point may be on the wrong side; 0 in the paper.
+    tolerance: Annotated[float, not_negative] = 0.01
     occupied: bool = True  # whether occupied points count
-    lookup: str = "nearest"  # how the SDF grid is read, see SdfGrid.query
-    outside: str = "surface_point"
-
-    def __post_init__(self) -> None:
-        require_choice("combine", self.combine, ("means", "sums"))
-        require_positive("violation", self.violation)
-        require_positive("tolerance", self.tolerance, zero=True)
-        require_choice("lookup", self.lookup, LOOKUPS)
-        require_choice("outside", self.outside, OUTSIDE)
+    lookup: Annotated[str, one_of(*LOOKUPS)] = "nearest"  # how the SDF is read, see SdfGrid.query
+    outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
 
 
 @dataclass(frozen=True)
@@ -73,21 +76,19 @@ class Offsets:
 
 
 @dataclass(frozen=True)
-class PoseGridSettings:
+class PoseGridSettings(CheckedSettings):
     """The poses that are scanned: positions around the true one, each with every rotation."""
 
     offsets: Offsets = field(default_factory=Offsets)  # of the positions
-    rotations: int = 10_000  # uniform on SO(3), absolute
-    upright: int = 100  # yaws of the object's frame on the world's, evenly spaced
-    extra: str = "added"  # upright and true rotation besides, or "replaced": in place of the first
+    rotations: Annotated[int, positive, at_most(MOST_ROTATIONS)] = 10_000  # uniform on SO(3)
+    # Yaws of the object's frame on the world's, evenly spaced.
+    upright: Annotated[int, not_negative, at_most(MOST_ROTATIONS)] = 100
+    # The upright and the true rotation: "added", "replaced" (in place of the first), or "none".
+    extra: Annotated[str, one_of("added", "replaced", "none")] = "added"
     seed: int | None = None  # of the rotations; by default that of the session
 
     def __post_init__(self) -> None:
-        require_positive("rotations", self.rotations)
-        require_at_most("rotations", self.rotations, MOST_ROTATIONS)
-        require_positive("upright", self.upright, zero=True)
-        require_at_most("upright", self.upright, MOST_ROTATIONS)
-        require_choice("extra", self.extra, ("added", "replaced", "none"))
+        super().__post_init__()
         if self.extra == "replaced" and self.rotations <= self.upright:
             raise SettingError(
                 f"rotations is {self.rotations}; accepted: more than the {self.upright} upright "
@@ -98,45 +99,39 @@ class PoseGridSettings:
 
 
 @dataclass(frozen=True)
-class ModeSearchSettings:
+class ModeSearchSettings(CheckedSettings):
     """How members are sought in modes between the poses of the grid, see chsel.plausible.off_grid.
 
     Poses of the grid climb if their mean over known points is less than `distance` above the true
-    pose's, and few points are deeper than `depth` on the wrong side, metres both.
+    pose's, and few points are deeper than `depth` on the wrong side.
     """
 
-    starts: int = 1000  # poses that climb, at most
-    distance: float = 0.01
-    depth: float = 0.02
-    separation: float = 0.01  # m, root mean square, of a new mode's surface from all other members'
-
-    def __post_init__(self) -> None:
-        require_positive("starts", self.starts)
-        require_at_most("starts", self.starts, MOST_STARTS)
-        for name in ("distance", "depth", "separation"):
-            require_positive(name, getattr(self, name))
+    starts: Annotated[int, positive, at_most(MOST_STARTS)] = 1000  # poses that climb, at most
+    distance: Annotated[float, positive] = 0.01  # metres
+    depth: Annotated[float, positive] = 0.02  # metres
+    # Root mean square, of a new mode's surface from all other members', metres.
+    separation: Annotated[float, positive] = 0.01
 
 
 @dataclass(frozen=True)
-class PlausibleSettings:
+class PlausibleSettings(CheckedSettings):
     """The plausible set P_eps = {X : C(X) < C(X*) + eps} (CHSEL, Sec. III and V).
 
     Without rescan, steps after the first look only at the members of the one before, which is
     exact only where C cannot fall as points are added, as with sums.
     """
 
-    epsilon: float = 0.001  # eps, metres
+    epsilon: Annotated[float, positive] = 0.001  # eps, metres
     cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)  # C
     grid: PoseGridSettings = field(default_factory=PoseGridSettings)  # of poses X
-    members: int = 1000  # kept for evaluation at most, a random subset
-    fill_to: int = 30  # with fewer members on the grid, others are sought around them; 0: never
+    members: Annotated[int, positive] = 1000  # kept for evaluation at most, a random subset
+    # With fewer members on the grid, others are sought around them; 0: never.
+    fill_to: Annotated[int, not_negative] = 30
     rescan: bool = True  # look at all poses at every step
     modes: ModeSearchSettings | None = None  # how to look for members far from all on the grid
 
     def __post_init__(self) -> None:
-        require_positive("epsilon", self.epsilon)
-        require_positive("members", self.members)
-        require_positive("fill_to", self.fill_to, zero=True)
+        super().__post_init__()
         if self.fill_to > self.members:
             raise SettingError(f"fill_to is {self.fill_to}; accepted: at most members")
 

@@ -9,11 +9,11 @@ surface; one-directional, s the distance to the mesh (CHSEL, Sec. V).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
-from chsel.errors import PoseError, SettingError, require_at_most, require_choice, require_positive
+from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled
@@ -27,6 +27,7 @@ from chsel.problem.sdf_lookup import (
     distance_field,
     distance_in_box,
 )
+from chsel.problem.settings import CheckedSettings, at_most, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 
 if TYPE_CHECKING:
@@ -40,22 +41,15 @@ _MOST_POINTS = 1_000_000
 
 
 @dataclass(frozen=True)
-class DistanceSettings:
-    """How distances are measured.
+class DistanceSettings(CheckedSettings):
+    """How distances are measured."""
 
-    "exact" measures to the mesh for every pair of poses; "nearest" only for the few pairs that the
-    interpolated SDF grid says are the nearest, which are all that the metrics read, and is 10 to
-    100 times faster; "grid" never.
-    """
-
-    points: int = 500  # Q, 200 in the paper
-    method: str = "nearest"
+    points: Annotated[int, positive, at_most(_MOST_POINTS)] = 500  # Q, 200 in the paper
+    # "exact" measures to the mesh for every pair of poses; "nearest" only for the few pairs that
+    # the interpolated SDF grid says are the nearest, which are all that the metrics read, and is
+    # 10 to 100 times faster; "grid" never.
+    method: Annotated[str, one_of(*METHODS)] = "nearest"
     bidirectional: bool = False  # the mean of d and of d with the roles of the poses swapped
-
-    def __post_init__(self) -> None:
-        require_positive("points", self.points)
-        require_at_most("points", self.points, _MOST_POINTS)
-        require_choice("method", self.method, METHODS)
 
 
 class SurfaceDistance:

@@ -7,16 +7,18 @@ of least evaluation cost near a guess is T*; the plausible set is then made arou
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
-from chsel.errors import PoseError, SettingError, require_at_most, require_positive
+from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray, frozen
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import MOST_ROTATIONS, EvaluationCostSettings, Offsets
 from chsel.plausible.pose_scan import PoseGrid, scan_grid
 from chsel.problem.poses import inverse, nearest_rigid, product, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.settings import CheckedSettings, at_most, positive
 from chsel.problem.streams import Purpose, normals
 
 _FIRST_LOOK = 4000  # poses that show which costs are worth looking for
@@ -24,25 +26,22 @@ _STREAM = 100  # of the plausible rotations' streams, and those after it
 
 
 @dataclass(frozen=True)
-class TruePoseSettings:
+class TruePoseSettings(CheckedSettings):
     """The poses to look at around the guess.
 
     Each pass after the first looks around the best pose so far, with a reach of one spacing, and
     spacing and angle scaled alike.
     """
 
-    reach: float = 0.08  # metres to either side of the guess, along each axis
-    spacing: float = 0.01  # metres between positions
-    rotations: int = 2000  # turned from the guess at random, the guess's own besides
-    angle: float = 0.02  # radians, standard deviation of their rotation vectors
-    passes: int = 2
+    reach: Annotated[float, positive] = 0.08  # along each axis, metres to either side of the guess
+    spacing: Annotated[float, positive] = 0.01  # metres between positions
+    rotations: Annotated[int, positive, at_most(MOST_ROTATIONS)] = 2000  # beside the guess's
+    angle: Annotated[float, positive] = 0.02  # standard deviation of these rotations, radians
+    passes: Annotated[int, positive, at_most(10)] = 2
     cost: EvaluationCostSettings = field(default_factory=EvaluationCostSettings)
 
     def __post_init__(self) -> None:
-        for name in ("reach", "spacing", "rotations", "angle", "passes"):
-            require_positive(name, getattr(self, name))
-        require_at_most("rotations", self.rotations, MOST_ROTATIONS)
-        require_at_most("passes", self.passes, 10)
+        super().__post_init__()
         if self.reach / self.spacing > 20.0:
             raise SettingError(
                 f"spacing is {self.spacing} with reach {self.reach}; accepted: at least a "

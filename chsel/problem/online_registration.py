@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel.errors import PoseError, require_at_most, require_choice, require_positive
+from chsel.errors import PoseError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import GrowingPoints, KnownPoints, Workspace
 from chsel.problem.poses import (
@@ -21,7 +21,7 @@ from chsel.problem.poses import (
 )
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 
 MOST_HYPOTHESES = 1_000_000
@@ -29,42 +29,28 @@ _CENTROID_SPREAD = 0.05
 
 
 @dataclass(frozen=True)
-class OnlineSettings:
-    """How the sets of a registration follow from the previous one.
+class OnlineSettings(CheckedSettings):
+    """How the sets of a registration follow from the previous one."""
 
-    hypotheses: B. initial: first E_0: "so3" uniform in workspace and SO(3), "upright" with yaw
-    alone, "origin" upright at the world's origin, "contact_centroid" upright within 5 cm of the
-    mean contact (uniform in the workspace while there is none). translation_noise: sigma_t,
-    metres. rotation_noise: sigma_R, radians. rotation_law: "axis_gauss" a uniform axis and a
-    Gaussian angle, "rotvec_gauss" a Gaussian rotation vector. keep_best: the first of E_0 is the
-    best pose itself. low_cost_set: E_l is "elites" of the whole archive, the "estimates" alone,
-    or "none". update: the next E_0 is "noise" around the best pose, or each of the "own" poses.
-    """
-
-    hypotheses: int = 30
-    initial: str = "so3"
-    translation_noise: float = 0.05
-    rotation_noise: float = 0.3
-    rotation_law: str = "rotvec_gauss"
-    keep_best: bool = True
-    low_cost_set: str = "elites"
-    update: str = "noise"
+    hypotheses: Annotated[int, positive, at_most(MOST_HYPOTHESES)] = 30  # B
+    # First E_0: "so3" uniform in workspace and SO(3), "upright" with yaw alone, "origin" upright at
+    # the world's origin, "contact_centroid" upright within 5 cm of the mean contact (uniform in the
+    # workspace while there is none).
+    initial: Annotated[str, one_of("so3", "upright", "origin", "contact_centroid")] = "so3"
+    translation_noise: Annotated[float, not_negative] = 0.05  # sigma_t, metres
+    rotation_noise: Annotated[float, not_negative] = 0.3  # sigma_R, radians
+    # "axis_gauss" a uniform axis and a Gaussian angle, "rotvec_gauss" a Gaussian rotation vector.
+    rotation_law: Annotated[str, one_of("axis_gauss", "rotvec_gauss")] = "rotvec_gauss"
+    keep_best: bool = True  # the first of E_0 is the best pose itself
+    # E_l: "elites" of the whole archive, the "estimates" alone, or "none".
+    low_cost_set: Annotated[str, one_of("elites", "estimates", "none")] = "elites"
+    # The next E_0: "noise" around the best pose, or each of the "own" poses.
+    update: Annotated[str, one_of("noise", "own")] = "noise"
 
     presets: ClassVar[Presets] = {
         "paper": {"rotation_law": "axis_gauss", "keep_best": False},
         "reference": {"initial": "upright"},
     }
-
-    def __post_init__(self) -> None:
-        require_positive("hypotheses", self.hypotheses)
-        require_at_most("hypotheses", self.hypotheses, MOST_HYPOTHESES)
-        choices = ("so3", "upright", "origin", "contact_centroid")
-        require_choice("initial", self.initial, choices)
-        require_choice("rotation_law", self.rotation_law, ("axis_gauss", "rotvec_gauss"))
-        require_choice("low_cost_set", self.low_cost_set, ("elites", "estimates", "none"))
-        require_choice("update", self.update, ("noise", "own"))
-        require_positive("translation_noise", self.translation_noise, zero=True)
-        require_positive("rotation_noise", self.rotation_noise, zero=True)
 
 
 def pose_problem(

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from chsel.errors import PoseError, SettingError, require_positive
+from chsel.errors import PoseError, SettingError, require_between, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import check_rigid
@@ -32,11 +32,7 @@ class RegistrationProblem:
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
-        if not FINEST <= self.free_resolution <= COARSEST:
-            raise SettingError(
-                f"free_resolution is {self.free_resolution}; "
-                f"accepted: {FINEST:g} to {COARSEST:g} (m)"
-            )
+        require_between("free_resolution", self.free_resolution, FINEST, COARSEST)
         for name in ("initial_set", "low_cost_set"):
             poses = frozen(name, getattr(self, name), (None, 4, 4), error=PoseError)
             check_rigid(name, poses)

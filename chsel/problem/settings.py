@@ -13,12 +13,13 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from chsel.errors import (
     SettingError,
     quoted,
     require_at_most,
+    require_between,
     require_choice,
     require_positive,
 )
@@ -26,8 +27,6 @@ from chsel.errors import (
 Settings = TypeVar("Settings")
 Presets = Mapping[str, Mapping[str, Any]]
 PRESETS = ("default", "paper", "reference")
-
-
 Check = Callable[[str, Any], None]
 
 
@@ -39,9 +38,9 @@ class CheckedSettings:
     """
 
     def __post_init__(self) -> None:
-        for name, checks in _checks_of(type(self)).items():  # type: ignore[arg-type]
+        for name, (optional, checks) in _checks_of(type(self)).items():  # type: ignore[arg-type]
             value = getattr(self, name)
-            if value is not None:
+            if not (optional and value is None):
                 for check in checks:
                     check(name, value)
 
@@ -61,16 +60,24 @@ def at_most(most: float) -> Check:
     return partial(require_at_most, most=most)
 
 
+def between(low: float, high: float) -> Check:
+    """A length from `low` to `high`, metres."""
+    return partial(require_between, low=low, high=high)
+
+
 def one_of(*accepted: str) -> Check:
     """One of the accepted names."""
     return partial(require_choice, accepted=accepted)
 
 
 @cache
-def _checks_of(cls: type) -> dict[str, tuple[Check, ...]]:
-    hints = typing.get_type_hints(cls, include_extras=True)
-    annotated = {name: hint for name, hint in hints.items() if hasattr(hint, "__metadata__")}
-    return {name: hint.__metadata__ for name, hint in annotated.items()}
+def _checks_of(cls: type) -> dict[str, tuple[bool, tuple[Check, ...]]]:
+    """Whether a field may be None, and its checks, by name."""
+    return {
+        name: (type(None) in typing.get_args(hint.__origin__), hint.__metadata__)
+        for name, hint in typing.get_type_hints(cls, include_extras=True).items()
+        if typing.get_origin(hint) is Annotated
+    }
 
 
 def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) -> Settings:

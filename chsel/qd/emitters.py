@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from chsel.cost.objective import EPSILON, Objective
-from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import Observer
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd import emitter_kernels as kernels
 from chsel.qd.archive import GridArchive, SearchObjective, batch_of
@@ -24,26 +23,20 @@ _MOST_DRAWN = 4_000_000  # normal draws held at once, 8 bytes each
 
 
 @dataclass(frozen=True)
-class EmitterSettings:
+class EmitterSettings(CheckedSettings):
     """Settings of a search."""
 
-    iterations: int = 100  # n_o
-    sigma0: float = 0.005  # first step size, of gradient coefficients or (CMA-ME) vectors
-    rate: float = 0.01  # of the Adam ascent of CMA-MEGA
-    start: str = "best"  # the first solution: "best" of E' and E_l, or "initial", the first of E_0
+    iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 100  # n_o
+    sigma0: Annotated[float, positive] = 0.005  # first step of gradient coefficients or vectors
+    rate: Annotated[float, positive] = 0.01  # of the Adam ascent of CMA-MEGA
+    # The first solution: the best of E' and E_l, or the first of E_0.
+    start: Annotated[str, one_of("best", "initial")] = "best"
     ribs_parity: bool = False  # see chsel.qd.evolution_kernels.Strategy
 
     presets: ClassVar[Presets] = {
         "paper": {"sigma0": 1.0, "rate": 0.05, "start": "initial"},
         "reference": {"sigma0": 1.0, "rate": 0.05, "start": "initial", "ribs_parity": True},
     }
-
-    def __post_init__(self) -> None:
-        require_positive("iterations", self.iterations, zero=True)
-        require_at_most("iterations", self.iterations, MOST_ITERATIONS)
-        require_positive("sigma0", self.sigma0)
-        require_positive("rate", self.rate)
-        require_choice("start", self.start, ("best", "initial"))
 
 
 @dataclass(frozen=True)

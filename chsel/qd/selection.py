@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from chsel.errors import ChselError, require_at_most, require_choice, require_positive
+from chsel.errors import ChselError, require_at_most
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SearchSpace, origin_bounds
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.subset import evenly_spaced, representative_poses
 from chsel.problem.surface import has_surface
 from chsel.qd.archive import Evaluated, GridArchive, SearchObjective
@@ -26,19 +26,19 @@ _MOST_REPRESENTATIVE = 300  # by facility location; more of them are taken evenl
 
 
 @dataclass(frozen=True)
-class ArchiveSettings:
+class ArchiveSettings(CheckedSettings):
     """The grid of the archive: mean +- range_sigmas standard deviations of the measures of E'."""
 
-    measure: str = "object_xy"  # of chsel.qd.measures
-    bins: int = 56  # cells per measure
-    range_sigmas: float = 3.0  # b_sigma of the paper
-    least_deviation: float = 0.005  # floor of the standard deviation, metres or radians
+    measure: Annotated[str, one_of(*MEASURES)] = "object_xy"  # of chsel.qd.measures
+    bins: Annotated[int, positive, at_most(MOST_CELLS)] = 56  # cells per measure
+    range_sigmas: Annotated[float, positive] = 3.0  # b_sigma of the paper
+    least_deviation: Annotated[float, positive] = 0.005  # floor of the deviation, metres or radians
     # Which of E' are left out of mean and deviation: "ratio" those above
     # ratio x lowest cost + tolerance, "quantile" those above the 80 % quantile, "none".
-    outliers: str = "ratio"
-    ratio: float = 5.0
-    tolerance_per_point: float = 1e-3  # tolerance per known point
-    tolerance: float = 1e-6  # its floor
+    outliers: Annotated[str, one_of("ratio", "quantile", "none")] = "ratio"
+    ratio: Annotated[float, positive] = 5.0
+    tolerance_per_point: Annotated[float, not_negative] = 1e-3  # tolerance per known point
+    tolerance: Annotated[float, not_negative] = 1e-6  # its floor
 
     presets: ClassVar[Presets] = {
         "paper": {
@@ -57,38 +57,32 @@ class ArchiveSettings:
     }
 
     def __post_init__(self) -> None:
-        require_choice("outliers", self.outliers, ("ratio", "quantile", "none"))
-        for name in ("bins", "range_sigmas", "least_deviation", "ratio"):
-            require_positive(name, getattr(self, name))
-        for name in ("tolerance_per_point", "tolerance"):
-            require_positive(name, getattr(self, name), zero=True)
-        require_choice("measure", self.measure, MEASURES)
-        require_at_most("bins", self.bins, MOST_CELLS)
+        super().__post_init__()
         count = MEASURES[self.measure].count
         require_at_most(f"bins ** {count}, the number of cells,", self.bins**count, MOST_CELLS)
 
 
 @dataclass(frozen=True)
-class OutputSettings:
+class OutputSettings(CheckedSettings):
     """How hypotheses are chosen from the archive."""
 
     # "lowest" for the lowest costs, "representative" for those below the limit that all others
     # below it are near to; it is "lowest" where no more than wanted are below.
-    choice: str = "representative"
+    choice: Annotated[str, one_of("lowest", "representative")] = "representative"
     # "none" for the cells of lowest cost whatever it is, "ratio" for those below
     # ratio x lowest cost + tolerance, "noise" for those below the larger of ratio x lowest cost
     # and lowest cost + tolerance_per_point x known points + free_tolerance.
-    limit: str = "noise"
-    ratio: float = 1.3
-    tolerance: float = 1e-6
-    tolerance_per_point: float = 5e-4
-    free_tolerance: float = 0.01
+    limit: Annotated[str, one_of("none", "ratio", "noise")] = "noise"
+    ratio: Annotated[float, positive] = 1.3
+    tolerance: Annotated[float, not_negative] = 1e-6
+    tolerance_per_point: Annotated[float, not_negative] = 5e-4
+    free_tolerance: Annotated[float, not_negative] = 0.01
     # What fills a set of too few: "next_best" the next cells, then copies; "resample" copies drawn
     # with replacement; "fewer" nothing.
-    shortage: str = "next_best"
+    shortage: Annotated[str, one_of("next_best", "resample", "fewer")] = "next_best"
     # Metres by which the object's origin may be beside the workspace, as long as any pose is
     # within; None: it may be anywhere.
-    margin: float | None = 0.15
+    margin: Annotated[float | None, not_negative] = 0.15
 
     _OTHERS: ClassVar = {  # of both other presets
         "choice": "lowest",
@@ -101,16 +95,6 @@ class OutputSettings:
         "paper": _OTHERS | {"limit": "none", "shortage": "fewer"},
         "reference": _OTHERS | {"limit": "ratio", "shortage": "resample"},
     }
-
-    def __post_init__(self) -> None:
-        require_choice("choice", self.choice, ("lowest", "representative"))
-        require_choice("limit", self.limit, ("none", "ratio", "noise"))
-        require_choice("shortage", self.shortage, ("next_best", "resample", "fewer"))
-        require_positive("ratio", self.ratio)
-        for name in ("tolerance", "tolerance_per_point", "free_tolerance"):
-            require_positive(name, getattr(self, name), zero=True)
-        if self.margin is not None:
-            require_positive("margin", self.margin, zero=True)
 
 
 def measure_range(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from chsel.cost.interior_points import VoxelGrid
-from chsel.errors import SettingError, require_at_most, require_positive
+from chsel.errors import SettingError
 from chsel.methods.anchored.sampling_kernels import (
     DRAWS,
     Anchors,
@@ -27,6 +27,7 @@ from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE2Space, SearchSpace, origin_bounds
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import farthest_points
 from chsel.problem.surface import has_surface, surface_points
@@ -93,16 +94,15 @@ def _values_and_depths(sdf: SdfGrid) -> tuple[Any, FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True)
-class AnchorSettings:
+class AnchorSettings(CheckedSettings):
     """How poses are drawn: on pairs of contacts, on single ones, or uniform in the workspace."""
 
-    pairs: float = 0.5  # share of poses with two surface points on the line of two contacts
-    contacts: float = 0.4  # share of poses with a surface point on a contact
-    margin: float = 0.15  # metres by which the workspace is widened for the object's origin
+    pairs: Annotated[float, not_negative] = 0.5  # share with two surface points on a pair's line
+    contacts: Annotated[float, not_negative] = 0.4  # share with one surface point on a contact
+    margin: Annotated[float, not_negative] = 0.15  # of the workspace for object origins, metres
 
     def __post_init__(self) -> None:
-        for name in ("pairs", "contacts", "margin"):
-            require_positive(name, getattr(self, name), zero=True)
+        super().__post_init__()
         if self.pairs + self.contacts > 1.0:
             raise SettingError(
                 f"pairs and contacts are {self.pairs} and {self.contacts}; accepted: shares whose "
@@ -237,18 +237,12 @@ def _spans(ascending: FloatArray, wanted: FloatArray, reach: FloatArray | float)
 
 
 @dataclass(frozen=True)
-class AnchoredStarts:
+class AnchoredStarts(CheckedSettings):
     """How many poses on contacts CHSEL descends from, beside E_0."""
 
-    samples: int = 10_000  # poses that are drawn
-    kept: int = 30  # those of them that score best
+    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 10_000  # poses that are drawn
+    kept: Annotated[int, positive, at_most(MOST_KEPT)] = 30  # those of them that score best
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
-
-    def __post_init__(self) -> None:
-        require_positive("samples", self.samples)
-        require_positive("kept", self.kept)
-        require_at_most("samples", self.samples, MOST_SAMPLES)
-        require_at_most("kept", self.kept, MOST_KEPT)
 
 
 def anchored_starts(

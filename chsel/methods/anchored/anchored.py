@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from chsel.errors import require_at_most, require_choice, require_positive
+from chsel.errors import require_at_most
 from chsel.methods.anchored.anchor_sampling import (
     AnchorSettings,
     anchored_poses,
@@ -25,6 +25,7 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
 from chsel.problem.subset import evenly_spaced, farthest_poses
 from chsel.qd.archive import evaluated
 from chsel.qd.measures import measure_named
@@ -48,38 +49,27 @@ _ONLINE = OnlineSettings(update="own")
 
 
 @dataclass(frozen=True)
-class Effort:
+class Effort(CheckedSettings):
     """How much is computed."""
 
-    samples: int = 60_000  # poses drawn
-    kept: int = 200  # of them, the best, which are fitted
-    first_steps: int = 6  # of these fits
-    refined: int = 100  # the better of these, which are fitted further
-    steps: int = 15  # of these fits
-    descents: int = 96  # chains that come down to the limit
-    descent_moves: int = 266
-    chains: int = 96  # chains that spread below the limit
-    moves: int = 300
-    polished: int = 16  # the lowest, which come down as far as they can
-    polish_moves: int = 300
+    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 60_000  # poses drawn
+    kept: Annotated[int, positive, at_most(MOST_POSES)] = 200  # the best of them, which are fitted
+    first_steps: Annotated[int, not_negative, at_most(MOST_MOVES)] = 6  # of these fits
+    refined: Annotated[int, positive, at_most(MOST_POSES)] = 100  # of these, fitted further
+    steps: Annotated[int, not_negative, at_most(MOST_MOVES)] = 15  # of these fits
+    descents: Annotated[int, positive, at_most(MOST_POSES)] = 96  # chains that descend to the limit
+    descent_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 266
+    chains: Annotated[int, positive, at_most(MOST_POSES)] = 96  # chains that spread below it
+    moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
+    polished: Annotated[int, not_negative, at_most(MOST_POSES)] = 16  # the lowest, to their minima
+    polish_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
     # How many evaluations may be spent, in rounds of all but the last stage, while the lowest
     # energy is above `enough` noise levels; 0: one round.
-    evaluations: int = 0
-    enough: float = 4.0
+    evaluations: Annotated[int, not_negative, at_most(MOST_SAMPLES)] = 0
+    enough: Annotated[float, positive] = 4.0
 
     def __post_init__(self) -> None:
-        poses = ("kept", "refined", "descents", "chains")
-        moves = ("first_steps", "steps", "descent_moves", "moves", "polish_moves")
-        for name in ("samples", *poses, "enough"):
-            require_positive(name, getattr(self, name))
-        for name in (*moves, "polished", "evaluations"):
-            require_positive(name, getattr(self, name), zero=True)
-        for name in ("samples", "evaluations"):
-            require_at_most(name, getattr(self, name), MOST_SAMPLES)
-        for name in (*poses, "polished"):
-            require_at_most(name, getattr(self, name), MOST_POSES)
-        for name in moves:
-            require_at_most(name, getattr(self, name), MOST_MOVES)
+        super().__post_init__()
         require_at_most("descents x descent_moves", self.descents * self.descent_moves, MOST_WORK)
         require_at_most("polished x polish_moves", self.polished * self.polish_moves, MOST_WORK)
         require_at_most("chains x moves", self.chains * self.moves, MOST_WORK)
@@ -116,35 +106,31 @@ EFFORTS = {
 
 
 @dataclass(frozen=True)
-class AnchoredSettings:
+class AnchoredSettings(CheckedSettings):
     """All settings of the contact-anchored search, the same in all presets.
 
     The method is neither in the paper nor in its authors' code.
     """
 
-    size: str = "medium"  # an effort, of EFFORTS
-    effort: Effort | None = None  # another one in its place
-    noise: float = 0.0005  # standard deviation of known points, metres: a noise level
-    penetration_tolerance: float = 0.0  # tau, the depth that free points may have, metres
+    size: Annotated[str, one_of(*EFFORTS)] = "medium"
+    effort: Effort | None = None  # in place of the one that `size` names
+    noise: Annotated[float, positive] = 0.0005  # "noise level", sigma of known points, metres
+    penetration_tolerance: Annotated[float, not_negative] = 0.0  # tau, of free points, metres
     # Most candidates have energies below the larger of limit_noise noise levels, and
     # limit_ratio x lowest energy + limit_slack noise levels.
-    limit_noise: float = 1.0
-    limit_ratio: float = 1.3
-    limit_slack: float = 0.5
-    outer_share: float = 0.25  # of the chains, whose limit is outer_noise noise levels higher
-    outer_noise: float = 1.0
+    limit_noise: Annotated[float, not_negative] = 1.0
+    limit_ratio: Annotated[float, not_negative] = 1.3
+    limit_slack: Annotated[float, not_negative] = 0.5
+    # Share of the chains whose limit is outer_noise noise levels higher.
+    outer_share: Annotated[float, not_negative, at_most(1.0)] = 0.25
+    outer_noise: Annotated[float, not_negative] = 1.0
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
     archive: ArchiveSettings = _ARCHIVE
     online: OnlineSettings = _ONLINE
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
     def __post_init__(self) -> None:
-        require_choice("size", self.size, EFFORTS)
-        require_positive("noise", self.noise)
-        limits = ("limit_noise", "limit_ratio", "limit_slack", "outer_share", "outer_noise")
-        for name in ("penetration_tolerance", *limits):
-            require_positive(name, getattr(self, name), zero=True)
-        require_at_most("outer_share", self.outer_share, 1.0)
+        super().__post_init__()
         measure_named(self.archive.measure, planar=self.plane is not None)
 
 

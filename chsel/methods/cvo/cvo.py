@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from chsel.errors import SettingError, require_at_most, require_choice, require_positive
+from chsel.errors import SettingError
 from chsel.methods.cvo.cvo_kernels import (
     STEPS,
     Ascent,
@@ -31,6 +31,7 @@ from chsel.methods.cvo.rkhs_fields import (
     full_cubes,
     surface_field,
 )
+from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import require_ieee_arithmetic, spread
@@ -43,7 +44,15 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.sdf_grid import COARSEST, FINEST
-from chsel.problem.settings import Presets
+from chsel.problem.settings import (
+    CheckedSettings,
+    Presets,
+    at_most,
+    between,
+    not_negative,
+    one_of,
+    positive,
+)
 from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000
@@ -52,44 +61,35 @@ _BLOCK = 10  # iterations between two traces
 
 
 @dataclass(frozen=True)
-class CvoSettings:
-    """All settings of CVO; names as in the authors' parameter file.
-
-    Preset paper: the authors' parameters, no threshold, and the paper's labels of the object's
-    cloud. reference: their parameter file with its threshold, and the labels of their simulation
-    (2 mm on real data); but without the cap of 512 neighbours in the order of their index, which
-    drops 97 % of the kernel, and with the search for a step where they take a root that may lead
-    downhill. default: the same model, made stronger: the flow turns about the workspace's centre,
-    a turn by 1 rad counts as a shift by 0.1 m instead of 1 m, which is nearer to what it does to
-    points of an object, and ell falls from 10 cm to 2.5 cm, as a smooth F is easy to climb and a
-    sharp one shows where contacts are. Each of these ascents has the authors' iterations.
-    """
+class CvoSettings(CheckedSettings):
+    """All settings of CVO; names as in the authors' parameter file."""
 
     free_space: bool = True  # use free points; else contacts and the object's surface alone
     balanced: bool = False  # weigh contacts by the number of free points per contact
     # Length scale of the kernel, metres. After an ascent it is multiplied by ell_decay and another
     # ascent follows, as long as it is above ell_min.
-    ell: float = 0.1
-    ell_min: float = 0.025
-    ell_decay: float = 0.5
+    ell: Annotated[float, positive, between(FINEST, COARSEST)] = 0.1
+    ell_min: Annotated[float, positive, between(FINEST, COARSEST)] = 0.025
+    ell_decay: Annotated[float, positive] = 0.5
     # Amplitudes of the kernels of places and of equal labels; unequal labels have a kernel of 0.
-    sigma: float = 0.1
-    s_sigma: float = 0.8
-    sp_thres: float = 0.0  # a product of the kernels that is not above it counts as 0; 0: none does
+    sigma: Annotated[float, positive] = 0.1
+    s_sigma: Annotated[float, positive] = 0.8
+    sp_thres: Annotated[float, not_negative] = 0.0  # products of kernels up to it count as 0
     # Nodes of the SDF within it of the surface make the object's surface, those farther outside its
     # free space, metres; null: the SDF's resolution (r_t).
-    surface_band: float | None = None
+    surface_band: Annotated[float | None, positive] = None
     # Divisors of the rotational and the translational part of the flow, so that a turn by 1 rad
     # counts as a shift by sqrt(c / d) m.
-    c: float = 0.07
-    d: float = 7.0
-    origin: str = "workspace"  # the flow turns about its centre, or the "world" origin as published
-    max_iterations: int = 100  # of an ascent
-    min_step: float = 1e-4  # the least and
-    max_step: float = 0.8  # the greatest length of a step that is tried first
+    c: Annotated[float, positive] = 0.07
+    d: Annotated[float, positive] = 7.0
+    # The flow turns about the workspace's centre, or the "world" origin as published.
+    origin: Annotated[str, one_of("world", "workspace")] = "workspace"
+    max_iterations: Annotated[int, positive, at_most(MOST_ITERATIONS)] = 100  # of an ascent
+    min_step: Annotated[float, positive] = 1e-4  # the least and
+    max_step: Annotated[float, positive] = 0.8  # the greatest length of a step that is tried first
     # A start ends when its inner product grew by no more than this fraction in 5 iterations in a
     # row; null: never.
-    stop_below: float | None = 1e-6
+    stop_below: Annotated[float | None, not_negative] = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
     _AUTHORS: ClassVar = {"ell_min": 0.1, "c": 7.0, "origin": "world", "stop_below": None}
@@ -104,19 +104,7 @@ class CvoSettings:
     }
 
     def __post_init__(self) -> None:
-        scales = "ell", "ell_min", "ell_decay", "sigma", "s_sigma", "c", "d"
-        for name in (*scales, "max_iterations", "min_step", "max_step"):
-            require_positive(name, getattr(self, name))
-        for name in ("ell", "ell_min"):
-            if not FINEST <= getattr(self, name) <= COARSEST:
-                raise SettingError(
-                    f"{name} is {getattr(self, name)}; accepted: {FINEST:g} to {COARSEST:g} (m)"
-                )
-        require_at_most("max_iterations", self.max_iterations, MOST_ITERATIONS)
-        require_choice("origin", self.origin, ("world", "workspace"))
-        if self.surface_band is not None:
-            require_positive("surface_band", self.surface_band)
-        require_positive("sp_thres", self.sp_thres, zero=True)
+        super().__post_init__()
         if not self.sp_thres < self.amplitude:
             raise SettingError(
                 f"sp_thres is {self.sp_thres}; accepted: below sigma^2 s_sigma^2 = {self.amplitude}"
@@ -133,8 +121,6 @@ class CvoSettings:
                 f"ell {self.ell}, ell_decay {self.ell_decay} and ell_min {self.ell_min} make more "
                 f"than {MOST_LEVELS} ascents; accepted: at most {MOST_LEVELS}"
             )
-        if self.stop_below is not None:
-            require_positive("stop_below", self.stop_below, zero=True)
 
     @property
     def amplitude(self) -> float:
@@ -168,7 +154,7 @@ class _Clouds:
         return 1.0 - values / self.norm if self.norm > 0.0 else np.ones(len(values))
 
 
-class Cvo:
+class Cvo(ConfiguredMethod[CvoSettings]):
     """Climbs the inner product of two clouds from every pose of E_0; E_l is not used.
 
     The observed cloud x: free points, and contacts; the object's z: nodes of the SDF grid within
@@ -180,13 +166,7 @@ class Cvo:
     the costs at the ell of its ascent.
     """
 
-    def __init__(self, settings: CvoSettings | None = None) -> None:
-        self.settings = settings or CvoSettings()
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = CvoSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None

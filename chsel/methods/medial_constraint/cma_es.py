@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.medial_constraint.medial_cost import MedialCost
 from chsel.methods.medial_constraint.medial_kernels import cost_of
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -17,7 +16,7 @@ from chsel.numerics.elementary import logs
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Observer
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import all_finite, rank
 from chsel.qd.evolution_kernels import Strategy, ask, strategy_around, tell
@@ -49,43 +48,30 @@ class StopRules(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CmaEsSettings:
+class CmaEsSettings(CheckedSettings):
     """Settings of CMA-ES; the stop rules are those of pycma, by its names."""
 
     # "per_start" a run from each of E_0, of which each gives the best pose that it met; "single"
     # one run from the first of E_0, whose last distribution gives all poses.
-    starts: str = "per_start"
+    starts: Annotated[str, one_of("per_start", "single")] = "per_start"
     # Samples of a generation; by default 4 + floor(3 ln d) in d dimensions, for a single run at
     # least as many as there are hypotheses.
-    population: int | None = None
+    population: Annotated[int | None, positive, at_most(MOST_SAMPLES)] = None
     # First step size, metres and entries of the 6-D rotation alike.
-    sigma0: float = 0.1
+    sigma0: Annotated[float, positive, at_most(MOST_SIGMA)] = 0.1
     # At most; by default 100 + floor(150 (d + 3)^2 / sqrt(population)).
-    generations: int | None = None
+    generations: Annotated[int | None, not_negative, at_most(MOST_GENERATIONS)] = None
     # A run ends when the costs of a generation and the best ones of the last generations differ by
     # less than tolfun, m^2; or those best ones alone by less than tolfunhist; or when no coordinate
     # has a step larger than tolx.
-    tolfun: float = 1e-8
-    tolfunhist: float = 1e-9
-    tolx: float = 1e-11
+    tolfun: Annotated[float, not_negative] = 1e-8
+    tolfunhist: Annotated[float, not_negative] = 1e-9
+    tolx: Annotated[float, not_negative] = 1e-11
 
     presets: ClassVar[Presets] = {
         "paper": {"tolfun": 1e-5, "tolfunhist": 1e-6},
         "reference": {"starts": "single", "tolfun": 1e-5, "tolfunhist": 1e-6},
     }
-
-    def __post_init__(self) -> None:
-        require_choice("starts", self.starts, ("per_start", "single"))
-        if self.population is not None:
-            require_positive("population", self.population)
-            require_at_most("population", self.population, MOST_SAMPLES)
-        if self.generations is not None:
-            require_positive("generations", self.generations, zero=True)
-            require_at_most("generations", self.generations, MOST_GENERATIONS)
-        require_positive("sigma0", self.sigma0)
-        require_at_most("sigma0", self.sigma0, MOST_SIGMA)
-        for name in ("tolfun", "tolfunhist", "tolx"):
-            require_positive(name, getattr(self, name), zero=True)
 
     def size(self, dimension: int, count: int) -> int:
         """Samples of a generation in `dimension` dimensions, for `count` hypotheses."""

@@ -8,6 +8,7 @@ from typing import ClassVar
 from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods.medial_constraint.medial_kernels import medial_cma_me
+from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
@@ -45,16 +46,10 @@ class MedialConstraintSettings:
     presets: ClassVar[Presets] = {}  # those of its groups
 
 
-class MedialConstraint:
+class MedialConstraint(ConfiguredMethod[MedialConstraintSettings]):
     """Evolves poses from E_0; costs are in m^2; E_l is not used."""
 
-    def __init__(self, settings: MedialConstraintSettings | None = None) -> None:
-        self.settings = settings or MedialConstraintSettings()
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = MedialConstraintSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
@@ -103,18 +98,10 @@ class MedialConstraintCmaMeSettings:
         measure_named(self.archive.measure, planar=self.plane is not None)
 
 
-class MedialConstraintCmaMe:
+class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
     """CMA-ES from E_0, then CMA-ME over an archive around what it finds; costs are in m^2."""
 
-    def __init__(self, settings: MedialConstraintCmaMeSettings | None = None) -> None:
-        self.settings = settings or MedialConstraintCmaMeSettings()
-        planar = self.settings.plane is not None
-        self._measure = measure_named(self.settings.archive.measure, planar=planar)
-
-    @property
-    def online(self) -> OnlineSettings:
-        """How a session makes the next problem."""
-        return self.settings.online
+    settings_class = MedialConstraintCmaMeSettings
 
     def register(
         self, problem: RegistrationProblem, observer: Observer | None = None
@@ -145,7 +132,8 @@ class MedialConstraintCmaMe:
         self, problem: RegistrationProblem, objective: MedialCost, vectors: FloatArray
     ) -> GridArchive:
         """The archive that measures of E', vectors (B, d), size, holding E' and E_l."""
-        settings, measure, space = self.settings.archive, self._measure, objective.space
+        settings, space = self.settings.archive, objective.space
+        measure = measure_named(settings.measure, planar=self.settings.plane is not None)
         estimates = evaluated(objective, measure, vectors)
         mean, deviation = measure_range(estimates, measure, settings, len(problem.points.known))
         archive = sized_archive(measure, mean, deviation, settings, space.dimension)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from chsel.errors import require_choice, require_positive
 from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls
 from chsel.methods.medial_constraint.medial_kernels import (
     MedialModel,
@@ -23,34 +22,27 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
 from chsel.problem.sdf_lookup import distance_field
 from chsel.problem.search_space import SE3Space, SearchSpace
-from chsel.problem.settings import Presets
+from chsel.problem.settings import CheckedSettings, Presets, not_negative, one_of
 
 _POSES_PER_THREAD = 100  # fewer are costed faster than a thread wakes up
 
 
 @dataclass(frozen=True)
-class MedialCostSettings:
+class MedialCostSettings(CheckedSettings):
     """Settings of the Medial Constraint cost."""
 
-    inflation: float = 0.02  # metres by which a ball of free space may be inflated to cover others
+    inflation: Annotated[float, not_negative] = 0.02  # of balls, to cover others, at most, metres
     # Weights of the two means; a ball_scale of 0 ignores free space, as the authors' released code
     # does, whose balls never enter the cost.
-    ball_scale: float = 1.0
-    known_scale: float = 1.0
-    # How the SDF grid is read, see SdfGrid.query.
-    lookup: str = "trilinear"
-    outside: str = "surface_point"
+    ball_scale: Annotated[float, not_negative] = 1.0
+    known_scale: Annotated[float, not_negative] = 1.0
+    lookup: Annotated[str, one_of(*LOOKUPS)] = "trilinear"  # how the SDF is read, see SdfGrid.query
+    outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
 
     presets: ClassVar[Presets] = {
         "paper": {"lookup": "nearest"},
         "reference": {"ball_scale": 0.0, "lookup": "nearest", "outside": "bounding_box"},
     }
-
-    def __post_init__(self) -> None:
-        for name in ("inflation", "ball_scale", "known_scale"):
-            require_positive(name, getattr(self, name), zero=True)
-        require_choice("lookup", self.lookup, LOOKUPS)
-        require_choice("outside", self.outside, OUTSIDE)
 
 
 class MedialCost:

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
+from typing import Annotated, Any
+
 import pytest
 
 from chsel.errors import SettingError
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.chsel import ChselSettings
-from chsel.problem.settings import PRESETS, build_settings, settings_mapping
+from chsel.problem.settings import (
+    PRESETS,
+    CheckedSettings,
+    at_most,
+    between,
+    build_settings,
+    not_negative,
+    one_of,
+    positive,
+    settings_mapping,
+)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -35,3 +49,56 @@ def test_wrong_settings_name_the_key_and_what_is_accepted(
 ) -> None:
     with pytest.raises(SettingError, match=message):
         build_settings(ChselSettings, mapping, "method")
+
+
+@dataclass(frozen=True)
+class Checked(CheckedSettings):
+    """A setting with each kind of check, and a relation between two."""
+
+    rate: Annotated[float, positive] = 1.0
+    count: Annotated[int, not_negative, at_most(1_000)] = 0
+    length: Annotated[float, between(1e-3, 10.0)] = 1.0
+    name: Annotated[str, one_of("a", "b")] = "a"
+    limit: Annotated[float | None, positive, at_most(5.0)] = None
+    free: float = -1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.limit is not None and self.rate > self.limit:
+            raise SettingError(f"rate is {self.rate}; accepted: at most limit")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rate": 0.0}, "rate is 0.0; accepted: a finite number above 0"),
+        ({"rate": float("nan")}, "rate is nan; accepted: a finite number above 0"),
+        ({"rate": "x"}, "rate is 'x'; accepted: a finite number above 0"),
+        ({"rate": None}, "rate is None; accepted: a finite number above 0"),
+        ({"count": -1}, "count is -1; accepted: a finite number of at least 0"),
+        ({"count": 1_001}, "count is 1001; accepted: at most 1_000"),
+        ({"length": 20.0}, r"length is 20.0; accepted: 0.001 to 10 (m)"),
+        ({"length": float("nan")}, r"length is nan; accepted: 0.001 to 10 (m)"),
+        ({"name": "c"}, "name is 'c'; accepted: a, b"),
+        ({"name": None}, "name is None; accepted: a, b"),
+        ({"limit": -1.0}, "limit is -1.0; accepted: a finite number above 0"),
+        ({"limit": 6.0}, "limit is 6.0; accepted: at most 5.0"),
+        ({"limit": 0.5}, "rate is 1.0; accepted: at most limit"),
+        ({"limit": 0.5, "name": "c"}, "name is 'c'; accepted: a, b"),
+    ],
+)
+def test_settings_accept_what_their_annotations_and_their_class_accept(
+    values: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SettingError, match=f"^{re.escape(message)}$"):
+        Checked(**values)
+
+
+def test_values_at_the_limits_and_none_pass_where_the_type_has_it() -> None:
+    limits = Checked(count=1_000, length=10.0, limit=5.0)
+    assert build_settings(Checked, settings_mapping(limits), "settings") == limits
+    assert build_settings(Checked, {"limit": None, "rate": 2}, "settings") == Checked(rate=2.0)
+    with pytest.raises(SettingError, match=r"^settings.count is None; accepted: an integer$"):
+        build_settings(Checked, {"count": None}, "settings")
+    with pytest.raises(SettingError, match=r"^settings: limit is 0.0; accepted: a finite number"):
+        build_settings(Checked, {"limit": 0}, "settings")
