@@ -15,7 +15,7 @@ from chsel.plausible.plausible_file import save_plausible
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
-from chsel.problem import warm_start as online
+from chsel.problem import online_registration as online
 from chsel.problem.poses import axis_angle, inverse
 from chsel.problem.registration_problem import Hypotheses
 from replay.__main__ import main

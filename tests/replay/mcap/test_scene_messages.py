@@ -17,7 +17,7 @@ from rerun.chunk import McapReader
 
 import replay
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import inverse, rotations
+from chsel.problem.poses import inverse, rotation_matrices
 from replay.comparing.recording_diff import recording_diff
 from replay.events import Event, HypothesesFound, Probe, SessionStarted
 from replay.mcap.cumulative_points import CumulativePoints
@@ -52,7 +52,7 @@ def positions(cloud: bytes) -> np.ndarray:
 def placed(mesh: Any) -> np.ndarray:
     """The points of a mesh of a scene, moved by its pose."""
     p, q = mesh.pose.position, mesh.pose.orientation
-    rotation = rotations(np.array([[q.x, q.y, q.z, q.w]]))[0]
+    rotation = rotation_matrices(np.array([[q.x, q.y, q.z, q.w]]))[0]
     points = np.array([(point.x, point.y, point.z) for point in mesh.points])
     return points @ rotation.T + (p.x, p.y, p.z)
 
