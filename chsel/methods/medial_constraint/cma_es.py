@@ -8,9 +8,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from chsel.cost.objective import cost_of
 from chsel.errors import require_at_most, require_choice, require_positive
 from chsel.methods.medial_constraint.medial_cost import MedialCost
-from chsel.methods.medial_constraint.medial_kernels import cost_of
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import logs
