@@ -9,7 +9,7 @@ import numpy as np
 
 from chsel.cost.cost_kernels import FreeTerm, Model, costs_of_poses, neighbours_of
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.interior_points import InteriorPoints, VoxelGrid, interior_points
+from chsel.cost.interior_points import InteriorPoints, interior_points
 from chsel.errors import SettingError, require_choice
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Region, box_of, clearance_of, triple
@@ -17,7 +17,7 @@ from chsel.numerics.lattice import MOST_CELLS, NO_LATTICE, cell_centres, lattice
 from chsel.numerics.octree import Tree, octree, rounding_margin
 from chsel.numerics.pose_tuples import Triple
 from chsel.numerics.threads import require_ieee_arithmetic, spread
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import KnownPoints, VoxelGrid
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid

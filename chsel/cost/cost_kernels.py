@@ -19,12 +19,11 @@ from chsel.numerics.pose_tuples import (
     Triple,
     finite,
     inverted,
-    moved,
     pose_at,
     rigid,
     turned_back,
 )
-from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
+from chsel.problem.sdf_lookup import DistanceField, distance_in_box, distance_in_place
 
 MOST_SLACK = 0.03  # metres
 STEPS_AHEAD = 3.0  # that gathered neighbours should last
@@ -187,12 +186,11 @@ def _centre_in_world(free, pose):
 @spliced
 def _free_sums(model, candidates, count):
     """lambda sum max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8)."""
-    box, table, trilinear = model.field.box, model.field.table, model.field.trilinear
     clearance, places = model.free.region.clearance, candidates.places
     sums = _NOTHING
     for n in range(count):
         if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
-            s, nx, ny, nz = distance_in_box(trilinear, box, table, places, n)
+            s, nx, ny, nz = distance_in_box(model.field, places, n)
             violation = max(model.alpha - s, 0.0)
             size = -model.free_scale * _slope(model, violation)
             value = model.free_scale * violation
@@ -222,12 +220,11 @@ def _interior_sums(free, pose, candidates, count):
 @spliced
 def _with_occupied(sums, model, pose, places):
     """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
-    field, table = model.field, model.field.table
     xs, ys, zs = model.occupied[0], model.occupied[1], model.occupied[2]
-    locate(pose, field.box, xs, ys, zs, places, len(xs))
+    locate(pose, model.field.box, xs, ys, zs, places, len(xs))
     for n in range(len(xs)):
         x, y, z = xs[n], ys[n], zs[n]
-        s, nx, ny, nz = _distance_at(field, table, places, n, pose, x, y, z)
+        s, nx, ny, nz = distance_in_place(model.field, pose, x, y, z, places, n)
         violation = max(model.alpha + s, 0.0)
         size = model.occupied_scale * _slope(model, violation)
         value = model.occupied_scale * violation
@@ -238,12 +235,11 @@ def _with_occupied(sums, model, pose, places):
 @spliced
 def _with_known(sums, model, pose, places):
     """sum |s - v|, with gradient (s - v) n, over points of known signed distance (Eq. 10)."""
-    field, table = model.field, model.field.table
     xs, ys, zs = model.known[0], model.known[1], model.known[2]
-    locate(pose, field.box, xs, ys, zs, places, len(xs))
+    locate(pose, model.field.box, xs, ys, zs, places, len(xs))
     for n in range(len(xs)):
         x, y, z = xs[n], ys[n], zs[n]
-        s, nx, ny, nz = _distance_at(field, table, places, n, pose, x, y, z)
+        s, nx, ny, nz = distance_in_place(model.field, pose, x, y, z, places, n)
         difference = s - model.known_sdf[n]
         excess = max(abs(difference) - model.known_tolerance, 0.0)
         size = model.known_scale * _slope(model, excess)
@@ -251,16 +247,6 @@ def _with_known(sums, model, pose, places):
         value = model.known_scale * excess
         sums = _added(sums, value, size * nx, size * ny, size * nz, x, y, z)
     return sums
-
-
-@spliced
-def _distance_at(field, table, places, n, pose, x, y, z):
-    """Signed distance and gradient at the n-th of the places, that of a world point x, y, z."""
-    inside = distance_in_box(field.trilinear, field.box, table, places, n)
-    if places.beyond[n] > 0.0:
-        x, y, z = moved(pose, x, y, z)
-        return distance_beyond_box(field.box_distance, field.box, inside, x, y, z)
-    return inside
 
 
 @leaf

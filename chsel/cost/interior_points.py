@@ -10,12 +10,10 @@ import numpy as np
 
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import SettingError
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.problem.points import Lattice
+from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.sdf_grid import SdfGrid
 
 FEW_INTERIOR_POINTS = 25  # fewer are worth a warning
-_MAX_VOXELS = 100_000_000
 _MAX_NODES = 10_000_000  # of the lattice over the SDF grid
 
 
@@ -68,28 +66,3 @@ def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
             stacklevel=3,
         )
     return InteriorPoints(nodes[inside], -s[inside], n[inside], spacing)
-
-
-@dataclass(frozen=True)
-class VoxelGrid:
-    """The voxels that hold a free point, with a layer of empty ones around."""
-
-    origin: FloatArray  # (3,) centre of the first voxel
-    resolution: float  # side of a voxel, metres
-    flags: BoolArray  # (nx, ny, nz)
-
-    @classmethod
-    def around(cls, free: FloatArray, resolution: float) -> VoxelGrid:
-        """The voxels of free points (N, 3), N > 0."""
-        lattice = Lattice(tuple(free.min(axis=0).tolist()), resolution)
-        count = math.prod((np.ptp(free, axis=0) / resolution + 3.0).tolist())
-        if not count <= _MAX_VOXELS:
-            raise SettingError(
-                f"free points span {count:.1e} voxels of {resolution} m; "
-                f"accepted: at most {_MAX_VOXELS:.0e}, so a coarser free_resolution"
-            )
-        voxels = lattice.voxels(free)
-        shape = voxels.max(axis=0) + 3
-        flags = np.zeros(shape, dtype=bool)
-        flags[tuple((voxels + 1).T)] = True
-        return cls(np.array(lattice.origin) - resolution, resolution, flags)

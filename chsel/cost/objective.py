@@ -7,9 +7,16 @@ from typing import Any
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_kernels import MOST_SLACK, Neighbours, evaluate, forget, neighbours_of
+from chsel.cost.cost_kernels import (
+    MOST_SLACK,
+    Model,
+    Neighbours,
+    evaluate,
+    forget,
+    neighbours_of,
+)
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.compiler import compiled, leaf, spliced
+from chsel.numerics.compiler import compiled, implements, leaf, spliced
 from chsel.numerics.pose_tuples import decode, pull_back
 from chsel.numerics.threads import spread
 from chsel.problem.search_space import SearchSpace
@@ -30,9 +37,13 @@ def adam_step(slope, moments, j, powers, rate, epsilon):
     return step / (np.sqrt(moments[1, j] / (1.0 - powers[1])) + epsilon)
 
 
-@spliced
-def cost_of(model, space, vector, near):
-    """The cost of a search vector (d,)."""
+def cost_of(model, space, vector, work):
+    """The cost of a search vector (d,), in kernels alone; see who implements it for a model."""
+    raise NotImplementedError
+
+
+@implements(cost_of, Model)
+def _relaxed_cost_of(model, space, vector, near):
     return evaluate(model, decode(space, vector), near, 0.0).cost
 
 

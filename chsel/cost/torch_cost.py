@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.interior_points import VoxelGrid, interior_points
+from chsel.cost.interior_points import interior_points
 from chsel.cost.torch_octree import NODES_PER_POSE, FreeTree, Pairs
 from chsel.errors import EngineError, require_positive
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import KnownPoints, VoxelGrid
 from chsel.problem.poses import as_tensor, moved, stacked
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid

@@ -21,6 +21,7 @@ import llvmlite.binding
 import numba
 from filelock import FileLock
 from numba.core import event
+from numba.extending import overload
 
 CACHE_VARIABLE = "CHSEL_CACHE_DIR"
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -190,6 +191,23 @@ def spliced(function: Function) -> Function:
     """
     kernel: Function = _njit(**_INNER, inline="always")(function)
     return kernel
+
+
+def implements(name: Callable[..., Any], model: type) -> Callable[[Function], Function]:
+    """Decorator of what kernels that call `name` run if its first argument is of type `model`.
+
+    model: a class of NamedTuples. So one kernel, compiled for each, serves several models.
+    """
+
+    def register(function: Function) -> Function:
+        def chosen(first: Any, *others: Any) -> Function | None:
+            return function if getattr(first, "instance_class", None) is model else None
+
+        options: Any = {**_INNER, "forceinline": True}
+        overload(name, jit_options=options, strict=False)(chosen)
+        return function
+
+    return register
 
 
 _INNER = {

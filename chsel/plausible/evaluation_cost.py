@@ -6,23 +6,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.cost.interior_points import VoxelGrid
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Box, Places, Region, box_of, clearance_of, locate
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
 from chsel.numerics.octree import Candidates, Tree, candidates_for, octree, walk
-from chsel.numerics.pose_tuples import finite, moved, pose_at, rigid, turned_back
+from chsel.numerics.pose_tuples import finite, pose_at, rigid, turned_back
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.plausible.plausible_settings import EvaluationCostSettings
-from chsel.problem.points import KnownPoints, Lattice
+from chsel.problem.points import KnownPoints, Lattice, VoxelGrid, voxels_spanned
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import (
     DistanceField,
-    distance_beyond_box,
     distance_field,
     distance_in_box,
+    distance_in_place,
 )
 from chsel.problem.subset import farthest_points
 
@@ -134,7 +133,7 @@ def _inside(sdf: SdfGrid, level: float) -> FloatArray:
 def _voxels(tree: Tree, resolution: float) -> tuple[Box, Any]:
     """The voxels of free points with an empty layer around them, and a free point of each."""
     free = tree.spheres[:3, len(tree.starts) - 1 :].T
-    if len(free) == 0 or np.prod(np.ptp(free, axis=0) / resolution + 3.0) > _MOST_VOXELS:
+    if len(free) == 0 or voxels_spanned(free, resolution) > _MOST_VOXELS:
         return box_of(np.zeros(3), 1.0, (1, 1, 1)), np.full(1, -1, dtype=np.int32)
     grid = VoxelGrid.around(free, resolution)
     point_in = np.full(grid.flags.shape, -1, dtype=np.int32)
@@ -194,7 +193,8 @@ def _known_sum(model: EvaluationModel, pose: Pose, scratch: Candidates) -> float
     known, total = model.known, 0.0
     locate(pose, model.field.box, known[0], known[1], known[2], scratch.places, known.shape[1])
     for n in range(known.shape[1]):
-        s = _distance(model.field, pose, known[0, n], known[1, n], known[2, n], scratch.places, n)
+        x, y, z = known[0, n], known[1, n], known[2, n]
+        s = distance_in_place(model.field, pose, x, y, z, scratch.places, n)[0]
         total += abs(s - model.known_sdf[n])
     return total
 
@@ -206,20 +206,9 @@ def _occupied_count(model: EvaluationModel, pose: Pose, scratch: Candidates) -> 
     locate(pose, model.field.box, occupied[0], occupied[1], occupied[2], places, number)
     for n in range(number):
         x, y, z = occupied[0, n], occupied[1, n], occupied[2, n]
-        count += 1 if _distance(model.field, pose, x, y, z, places, n) >= -model.level else 0
+        s = distance_in_place(model.field, pose, x, y, z, places, n)[0]
+        count += 1 if s >= -model.level else 0
     return count
-
-
-@leaf
-def _distance(
-    field: DistanceField, pose: Pose, x: float, y: float, z: float, places: Places, n: int
-) -> float:
-    """Signed distance of a world point, whose place in the grid is the n-th of the places."""
-    inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
-    if places.beyond[n] > 0.0:
-        a, b, c = moved(pose, x, y, z)
-        inside = distance_beyond_box(field.box_distance, field.box, inside, a, b, c)
-    return inside[0]
 
 
 @spliced
@@ -268,9 +257,7 @@ def _violates(model: EvaluationModel, places: Places, n: int) -> bool:
     """Whether a free point at the n-th of the places is inside; nothing beyond the grid is."""
     if model.region.clearance[places.cell[n]] >= 0.0 or places.beyond[n] > 0.0:
         return False
-    field = model.field
-    inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
-    return inside[0] <= model.level
+    return distance_in_box(model.field, places, n)[0] <= model.level
 
 
 @spliced

@@ -17,16 +17,11 @@ from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled
-from chsel.numerics.pose_tuples import composed, inverted, moved, pose_at
+from chsel.numerics.pose_tuples import composed, inverted, pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses, compose, inverse, product, rotated, stacked
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import (
-    DistanceField,
-    distance_beyond_box,
-    distance_field,
-    distance_in_box,
-)
+from chsel.problem.sdf_lookup import DistanceField, distance_field, distance_in_place
 from chsel.problem.settings import CheckedSettings, at_most, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 
@@ -200,9 +195,6 @@ def mean_squares(
             locate(move, field.box, xs, ys, zs, places, len(xs))
             total = 0.0
             for n in range(len(xs)):
-                inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
-                if places.beyond[n] > 0.0:
-                    x, y, z = moved(move, xs[n], ys[n], zs[n])
-                    inside = distance_beyond_box(field.box_distance, field.box, inside, x, y, z)
-                total += inside[0] * inside[0]
+                s = distance_in_place(field, move, xs[n], ys[n], zs[n], places, n)[0]
+                total += s * s
             out[b, p] = total / len(xs)

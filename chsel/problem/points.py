@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -9,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from chsel.errors import PointsError, require_positive
-from chsel.numerics.arrays import FloatArray, digest, frozen
+from chsel.errors import PointsError, SettingError, require_positive
+from chsel.numerics.arrays import BoolArray, FloatArray, digest, frozen
 
 _CLASSES = ("free", "occupied", "known", "known_sdf")
 
@@ -154,6 +155,35 @@ class Lattice:
     def centres(self, voxels: np.ndarray) -> FloatArray:
         """Centres (N, 3) of voxels (N, 3)."""
         return np.array(self.origin) + voxels * self.spacing
+
+
+def voxels_spanned(points: FloatArray, resolution: float) -> float:
+    """At least the number of voxels in a grid around points (N, 3), N > 0; see VoxelGrid."""
+    return math.prod((np.ptp(points, axis=0) / resolution + 3.0).tolist())
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """The voxels that hold a free point, with a layer of empty ones around."""
+
+    origin: FloatArray  # (3,) centre of the first voxel
+    resolution: float  # side of a voxel, metres
+    flags: BoolArray  # (nx, ny, nz)
+
+    @classmethod
+    def around(cls, free: FloatArray, resolution: float, most: int = 100_000_000) -> VoxelGrid:
+        """The voxels of free points (N, 3), N > 0. Raises SettingError for too many voxels."""
+        lattice = Lattice(tuple(free.min(axis=0).tolist()), resolution)
+        count = voxels_spanned(free, resolution)
+        if not count <= most:
+            raise SettingError(
+                f"free points span {count:.1e} voxels of {resolution} m; "
+                f"accepted: at most {most:.0e}, so a coarser free_resolution"
+            )
+        voxels = lattice.voxels(free)
+        flags = np.zeros(voxels.max(axis=0) + 3, dtype=bool)
+        flags[tuple((voxels + 1).T)] = True
+        return cls(np.array(lattice.origin) - resolution, resolution, flags)
 
 
 class FreeVoxels:

@@ -286,25 +286,6 @@ def moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
     return columns[0] + columns[1] + columns[2] + translation
 
 
-def decode_6d(rows: Tensor) -> Tensor:
-    """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
-    import torch
-
-    first, second = rows[:, 0:3], rows[:, 3:6]
-    b1 = first / length(first)
-    b2 = second - _dot(b1, second) * b1
-    b2 = b2 / length(b2)
-    b3 = torch.stack(
-        [
-            b1[:, 1] * b2[:, 2] - b1[:, 2] * b2[:, 1],
-            b1[:, 2] * b2[:, 0] - b1[:, 0] * b2[:, 2],
-            b1[:, 0] * b2[:, 1] - b1[:, 1] * b2[:, 0],
-        ],
-        dim=1,
-    )
-    return torch.stack([b1, b2, b3], dim=1)
-
-
 def length(vectors: Tensor) -> Tensor:
     """Lengths (B, 1) of vectors (B, 3), of at least 1e-12 so that they can be divided by."""
     return squared_length(vectors).sqrt().clamp_min(1e-12)
@@ -312,9 +293,5 @@ def length(vectors: Tensor) -> Tensor:
 
 def squared_length(vectors: Tensor) -> Tensor:
     """Squared lengths (B, 1) of vectors (B, 3), each sum in the order of its index."""
-    return _dot(vectors, vectors)
-
-
-def _dot(left: Tensor, right: Tensor) -> Tensor:
-    products = left * right
-    return products[:, 0:1] + products[:, 1:2] + products[:, 2:3]
+    squares = vectors * vectors
+    return squares[:, 0:1] + squares[:, 1:2] + squares[:, 2:3]

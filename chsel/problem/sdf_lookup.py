@@ -9,6 +9,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Box, Region, box_of, clearance_of
 from chsel.numerics.compiler import leaf
+from chsel.numerics.pose_tuples import moved
 from chsel.problem.sdf_grid import SdfGrid
 
 
@@ -40,12 +41,12 @@ def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
 
 
 @leaf
-def distance_in_box(trilinear, box, table, places, n):
+def distance_in_box(field, places, n):
     """Signed distance and gradient (s, n_x, n_y, n_z) at place n, which is in the box."""
-    if trilinear:
+    table, at = field.table, places.cell[n]
+    if field.trilinear:
         u, v, w = places.u[n], places.v[n], places.w[n]
-        return distance_between_nodes(box, table, places.cell[n], u, v, w)
-    at = places.cell[n]
+        return distance_between_nodes(field.box, table, at, u, v, w)
     return table[at, 0], table[at, 1], table[at, 2], table[at, 3]
 
 
@@ -83,6 +84,16 @@ def distance_beyond_box(box_distance, box, inside, x, y, z):
 
 
 @leaf
+def distance_in_place(field, pose, x, y, z, places, n):
+    """The same of a world point x, y, z, whose place is the n-th, in the box or nearest to it."""
+    inside = distance_in_box(field, places, n)
+    if places.beyond[n] > 0.0:
+        x, y, z = moved(pose, x, y, z)
+        return distance_beyond_box(field.box_distance, field.box, inside, x, y, z)
+    return inside
+
+
+@leaf
 def distance_at(field, pose, x, y, z):
     """Interpolated signed distance at a world point."""
     return distance_with_gradient(field, pose, x, y, z)[0]
@@ -93,9 +104,7 @@ def distance_with_gradient(field, pose, x, y, z):
     """Interpolated signed distance and gradient (s, n_x, n_y, n_z) at a world point."""
     box, table = field.box, field.table
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
-    a = pose[0] * x + pose[1] * y + pose[2] * z + pose[9]
-    b = pose[3] * x + pose[4] * y + pose[5] * z + pose[10]
-    c = pose[6] * x + pose[7] * y + pose[8] * z + pose[11]
+    a, b, c = moved(pose, x, y, z)
     d = min(max(first[0], a), last[0])
     e = min(max(first[1], b), last[1])
     f = min(max(first[2], c), last[2])

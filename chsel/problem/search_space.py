@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,20 +13,8 @@ from chsel.numerics.cell_set import triple
 from chsel.numerics.elementary import arctangents
 from chsel.numerics.pose_tuples import SpaceConstants, decode_all, matrix_of
 from chsel.problem.points import Workspace
-from chsel.problem.poses import (
-    Poses,
-    as_tensor,
-    decode_6d,
-    hat,
-    product,
-    rotated,
-    rotation_vector,
-    twice_sine_axis,
-)
+from chsel.problem.poses import Poses, hat, product, rotated, rotation_vector, twice_sine_axis
 from chsel.problem.sdf_grid import SdfGrid
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 class SearchSpace(ABC):
@@ -39,10 +26,6 @@ class SearchSpace(ABC):
     @abstractmethod
     def encode(self, poses: Poses) -> FloatArray:
         """Vectors (B, d) of poses, or of the nearest poses in the space."""
-
-    @abstractmethod
-    def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (B, 3, 3) and translations (B, 3) of vectors (B, d), differentiable."""
 
     def poses(self, vectors: FloatArray) -> Poses:
         """The poses of vectors (B, d)."""
@@ -60,10 +43,6 @@ class SE3Space(SearchSpace):
     def encode(self, poses: Poses) -> FloatArray:
         """The 9-D vectors of poses."""
         return poses.vectors
-
-    def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Gram-Schmidt on the two rows; the translation as it is."""
-        return decode_6d(vectors[:, :6]), vectors[:, 6:9]
 
 
 @dataclass(frozen=True)
@@ -108,8 +87,6 @@ class SE2Space(SearchSpace):
         self.offset = offset
         self.resting_rotation = rotation_vector(np.array(settings.resting_rotation))
         hat_squared = np.outer(axis, axis) - np.eye(3)
-        constants = hat(axis), hat_squared, self.resting_rotation, e_u, self.e_v, axis
-        self._tensors = [as_tensor(constant) for constant in constants]
         self.arrays = SpaceConstants(
             planar=True,
             axis=triple(axis),
@@ -134,18 +111,6 @@ class SE2Space(SearchSpace):
         theta = arctangents(sine, np.trace(turned, axis1=1, axis2=2) - along)
         u, v = ((poses.translations * axis).sum(axis=1) for axis in (self.e_u, self.e_v))
         return np.stack([theta, u, v], axis=1)
-
-    def decode(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Rodrigues' formula about the axis, and a point of the plane."""
-        import torch
-
-        device = vectors.device
-        turn, turn_squared, rest, e_u, e_v, axis = (part.to(device) for part in self._tensors)
-        sine, cosine = torch.sin(vectors[:, 0]), torch.cos(vectors[:, 0])
-        about_axis = torch.eye(3, dtype=torch.float64, device=device) + sine[:, None, None] * turn
-        about_axis = about_axis + (1.0 - cosine)[:, None, None] * turn_squared
-        rotation = (about_axis[:, :, :, None] * rest[None, None]).sum(dim=2)
-        return rotation, vectors[:, 1:2] * e_u + vectors[:, 2:3] * e_v + self.offset * axis
 
 
 def search_space(plane: PlaneSettings | None, sdf: SdfGrid) -> SearchSpace:

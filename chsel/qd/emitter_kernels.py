@@ -108,7 +108,7 @@ def cma_mega(
         parents = rank(branches.status, branches.value, branches.order)
         tell(strategy, coefficients, branches.order, parents)
         if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
-            move_to_elite(archive, draws.elites[iteration], theta)
+            _move_to_elite(archive, draws.elites[iteration], theta)
             _forget(search.adam)
             reset(strategy)
             strategy.mean[:] = 0.0
@@ -134,7 +134,7 @@ def cma_me(
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            move_to_elite(archive, draws.elites[iteration], strategy.mean)
+            _move_to_elite(archive, draws.elites[iteration], strategy.mean)
             reset(strategy)
 
 
@@ -177,7 +177,7 @@ def _branch(
 
 
 @inner
-def move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
+def _move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
     """Make a vector (d,) that of an elite, chosen by a number from [0, 1), if there is any."""
     cell = sampled_cell(archive.objectives, uniform)
     if cell >= 0:

@@ -123,16 +123,13 @@ def cma_me(
     settings: EmitterSettings,
     draws: Draws,
     watch: ArchiveWatch,
-    kernel: Callable[..., None] | None = None,
 ) -> None:
     """Fill the archive by an evolution strategy on the search vectors (Fontaine et al., 2020).
 
-    start (d,): the first mean. An iteration evaluates count samples. kernel: runs the iterations
-    on an objective that is not the relaxed cost.
+    start (d,): the first mean. An iteration evaluates count samples.
     """
     search = me_search(start, archive.measure.count, count, settings)
-    kernel = kernel or kernels.cma_me
-    _iterate(kernel, objective, archive, search, settings.iterations, draws, watch)
+    _iterate(kernels.cma_me, objective, archive, search, settings.iterations, draws, watch)
 
 
 def _iterate(

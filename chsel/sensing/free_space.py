@@ -11,7 +11,7 @@ from chsel.errors import PointsError, PoseError, SettingError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, frozen
 from chsel.numerics.threads import spread
 from chsel.problem.points import Lattice, Workspace
-from chsel.problem.poses import SENSOR_TOLERANCE, check_rigid
+from chsel.problem.poses import SENSOR_TOLERANCE, Poses, check_rigid
 from chsel.sensing.depth_camera import PinholeCamera
 from chsel.sensing.ray_kernels import (
     MarkedVoxels,
@@ -93,8 +93,8 @@ class FreeGrid:
         move, mask = _pose(world_from_camera), camera.image("mask", mask, bool)
         parts = camera.image("depth", depth), mask, camera.columns, camera.rows
         image = RayImage(*(np.require(part, requirements=("C", "W")) for part in parts))
-        least = -(-_RAYS_PER_THREAD // camera.width)
-        self._mark(mark_image, image, move[:3], float(fraction), count=camera.height, least=least)
+        pose, least = tuple(Poses.of(move[None]).numbers[0]), -(-_RAYS_PER_THREAD // camera.width)
+        self._mark(mark_image, image, pose, float(fraction), count=camera.height, least=least)
         return self._settle(1)
 
     def scaled_images(
@@ -134,9 +134,8 @@ class FreeGrid:
         return self.lattice.centres(np.stack(np.unravel_index(voxels, self.shape), axis=1))
 
     def _mark_points(self, points: FloatArray, moves: FloatArray) -> None:
-        moves = np.ascontiguousarray(moves[:, :3])
-        least = -(-_POINTS_PER_THREAD // max(len(moves), 1))
-        self._mark(mark_points, points, moves, count=len(points), least=least)
+        numbers, least = Poses.of(moves).numbers, -(-_POINTS_PER_THREAD // max(len(moves), 1))
+        self._mark(mark_points, points, numbers, count=len(points), least=least)
 
     def _mark(self, kernel: Callable[..., None], *arguments: Any, count: int, least: int) -> None:
         """Run a kernel on pieces of range(count), of at least `least`, on several threads."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.pose_tuples import moved, pose_at
 
 _FARTHEST = 2.0**52  # voxels from the first: beyond, neighbours are the same number
 _SHORTEST = 1e-100  # voxels: shorter moves along an axis count as none
@@ -44,28 +45,28 @@ def mark_segments(grid, origins, ends, first, last):
 
 
 @compiled
-def mark_image(grid, image, move, fraction, first, last):
+def mark_image(grid, image, pose, fraction, first, last):
     """Mark the voxels on the rays of the masked pixels of rows first to last of a RayImage.
 
-    move (3, 4): from the camera's frame. Rays end at `fraction` of their depth.
+    pose: of the camera, world_from_camera. Rays end at `fraction` of their depth.
     """
-    a = _place(grid, move[0, 3], move[1, 3], move[2, 3])
+    a = _place(grid, pose[9], pose[10], pose[11])
     for row in range(first, last):
         for column in range(len(image.columns)):
             if image.mask[row, column]:
                 z = fraction * image.depth[row, column]
-                x, y, z = _moved(move, image.columns[column] * z, image.rows[row] * z, z)
+                x, y, z = moved(pose, image.columns[column] * z, image.rows[row] * z, z)
                 _walk(grid, a, _place(grid, x, y, z))
 
 
 @compiled
 def mark_points(grid, points, moves, first, last):
-    """Mark the voxels of points (N, 3) first to last, moved by each of the moves (P, 3, 4)."""
+    """Mark the voxels of points (N, 3) first to last, moved by each of the moves (P, 12)."""
     nx, ny, nz = grid.counts
     lower, spacing = grid.lower, grid.spacing
     for n in range(first, last):
         for p in range(len(moves)):
-            x, y, z = _moved(moves[p], points[n, 0], points[n, 1], points[n, 2])
+            x, y, z = moved(pose_at(moves, p), points[n, 0], points[n, 1], points[n, 2])
             i = np.rint((x - lower[0]) / spacing)
             j = np.rint((y - lower[1]) / spacing)
             k = np.rint((z - lower[2]) / spacing)
@@ -90,15 +91,6 @@ def settle(words, marks, seen, gain, enough):
                         seen[n] = min(seen[n] + gain, enough)
                         fresh += 1 if seen[n] == enough else 0
     return fresh
-
-
-@leaf
-def _moved(move, x, y, z):
-    return (
-        move[0, 0] * x + move[0, 1] * y + move[0, 2] * z + move[0, 3],
-        move[1, 0] * x + move[1, 1] * y + move[1, 2] * z + move[1, 3],
-        move[2, 0] * x + move[2, 1] * y + move[2, 2] * z + move[2, 3],
-    )
 
 
 @leaf

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import numpy as np
 
-from chsel.cost.interior_points import VoxelGrid
 from chsel.errors import SettingError
 from chsel.methods.anchored.sampling_kernels import (
     DRAWS,
@@ -22,7 +20,7 @@ from chsel.methods.anchored.sampling_kernels import (
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import box_of
 from chsel.numerics.threads import spread
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import KnownPoints, VoxelGrid, voxels_spanned
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
@@ -64,7 +62,7 @@ def coarse_of(problem: RegistrationProblem, known: KnownPoints, margin: float) -
     free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]
     box = voxels = box_of(sdf.origin, sdf.resolution, sdf.shape)
     flags = np.zeros(1, dtype=bool)
-    if len(free) and math.prod((np.ptp(free, axis=0) / resolution + 3.0).tolist()) < _MOST_VOXELS:
+    if len(free) and voxels_spanned(free, resolution) < _MOST_VOXELS:
         grid = VoxelGrid.around(free, resolution)
         voxels = box_of(grid.origin, resolution, grid.flags.shape)
         flags = grid.flags.reshape(-1)

@@ -121,8 +121,7 @@ def _fitted(model, twists, pose, iterations, fit):
 @inner
 def _squares(model, twists, pose, count, fit, with_normal):
     """The sum of squared residuals; fills the normal equations, if wanted."""
-    field, box, table = model.field, model.field.box, model.field.table
-    total, dimension = 0.0, len(twists.basis)
+    field, total, dimension = model.field, 0.0, len(twists.basis)
     if with_normal:
         for i in range(dimension):
             fit.right[i] = 0.0
@@ -133,7 +132,7 @@ def _squares(model, twists, pose, count, fit, with_normal):
     locate(pose, model.free.region.box, candidates.x, candidates.y, candidates.z, places, count)
     for n in range(count):
         if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
-            looked_up = distance_in_box(field.trilinear, box, table, places, n)
+            looked_up = distance_in_box(field, places, n)
             residual = looked_up[0] - model.alpha
             if residual < 0.0:
                 total += residual * residual

@@ -8,8 +8,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from chsel.cost.objective import cost_of
 from chsel.methods.medial_constraint.medial_cost import MedialCost
-from chsel.methods.medial_constraint.medial_kernels import cost_of
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import logs

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from chsel.errors import SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner
-from chsel.problem.points import Lattice, Workspace
+from chsel.problem.points import VoxelGrid, Workspace
 
 MOST_VOXELS = 30_000_000
 _FAR = 2**60
@@ -45,8 +43,7 @@ def medial_balls(
     inside = free[((free >= lower - margin) & (free <= upper + margin)).all(axis=1)]
     if len(inside) == 0:
         return Balls(np.zeros((0, 3)), np.zeros(0))
-    lattice = Lattice(tuple(inside.min(axis=0).tolist()), resolution)
-    flags = _free_voxels(inside, lattice)
+    flags = VoxelGrid.around(inside, resolution, MOST_VOXELS).flags
     squared = np.empty(flags.shape, dtype=np.int64)
     squared_clearances(flags, squared)
     medial = np.zeros(squared.shape, dtype=np.bool_)
@@ -55,21 +52,8 @@ def medial_balls(
     radii = np.sqrt(squared[medial].astype(np.float64))  # half sides
     order = np.argsort(-squared[medial], kind="stable")
     chosen = _covering(voxels, radii, _row_starts(medial), order, 2.0 * inflation / resolution)
-    return Balls(lattice.centres(voxels[chosen] - 1), radii[chosen] * (resolution / 2.0))
-
-
-def _free_voxels(points: FloatArray, lattice: Lattice) -> BoolArray:
-    """Flags (nx, ny, nz) of the voxels that hold a point, with a layer of others around."""
-    count = math.prod((np.ptp(points, axis=0) / lattice.spacing + 3.0).tolist())
-    if not count <= MOST_VOXELS:
-        raise SettingError(
-            f"free points span {count:.1e} voxels of {lattice.spacing} m; "
-            f"accepted: at most {MOST_VOXELS:.0e}, so a coarser free_resolution"
-        )
-    voxels = lattice.voxels(points)
-    flags = np.zeros(voxels.max(axis=0) + 3, dtype=np.bool_)
-    flags[tuple((voxels + 1).T)] = True
-    return flags
+    centres = inside.min(axis=0) + (voxels[chosen] - 1) * resolution
+    return Balls(centres, radii[chosen] * (resolution / 2.0))
 
 
 def _row_starts(medial: BoolArray) -> IntArray:

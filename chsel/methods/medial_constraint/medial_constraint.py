@@ -7,7 +7,6 @@ from typing import ClassVar
 
 from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
-from chsel.methods.medial_constraint.medial_kernels import medial_cma_me
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import OnlineSettings
@@ -120,7 +119,7 @@ class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
         first, best = space.encode(initial_set[:1])[0], archive.best_solution
         start = first if settings.emitter.start == "initial" else best
         draws, watch = Draws(key), ArchiveWatch(observer, 0, "cma_me")
-        cma_me(objective, archive, start, count, settings.emitter, draws, watch, medial_cma_me)
+        cma_me(objective, archive, start, count, settings.emitter, draws, watch)
         # E <- cells of M with the |E_0| lowest costs
         stream, elites = key.stream(Purpose.RESAMPLE), space.poses(archive.solutions)
         chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)

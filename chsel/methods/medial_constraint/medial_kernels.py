@@ -1,4 +1,4 @@
-"""The Medial Constraint cost of a pose, and the iterations of CMA-ME on it."""
+"""The Medial Constraint cost of a pose."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from chsel.cost.objective import cost_of
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Places, locate, places_for
-from chsel.numerics.compiler import compiled, inner, spliced
-from chsel.numerics.pose_tuples import decode, finite, moved, pose_at
-from chsel.problem.sdf_lookup import DistanceField, distance_beyond_box, distance_in_box
-from chsel.qd.archive import Batch, Cells, all_finite, insert, rank
-from chsel.qd.emitter_kernels import Landscape, MeSearch, SearchDraws, move_to_elite
-from chsel.qd.evolution_kernels import ask, reset, stopped, tell
-from chsel.qd.measures import measures_of
+from chsel.numerics.compiler import compiled, implements, inner, spliced
+from chsel.numerics.pose_tuples import decode, finite, pose_at
+from chsel.problem.sdf_lookup import DistanceField, distance_in_place
 
 
 class MedialModel(NamedTuple):
@@ -64,7 +61,8 @@ def _ball_mean(model, pose, places):
         further = max(least[places.cell[n]], 0.0)
         further = 0.0 if field.box_distance and beyond > 0.0 else further * further
         if beyond + further < radius * radius:
-            depth = max(radius - _distance(field, pose, xs[n], ys[n], zs[n], places, n), 0.0)
+            s = distance_in_place(field, pose, xs[n], ys[n], zs[n], places, n)[0]
+            depth = max(radius - s, 0.0)
             total += depth * depth
     return total / max(len(radii), 1)
 
@@ -77,23 +75,14 @@ def _known_mean(model, pose, places):
     locate(pose, box, xs, ys, zs, places, len(known_sdf))
     total = 0.0
     for n in range(len(known_sdf)):
-        difference = _distance(field, pose, xs[n], ys[n], zs[n], places, n) - known_sdf[n]
+        s = distance_in_place(field, pose, xs[n], ys[n], zs[n], places, n)[0]
+        difference = s - known_sdf[n]
         total += difference * difference
     return total / max(len(known_sdf), 1)
 
 
-@inner
-def _distance(field, pose, x, y, z, places, n):
-    """Signed distance at the n-th of the places, that of a world point x, y, z."""
-    if places.beyond[n] > 0.0:
-        inside = distance_in_box(field.trilinear, field.box, field.table, places, n)
-        return distance_beyond_box(field.box_distance, field.box, inside, *moved(pose, x, y, z))[0]
-    return distance_in_box(field.trilinear, field.box, field.table, places, n)[0]
-
-
-@spliced
-def cost_of(model, space, vector, places):
-    """The cost of a search vector (d,)."""
+@implements(cost_of, MedialModel)
+def _medial_cost_of(model, space, vector, places):
     return medial_cost(model, decode(space, vector), places)
 
 
@@ -102,39 +91,3 @@ def medial_costs_of_poses(model, poses, out, first, last, places):
     """Fill out (B,) with the costs of poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
         out[n] = medial_cost(model, pose_at(poses, n), places)
-
-
-@compiled
-def medial_cma_me(
-    landscape: Landscape,
-    archive: Cells,
-    search: MeSearch,
-    draws: SearchDraws,
-    first: int,
-    last: int,
-) -> None:
-    """Iterations of CMA-ME, as chsel.qd.emitter_kernels.cma_me has them, on another objective."""
-    samples, strategy = search.samples, search.strategy
-    for iteration in range(first, last):
-        ask(strategy, draws.normals[iteration], samples.vectors)
-        _evaluate(landscape, samples)
-        insert(archive, samples)
-        parents = rank(samples.status, samples.value, samples.order)
-        tell(strategy, samples.vectors, samples.order, parents)
-        if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            move_to_elite(archive, draws.elites[iteration], strategy.mean)
-            reset(strategy)
-
-
-@spliced
-def _evaluate(landscape: Landscape, batch: Batch) -> None:
-    """Fill objectives and measures; a vector that is not finite is not looked up anywhere."""
-    model, space, measure, work = landscape
-    vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures
-    for i in range(len(objectives)):
-        vector = vectors[i]
-        if all_finite(vector):
-            objectives[i] = -cost_of(model, space, vector, work)
-            measures_of(space, measure, vector, measures[i])
-        else:
-            objectives[i] = -np.inf

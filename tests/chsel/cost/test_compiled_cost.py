@@ -23,6 +23,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+from tests.chsel.problem.torch_spaces import decode
 
 pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
 BOX_SIDES = (0.12, 0.08, 0.06)
@@ -120,7 +121,7 @@ def cases(draw: st.DrawFn, free_terms: tuple[str, ...] = ("direct", "interior"))
 def oracle(cost: RelaxedCost, space: SearchSpace, vectors: FloatArray) -> list[FloatArray]:
     """Costs (B,) and gradients (B, d) by torch."""
     leaves = torch.tensor(vectors, requires_grad=True)
-    values = cost(*space.decode(leaves))
+    values = cost(*decode(space, leaves))
     values.sum().backward()
     assert leaves.grad is not None
     return [values.detach().numpy(), leaves.grad.numpy()]

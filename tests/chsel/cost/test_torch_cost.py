@@ -13,6 +13,7 @@ from chsel.cost.objective import Objective
 from chsel.errors import SettingError
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import SE3Space
+from tests.chsel.problem.torch_spaces import decode
 
 RADIUS = 0.1
 EYE = torch.eye(3, dtype=torch.float64)[None]
@@ -124,7 +125,7 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
         expected[i] = (slope * point_gradients).sum()
     np.testing.assert_allclose(gradient[0], expected, rtol=1e-6, atol=1e-8)
     leaf = torch.tensor(vector, requires_grad=True)
-    cost(*space.decode(leaf)).backward()
+    cost(*decode(space, leaf)).backward()
     assert leaf.grad is not None
     np.testing.assert_allclose(leaf.grad[0], expected, rtol=1e-6, atol=1e-8)
 
@@ -136,7 +137,7 @@ def point_gradients_by_hand(cost, sphere, points, vector, free_term):  # type: i
     world = np.concatenate([free, points.occupied, points.known])
 
     def moved(x: np.ndarray) -> np.ndarray:
-        rotation, translation = (part[0].numpy() for part in SE3Space().decode(torch.tensor(x)))
+        rotation, translation = (part[0].numpy() for part in decode(SE3Space(), torch.tensor(x)))
         to_world = (interior - translation) @ rotation  # R^T (m - t)
         return np.concatenate([world @ rotation.T + translation, to_world])
 
@@ -152,7 +153,7 @@ def point_gradients_by_hand(cost, sphere, points, vector, free_term):  # type: i
     )
     gradients = [size[:, None] * n]
     if free_term == "interior":
-        rotation = SE3Space().decode(torch.tensor(vector))[0][0].numpy()
+        rotation = decode(SE3Space(), torch.tensor(vector))[0][0].numpy()
         s, n = read(interior)
         cells = {tuple(c) for c in np.rint((points.free - points.free.min(axis=0)) / 0.02).tolist()}
         seen = np.rint((at[len(world) :] - points.free.min(axis=0)) / 0.02).tolist()

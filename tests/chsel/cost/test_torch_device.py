@@ -19,6 +19,7 @@ from chsel.errors import EngineError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
+from tests.chsel.problem.torch_spaces import decode
 
 needs_gpu = pytest.mark.skipif(gpus() == 0, reason="torch finds no GPU here")
 SETTINGS = [
@@ -51,7 +52,7 @@ def poses(count: int, reach: float = 0.2) -> FloatArray:
 def costs_and_gradients(cost: RelaxedCost, space: Any, vectors: FloatArray) -> list[FloatArray]:
     """Costs (B,) and gradients (B, d) by torch, on the cost's device."""
     leaves = torch.tensor(vectors).to(cost.device).requires_grad_()
-    values = cost(*space.decode(leaves))
+    values = cost(*decode(space, leaves))
     values.sum().backward()
     assert leaves.grad is not None
     assert leaves.grad.device == values.device == cost.device

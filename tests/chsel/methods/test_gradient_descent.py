@@ -17,6 +17,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+from tests.chsel.problem.torch_spaces import decode
 
 SIDES = np.array([0.12, 0.08, 0.06])
 BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)
@@ -62,7 +63,7 @@ def descended_by_torch(
     optimizer = torch.optim.Adam([leaves], lr=rate)
     for _ in range(iterations):
         optimizer.zero_grad()
-        cost(*space.decode(leaves)).mean().backward()
+        cost(*decode(space, leaves)).mean().backward()
         optimizer.step()
     return leaves.detach().numpy()
 
@@ -110,7 +111,7 @@ def test_descent_moves_the_surface_onto_the_contacts() -> None:
 def rotations_near_identity(count: int) -> FloatArray:
     rows = np.eye(3)[None] + np.random.default_rng(1).uniform(-0.1, 0.1, (count, 3, 3))
     vectors = torch.tensor(np.concatenate([rows[:, :2].reshape(-1, 6), rows[:, 2]], axis=1))
-    return SE3Space().decode(vectors)[0].numpy()
+    return decode(SE3Space(), vectors)[0].numpy()
 
 
 def test_descent_reports_every_block_as_it_stands() -> None:

@@ -24,6 +24,7 @@ from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE3Space
 from chsel.problem.settings import PRESETS
 from chsel.problem.streams import StreamKey
+from tests.chsel.problem.torch_spaces import decode
 
 SIDES = np.array([0.2, 0.12, 0.08])
 MESH = trimesh.creation.box(SIDES)
@@ -173,7 +174,7 @@ def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
     for iteration in range(60):
         if iteration == 50:
             np.testing.assert_allclose(kept.traced[50][0], vectors.detach(), atol=1e-8)
-        (gradient,) = torch.autograd.grad(cost(*space.decode(vectors)).sum(), vectors)
+        (gradient,) = torch.autograd.grad(cost(*decode(space, vectors)).sum(), vectors)
         phi = directions_by_torch(
             vectors, -settings.sharpness * gradient, settings.scale, median=kernel == "median"
         )

@@ -21,6 +21,7 @@ from chsel.problem.poses import (
 )
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 from chsel.qd.measures import MEASURES, Measure, measure_named
+from tests.chsel.problem.torch_spaces import decode
 
 BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
 STREAM = np.random.default_rng(0)
@@ -47,7 +48,7 @@ def test_raw_rows_decode_to_the_rotation_of_gram_schmidt() -> None:
 def test_degenerate_rows_decode_to_finite_numbers() -> None:
     vectors = torch.zeros((2, 9), dtype=torch.float64)
     vectors[1, 0] = vectors[1, 3] = 1.0
-    rotation, _ = SE3Space().decode(vectors)
+    rotation, _ = decode(SE3Space(), vectors)
     assert bool(torch.isfinite(rotation).all())
 
 
@@ -179,7 +180,7 @@ def test_compiled_decoding_is_that_of_torch(planar: bool) -> None:
         settings = PlaneSettings(axis=(0.3, 0.6, 0.8), offset=0.1, resting_rotation=(0.4, 1.0, 0.2))
         space = SE2Space(settings, BOX)
     vectors = STREAM.uniform(-3.0, 3.0, (50, space.dimension))
-    rotation, translation = space.decode(torch.tensor(vectors))
+    rotation, translation = decode(space, torch.tensor(vectors))
     expected = compose(rotation.numpy(), translation.numpy())
     np.testing.assert_allclose(space.poses(vectors).matrices, expected, rtol=0.0, atol=3e-15)
 
