@@ -93,9 +93,9 @@ def register(
     return result
 
 
-def _warn(found: list[PointsWarning]) -> None:
+def _warn(points_warnings: list[PointsWarning]) -> None:
     """Warn at the line that calls `register`."""
-    for warning in found:
+    for warning in points_warnings:
         warnings.warn(warning, stacklevel=3)
 
 

@@ -54,9 +54,9 @@ def installed_method(name: str) -> tuple[Callable[[Any], Method], Any]:
         offered = point.load()
         default = offered()
     except Exception as error:  # whatever somebody else's code raises
-        told = f"{type(error).__name__}: {error}"
+        reason = f"{type(error).__name__}: {error}"
         raise SettingError(
-            f"{who} cannot be loaded: {told}; accepted: a class as in {_IMPLEMENTED}"
+            f"{who} cannot be loaded: {reason}; accepted: a class as in {_IMPLEMENTED}"
         ) from error
     if lacks := _lacks(default):
         raise SettingError(f"{who} has {lacks}; see {_IMPLEMENTED}")
