@@ -40,17 +40,11 @@ PLANTS = {
     ),
     "the order of a sum": Plant(
         "chsel/cost/cost_kernels.py",
-        "def _with_known(sums, model, pose, places):\n"
-        '    """sum |s - v|, with gradient (s - v) n, over points of known signed distance '
-        '(Eq. 10)."""\n'
-        "    field, table = model.field, model.field.table\n"
-        "    xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
-        "    locate(pose, field.box, xs, ys, zs, places, len(xs))\n"
+        "xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
+        "    locate(pose, model.field.box, xs, ys, zs, places, len(xs))\n"
         "    for n in range(len(xs)):\n",
-        "def _with_known(sums, model, pose, places):\n"
-        "    field, table = model.field, model.field.table\n"
-        "    xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
-        "    locate(pose, field.box, xs, ys, zs, places, len(xs))\n"
+        "xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
+        "    locate(pose, model.field.box, xs, ys, zs, places, len(xs))\n"
         "    for n in range(len(xs) - 1, -1, -1):\n",
         "points_exact_descent",
         "descent, iteration 0",
@@ -147,5 +141,6 @@ def test_without_a_change_the_bits_are_those_recorded(
 ) -> None:
     """What the tests above see is their plants alone."""
     done = runs["nothing"]
-    assert (done.returncode, done.stderr) == (0, "")
+    notices = re.sub(r"compiling the kernels .*\n", "", done.stderr)  # if none are kept yet
+    assert (done.returncode, notices) == (0, "")
     assert "4 of 4 steps equal" in done.stdout
