@@ -152,7 +152,7 @@ def _recorded_preset(recording: Recording) -> str:
 def _pair(change: str) -> tuple[str, Any]:
     key, sign, value = change.partition("=")
     if not sign or not key:
-        raise SettingError(f"{change!r} is no setting; accepted: KEY=VALUE")
+        raise SettingError(f"{change!r} is not a setting; accepted: KEY=VALUE")
     try:
         return key, yaml.safe_load(value)
     except yaml.YAMLError:

@@ -119,7 +119,7 @@ def _message(error: BaseException, config_name: str) -> str:
         return _missing(str(error.missing_cfg_file))
     if isinstance(error, OverrideParseException):
         what = error.message.splitlines()[0]
-        return f"{error.override!r} is no setting ({what}); accepted: KEY=VALUE"
+        return f"{error.override!r} is not a setting ({what}); accepted: KEY=VALUE"
     cause = error.__cause__ if isinstance(error, HydraException) else None
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):
         return _unknown_key(cause, config_name)

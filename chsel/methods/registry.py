@@ -43,7 +43,7 @@ def offering_packages(name: str) -> tuple[str, ...]:
 def installed_method(name: str) -> tuple[Callable[[Any], Method], Any]:
     """What makes an installed method of its settings, and its settings by default.
 
-    Raises SettingError for one that cannot be imported, is no method, or is of two packages.
+    Raises SettingError for one that cannot be imported, is not a method, or has two packages.
     """
     point, *others = _offers()[name]
     package = offering_packages(name)

@@ -67,10 +67,9 @@ def pose_problem(
         initial_set = first_initial_set(workspace, points, key, settings)
         low_cost_set = np.zeros((0, 4, 4))
     else:
-        own = settings.update == "own"
-        initial_set = (
-            previous.object_from_world if own else updated_initial_set(previous, key, settings)
-        )
+        initial_set = previous.object_from_world
+        if settings.update == "noise":
+            initial_set = updated_initial_set(previous, key, settings)
         low_cost_set = _low_cost_set(previous, settings)
     return RegistrationProblem(
         sdf, points, initial_set, workspace, free_resolution, key, low_cost_set

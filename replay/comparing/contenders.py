@@ -87,7 +87,7 @@ def _name_and_preset(label: str) -> tuple[str, list[str]]:
     """The method of a label, and its preset as a change."""
     match = _LABEL.fullmatch(label)
     if match is None:
-        raise SettingError(f"{label!r} is no method; accepted: {METHODS_HELP}")
+        raise SettingError(f"{label!r} is not a method; accepted: {METHODS_HELP}")
     require_choice("method", match["name"], METHODS)
     if match["preset"] is None:
         return match["name"], []
@@ -100,7 +100,7 @@ def _parted(change: str, labels: Sequence[str]) -> tuple[str | None, str, str]:
     key, sign, _ = change.partition("=")
     label, colon, inner = key.rpartition(":")
     if not sign or not (inner if colon else key):
-        raise SettingError(f"{change!r} is no setting; accepted: KEY=VALUE or METHOD:KEY=VALUE")
+        raise SettingError(f"{change!r} is not a setting; accepted: KEY=VALUE or METHOD:KEY=VALUE")
     if not colon:
         return None, key, change
     if label not in labels:

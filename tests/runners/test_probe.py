@@ -280,7 +280,7 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
         ("session.path=nothing.npz", "point file nothing.npz does not exist"),
         ("logs=/dev/null", "run folder /dev/null/probe"),
         ("session.path=null", "session.path=FILE"),
-        ("seed=1=2{", "'seed=1=2{' is no setting"),
+        ("seed=1=2{", "'seed=1=2{' is not a setting"),
         (
             "session=kinematic object=clamp configuration=drill",
             "accepted for object clamp: clamp, ",

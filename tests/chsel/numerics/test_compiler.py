@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
@@ -188,3 +189,42 @@ def test_kernels_are_saved_while_no_other_process_saves(monkeypatch: pytest.Monk
     assert events == ["locked", "signature", "code", "free"]
     kernel: Any = compiler.compiled(twice)
     assert kernel._cache.save_overload.__qualname__.startswith("_one_at_a_time")
+
+
+def names_from_elsewhere(source: Path) -> set[str]:
+    """Names that kernels of a file take from files without kernels, as "kernel: name"."""
+    tree, kernel_files = ast.parse(source.read_text()), set(compiler.kernel_sources())
+    elsewhere = {
+        alias.asname or alias.name
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("chsel.")
+        for alias in node.names
+        if ROOT / f"{str(node.module).replace('.', '/')}.py" not in kernel_files
+    }
+    decorators = {"compiled", "inner", "leaf", "spliced"}
+    found = set()
+    for kernel in tree.body:
+        if not isinstance(kernel, ast.FunctionDef):
+            continue
+        if decorators.isdisjoint(ast.unparse(each) for each in kernel.decorator_list):
+            continue
+        names = {node.id for line in kernel.body for node in ast.walk(line) if _is_read(node)}
+        parameters = {argument.arg for argument in kernel.args.args}
+        found |= {f"{kernel.name}: {name}" for name in names & elsewhere - parameters}
+    return found
+
+
+def _is_read(node: ast.AST) -> bool:
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
+
+
+def test_kernels_take_constants_from_kernel_files_alone(tmp_path: Path) -> None:
+    """Machine code holds them, and other files are not in its fingerprint."""
+    assert {
+        name for source in compiler.kernel_sources() for name in names_from_elsewhere(source)
+    } == set()
+    planted = tmp_path / "planted.py"
+    planted.write_text(
+        "from chsel.problem.sdf_grid import COARSEST\n@leaf\ndef f(x):\n    return x + COARSEST\n"
+    )
+    assert names_from_elsewhere(planted) == {"f: COARSEST"}
