@@ -27,10 +27,11 @@ class Noise(NamedTuple):
 def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
     """Noise and share of outliers from distances (N,), in metres, at the pose that fits best.
 
-    Both at once: an outlier is a distance beyond FOREIGN sigma, and sigma that of all others. The
-    sensor's noise, metres, counts as that of PRIOR_CONTACTS further contacts (the mean of a scaled
-    inverse chi-squared distribution), as a pose can be fitted to six distances whatever their
-    noise. Sums are rounded once, so that the result does not depend on the machine.
+    Both at once: an outlier is a distance beyond FOREIGN sigma, and sigma is that of all others.
+    The sensor's noise, metres, counts as that of PRIOR_CONTACTS further contacts (the mean of a
+    scaled inverse chi-squared distribution), as a pose can be fitted to six distances whatever
+    their noise. Sigma is no less than it, as errors that contacts share do not show. Sums are
+    rounded once, so that the result does not depend on the machine.
     """
     sizes = np.sort(np.abs(np.asarray(distances, dtype=np.float64)))
     count = len(sizes)
@@ -44,4 +45,4 @@ def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
         weight = PRIOR_CONTACTS + max(within - _FITTED, 0)
         sigma = math.sqrt((PRIOR_CONTACTS * sensor_noise**2 + squares) / weight)
     foreign = PRIOR_CONTACTS * PRIOR_OUTLIERS + count - max(within, 0)
-    return Noise(sigma, foreign / (PRIOR_CONTACTS + count))
+    return Noise(max(sigma, sensor_noise), foreign / (PRIOR_CONTACTS + count))

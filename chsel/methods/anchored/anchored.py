@@ -13,9 +13,10 @@ from chsel.methods.anchored.anchor_sampling import (
     anchored_poses,
     most_informative_first,
 )
-from chsel.methods.anchored.energy import Energy
+from chsel.methods.anchored.energy import Energy, NoiseLevel
+from chsel.methods.anchored.fit_kernels import Loss
 from chsel.methods.method import ConfiguredMethod
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
@@ -26,13 +27,18 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
-from chsel.problem.subset import evenly_spaced, farthest_poses
-from chsel.qd.archive import evaluated
+from chsel.problem.subset import (
+    evenly_spaced,
+    farthest_points,
+    farthest_poses,
+    surface_descriptors,
+)
+from chsel.qd.archive import Evaluated
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
     measure_range,
-    ranked_hypotheses,
+    ranked,
     repeated,
     representatives,
     sized_archive,
@@ -42,6 +48,11 @@ MOST_SAMPLES = 1_000_000_000
 MOST_POSES = 1_000_000
 MOST_MOVES = 100_000
 MOST_WORK = 1_000_000_000  # of the two
+_MOST_ROUNDS = 12
+_REACH = 0.03  # metres beyond which a known point costs no more while minima are sought
+_OUTLYING = 0.01  # and then, at least
+_COARSE, _FINE = Loss(0.01, 0.06, 0.0), Loss(0.002, 0.03, 0.0)  # of fits
+_FAR = 0.01  # metres between outlines of different modes, at least
 _KEPT = 6  # states of a chain
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
 _ARCHIVE = ArchiveSettings(bins=40, outliers="none")
@@ -63,8 +74,9 @@ class Effort(CheckedSettings):
     moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
     polished: Annotated[int, not_negative, at_most(MOST_POSES)] = 16  # the lowest, to their minima
     polish_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
-    # How many evaluations may be spent, in rounds of all but the last stage, while the lowest
-    # energy is above `enough` noise levels; 0: one round.
+    # How many evaluations may be spent in rounds of all stages up to the descent: a second one, and
+    # further ones while the last found a new mode; 0: one round. While the lowest energy is above
+    # `enough` noise levels of the sensor, a round tries a larger penetration_tolerance.
     evaluations: Annotated[int, not_negative, at_most(MOST_SAMPLES)] = 0
     enough: Annotated[float, positive] = 4.0
 
@@ -101,7 +113,7 @@ EFFORTS = {
     "small": _SMALL,
     "medium": Effort(),
     "large": _LARGE,
-    "adaptive": replace(_SMALL, evaluations=2_000_000),
+    "adaptive": replace(_SMALL, chains=96, moves=300, evaluations=600_000),
 }
 
 
@@ -112,10 +124,14 @@ class AnchoredSettings(CheckedSettings):
     The method is neither in the paper nor in its authors' code.
     """
 
-    size: Annotated[str, one_of(*EFFORTS)] = "medium"
+    size: Annotated[str, one_of(*EFFORTS)] = "adaptive"
     effort: Effort | None = None  # in place of the one that `size` names
-    noise: Annotated[float, positive] = 0.0005  # "noise level", sigma of known points, metres
-    penetration_tolerance: Annotated[float, not_negative] = 0.0  # tau, of free points, metres
+    # Of the sensor, as in its data sheet: standard deviation of known points, metres. The noise
+    # that is estimated from the points is no less.
+    noise: Annotated[float, positive] = 0.0005
+    # tau, of free points, metres; None: none, unless nothing fits with less than half a voxel of
+    # free space, or one.
+    penetration_tolerance: Annotated[float | None, not_negative] = None
     # Most candidates have energies below the larger of limit_noise noise levels, and
     # limit_ratio x lowest energy + limit_slack noise levels.
     limit_noise: Annotated[float, not_negative] = 1.0
@@ -124,6 +140,8 @@ class AnchoredSettings(CheckedSettings):
     # Share of the chains whose limit is outer_noise noise levels higher.
     outer_share: Annotated[float, not_negative, at_most(1.0)] = 0.25
     outer_noise: Annotated[float, not_negative] = 1.0
+    # Of contacts, what no residual shows: calibration of hand and camera, scale of the mesh, metres.
+    shared_error: Annotated[float, not_negative] = 0.004
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
     archive: ArchiveSettings = _ARCHIVE
     online: OnlineSettings = _ONLINE
@@ -167,6 +185,39 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         search = _Search(problem, self.settings, observer or NullObserver())
         return search.hypotheses(search.spread(search.minima()))
 
+    def holds(
+        self, problem: RegistrationProblem, hypotheses: Hypotheses, object_from_world: FloatArray
+    ) -> BoolArray:
+        """Which poses (N, 4, 4) the points allow, beside hypotheses for them: flags (N,).
+
+        Those with an energy below the limit of the best hypothesis plus the errors that points may
+        share, with free points as deep as a voxel of free space may be off.
+        """
+        search = _Search(problem, self.settings, NullObserver())
+        best = Poses.of(hypotheses.object_from_world[:1])
+        return search.holds(best, Poses.of(object_from_world))
+
+
+def _apart(outlines: FloatArray, others: FloatArray) -> float:
+    """The largest distance (m) of other outlines (M, D) from the nearest of outlines (N, D)."""
+    nearest = [((outlines - other) ** 2).mean(axis=1).min() for other in others]
+    return float(np.sqrt(max(nearest)))
+
+
+def _tolerances(problem: RegistrationProblem, fixed: float | None) -> tuple[float, ...]:
+    """The depths (metres) that free points may have at no cost, the first unless nothing fits.
+
+    Voxels may be off by half of one, or by a whole one; but no more than half as much as the
+    object is deep, so that free points still matter.
+    """
+    if fixed is not None:
+        return (fixed,)
+    if len(problem.points.free) == 0:
+        return (0.0,)
+    deepest = 0.5 * max(-float(problem.sdf.values.min()), 0.0)
+    levels = [0.0, 0.5 * problem.free_resolution, problem.free_resolution]
+    return tuple(dict.fromkeys(min(level, deepest) for level in levels))
+
 
 class _Search:
     """The stages of one registration."""
@@ -178,24 +229,26 @@ class _Search:
         self._effort = settings.effort or EFFORTS[settings.size]
         self._space = search_space(settings.plane, problem.sdf)
         self._known = most_informative_first(problem.points)
+        self._tolerances = _tolerances(problem, settings.penetration_tolerance)
         bounds = origin_bounds(problem.workspace, self._space, settings.anchors.margin)
-        tolerance = settings.penetration_tolerance
-        self._energy = Energy(problem, self._known, self._space, tolerance, bounds)
+        self._energy = Energy(problem, self._known, self._space, bounds, self._wide(0))
+
+    def _wide(self, raised: int) -> NoiseLevel:
+        """The noise of the sensor, with known points far off still drawn to the object."""
+        return NoiseLevel(self._settings.noise, self._tolerances[raised], _REACH)
 
     def minima(self) -> RatedPoses:
         """Poses near minima, the lowest first, from as many rounds as needed.
 
-        The best of E_0 and E_l join the first round.
+        The best of E_0 and E_l join the first round, and are kept as they are, too.
         """
         effort, problem = self._effort, self._problem
         given = Poses.of(np.concatenate([problem.initial_set, problem.low_cost_set]))
         if self._settings.plane is not None:  # moves keep to the plane, but do not lead onto it
             given = self._space.poses(self._space.encode(given))
         given = self._costed(given).ordered().poses[:_MOST_GIVEN]
-        rounds: list[RatedPoses] = []
-        spent = 0
-        while True:
-            index = len(rounds)
+        found, spent, raised = given, 0, 0
+        for index in range(_MOST_ROUNDS):
             starts = anchored_poses(
                 problem,
                 self._known,
@@ -206,38 +259,101 @@ class _Search:
                 index=index,
             )
             self._observer.progress("sample", effort.samples, effort.samples)
-            starts = starts if index else Poses.joined([starts, given])
-            rounds.append(self._descended(self._fitted(starts), index))
+            fitted = self._fitted(starts if index else Poses.joined([starts, given]))
+            descended = self._descended(fitted, index)
+            before, found = found, Poses.joined([found, descended.poses])
             spent += effort.samples + effort.kept * effort.first_steps
             spent += effort.refined * effort.steps + effort.descents * effort.descent_moves
             self._observer.progress("search", min(spent, effort.evaluations), effort.evaluations)
-            lowest = min(float(part.energies.min()) for part in rounds)
-            if lowest <= effort.enough * self._settings.noise or spent >= effort.evaluations:
-                return RatedPoses.joined(*rounds).ordered()
+            lowest = float(descended.energies.min())
+            if lowest > effort.enough * self._settings.noise and raised + 1 < len(self._tolerances):
+                raised += 1
+                self._energy = self._energy.at(self._wide(raised))
+                continue
+            if spent >= effort.evaluations or not (
+                index == 0 or self._new_modes(before, descended)
+            ):
+                break
+            self._energy = self._energy.at(self._wide(raised))
+        self._settle(found, raised)
+        lowest = self._walked_down(
+            self._costed(found),
+            0.0,
+            effort.polished,
+            effort.polish_moves,
+            index=3,
+        ).ordered()
+        self._show("descend", lowest)
+        return lowest
+
+    def holds(self, best: Poses, poses: Poses) -> BoolArray:
+        """Which poses have energies that the noise and shared errors allow beside the best pose."""
+        self._energy = self._energy.at(self._wide(len(self._tolerances) - 1))
+        self._estimate(self._costed(best))
+        limit = self._limit(self._energy.of(best)) + self._settings.shared_error
+        return self._energy.of(poses) <= limit
+
+    def _new_modes(self, before: Poses, last: RatedPoses) -> bool:
+        """Whether candidates of the last round are far from all before.
+
+        Far is farther apart than as many hypotheses as are wanted would be.
+        """
+        limit = self._limit(last.energies)
+        new = last.chosen(last.energies <= limit).poses
+        old = before[self._energy.of(before) <= limit]
+        if len(old) == 0:
+            return True
+        outlines = surface_descriptors(self._problem.sdf, Poses.joined([old, new]))
+        outlines, new_outlines = outlines[: len(old)], outlines[len(old) :]
+        chosen = farthest_points(outlines, len(self._problem.initial_set))
+        spacing = _apart(outlines[chosen[:-1]], outlines[chosen[-1:]]) if len(chosen) > 1 else 0.0
+        return _apart(outlines, new_outlines) > max(spacing, _FAR)
+
+    def _settle(self, found: Poses, raised: int) -> None:
+        """Take the least tolerance of free points that explains them about as well as the last.
+
+        With it the noise at the lowest pose.
+        """
+        levels = [self._energy.at(self._wide(n)) for n in range(raised + 1)]
+        rated = [RatedPoses(found, energy.of(found)).ordered() for energy in levels]
+        least = [float(one.energies[0]) for one in rated]
+        most = max(1.5 * least[-1], self._effort.enough * self._settings.noise)
+        chosen = next(n for n, energy in enumerate(least) if energy <= most or n == raised)
+        self._energy = levels[chosen]
+        self._estimate(rated[chosen])
 
     def _costed(self, poses: Poses) -> RatedPoses:
         return RatedPoses(poses, self._energy.of(poses))
 
+    def _estimate(self, poses: RatedPoses) -> None:
+        """Take the noise at the lowest pose, but no less than the sensor's."""
+        settings = self._settings
+        noise = self._energy.noise(poses.ordered().poses[:1], settings.noise)
+        tolerance = self._energy.level.tolerance
+        self._energy = self._energy.at(NoiseLevel(noise.sigma, tolerance, _OUTLYING))
+
     def _fitted(self, poses: Poses) -> RatedPoses:
         """All fitted by a few steps, and the better part of them by more; the lowest first."""
-        effort = self._effort
-        poses = self._costed(self._energy.fitted(poses, effort.first_steps)).ordered().poses
-        better = self._energy.fitted(poses[: effort.refined], effort.steps)
-        fitted = self._costed(Poses.joined([better, poses[effort.refined :]])).ordered()
+        effort, energy = self._effort, self._energy
+        fitted = self._costed(energy.fitted(poses, effort.first_steps, _COARSE)).ordered()
+        better = fitted.chosen(slice(effort.refined))
+        refined = self._costed(energy.fitted(better.poses, effort.steps, _FINE))
+        lower = refined.energies < better.energies
+        fitted = RatedPoses.joined(
+            refined.chosen(lower), better.chosen(~lower), fitted.chosen(slice(effort.refined, None))
+        ).ordered()
         self._show("fit", fitted)
         return fitted
 
     def _descended(self, fitted: RatedPoses, index: int) -> RatedPoses:
-        """The lowest walk down to the limit that holds so far, and the lowest of all further."""
-        effort, limit = self._effort, self._limit(fitted.energies)
-        lower = self._walked_down(
+        """The lowest walk down to the limit that holds so far."""
+        effort = self._effort
+        self._estimate(fitted)
+        fitted = self._costed(fitted.poses).ordered()
+        limit = self._limit(fitted.energies)
+        return self._walked_down(
             fitted, limit, effort.descents, effort.descent_moves, index=2 + 2 * index
         )
-        lowest = self._walked_down(
-            lower, 0.0, effort.polished, effort.polish_moves, index=3 + 2 * index
-        )
-        self._show("descend", lowest)
-        return lowest
 
     def _walked_down(
         self, candidates: RatedPoses, floor: float, count: int, moves: int, *, index: int
@@ -251,9 +367,9 @@ class _Search:
 
     def _limit(self, energies: FloatArray) -> float:
         """The energy below which poses are candidates."""
-        settings, least = self._settings, float(energies.min())
-        relative = settings.limit_ratio * least + settings.limit_slack * settings.noise
-        return max(settings.limit_noise * settings.noise, relative, least)
+        settings, least, sigma = self._settings, float(energies.min()), self._energy.level.sigma
+        relative = settings.limit_ratio * least + settings.limit_slack * sigma
+        return max(settings.limit_noise * sigma, relative, least)
 
     def spread(self, minima: RatedPoses) -> RatedPoses:
         """Minima below the limit, walks from there below it, and others below a higher limit.
@@ -261,7 +377,7 @@ class _Search:
         The latter as it is not known that well which energies the contacts allow.
         """
         settings, limit = self._settings, self._limit(minima.energies)
-        outer_limit = limit + settings.outer_noise * settings.noise
+        outer_limit = limit + settings.outer_noise * self._energy.level.sigma
         chains = max(self._effort.chains, -(-2 * len(self._problem.initial_set) // _KEPT))
         outer = int(settings.outer_share * chains)
         candidates = RatedPoses.joined(
@@ -269,6 +385,10 @@ class _Search:
             self._walked_below(minima, limit, chains - outer, index=0),
             self._walked_below(minima, outer_limit, outer, index=1),
         )
+        lowest = int(np.argmin(candidates.energies))
+        order = np.arange(len(candidates.energies))
+        order[[0, lowest]] = lowest, 0
+        candidates = candidates.chosen(order)  # the first is always chosen
         self._show("spread", candidates)
         return candidates
 
@@ -296,8 +416,8 @@ class _Search:
             others = others[evenly_spaced(len(others), count - len(chosen))]
             chosen = np.resize(np.concatenate([chosen, others]), count)
         measure = measure_named(settings.measure, planar=self._settings.plane is not None)
-        vectors, objective = space.encode(poses), self._energy.objective
-        offered = evaluated(objective, measure, vectors, candidates.energies)
+        vectors = space.encode(poses)
+        offered = Evaluated(vectors, candidates.energies, measure.values(space, vectors))
         mean, deviation = measure_range(offered, measure, settings, len(problem.points.known))
         archive = sized_archive(measure, mean, deviation, settings, space.dimension)
         archive.update_cells(offered)
@@ -305,7 +425,9 @@ class _Search:
         elites = space.poses(archive.solutions)
         cells = archive.cells_of(offered.measures[chosen])
         hypotheses = space.poses(vectors[chosen])
-        return ranked_hypotheses(objective, hypotheses, cells, elites, archive.snapshot(0, 0))
+        energies = self._energy.of(hypotheses)
+        last = archive.snapshot(0, 0)
+        return ranked(hypotheses.matrices, energies, cells, elites.matrices, last)
 
     def _show(self, stage: str, candidates: RatedPoses) -> None:
         vectors = self._space.encode(candidates.poses)

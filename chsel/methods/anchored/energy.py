@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from copy import copy
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.objective import Objective
-from chsel.methods.anchored.fit_kernels import Twists, fit_for, fit_poses, surrounding_for
+from chsel.methods.anchored.fit_kernels import Loss, Twists, fit_for, fit_poses, surrounding_for
 from chsel.methods.anchored.walk_kernels import (
     DRAWS,
     Chains,
@@ -21,23 +21,37 @@ from chsel.methods.anchored.walk_kernels import (
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import triple
 from chsel.numerics.threads import spread
+from chsel.problem.noise import Noise, estimate_noise
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.search_space import SE2Space, SearchSpace
 from chsel.problem.streams import Purpose
+from chsel.problem.subset import distances_from_surface
 from chsel.problem.surface import object_centre
 
 _FIT_LEVEL = -0.003  # metres: free points at less depth do not push
 _LEVER = 0.15  # metres that a radian counts for
+_FOREIGN = 8.0  # noise levels beyond which a known point costs no more
+_WRONG = 20.0  # noise levels off that a known point costs as much as a free one can
 _BLOCK = 512  # chains whose moves are drawn at a time
 
 
-class Energy:
-    """E(X) = mean |s - v| over known points + sum max(0, -tau - s) over free ones, in metres.
+class NoiseLevel(NamedTuple):
+    """How inexact points are taken to be."""
 
-    The same above tau for occupied points. It is the relaxed cost (CHSEL, Eq. 7) with other
-    weights and alpha = -tau, interpolated.
+    sigma: float  # standard deviation of known points, metres
+    tolerance: float  # depth that free points may have at no cost, metres
+    least_cap: float  # distance beyond which known points cost no more, at least, metres
+
+
+class Energy:
+    """E(X) = mean loss of s - v over known points + a sum of depths over free ones, in metres.
+
+    The loss is quadratic up to the noise, then linear, then constant; a free point costs its depth
+    beyond a tolerance, but at most as much as some known points that are off; occupied points are
+    the mirror image of free ones. N / sigma times it is a negative log-likelihood of the pose, with
+    N known points of noise sigma.
     """
 
     def __init__(
@@ -45,33 +59,27 @@ class Energy:
         problem: RegistrationProblem,
         known: KnownPoints,
         space: SearchSpace,
-        tolerance: float,
         bounds: tuple[FloatArray, FloatArray],
+        level: NoiseLevel,
     ) -> None:
-        """known: the problem's points, see most_informative_first. tolerance: tau, metres.
+        """known: the problem's points, see most_informative_first.
 
         bounds: where walks keep the object's origin.
         """
-        sdf = problem.sdf
         settings = CostSettings(
-            penetration_tolerance=-tolerance,
-            free_scale=1.0,
-            occupied_scale=1.0,
-            known_scale=1.0 / max(len(known.known), 1),
-            gradient="exact",
+            penetration_tolerance=0.0, known_scale=1.0 / max(len(known.known), 1)
         )
         resolution = problem.free_resolution
-        cost = CompiledCost(sdf, known, settings, free_resolution=resolution, culling="octree")
-        self.objective = Objective(cost, space)
-        self._model = cost.model
-        self._fitting = cost.at_level(sdf, _FIT_LEVEL - tolerance)
-        self._key = problem.key
+        self._sdf, self._known, self._key = problem.sdf, known, problem.key
+        self._cost = CompiledCost(
+            problem.sdf, known, settings, free_resolution=resolution, culling="octree"
+        )
         basis, axis = np.eye(6), (0.0, 0.0, 0.0)
         if isinstance(space, SE2Space):
             basis, axis = np.zeros((3, 6)), triple(space.axis)
             basis[0, :3], basis[1, 3:], basis[2, 3:] = space.axis, space.e_u, space.e_v
         basis[:, :3] /= _LEVER
-        centre = triple(object_centre(sdf))
+        centre = triple(object_centre(problem.sdf))
         self._twists = Twists(basis, centre)
         self._stride = Stride(
             planar=isinstance(space, SE2Space),
@@ -80,23 +88,46 @@ class Energy:
             lower=triple(bounds[0]),
             upper=triple(bounds[1]),
         )
+        self._set(level)
+
+    def _set(self, level: NoiseLevel) -> None:
+        self.level = level
+        self._model = self._cost.at_level(self._sdf, -level.tolerance)
+        self._fitting = self._cost.at_level(self._sdf, _FIT_LEVEL - level.tolerance)
+        cap = max(_FOREIGN * level.sigma, level.least_cap)
+        self._loss = Loss(level.sigma, cap, _WRONG * level.sigma / max(len(self._known.known), 1))
+
+    def at(self, level: NoiseLevel) -> Energy:
+        """The energy at another level of noise."""
+        energy = copy(self)
+        energy._set(level)
+        return energy
+
+    def noise(self, pose: Poses, sensor_noise: float) -> Noise:
+        """What known points are off at a pose."""
+        places = self._known.known
+        distances = np.empty((1, len(places)))
+        distances_from_surface(self._model.field, pose.numbers, places, distances, 0, 1)
+        return estimate_noise(distances[0] - self._known.sdf, sensor_noise)
 
     def of(self, poses: Poses) -> FloatArray:
         """Energies (B,) of poses."""
         energies = np.empty(len(poses))
 
         def run(first: int, last: int, near: Any) -> None:
-            energies_below(self._model, poses.numbers, np.inf, energies, first, last, near)
+            energies_below(
+                self._model, self._loss, poses.numbers, np.inf, energies, first, last, near
+            )
 
         spread(run, len(poses), lambda: surrounding_for(self._model), least=50)
         return energies
 
-    def fitted(self, poses: Poses, steps: int) -> Poses:
-        """Poses after at most so many Levenberg-Marquardt steps."""
+    def fitted(self, poses: Poses, steps: int, loss: Loss) -> Poses:
+        """Poses after at most so many Levenberg-Marquardt steps that lower a loss."""
         moved = np.array(poses.numbers)
 
         def run(first: int, last: int, fit: Any) -> None:
-            fit_poses(self._fitting, self._twists, moved, steps, first, last, fit)
+            fit_poses(self._fitting, loss, self._twists, moved, steps, first, last, fit)
 
         dimension = len(self._twists.basis)
         spread(run, len(moved), lambda: fit_for(self._fitting, dimension), least=8)
@@ -121,7 +152,9 @@ class Energy:
         stream = self._key.stream(Purpose.WALKS, index)
 
         def run(first: int, last: int, near: Any) -> None:
-            walk_below(self._model, self._stride, floor, block, draws, first, last, near)
+            walk_below(
+                self._model, self._loss, self._stride, floor, block, draws, first, last, near
+            )
 
         for before in range(0, len(poses), _BLOCK):
             block = Chains._make(part[before : before + _BLOCK] for part in chains)

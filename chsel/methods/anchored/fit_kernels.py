@@ -1,7 +1,8 @@
 """Levenberg-Marquardt steps that fit poses to known points and out of free space.
 
-The residuals, all of the same weight, are s - v of every known point, the depth below a level of
-every free point that is deeper, and the height above it of every occupied point that is higher.
+The residuals are s - v of every known point, the depth below a level of every free point that is
+deeper, and the height above it of every occupied point that is higher. Each costs a robust loss,
+by iteratively reweighted least squares (Holland and Welsch, 1977).
 """
 
 from __future__ import annotations
@@ -31,6 +32,14 @@ class Twists(NamedTuple):
 
     basis: FloatArray  # (d, 6), turns in radians, then shifts in metres
     pivot: tuple[float, float, float]  # the point of the object about which it turns
+
+
+class Loss(NamedTuple):
+    """What residuals cost: quadratic up to a knee (Huber, 1964), then linear, then a constant."""
+
+    knee: float  # metres
+    cap: float  # metres; at least the knee
+    most_wrong: float  # what a free or occupied point costs an energy at most, metres
 
 
 class Surrounding(NamedTuple):
@@ -77,23 +86,37 @@ def travel_since_gathering(model, pose, near):
     return travel(model.free, pose, near.memory)
 
 
+@leaf
+def cost_of_residual(loss, residual):
+    """The loss, in metres: the size of a residual less half a knee, where that is linear."""
+    size = min(abs(residual), loss.cap)
+    return size - 0.5 * loss.knee if size > loss.knee else 0.5 * size * size / loss.knee
+
+
+@leaf
+def _weight(loss, residual):
+    """The derivative of the loss by half of the residual's square."""
+    size = abs(residual)
+    return 1.0 / max(size, loss.knee) if size < loss.cap else 0.0
+
+
 @compiled
-def fit_poses(model, twists, poses, iterations, first, last, fit):
+def fit_poses(model, loss, twists, poses, iterations, first, last, fit):
     """Move poses (B, 12) from `first` to `last` by up to so many steps."""
     for n in range(first, last):
-        pose = _fitted(model, twists, pose_at(poses, n), iterations, fit)
+        pose = _fitted(model, loss, twists, pose_at(poses, n), iterations, fit)
         for i in range(12):
             poses[n, i] = pose[i]
 
 
 @inner
-def _fitted(model, twists, pose, iterations, fit):
+def _fitted(model, loss, twists, pose, iterations, fit):
     dimension = len(twists.basis)
     count = gather(model, pose, _SLACK, fit.near)
-    squares = _squares(model, twists, pose, count, fit, True)
+    losses = _losses(model, loss, twists, pose, count, fit, True)
     damping = _FIRST_DAMPING
     for _ in range(iterations):
-        if squares == 0.0:
+        if losses == 0.0:
             break
         trace = 0.0
         for i in range(dimension):
@@ -103,11 +126,11 @@ def _fitted(model, twists, pose, iterations, fit):
         trial = _moved_by(twists, pose, fit)
         if travel_since_gathering(model, trial, fit.near) > _SLACK:
             count = gather(model, trial, _SLACK, fit.near)
-        tried = _squares(model, twists, trial, count, fit, False)
-        if tried < squares:
-            gain = squares - tried
+        tried = _losses(model, loss, twists, trial, count, fit, False)
+        if tried < losses:
+            gain = losses - tried
             pose = trial
-            squares = _squares(model, twists, pose, count, fit, True)
+            losses = _losses(model, loss, twists, pose, count, fit, True)
             damping *= _LESS
             if gain < _ENOUGH * tried:
                 break
@@ -119,8 +142,8 @@ def _fitted(model, twists, pose, iterations, fit):
 
 
 @inner
-def _squares(model, twists, pose, count, fit, with_normal):
-    """The sum of squared residuals; fills the normal equations, if wanted."""
+def _losses(model, loss, twists, pose, count, fit, with_normal):
+    """The sum of the losses; fills the normal equations, if wanted."""
     field, total, dimension = model.field, 0.0, len(twists.basis)
     if with_normal:
         for i in range(dimension):
@@ -135,30 +158,33 @@ def _squares(model, twists, pose, count, fit, with_normal):
             looked_up = distance_in_box(field, places, n)
             residual = looked_up[0] - model.alpha
             if residual < 0.0:
-                total += residual * residual
+                total += cost_of_residual(loss, residual)
                 if with_normal:
                     point = candidates.x[n], candidates.y[n], candidates.z[n]
-                    _add(fit, twists, pose, point, looked_up[1:], residual)
+                    weight = _weight(loss, residual)
+                    _add(fit, twists, pose, point, looked_up[1:], residual, weight)
     for n in range(model.known.shape[1]):
         point = model.known[0, n], model.known[1, n], model.known[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         residual = looked_up[0] - model.known_sdf[n]
-        total += residual * residual
+        total += cost_of_residual(loss, residual)
         if with_normal:
-            _add(fit, twists, pose, point, looked_up[1:], residual)
+            weight = _weight(loss, residual)
+            _add(fit, twists, pose, point, looked_up[1:], residual, weight)
     for n in range(model.occupied.shape[1]):
         point = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         residual = looked_up[0] + model.alpha
         if residual > 0.0:
-            total += residual * residual
+            total += cost_of_residual(loss, residual)
             if with_normal:
-                _add(fit, twists, pose, point, looked_up[1:], residual)
+                weight = _weight(loss, residual)
+                _add(fit, twists, pose, point, looked_up[1:], residual, weight)
     return total
 
 
 @inner
-def _add(fit, twists, pose, point, gradient, residual):
+def _add(fit, twists, pose, point, gradient, residual, weight):
     """Add a residual at a world point, with its gradient by the point in the object frame."""
     u, v, w = moved(pose, point[0], point[1], point[2])
     u, v, w = u - twists.pivot[0], v - twists.pivot[1], w - twists.pivot[2]
@@ -169,9 +195,10 @@ def _add(fit, twists, pose, point, gradient, residual):
         turn = a * basis[i, 0] + b * basis[i, 1] + c * basis[i, 2]
         row[i] = turn + nx * basis[i, 3] + ny * basis[i, 4] + nz * basis[i, 5]
     for i in range(len(basis)):
-        fit.right[i] += row[i] * residual
+        weighted = weight * row[i]
+        fit.right[i] += weighted * residual
         for j in range(i + 1):
-            fit.normal[i, j] += row[i] * row[j]
+            fit.normal[i, j] += weighted * row[j]
 
 
 @inner

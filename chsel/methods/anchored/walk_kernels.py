@@ -10,7 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.methods.anchored.fit_kernels import gather, moved_about, travel_since_gathering
+from chsel.methods.anchored.fit_kernels import (
+    cost_of_residual,
+    gather,
+    moved_about,
+    travel_since_gathering,
+)
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner
@@ -63,26 +68,26 @@ def chains_from(poses: FloatArray, energies: FloatArray, kept: int) -> Chains:
 
 
 @inner
-def _known_below(model, pose, limit):
+def _known_below(model, loss, pose, limit):
     """The cost of known and occupied points; infinite if it is above the limit."""
     total = 0.0
     known, field = model.known, model.field
     for n in range(known.shape[1]):
         s = distance_at(field, pose, known[0, n], known[1, n], known[2, n])
-        total += model.known_scale * max(abs(s - model.known_sdf[n]) - model.known_tolerance, 0.0)
+        total += model.known_scale * cost_of_residual(loss, s - model.known_sdf[n])
         if not total <= limit:
             return np.inf
     occupied = model.occupied
     for n in range(occupied.shape[1]):
         s = distance_at(field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
-        total += model.occupied_scale * max(model.alpha + s, 0.0)
+        total += min(max(model.alpha + s, 0.0), loss.most_wrong)
         if not total <= limit:
             return np.inf
     return total
 
 
 @inner
-def _with_free(model, pose, total, limit, candidates, count):
+def _with_free(model, loss, pose, total, limit, candidates, count):
     """A sum plus the cost of `count` free points; infinite if it is above the limit."""
     free, box, table = model.free, model.field.box, model.field.table
     across, along = int(box.across), int(box.along)
@@ -92,31 +97,31 @@ def _with_free(model, pose, total, limit, candidates, count):
         at = places.cell[n]
         if clearance[at] < 0.0 and places.beyond[n] == 0.0:
             s = value_between_nodes(table, at, across, along, places.u[n], places.v[n], places.w[n])
-            total += model.free_scale * max(model.alpha - s, 0.0)
+            total += min(max(model.alpha - s, 0.0), loss.most_wrong)
             if not total <= limit:
                 return np.inf
     return total
 
 
 @inner
-def _energy_below(model, pose, limit, candidates):
+def _energy_below(model, loss, pose, limit, candidates):
     """The energy of a rigid pose; infinite if it is above the limit."""
-    total = _known_below(model, pose, limit)
+    total = _known_below(model, loss, pose, limit)
     if not total <= limit:
         return np.inf
     count = walk(model.free.tree, model.free.region, pose, 0.0, candidates)
-    return _with_free(model, pose, total, limit, candidates, count)
+    return _with_free(model, loss, pose, total, limit, candidates, count)
 
 
 @compiled
-def energies_below(model, poses, limit, out, first, last, near):
+def energies_below(model, loss, poses, limit, out, first, last, near):
     """Fill out (B,) with the energies of poses (B, 12) up to a limit, from `first` to `last`."""
     for n in range(first, last):
-        out[n] = _energy_below(model, pose_at(poses, n), limit, near.candidates)
+        out[n] = _energy_below(model, loss, pose_at(poses, n), limit, near.candidates)
 
 
 @compiled
-def walk_below(model, stride, floor, chains, draws, first, last, near):
+def walk_below(model, loss, stride, floor, chains, draws, first, last, near):
     """Move the chains from `first` to before `last` once for each of their draws (C, M, 9).
 
     A move is accepted if its energy is at most the limit of its chain: the energy of the chain
@@ -131,12 +136,12 @@ def walk_below(model, stride, floor, chains, draws, first, last, near):
             trial = _proposed(model, stride, pose, size, draws[n, m])
             accepted = False
             if origin_within(trial, stride.lower, stride.upper):
-                total = _known_below(model, trial, limit)
+                total = _known_below(model, loss, trial, limit)
                 if total <= limit:
                     if slack < 0.0 or travel_since_gathering(model, trial, near) > slack:
                         slack = min(max(_SLACKS * size, _LEAST_SLACK), _MOST_SLACK)
                         count = gather(model, trial, slack, near)
-                    total = _with_free(model, trial, total, limit, near.candidates, count)
+                    total = _with_free(model, loss, trial, total, limit, near.candidates, count)
                     accepted = total <= limit
             if accepted:
                 pose, energy = trial, total
