@@ -48,14 +48,15 @@ class CompiledCost:
     ) -> None:
         require_ieee_arithmetic()
         require_choice("culling", culling, CULLINGS)
-        self.settings = settings = settings or CostSettings()
+        settings = (settings or CostSettings()).of_object(sdf, free_resolution)
+        self.settings = settings
         self.model = Model(
             field=distance_field(sdf, settings.lookup, settings.outside),
             free=_free_term(sdf, points.free, settings, free_resolution, culling),
             occupied=points.occupied.T.copy(),
             known=points.known.T.copy(),
             known_sdf=points.sdf.copy(),
-            alpha=settings.penetration_tolerance,
+            alpha=settings.alpha,
             free_scale=settings.free_scale,
             occupied_scale=settings.occupied_scale,
             known_scale=settings.known_scale,
@@ -111,7 +112,7 @@ def _free_term(
         region = Region(box, clearance_of(voxels.flags, free_resolution))
         centre, radius = _sphere_around(interior.points, 0.0)
     else:
-        alpha, lookup = settings.penetration_tolerance, settings.lookup
+        alpha, lookup = settings.alpha, settings.lookup
         tree, region = octree(free, free_resolution), cells_below(sdf, alpha, lookup)
         centre, radius = _sphere_around_cells(sdf, alpha, lookup)
         cells = int((region.clearance < 0.0).sum())

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 from chsel.errors import SettingError
-from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
+from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
 from chsel.problem.settings import CheckedSettings, Presets, not_negative, one_of, positive
 
 FREE_TERMS = ("direct", "interior")
@@ -17,7 +17,9 @@ GRADIENTS = ("defined", "exact")
 class CostSettings(CheckedSettings):
     """Settings of the relaxed cost, with the paper's symbols."""
 
-    penetration_tolerance: float = -0.01  # alpha, the level that free points may reach, metres
+    # alpha, the level that free points may reach, metres; None: half a voxel of free space, or half
+    # of the object's greatest depth where that is less.
+    penetration_tolerance: float | None = None
     free_scale: Annotated[float, not_negative] = 20.0  # lambda
     occupied_scale: Annotated[float, not_negative] = 20.0  # lambda
     known_scale: Annotated[float, not_negative] = 1.0  # weight of known-SDF points
@@ -33,8 +35,9 @@ class CostSettings(CheckedSettings):
     gradient: Annotated[str, one_of(*GRADIENTS)] = "defined"
 
     presets: ClassVar[Presets] = {
-        "paper": {"lookup": "nearest"},
+        "paper": {"penetration_tolerance": -0.01, "lookup": "nearest"},
         "reference": {
+            "penetration_tolerance": -0.01,
             "free_term": "interior",
             "occupied_scale": 0.0,
             "lookup": "nearest",
@@ -44,12 +47,33 @@ class CostSettings(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not -10.0 < self.penetration_tolerance <= 0.0:
+        alpha = self.penetration_tolerance
+        if alpha is not None and not -10.0 < alpha <= 0.0:
             raise SettingError(
-                f"penetration_tolerance is {self.penetration_tolerance}; accepted: at most 0 (m)"
+                f"penetration_tolerance is {alpha}; accepted: at most 0 (m), or null"
             )
         if self.free_term == "interior" and self.gradient == "exact":
             raise SettingError(
                 "gradient is exact with free_term interior, whose value is piecewise constant; "
                 "accepted: gradient defined, or free_term direct"
             )
+
+    def of_object(self, sdf: SdfGrid, free_resolution: float) -> CostSettings:
+        """The settings with alpha for an object, and free voxels of that side in metres."""
+        if self.penetration_tolerance is not None:
+            return self
+        return replace(self, penetration_tolerance=-uncertain_depth(sdf, 0.5 * free_resolution))
+
+    @property
+    def alpha(self) -> float:
+        """The level that free points may reach, metres; see of_object."""
+        assert self.penetration_tolerance is not None
+        return self.penetration_tolerance
+
+
+def uncertain_depth(sdf: SdfGrid, depth: float) -> float:
+    """A depth in metres that free points may have, but at most half of the object's greatest.
+
+    So free points still matter to a thin object.
+    """
+    return min(depth, 0.5 * max(-float(sdf.values.min()), 0.0))

@@ -41,7 +41,7 @@ class InteriorPoints:
 
 def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
     """The nodes of a lattice over the grid that are deeper than alpha."""
-    alpha = settings.penetration_tolerance
+    alpha = settings.alpha
     spacing = settings.interior_spacing or max(-alpha, sdf.resolution / 4)
     lower, upper = sdf.bounds
     counts = np.floor((upper - lower) / spacing).astype(int) + 1

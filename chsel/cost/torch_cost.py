@@ -81,7 +81,8 @@ class RelaxedCost:
         device: str = "cpu",
         pairs_at_once: int | None = None,
     ) -> None:
-        self.settings = settings = settings or CostSettings()
+        settings = (settings or CostSettings()).of_object(sdf, free_resolution)
+        self.settings = settings
         self.sdf = sdf
         self.points = points
         self.device = device_named(device)
@@ -94,7 +95,7 @@ class RelaxedCost:
         self._known_sdf = as_tensor(points.sdf, self.device)
         self._tree: FreeTree | None = None
         self._interior: _InteriorPoints | None = None
-        free, alpha, lookup = points.free, settings.penetration_tolerance, settings.lookup
+        free, alpha, lookup = points.free, settings.alpha, settings.lookup
         if len(free) and not bool(sdf.active_cells(alpha, lookup).any()):
             warnings.warn(
                 f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
@@ -165,7 +166,7 @@ class RelaxedCost:
             halves = zip(rotation.split(half), translation.split(half), strict=True)
             return _joined([self._free(r, t) for r, t in halves])
         s, n = self._query(violated)
-        violation = (self.settings.penetration_tolerance - s).clamp_min(0.0)
+        violation = (self.settings.alpha - s).clamp_min(0.0)
         return self._sum(rotation, violated, self.settings.free_scale, violation, -n)
 
     def _of_occupied(self, rotation: Tensor, translation: Tensor) -> Part:
@@ -174,7 +175,7 @@ class RelaxedCost:
             return _zero(rotation)
         pairs = _all_pairs(rotation, translation, self._occupied)
         s, n = self._query(pairs)
-        violation = (self.settings.penetration_tolerance + s).clamp_min(0.0)
+        violation = (self.settings.alpha + s).clamp_min(0.0)
         return self._sum(rotation, pairs, self.settings.occupied_scale, violation, n)
 
     def _of_known(self, rotation: Tensor, translation: Tensor) -> Part:

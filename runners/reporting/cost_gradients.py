@@ -41,6 +41,7 @@ def picture_of_gradients(path: Path, name: str) -> Picture:
     except ChselError as error:
         raise NotDrawn(str(error)) from None
     settings = recorded_cost(start.config, start.method)
+    settings = settings.of_object(start.sdf, start.free_resolution)
     alt = (
         f"Three cross-sections of the object {start.object} with arrows: free points inside of it "
         "are pushed outwards, occupied points outside of it inwards, and known points to the "
@@ -106,7 +107,7 @@ def _figure(sdf: SdfGrid, settings: CostSettings) -> Figure:
         section = sdf.values[:, j, :].T
         axes.contour(nodes[0], nodes[2], section, [0.0], colors="#1f6f8b", linewidths=2.0)
         if kind != "known":
-            level = settings.penetration_tolerance * (1.0 if kind == "free" else -1.0)
+            level = settings.alpha * (1.0 if kind == "free" else -1.0)
             style: Any = {"colors": "#1f6f8b", "linewidths": 1.0, "linestyles": "dashed"}
             if section.min() < level < section.max():
                 axes.contour(nodes[0], nodes[2], section, [level], **style)

@@ -7,6 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from chsel.cost.cost_settings import uncertain_depth
 from chsel.errors import require_at_most
 from chsel.methods.anchored.anchor_sampling import (
     AnchorSettings,
@@ -140,7 +141,8 @@ class AnchoredSettings(CheckedSettings):
     # Share of the chains whose limit is outer_noise noise levels higher.
     outer_share: Annotated[float, not_negative, at_most(1.0)] = 0.25
     outer_noise: Annotated[float, not_negative] = 1.0
-    # Of contacts, what no residual shows: calibration of hand and camera, scale of the mesh, metres.
+    # What contacts are off that no residual shows, metres: calibration of hand and camera, scale
+    # of the mesh.
     shared_error: Annotated[float, not_negative] = 0.004
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
     archive: ArchiveSettings = _ARCHIVE
@@ -207,16 +209,14 @@ def _apart(outlines: FloatArray, others: FloatArray) -> float:
 def _tolerances(problem: RegistrationProblem, fixed: float | None) -> tuple[float, ...]:
     """The depths (metres) that free points may have at no cost, the first unless nothing fits.
 
-    Voxels may be off by half of one, or by a whole one; but no more than half as much as the
-    object is deep, so that free points still matter.
+    Voxels may be off by half of one, or by a whole one.
     """
     if fixed is not None:
         return (fixed,)
     if len(problem.points.free) == 0:
         return (0.0,)
-    deepest = 0.5 * max(-float(problem.sdf.values.min()), 0.0)
-    levels = [0.0, 0.5 * problem.free_resolution, problem.free_resolution]
-    return tuple(dict.fromkeys(min(level, deepest) for level in levels))
+    sdf, voxel = problem.sdf, problem.free_resolution
+    return tuple(dict.fromkeys(uncertain_depth(sdf, depth) for depth in (0.0, 0.5 * voxel, voxel)))
 
 
 class _Search:
@@ -276,15 +276,15 @@ class _Search:
                 break
             self._energy = self._energy.at(self._wide(raised))
         self._settle(found, raised)
-        lowest = self._walked_down(
+        polished = self._walked_down(
             self._costed(found),
             0.0,
             effort.polished,
             effort.polish_moves,
             index=3,
         ).ordered()
-        self._show("descend", lowest)
-        return lowest
+        self._show("descend", polished)
+        return polished
 
     def holds(self, best: Poses, poses: Poses) -> BoolArray:
         """Which poses have energies that the noise and shared errors allow beside the best pose."""
