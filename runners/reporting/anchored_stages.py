@@ -15,12 +15,11 @@ from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError
 from chsel.methods.anchored.anchor_sampling import anchored_poses, most_informative_first
-from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings
-from chsel.methods.anchored.energy import Energy
+from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Search
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.problem.registration_problem import NullObserver, RegistrationProblem
-from chsel.problem.search_space import origin_bounds, search_space
+from chsel.problem.search_space import search_space
 from replay.console import print_error
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.panels import drawn, new_figure
@@ -68,8 +67,7 @@ def stages_of(problem: RegistrationProblem, settings: AnchoredSettings) -> list[
     sampled = anchored_poses(
         problem, known, space, anchors, samples=effort.samples, most=effort.kept
     )
-    bounds = origin_bounds(problem.workspace, space, anchors.margin)
-    energy = Energy(problem, known, space, settings.penetration_tolerance, bounds)
+    energy = Search(problem, settings, NullObserver()).energy
     traces = _Traces()
     found = Anchored(settings).register(problem, traces)
     stages = [_sorted("sampled on contacts", sampled.matrices, energy.of(sampled))]
@@ -144,7 +142,7 @@ def main() -> int:
     parser.add_argument("recording", type=Path, help="of any method, whose problem is taken")
     parser.add_argument("png", type=Path)
     parser.add_argument("--step", type=int, help="by default the first that has a problem")
-    parser.add_argument("--size", choices=tuple(EFFORTS), default="medium")
+    parser.add_argument("--size", choices=tuple(EFFORTS), default="adaptive")
     parser.add_argument("--view", choices=tuple(VIEWS), default="xz")
     given = parser.parse_args()
     try:

@@ -39,7 +39,9 @@ MOST_KEPT = 100_000
 _DEEP = 0.3  # of the greatest depth: points inside are at least so deep
 _MOST_NODES = 4000  # of which they are chosen
 _WEIGHT = 90.0  # of the mean depth of the points inside that are in free space
+_TOLERANT_WEIGHT = 9.0  # the same where free points may be wrong
 _MOST_VOXELS = 20_000_000
+_REACH = 0.06  # metres beyond which known points cost no more
 _MOST_ORDERED = 64  # known points that are put in order
 _BLOCK = 65_536  # poses that are drawn at a time
 _SAMPLES_PER_THREAD = 5_000
@@ -47,15 +49,20 @@ _LENGTHS_ALIKE = 0.004  # metres
 _LEAST_LENGTH = 0.01  # metres between two contacts that give a direction
 
 
-def coarse_of(problem: RegistrationProblem, known: KnownPoints, margin: float) -> Coarse:
+def coarse_of(
+    problem: RegistrationProblem, known: KnownPoints, margin: float, tolerance: float = 0.0
+) -> Coarse:
     """The score of poses: mean contact distance, and the depths of points inside in free space.
 
     known: the problem's points, see most_informative_first. margin: metres by which the object's
     origin may be beside the workspace; free space beyond its reach is left out, and all of it if
-    it needs too many voxels.
+    it needs too many voxels. tolerance: depth (m) that free points may have at no cost.
     """
     sdf, resolution = problem.sdf, problem.free_resolution
-    values, inside, depth = sdf.derived("coarse", lambda: _values_and_depths(sdf))
+    values, inside, depth = sdf.derived(
+        ("coarse", tolerance), lambda: _values_and_depths(sdf, tolerance)
+    )
+    weight = _WEIGHT if tolerance == 0.0 else _TOLERANT_WEIGHT
     count = min(len(known.known), MOST_CONTACTS)
     free, (lower, upper) = problem.points.free, problem.workspace.bounds
     reach = margin + sdf.diameter
@@ -74,16 +81,18 @@ def coarse_of(problem: RegistrationProblem, known: KnownPoints, margin: float) -
         contacts=known.known[:count].T.copy(),
         known_sdf=known.sdf[:count].copy(),
         scale=1.0 / max(count, 1),
+        reach=_REACH,
         inside=inside.T.copy(),
-        weights=depth * (_WEIGHT / max(len(depth), 1)),
+        weights=depth * (weight / max(len(depth), 1)),
         voxels=voxels,
         flags=flags,
     )
 
 
-def _values_and_depths(sdf: SdfGrid) -> tuple[Any, FloatArray, FloatArray]:
+def _values_and_depths(sdf: SdfGrid, tolerance: float) -> tuple[Any, FloatArray, FloatArray]:
     """All signed distances, and points (P, 3) inside of the object with their depths (P,)."""
-    deep = np.argwhere(sdf.values <= _DEEP * min(float(sdf.values.min()), 0.0))
+    level = min(_DEEP * min(float(sdf.values.min()), 0.0), -tolerance)
+    deep = np.argwhere(sdf.values <= level)
     if len(deep) > _MOST_NODES:
         deep = deep[np.arange(_MOST_NODES) * len(deep) // _MOST_NODES]
     nodes = deep[farthest_points(deep.astype(np.float64), MOST_INSIDE)]
@@ -117,14 +126,15 @@ def anchored_poses(
     samples: int,
     most: int,
     index: int = 0,
+    tolerance: float = 0.0,
 ) -> Poses:
     """The best of so many random poses by their coarse score: K poses, best first.
 
     known: the problem's points, see most_informative_first. most: K at most; fewer where the
-    object is out of its bounds too often. index: of the stream.
+    object is out of its bounds too often. index: of the stream. tolerance: see coarse_of.
     """
     anchors = _anchors(problem, known, space, settings)
-    coarse = coarse_of(problem, known, settings.margin)
+    coarse = coarse_of(problem, known, settings.margin, tolerance)
     stream = problem.key.stream(Purpose.ANCHORS, index)
     bests: list[Best] = []
 

@@ -53,6 +53,7 @@ _MOST_ROUNDS = 12
 _REACH = 0.03  # metres beyond which a known point costs no more while minima are sought
 _OUTLYING = 0.01  # and then, at least
 _COARSE, _FINE = Loss(0.01, 0.06, 0.0), Loss(0.002, 0.03, 0.0)  # of fits
+_AS_WELL = 1.5  # a tolerance explains points as well if its energy is at most so much higher
 _FAR = 0.01  # metres between outlines of different modes, at least
 _KEPT = 6  # states of a chain
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
@@ -79,7 +80,7 @@ class Effort(CheckedSettings):
     # further ones while the last found a new mode; 0: one round. While the lowest energy is above
     # `enough` noise levels of the sensor, a round tries a larger penetration_tolerance.
     evaluations: Annotated[int, not_negative, at_most(MOST_SAMPLES)] = 0
-    enough: Annotated[float, positive] = 4.0
+    enough: Annotated[float, positive] = 2.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -184,7 +185,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         self, problem: RegistrationProblem, observer: Observer | None = None
     ) -> Hypotheses:
         """Hypotheses for the known points of a problem, best first; costs are energies."""
-        search = _Search(problem, self.settings, observer or NullObserver())
+        search = Search(problem, self.settings, observer or NullObserver())
         return search.hypotheses(search.spread(search.minima()))
 
     def holds(
@@ -195,7 +196,7 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         Those with an energy below the limit of the best hypothesis plus the errors that points may
         share, with free points as deep as a voxel of free space may be off.
         """
-        search = _Search(problem, self.settings, NullObserver())
+        search = Search(problem, self.settings, NullObserver())
         best = Poses.of(hypotheses.object_from_world[:1])
         return search.holds(best, Poses.of(object_from_world))
 
@@ -219,7 +220,7 @@ def _tolerances(problem: RegistrationProblem, fixed: float | None) -> tuple[floa
     return tuple(dict.fromkeys(uncertain_depth(sdf, depth) for depth in (0.0, 0.5 * voxel, voxel)))
 
 
-class _Search:
+class Search:
     """The stages of one registration."""
 
     def __init__(
@@ -231,7 +232,7 @@ class _Search:
         self._known = most_informative_first(problem.points)
         self._tolerances = _tolerances(problem, settings.penetration_tolerance)
         bounds = origin_bounds(problem.workspace, self._space, settings.anchors.margin)
-        self._energy = Energy(problem, self._known, self._space, bounds, self._wide(0))
+        self.energy = Energy(problem, self._known, self._space, bounds, self._wide(0))
 
     def _wide(self, raised: int) -> NoiseLevel:
         """The noise of the sensor, with known points far off still drawn to the object."""
@@ -257,6 +258,7 @@ class _Search:
                 samples=effort.samples,
                 most=effort.kept,
                 index=index,
+                tolerance=self._tolerances[raised],
             )
             self._observer.progress("sample", effort.samples, effort.samples)
             fitted = self._fitted(starts if index else Poses.joined([starts, given]))
@@ -268,13 +270,13 @@ class _Search:
             lowest = float(descended.energies.min())
             if lowest > effort.enough * self._settings.noise and raised + 1 < len(self._tolerances):
                 raised += 1
-                self._energy = self._energy.at(self._wide(raised))
+                self.energy = self.energy.at(self._wide(raised))
                 continue
             if spent >= effort.evaluations or not (
                 index == 0 or self._new_modes(before, descended)
             ):
                 break
-            self._energy = self._energy.at(self._wide(raised))
+            self.energy = self.energy.at(self._wide(raised))
         self._settle(found, raised)
         polished = self._walked_down(
             self._costed(found),
@@ -288,10 +290,10 @@ class _Search:
 
     def holds(self, best: Poses, poses: Poses) -> BoolArray:
         """Which poses have energies that the noise and shared errors allow beside the best pose."""
-        self._energy = self._energy.at(self._wide(len(self._tolerances) - 1))
+        self.energy = self.energy.at(self._wide(len(self._tolerances) - 1))
         self._estimate(self._costed(best))
-        limit = self._limit(self._energy.of(best)) + self._settings.shared_error
-        return self._energy.of(poses) <= limit
+        limit = self._limit(self.energy.of(best)) + self._settings.shared_error
+        return self.energy.of(poses) <= limit
 
     def _new_modes(self, before: Poses, last: RatedPoses) -> bool:
         """Whether candidates of the last round are far from all before.
@@ -300,7 +302,7 @@ class _Search:
         """
         limit = self._limit(last.energies)
         new = last.chosen(last.energies <= limit).poses
-        old = before[self._energy.of(before) <= limit]
+        old = before[self.energy.of(before) <= limit]
         if len(old) == 0:
             return True
         outlines = surface_descriptors(self._problem.sdf, Poses.joined([old, new]))
@@ -314,27 +316,27 @@ class _Search:
 
         With it the noise at the lowest pose.
         """
-        levels = [self._energy.at(self._wide(n)) for n in range(raised + 1)]
+        levels = [self.energy.at(self._wide(n)) for n in range(raised + 1)]
         rated = [RatedPoses(found, energy.of(found)).ordered() for energy in levels]
         least = [float(one.energies[0]) for one in rated]
-        most = max(1.5 * least[-1], self._effort.enough * self._settings.noise)
+        most = _AS_WELL * least[-1] + self._settings.noise
         chosen = next(n for n, energy in enumerate(least) if energy <= most or n == raised)
-        self._energy = levels[chosen]
+        self.energy = levels[chosen]
         self._estimate(rated[chosen])
 
     def _costed(self, poses: Poses) -> RatedPoses:
-        return RatedPoses(poses, self._energy.of(poses))
+        return RatedPoses(poses, self.energy.of(poses))
 
     def _estimate(self, poses: RatedPoses) -> None:
         """Take the noise at the lowest pose, but no less than the sensor's."""
         settings = self._settings
-        noise = self._energy.noise(poses.ordered().poses[:1], settings.noise)
-        tolerance = self._energy.level.tolerance
-        self._energy = self._energy.at(NoiseLevel(noise.sigma, tolerance, _OUTLYING))
+        noise = self.energy.noise(poses.ordered().poses[:1], settings.noise)
+        sigma = min(noise.sigma, max(_REACH, settings.noise))
+        self.energy = self.energy.at(NoiseLevel(sigma, self.energy.level.tolerance, _OUTLYING))
 
     def _fitted(self, poses: Poses) -> RatedPoses:
         """All fitted by a few steps, and the better part of them by more; the lowest first."""
-        effort, energy = self._effort, self._energy
+        effort, energy = self._effort, self.energy
         fitted = self._costed(energy.fitted(poses, effort.first_steps, _COARSE)).ordered()
         better = fitted.chosen(slice(effort.refined))
         refined = self._costed(energy.fitted(better.poses, effort.steps, _FINE))
@@ -361,13 +363,13 @@ class _Search:
         """RatedPoses of which the `count` lowest walked down to a floor, these first."""
         candidates = candidates.ordered()
         first = candidates.chosen(slice(count))
-        chains = self._energy.walked(*first, floor, moves, kept=0, index=index)
+        chains = self.energy.walked(*first, floor, moves, kept=0, index=index)
         walked = RatedPoses(Poses(chains.poses), chains.energies)
         return RatedPoses.joined(walked, candidates.chosen(slice(count, None)))
 
     def _limit(self, energies: FloatArray) -> float:
         """The energy below which poses are candidates."""
-        settings, least, sigma = self._settings, float(energies.min()), self._energy.level.sigma
+        settings, least, sigma = self._settings, float(energies.min()), self.energy.level.sigma
         relative = settings.limit_ratio * least + settings.limit_slack * sigma
         return max(settings.limit_noise * sigma, relative, least)
 
@@ -377,7 +379,7 @@ class _Search:
         The latter as it is not known that well which energies the contacts allow.
         """
         settings, limit = self._settings, self._limit(minima.energies)
-        outer_limit = limit + settings.outer_noise * self._energy.level.sigma
+        outer_limit = limit + settings.outer_noise * self.energy.level.sigma
         chains = max(self._effort.chains, -(-2 * len(self._problem.initial_set) // _KEPT))
         outer = int(settings.outer_share * chains)
         candidates = RatedPoses.joined(
@@ -398,7 +400,7 @@ class _Search:
         """States below a limit of chains that start at minima far apart."""
         minima = minima.chosen(minima.energies <= limit)
         starts = np.resize(farthest_poses(self._problem.sdf, minima.poses, chains), chains)
-        walked = self._energy.walked(
+        walked = self.energy.walked(
             *minima.chosen(starts), limit, self._effort.moves, kept=_KEPT, index=index
         )
         states = RatedPoses(Poses(walked.kept.reshape(-1, 12)), walked.kept_energies.reshape(-1))
@@ -425,7 +427,7 @@ class _Search:
         elites = space.poses(archive.solutions)
         cells = archive.cells_of(offered.measures[chosen])
         hypotheses = space.poses(vectors[chosen])
-        energies = self._energy.of(hypotheses)
+        energies = self.energy.of(hypotheses)
         last = archive.snapshot(0, 0)
         return ranked(hypotheses.matrices, energies, cells, elites.matrices, last)
 

@@ -25,6 +25,7 @@ class Coarse(NamedTuple):
     contacts: FloatArray  # (3, A), world
     known_sdf: FloatArray  # (A,)
     scale: float  # cost of a metre of distance
+    reach: float  # metres beyond which a known point costs no more
     inside: FloatArray  # (3, P), object frame
     weights: FloatArray  # (P,), cost of each in free space
     voxels: Box  # of the free space
@@ -109,7 +110,7 @@ def score_below(coarse, pose, limit):
         k, m, o = _clamped(box, u, v, w)
         away = (abs(u - k) + abs(v - m) + abs(w - o)) / inverse
         s = coarse.values[_nearest_node(box, k, m, o)]
-        total += coarse.scale * abs(s + away - coarse.known_sdf[n])
+        total += coarse.scale * min(abs(s + away - coarse.known_sdf[n]), coarse.reach)
         if not total <= limit:
             return np.inf
     inside, voxels = coarse.inside, coarse.voxels

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from chsel.methods.anchored.anchor_sampling import most_informative_first
-from chsel.methods.anchored.energy import Energy
-from chsel.methods.anchored.fit_kernels import surrounding_for
+from chsel.methods.anchored.energy import Energy, NoiseLevel
+from chsel.methods.anchored.fit_kernels import Loss, surrounding_for
 from chsel.methods.anchored.walk_kernels import Chains, energies_below
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
@@ -35,6 +35,8 @@ POINTS = KnownPoints(
 )
 TOUCHED = KnownPoints(free=FREE, known=CONTACTS)
 MARGIN = 0.15
+SIGMA, CAP = 0.003, 0.05  # the last known point is farther off
+FINE = Loss(0.002, 0.03, 0.0)
 
 
 def energy_of(
@@ -44,7 +46,8 @@ def energy_of(
     problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
     space = search_space(plane, GRID)
     bounds = origin_bounds(problem.workspace, space, MARGIN)
-    return Energy(problem, most_informative_first(points), space, tolerance, bounds), bounds
+    level = NoiseLevel(SIGMA, tolerance, CAP)
+    return Energy(problem, most_informative_first(points), space, bounds, level), bounds
 
 
 def around(count: int, shift: float, turn: float) -> Poses:
@@ -56,26 +59,33 @@ def around(count: int, shift: float, turn: float) -> Poses:
     return Poses.of(inverse(np.stack([TRUTH @ move for move in moves])))
 
 
+def losses(residuals: FloatArray, knee: float, cap: float) -> FloatArray:
+    """Quadratic up to the knee, then linear with the same slope, then constant."""
+    sizes = np.minimum(np.abs(residuals), cap)
+    return np.where(sizes <= knee, sizes**2 / (2.0 * knee), sizes - knee / 2.0)
+
+
 def plainly(points: KnownPoints, poses: Poses, tau: float) -> FloatArray:
+    most = 20.0 * SIGMA / max(len(points.known), 1)
     energies = []
     for transform in poses.matrices:
         known, free, occupied = (
             GRID.query(apply(transform, part), lookup="trilinear")[0].numpy()
             for part in (points.known, points.free, points.occupied)
         )
-        mean = np.abs(known - points.sdf).mean() if len(known) else 0.0
-        depth = np.maximum(-tau - free, 0.0).sum() + np.maximum(occupied - tau, 0.0).sum()
-        energies.append(mean + depth)
+        mean = losses(known - points.sdf, SIGMA, CAP).mean() if len(known) else 0.0
+        wrong = np.concatenate([-tau - free, occupied - tau])
+        energies.append(mean + np.clip(wrong, 0.0, most).sum())
     return np.array(energies)
 
 
-def squares(points: KnownPoints, poses: Poses) -> FloatArray:
+def fit_losses(points: KnownPoints, poses: Poses, loss: Loss) -> FloatArray:
     """What a fit lowers, without free points."""
-    residuals = []
+    sums = []
     for transform in poses.matrices:
         known = GRID.query(apply(transform, points.known), lookup="trilinear")[0].numpy()
-        residuals.append(((known - points.sdf) ** 2).sum())
-    return np.array(residuals)
+        sums.append(losses(known - points.sdf, loss.knee, loss.cap).sum())
+    return np.array(sums)
 
 
 def far_poses() -> Poses:
@@ -108,14 +118,15 @@ def test_energies_above_a_limit_are_infinite_and_others_as_they_are() -> None:
     model, poses = energy._model, Poses.joined([around(40, 0.02, 0.3), far_poses()])
     energies, limited = energy.of(poses), np.empty(len(poses))
     limit = float(np.sort(energies)[30])
-    energies_below(model, poses.numbers, limit, limited, 0, len(poses), surrounding_for(model))
+    near = surrounding_for(model)
+    energies_below(model, energy._loss, poses.numbers, limit, limited, 0, len(poses), near)
     np.testing.assert_array_equal(limited, np.where(energies <= limit, energies, np.inf))
 
 
 def test_a_fit_recovers_a_pose_that_was_moved_a_little() -> None:
     energy, _ = energy_of(TOUCHED)
     poses = around(20, 0.01, 0.15)
-    fitted = energy.fitted(poses, 30)
+    fitted = energy.fitted(poses, 30, FINE)
     assert (energy.of(fitted) < 0.0005).all()
     assert (energy.of(poses) > 0.002).all()
     truth = inverse(TRUTH)
@@ -123,14 +134,29 @@ def test_a_fit_recovers_a_pose_that_was_moved_a_little() -> None:
     np.testing.assert_allclose(fitted.rotations, np.tile(truth[:3, :3], (20, 1, 1)), atol=0.03)
 
 
-def test_no_fit_raises_the_sum_of_squares() -> None:
+@pytest.mark.parametrize("loss", [FINE, Loss(0.01, 0.06, 0.0), Loss(1.0, 2.0, 0.0)])
+def test_no_fit_raises_its_loss(loss: Loss) -> None:
     points = KnownPoints(known=CONTACTS)
     energy, _ = energy_of(points)
-    poses = far_poses()
-    before, after = squares(points, poses), squares(points, energy.fitted(poses, 10))
+    poses = far_poses() if loss.cap > 1.0 else around(40, 0.01, 0.1)
+    fitted = energy.fitted(poses, 10, loss)
+    before, after = fit_losses(points, poses, loss), fit_losses(points, fitted, loss)
     assert (after <= before * (1.0 + 1e-9)).all()
     assert np.median(after / before) < 0.1
-    np.testing.assert_array_equal(energy.fitted(poses, 0).numbers, poses.numbers)
+    np.testing.assert_array_equal(energy.fitted(poses, 0, loss).numbers, poses.numbers)
+
+
+def test_points_far_off_the_object_do_not_move_a_fit() -> None:
+    """A tenth of the contacts is on something behind the object."""
+    foreign = np.tile([0.2, 0.1, 0.5], (4, 1)) + 0.02 * RANDOM.standard_normal((4, 3))
+    poses = around(20, 0.005, 0.1)
+    alone, _ = energy_of(KnownPoints(known=CONTACTS))
+    both, _ = energy_of(KnownPoints(known=np.concatenate([CONTACTS, foreign])))
+    fitted = both.fitted(poses, 40, FINE)
+    assert (alone.of(fitted) < 2e-4).mean() > 0.9
+    noise = both.noise(fitted[:1], 0.0005)
+    assert noise.sigma < 0.001
+    assert noise.outliers == pytest.approx((4.0 + 0.08) / (34.0 + 4.0))
 
 
 def walked(energy: Energy, poses: Poses, floor: float, moves: int, kept: int = 4) -> Chains:
@@ -139,7 +165,7 @@ def walked(energy: Energy, poses: Poses, floor: float, moves: int, kept: int = 4
 
 def test_walks_stay_below_the_limit_and_within_bounds() -> None:
     energy, (lower, upper) = energy_of(TOUCHED)
-    starts = energy.fitted(around(12, 0.01, 0.1), 30)
+    starts = energy.fitted(around(12, 0.01, 0.1), 30, FINE)
     chains = walked(energy, starts, 0.01, 200)
     kept = Poses(chains.kept.reshape(-1, 12))
     assert np.isfinite(chains.kept_energies).all()
@@ -170,7 +196,7 @@ def test_neither_fits_nor_walks_depend_on_threads() -> None:
     results = []
     for count in (1, 2):
         with threads(count):
-            fitted = energy.fitted(poses, 4)
+            fitted = energy.fitted(poses, 4, FINE)
             chains = walked(energy, fitted, 0.02, 40)
             results.append([fitted.numbers, energy.of(fitted), *chains])
     for one, two in zip(*results, strict=True):
@@ -183,7 +209,7 @@ def test_on_a_plane_fits_and_walks_stay_on_it() -> None:
     space = search_space(plane, GRID)
     near = around(6, 0.01, 0.1)
     poses = space.poses(space.encode(near))
-    chains = walked(energy, energy.fitted(poses, 10), 0.0, 60)
+    chains = walked(energy, energy.fitted(poses, 10, FINE), 0.0, 60)
     again = space.poses(space.encode(Poses(chains.poses)))
     np.testing.assert_allclose(again.numbers, chains.poses, atol=1e-9)
     assert np.abs(chains.poses - poses.numbers).max() > 1e-3
