@@ -22,7 +22,7 @@ from replay.console import Console, Progress, TextColumn
 from runners.sensors.tally import Report, Tally
 from runners.step_warning import FROM_SESSION, StepWarning
 
-_MEANINGS = {
+MEANINGS = {
     "determined": "one pose explains the points",
     "several modes": "several poses explain the points; probe where they differ",
     "wide": "many poses explain the points; probe further sides",
@@ -156,7 +156,7 @@ class Display:
     def verdict(self, trust: Trust | None) -> None:
         """How far to trust the last result, if there is one."""
         if trust is not None:
-            self._console.print(f"{trust}: {_MEANINGS[trust.verdict]}")
+            self._console.print(f"{trust}: {MEANINGS[trust.verdict]}")
 
     def close(self) -> None:
         """Give the terminal back."""

@@ -13,14 +13,13 @@ from scipy.sparse.csgraph import connected_components
 
 from chsel.errors import PointsWarning, PoseError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.problem.freedom import can_be_moved
 from chsel.problem.noise import FOREIGN, estimate_noise
-from chsel.problem.poses import Poses, rotated
+from chsel.problem.outline import in_order, outline_distances, signed_distances
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
-from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.sdf_lookup import distance_field
-from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.subset import distances_from_surface, evenly_spaced
-from chsel.problem.surface import has_surface, surface_points
+from chsel.problem.sdf_grid import FARTHEST
+from chsel.problem.subset import evenly_spaced
 
 SENSOR_NOISE = 0.0005  # metres, of known points, where nothing is known about the sensor
 DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS
@@ -44,7 +43,6 @@ _LEAST_CORRELATED = 8  # points
 _MOST_HYPOTHESES = 100  # that are compared, the best ones
 _MOST_KNOWN, _MOST_FREE = 1000, 5000  # points that they are compared by
 _MOST_CORRELATED = 300
-_OUTLINE = 100  # points on the object's surface
 
 
 def trust_in(
@@ -59,7 +57,7 @@ def trust_in(
     """
     require_positive("sensor_noise", sensor_noise)
     poses, sdf = _compared(hypotheses), problem.sdf
-    off = _signed(sdf, poses[:1], problem.points.known)[0] - problem.points.sdf
+    off = signed_distances(sdf, poses[:1], problem.points.known)[0] - problem.points.sdf
     noise = estimate_noise(off, sensor_noise)
     most = FOREIGN * noise.sigma
     error = float(_mean_errors(problem, poses[:1], sensor_noise, most)[0])
@@ -77,7 +75,8 @@ def trust_in(
     if error > limit or noise.outliers > MOST_OUTLIERS:
         verdict = NOTHING
     elif count == 1:
-        verdict = DETERMINED if spread <= width else WIDE
+        wide = spread > width or can_be_moved(problem, poses[:1], noise.sigma, width)
+        verdict = WIDE if wide else DETERMINED
     else:
         narrow = count <= MOST_MODES and _widest(apart, mode) <= width
         verdict = SEVERAL if narrow else WIDE
@@ -105,22 +104,6 @@ def check_trust(trust: Trust, sensor_noise: float | None = None) -> list[PointsW
         f"{trust.noise:.2g} m, or the object is not quite this one"
     )
     return [PointsWarning("above_noise", text)]
-
-
-def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
-    """How far the object's surface in a pose is from that in another (B, B), metres.
-
-    Root mean square over points of both surfaces: 0 between poses that a symmetry maps to each
-    other. The grid's interpolation is exact to a fraction of its resolution.
-    """
-    outline = sdf.derived("outline", lambda: _outline(sdf))  # (Q, 3)
-    count, turns = len(poses), np.swapaxes(poses.rotations, 1, 2)
-    places = rotated(turns[:, None], outline - poses.translations[:, None])  # (B, Q, 3), world
-    distances = _signed(sdf, poses, places.reshape(-1, 3)).reshape(count, count, len(outline))
-    squares = _sums(distances**2) / max(len(outline), 1)
-    apart: FloatArray = np.sqrt(0.5 * (squares + squares.T))
-    np.fill_diagonal(apart, 0.0)
-    return apart
 
 
 def correlation(points: FloatArray, errors: FloatArray) -> float:
@@ -166,15 +149,6 @@ def _compared(hypotheses: Hypotheses) -> Poses:
     return poses[np.flatnonzero(chosen)[:_MOST_HYPOTHESES]]
 
 
-def _signed(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
-    """Signed distances (B, N), metres, of world points (N, 3) in poses."""
-    field = distance_field(sdf, "trilinear", "surface_point")
-    signed = np.empty((len(poses), len(points)))
-    numbers, places = np.array(poses.numbers), np.array(points)
-    distances_from_surface(field, numbers, places, signed, 0, len(poses))
-    return np.minimum(signed, FARTHEST)
-
-
 def _mean_errors(
     problem: RegistrationProblem,
     poses: Poses,
@@ -191,30 +165,18 @@ def _mean_errors(
     """
     points, sdf = problem.points, problem.sdf
     known = evenly_spaced(len(points.known), _MOST_KNOWN if thinned else len(points.known))
-    off = np.abs(_signed(sdf, poses, points.known[known]) - points.sdf[known])
-    total, count = _sums(np.minimum(off, most)), np.full(len(poses), float(len(known)))
+    off = np.abs(signed_distances(sdf, poses, points.known[known]) - points.sdf[known])
+    total, count = in_order(np.minimum(off, most)), np.full(len(poses), float(len(known)))
     tolerance = problem.free_resolution + LEAST_LEVELS * sensor_noise
     known_share = len(known) / max(len(points.known), 1)
     for sign, group in ((-1.0, points.free), (1.0, points.occupied)):
         some = evenly_spaced(len(group), _MOST_FREE if thinned else len(group))
-        depth = sign * _signed(sdf, poses, group[some])
+        depth = sign * signed_distances(sdf, poses, group[some])
         wrong = depth > tolerance
         each = (known_share or 1.0) * len(group) / max(len(some), 1)
-        total += each * _sums(np.where(wrong, depth, 0.0))
+        total += each * in_order(np.where(wrong, depth, 0.0))
         count += each * wrong.sum(axis=1)
     return total / np.maximum(count, 1.0)
-
-
-def _outline(sdf: SdfGrid) -> FloatArray:
-    """Points (Q, 3) on the object's surface, object frame; none if the grid has no surface."""
-    if has_surface(sdf):
-        return surface_points(sdf, _OUTLINE, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
-    near: IntArray = np.argwhere(np.abs(sdf.values) < 2.0 * sdf.resolution)  # of thin objects
-    near = near[evenly_spaced(len(near), _OUTLINE)]
-    i, j, k = near.T
-    away = sdf.values[i, j, k][:, None] * sdf.gradients[i, j, k]
-    points: FloatArray = sdf.origin + near * sdf.resolution - away
-    return points
 
 
 def _widest(apart: FloatArray, mode: IntArray) -> float:
@@ -225,10 +187,3 @@ def _widest(apart: FloatArray, mode: IntArray) -> float:
 
 def _root_mean_square(values: FloatArray) -> float:
     return math.sqrt(math.fsum((values**2).tolist()) / len(values))
-
-
-def _sums(values: FloatArray) -> FloatArray:
-    """Sums along the last axis, added in their order."""
-    if values.shape[-1] == 0:
-        return np.zeros(values.shape[:-1])
-    return np.cumsum(values, axis=-1)[..., -1]

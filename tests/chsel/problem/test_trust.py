@@ -11,6 +11,7 @@ import trimesh
 import chsel
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.outline import outline_distances
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
@@ -21,7 +22,6 @@ from chsel.problem.trust import (
     check_trust,
     correlation,
     has_pose,
-    outline_distances,
     trust_in,
 )
 
@@ -173,7 +173,8 @@ def test_poses_on_two_sides_are_two_modes_and_far_ones_do_not_count() -> None:
     trust = trust_in(posed, hypotheses(*near, off))
     assert (trust.verdict, trust.modes) == ("several modes", 2)
     assert trust.spread > MOST_WIDTH * GRID.diameter
-    assert trust_in(posed, hypotheses(near[0], near[1], off)).verdict == "determined"
+    alike = trust_in(posed, hypotheses(near[0], near[1], off))
+    assert (alike.verdict, alike.modes) == ("wide", 1)  # a set that leaves out what also fits
     along = [moved(z=shift) for shift in np.linspace(0.0, 0.04, 12)]
     assert trust_in(posed, hypotheses(*along)).verdict == "wide"
 
