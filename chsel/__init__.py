@@ -24,8 +24,14 @@ if TYPE_CHECKING:
     from chsel.problem.mesh import load_mesh
     from chsel.problem.online_registration import OnlineRegistration
     from chsel.problem.points import KnownPoints, Workspace
-    from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+    from chsel.problem.registration_problem import (
+        ArchiveSnapshot,
+        Hypotheses,
+        RegistrationProblem,
+        Trust,
+    )
     from chsel.problem.sdf_grid import SdfGrid
+    from chsel.problem.trust import trust_in
 
 __all__ = [
     "ArchiveSnapshot",
@@ -41,9 +47,11 @@ __all__ = [
     "RegistrationProblem",
     "RelaxedCost",
     "SdfGrid",
+    "Trust",
     "Workspace",
     "load_mesh",
     "register",
+    "trust_in",
 ]
 
 _PLACES = {
@@ -60,9 +68,11 @@ _PLACES = {
     "RegistrationProblem": "problem.registration_problem",
     "RelaxedCost": "cost.torch_cost",
     "SdfGrid": "problem.sdf_grid",
+    "Trust": "problem.registration_problem",
     "Workspace": "problem.points",
     "load_mesh": "problem.mesh",
     "register": "api",
+    "trust_in": "problem.trust",
 }
 
 

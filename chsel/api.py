@@ -13,17 +13,17 @@ import numpy as np
 import trimesh
 
 from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
-from chsel.methods import build_method, noise_of, preset_settings
+from chsel.methods import build_method, noise_of, preset_settings, trust_by
 from chsel.numerics.arrays import frozen
-from chsel.problem.input_checks import check_contacts, check_fit, check_points
+from chsel.problem.defaults import FREE_RESOLUTION, object_grid, workspace_around
+from chsel.problem.input_checks import check_contacts, check_points
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import changed_settings
-
-_VOXELS_PER_EXTENT = 20
+from chsel.problem.trust import check_trust
 
 
 def register(
@@ -42,7 +42,7 @@ def register(
     initial_set: Any = None,
     previous: Hypotheses | None = None,
     resolution: float | None = None,
-    free_resolution: float = 0.01,
+    free_resolution: float = FREE_RESOLUTION,
     seed: int = 0,
     step: int = 0,
     observer: Observer | None = None,
@@ -61,10 +61,11 @@ def register(
     1 cm. free_resolution: voxel side of free space, metres; used by free_term interior.
     seed, step: of the random streams.
 
-    Returns hypotheses with costs, best first, repeated poses flagged.
+    Returns hypotheses with costs, best first, repeated poses flagged, and with `trust`: how far to
+    trust them, see `trust_in`; None if an installed method finds no pose.
     Raises ChselError, with what is accepted, for malformed input; at least one point is needed.
     Warns with PointsWarning about points that are hardly meant, and where no hypothesis explains
-    them, see chsel.problem.input_checks.
+    them, see chsel.problem.input_checks and chsel.problem.trust.
     """
     points = _known_points(surface, free, occupied, known, known_sdf)
     if workspace is not None:
@@ -75,7 +76,7 @@ def register(
     solver = build_method(method, _settings(method, preset, settings, hypotheses))
     sdf = _grid(target, resolution)
     _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
-    workspace = workspace or Workspace.around(points.all_points(), sdf.diameter)
+    workspace = workspace or workspace_around(points, sdf)
     online = OnlineRegistration(
         sdf,
         workspace,
@@ -89,8 +90,10 @@ def register(
     if initial_set is not None:
         problem = replace(problem, initial_set=initial_set)
     result = solver.register(problem, observer)
-    _warn(check_fit(problem, result, noise_of(solver)))
-    return result
+    trust = trust_by(solver, problem, result)
+    if trust is not None:
+        _warn(check_trust(trust, noise_of(solver)))
+    return replace(result, trust=trust)
 
 
 def _warn(points_warnings: list[PointsWarning]) -> None:
@@ -133,10 +136,7 @@ def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGri
             f"target is {shown}; accepted: a mesh such as chsel.load_mesh({str(path)!r}), "
             "a Trimesh, or a SdfGrid"
         )
-    mesh = clean_mesh(target.vertices, target.faces, name="target")
-    if resolution is None:
-        resolution = min(0.01, float(np.min(mesh.extents)) / _VOXELS_PER_EXTENT)
-    return SdfGrid.from_mesh(mesh, resolution)
+    return object_grid(clean_mesh(target.vertices, target.faces, name="target"), resolution)
 
 
 def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) -> Any:

@@ -13,6 +13,7 @@ from chsel.plausible.pose_metrics import result_numbers
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.trust import trust_in
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 
@@ -66,7 +67,8 @@ def _register_twice(method: Method) -> None:
     for step in online.steps(enumerate((touched, others)), method.register):
         assert step.hypotheses is not None
         assert step.problem is not None
-        result_numbers(step.hypotheses, step.problem, np.eye(4), None)
+        trust = trust_in(step.problem, step.hypotheses)
+        result_numbers(step.hypotheses, step.problem, np.eye(4), None, trust)
 
 
 def _ball() -> SdfGrid:

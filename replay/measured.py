@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from chsel.methods import trust_by
+from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.events import Measured, SessionStarted
@@ -23,13 +25,20 @@ def measured_differences(
     problem: RegistrationProblem,
     hypotheses: Hypotheses,
     recorded: Sequence[Measured],
+    method: Method,
 ) -> list[str]:
-    """Lines about measured values of one registration that are not those of its result."""
+    """Lines about measured values of one registration that are not those of its result.
+
+    method: that of the recording. Older recordings do not say how far to trust a result.
+    """
     if len(recorded) != 1:
         return [f"there are {len(recorded)} messages of measured values; accepted: one"]
     values = recorded[0].values
     symmetry = symmetry_for_errors(start)
-    again = result_numbers(hypotheses, problem, start.world_from_object, symmetry)
+    trust = trust_by(method, problem, hypotheses)
+    if trust is not None and not values.keys() & trust.numbers.keys():
+        trust = None
+    again = result_numbers(hypotheses, problem, start.world_from_object, symmetry, trust)
     return [
         f"measured {name}: {_shown(values, name)} recorded, {_shown(again, name)} computed"
         for name in sorted({*values, *again})

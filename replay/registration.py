@@ -10,13 +10,13 @@ from typing import Any
 import yaml
 
 from chsel.errors import RecordingError, SettingError
-from chsel.methods import build_method, preset_settings
+from chsel.methods import build_method, preset_settings, trust_by
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
 from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.registration_problem import Hypotheses, Trust
 from chsel.problem.settings import PRESETS, changed_settings, settings_mapping
 from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder, SessionStarted
 from replay.lost_attachment import is_lost
@@ -46,6 +46,7 @@ class Registered:
     hypotheses: Hypotheses
     numbers: Mapping[str, float]
     seconds: Mapping[str, float]
+    trust: Trust | None  # None if no pose was found
 
     @property
     def total_seconds(self) -> float:
@@ -133,9 +134,10 @@ def register_recorded(
     seconds = dict(observer.seconds)
     seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
     recorder.record(HypothesesFound(posed.step, hypotheses))
-    numbers = result_numbers(hypotheses, posed.problem, world_from_object, symmetry)
+    trust = trust_by(method, posed.problem, hypotheses)
+    numbers = result_numbers(hypotheses, posed.problem, world_from_object, symmetry, trust)
     recorder.record(Measured(posed.step, numbers))
-    return Registered(hypotheses, numbers, seconds)
+    return Registered(hypotheses, numbers, seconds, trust)
 
 
 def _named(name: str, settings: Any) -> NamedMethod:

@@ -206,7 +206,7 @@ def _verified(
     numbers = [event for event in recorded if isinstance(event, Measured)]
     measured = recording.version >= SEALED_SINCE  # before, numbers may be others than today's
     if measured and (numbers or not any(map(tells_loss, events))):
-        lines = measured_differences(start, posed.problem, expected, numbers)
+        lines = measured_differences(start, posed.problem, expected, numbers, method.method)
         comparison.stage_is("the measured values", equal=not lines)
         comparison.differences += lines
     return comparison.verdict(step, method.name, environment, seconds)

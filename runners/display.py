@@ -17,9 +17,17 @@ from rich.progress import BarColumn, TimeElapsedColumn
 from rich.table import Table
 
 from chsel.errors import InputWarning
+from chsel.problem.registration_problem import Trust
 from replay.console import Console, Progress, TextColumn
 from runners.sensors.tally import Report, Tally
 from runners.step_warning import FROM_SESSION, StepWarning
+
+MEANINGS = {
+    "determined": "one pose explains the points",
+    "several modes": "several poses explain the points; probe where they differ",
+    "wide": "many poses explain the points; probe further sides",
+    "nothing fits": "no pose explains the points; see the warning",
+}
 
 
 class Bar:
@@ -118,12 +126,13 @@ class Display:
         errors = ["mm", "°", "mm", "°"] if truth else []
         for name in [*names, *errors, "time"]:
             table.add_column(name, justify="right")
+        table.add_column("verdict")
         for row in rows:
             cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
             cells.append(str(row["distinct"]))
             if truth:
                 cells += [*_errors(row, "best"), *_errors(row, "closest")]
-            table.add_row(*cells, f"{row['seconds']:.2f} s")
+            table.add_row(*cells, f"{row['seconds']:.2f} s", row.get("verdict", ""))
         self._console.print(table)
 
     def sensed(self, report: Report) -> None:
@@ -143,6 +152,11 @@ class Display:
             path = shlex.quote(str(folder / "recording.rrd"))
             self._console.print("look at it:")
             self._console.print(f"{viewer} {path}", soft_wrap=True)
+
+    def verdict(self, trust: Trust | None) -> None:
+        """How far to trust the last result, if there is one."""
+        if trust is not None:
+            self._console.print(f"{trust}: {MEANINGS[trust.verdict]}")
 
     def close(self) -> None:
         """Give the terminal back."""

@@ -125,7 +125,7 @@ def _of_session(
         events = list(opened.probes())
     finally:
         opened.close()
-    sdf = SdfGrid.from_mesh(model.mesh, settings.object_resolution, padding=settings.object_padding)
+    sdf = model.grid(settings)
     problems = _ProbedProblems(events, opened, sdf, seed)
     told = [event.source for event in events if isinstance(event, RigDescribed)]
     return Source(

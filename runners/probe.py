@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -47,7 +47,6 @@ from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
-from runners.step_warning import StepWarning
 from runners.whole_file import WritingError
 
 if TYPE_CHECKING:
@@ -180,12 +179,7 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
         return Scene(recorded, of.object, of.mesh, of.sdf, recorded.start)
     object_model, found = _load_object(config)
     session = open_session(kind, settings, object_model, config.seed, watcher)
-    sdf = SdfGrid.from_mesh(
-        object_model.mesh,
-        settings.object_resolution,
-        padding=settings.object_padding,
-        progress=lambda done, total: watcher("signed distance grid, nodes", done, total),
-    )
+    sdf = object_model.grid(settings, watcher)
     start = Start(settings.start_contacts, settings.start_probe)
     if kind in _OF_REAL_OBJECTS:
         found += check_size(object_model, session.workspace)
@@ -289,6 +283,7 @@ def run(
     if outcome == "interrupted":
         display.say("interrupted: the recording holds everything up to here")
     display.written(folder, _sizes(folder))
+    display.verdict(session_run.trust)
     return outcome == "interrupted"
 
 
@@ -307,9 +302,9 @@ def _finish(
             _end(recorder, session_run.step, "info" if finished else "warning", outcome)
     except RecordingError as error:
         with suppress(OSError, WritingError):  # the first error is the one to tell
-            _summarise(folder, started, rows, session_run.warnings, f"failed: {error}")
+            _summarise(folder, started, rows, session_run, f"failed: {error}")
         raise
-    _summarise(folder, started, rows, session_run.warnings, outcome)
+    _summarise(folder, started, rows, session_run, outcome)
 
 
 def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:
@@ -324,10 +319,11 @@ def _summarise(
     folder: Path,
     started: SessionStarted,
     rows: list[Row],
-    found: Sequence[StepWarning],
+    session_run: SessionRun,
     outcome: str,
 ) -> None:
     """Write summary.json: the outcome, warnings, and the numbers of every step, times included."""
+    trust = session_run.trust
     summary = {
         "runner": started.runner,
         "object": started.object,
@@ -336,7 +332,8 @@ def _summarise(
         "seed": started.seed,
         "outcome": outcome,
         "recording_digest": recording_digest(folder / "recording.mcap"),
-        "warnings": [asdict(warning) for warning in found],
+        "trust": None if trust is None else asdict(trust),  # of the last result
+        "warnings": [asdict(warning) for warning in session_run.warnings],
         "steps": rows,
         "bytes": _sizes(folder),
         "environment": dict(started.environment),

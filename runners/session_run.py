@@ -10,10 +10,11 @@ from chsel.errors import ChselError, InputWarning
 from chsel.methods import noise_of
 from chsel.methods.method import Method
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.problem.input_checks import check_contacts, check_fit, check_points
+from chsel.problem.input_checks import check_contacts, check_points
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
 from chsel.problem.points import KnownPoints
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
+from chsel.problem.trust import check_trust
 from replay.events import Logged, Probe, ProblemPosed, Recorder, Timed
 from replay.registration import Registered, register_recorded
 from runners.recording import RecordingConfig
@@ -27,7 +28,8 @@ class SessionRun:
     """Walks the loop of an `OnlineRegistration` over a session, and records every step.
 
     step: of the last probe. warnings: so far. registered: what the method gave in that step, None
-    without a registration. failure: why it gave nothing, "" if nothing failed.
+    without a registration. failure: why it gave nothing, "" if nothing failed. trust: how far to
+    trust the last result, None before the first.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class SessionRun:
         self.warnings: list[StepWarning] = []
         self.registered: Registered | None = None
         self.failure = ""
+        self.trust: Trust | None = None
 
     def steps(
         self,
@@ -74,13 +77,15 @@ class SessionRun:
                 "free_points": self._online.points.free,
             }
             if step.problem is not None and self.registered is not None:
-                found = self.registered.hypotheses
+                found, trust = self.registered.hypotheses, self.registered.trust
                 if len(found.cost) > 0:
-                    self._warn(check_fit(step.problem, found, noise_of(self._method)))
                     row["best_cost"] = float(found.cost[0])
                 row |= {"distinct": found.distinct, "digest": found.digest}
                 row |= self.registered.numbers
-            self._recorder.record(Logged(step.step, "info", _line(row)))
+                if trust is not None:
+                    self._warn(check_trust(trust, noise_of(self._method)))
+                    self.trust, row["verdict"] = trust, trust.verdict
+            self._recorder.record(Logged(step.step, "info", self._line(row)))
             if self._recording.timings:
                 self._recorder.record(Timed(step.step, self._seconds))
             self._recorder.flush()
@@ -131,6 +136,13 @@ class SessionRun:
         points, diameter = self._online.points.all(), self._online.sdf.diameter
         self._warn(check_points(points, diameter, resolution, workspace))
 
+    def _line(self, row: Row) -> str:
+        """What the recording's log says about a probe."""
+        text = f"probe {row['step']}: {row['outcome']}, {row['contacts']} contacts"
+        if "digest" not in row:
+            return f"{text}, too little for a registration"
+        return f"{text}; {self.trust}" if "verdict" in row else text
+
     def _warn(self, found: Iterable[InputWarning]) -> None:
         """Record warnings, each kind once a session."""
         for warning in found:
@@ -143,9 +155,3 @@ def one_line(error: BaseException) -> str:
     """The text of an error, with its class if it is none of ours."""
     text = " ".join(str(error).split())
     return text if isinstance(error, ChselError) else f"{type(error).__name__}: {text}"
-
-
-def _line(row: Row) -> str:
-    """What the recording's log says about a probe; results speak for themselves."""
-    text = f"probe {row['step']}: {row['outcome']}, {row['contacts']} contacts"
-    return text if "digest" in row else f"{text}, too little for a registration"

@@ -1,5 +1,12 @@
 """Registration methods: each a file, or a folder with its parts."""
 
-from chsel.methods.registry import METHODS, OURS, build_method, noise_of, preset_settings
+from chsel.methods.registry import (
+    METHODS,
+    OURS,
+    build_method,
+    noise_of,
+    preset_settings,
+    trust_by,
+)
 
-__all__ = ["METHODS", "OURS", "build_method", "noise_of", "preset_settings"]
+__all__ = ["METHODS", "OURS", "build_method", "noise_of", "preset_settings", "trust_by"]

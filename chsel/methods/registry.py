@@ -23,7 +23,9 @@ from chsel.methods.medial_constraint import (
 from chsel.methods.method import Method
 from chsel.methods.svgd import Svgd, SvgdSettings
 from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.settings import PRESETS, changed_settings, in_preset
+from chsel.problem.trust import SENSOR_NOISE, has_pose, trust_in
 
 GROUP = "chsel.methods"
 _IMPLEMENTED = "docs/writing_a_method.md"
@@ -130,7 +132,15 @@ def build_method(name: str, settings: Any = None) -> Method:
 
 def noise_of(method: Method) -> float | None:
     """The noise of known points by a method's settings, metres; None if it has no such setting."""
-    return method.settings.noise if isinstance(method.settings, AnchoredSettings) else None
+    settings = getattr(method, "settings", None)
+    return settings.noise if isinstance(settings, AnchoredSettings) else None
+
+
+def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypotheses) -> Trust | None:
+    """How far to trust what a method found, by the noise in its settings; None without a pose."""
+    if not has_pose(hypotheses):
+        return None
+    return trust_in(problem, hypotheses, noise_of(method) or SENSOR_NOISE)
 
 
 def _entry(name: str) -> tuple[Callable[[Any], Method], Any]:

@@ -13,7 +13,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
 from chsel.problem.poses import apply, inverse, product, rotated, rotation_angle
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 
 
 def pose_errors(
@@ -38,8 +38,9 @@ def result_numbers(
     problem: RegistrationProblem,
     world_from_object: FloatArray | None,
     symmetry: ObjectSymmetry | None,
+    trust: Trust | None = None,
 ) -> dict[str, float]:
-    """Counts and archive measures, and the errors to the true pose (4, 4) where it is known.
+    """Counts, archive measures and trust, and the errors to the true pose (4, 4) where it is known.
 
     Errors are those of the best hypothesis and of the one closest in position, in metres and
     radians, as `pose_errors` defines them. symmetry: of the object; None if its mesh is not
@@ -52,6 +53,8 @@ def result_numbers(
     if hypotheses.archive is not None:
         values["archive_coverage"] = hypotheses.archive.coverage
         values["archive_qd_score"] = hypotheses.archive.qd_score
+    if trust is not None:
+        values |= trust.numbers
     if world_from_object is not None and len(hypotheses.object_from_world) > 0:
         symmetry = symmetry or grid_symmetry(problem.sdf)
         position, rotation = pose_errors(hypotheses.object_from_world, world_from_object, symmetry)

@@ -1,4 +1,4 @@
-"""Whether known points can be those of an object, and whether any hypothesis explains them."""
+"""Whether known points can be those of an object."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ from scipy.spatial import cKDTree
 from chsel.errors import PointsError, PointsWarning
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Lattice, Workspace
-from chsel.problem.poses import apply
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 
 # In diameters of the object:
 MOST_APART = 10.0  # between contacts, and from a contact to the free points
 NEVER_APART = 100.0  # between contacts: a tenth of an object whose points are in millimetres
 NEVER_AROUND = 1000.0  # between any points: an object whose points are in millimetres
 MOST_OUTSIDE = 0.2  # from the workspace to a contact
-MOST_OFF = 0.04  # average error of known points
 
-MOST_NOISE = 10.0  # noise levels that the lowest energy may have
 _BLOCK = np.array(sorted(np.ndindex(3, 3, 3), key=lambda at: at != (1, 1, 1))) - 1  # centre first
 _MOST_VOXELS = 2.0**62  # that can be numbered
 
@@ -174,50 +170,3 @@ def _spread(points: FloatArray) -> float:
 
 def _count(chosen: BoolArray, what: str) -> str:
     return f"{int(chosen.sum())} of {len(chosen)} {what}"
-
-
-def check_fit(
-    problem: RegistrationProblem, hypotheses: Hypotheses, noise: float | None = None
-) -> list[PointsWarning]:
-    """A warning if the best hypothesis contradicts the points by more than inexact sensors can.
-
-    By the SDF, whatever the method's cost is: the distance between known points and their level,
-    the depth of free points in the object, and the height of occupied points above it.
-    noise: of known points by the method's settings, metres, if its costs are energies in metres.
-    """
-    sdf, points, best = problem.sdf, problem.points, hypotheses.object_from_world[0]
-
-    def signed(of: FloatArray) -> FloatArray:
-        value: FloatArray = sdf.query(apply(best, of), lookup="trilinear")[0].numpy()
-        return value
-
-    tolerance = max(MOST_OFF * sdf.diameter, sdf.resolution)
-    off = np.abs(signed(points.known) - points.sdf)
-    depth = float(-signed(points.free).min(initial=0.0))
-    height = float(signed(points.occupied).max(initial=0.0))
-    contradictions = []
-    if len(off) and off.mean() > tolerance:
-        mean, most = _length(float(off.mean())), _length(float(off.max()))
-        contradictions.append(f"known points are {mean} off on average (up to {most})")
-    if depth > tolerance + problem.free_resolution:
-        contradictions.append(f"free points are up to {_length(depth)} inside")
-    if height > tolerance + problem.free_resolution:
-        contradictions.append(f"occupied points are up to {_length(height)} outside")
-    if contradictions:
-        text = (
-            f"no hypothesis explains the points: for the best, {', '.join(contradictions)}; check "
-            "units, frames, and the object and its scale"
-        )
-        return [PointsWarning("no_fit", text)]
-    energy = float(hypotheses.cost[0])
-    if noise is None or energy <= MOST_NOISE * noise:
-        return []
-    text = (
-        f"the lowest energy is {_length(energy)}, {energy / noise:.0f} noise levels: no hypothesis "
-        f"explains the points, or sensors are less exact than the method's noise of {noise:g} m"
-    )
-    return [PointsWarning("above_noise", text)]
-
-
-def _length(metres: float) -> str:
-    return f"{1000.0 * metres:.3g} mm" if metres < 1.0 else f"{metres:.3g} m"

@@ -83,6 +83,43 @@ class ArchiveSnapshot:
         return digest(self.cells, self.solutions, self.objectives, self.measures)
 
 
+VERDICTS = ("determined", "several modes", "wide", "nothing fits")
+"""What `chsel.problem.trust` says of a result; in recordings 0 to 3, so this order stays."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How far to trust a result: how well it explains the points, and how far it is unique."""
+
+    noise: float  # standard deviation of the known points on the object, estimated, metres
+    outliers: float  # share of known points that are not on the object, estimated
+    misfit: float  # how far points are off the best hypothesis on average, in sensor noise levels
+    modes: int  # groups of hypotheses that explain the points, with gaps between their surfaces
+    spread: float  # root mean square distance of their surfaces to that of the best one, metres
+    verdict: str  # one of VERDICTS
+
+    def __str__(self) -> str:
+        """One line for people."""
+        modes = f"{self.modes} modes" if self.modes > 1 else "1 mode"
+        return (
+            f"{self.verdict} ({modes}, spread {1000.0 * self.spread:.1f} mm, noise "
+            f"{1000.0 * self.noise:.1f} mm, {100.0 * self.outliers:.0f} % outliers, misfit "
+            f"{self.misfit:.1f} noise levels)"
+        )
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """As recordings have it, the verdict as the number of its place in VERDICTS."""
+        return {
+            "estimated_noise": self.noise,
+            "outlier_share": self.outliers,
+            "misfit": self.misfit,
+            "modes": float(self.modes),
+            "set_spread": self.spread,
+            "verdict": float(VERDICTS.index(self.verdict)),
+        }
+
+
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
     """The result of one registration: B poses, best first."""
@@ -93,6 +130,7 @@ class Hypotheses:
     cell: IntArray  # (B,): the archive cell that a pose came from, -1 for none
     elites: FloatArray  # (L, 4, 4): object_from_world of all solutions, from which E_l follows
     archive: ArchiveSnapshot | None = None  # the last one, if the method keeps an archive
+    trust: Trust | None = None  # of `chsel.register`; methods leave it out, see `chsel.trust_in`
 
     @property
     def distinct(self) -> int:

@@ -6,6 +6,7 @@ from contextlib import suppress
 from typing import Any
 
 from chsel.errors import ChselError, RecordingError
+from chsel.problem.defaults import object_grid
 from chsel.problem.points import GrowingPoints
 from chsel.problem.sdf_grid import SdfGrid
 from replay.events import HypothesesFound, Probe, ProblemPosed, SensorImage, SessionStarted
@@ -95,9 +96,9 @@ class GapReader(EventReader):
         session = config_from_json(self._opening["config"]).get("session")
         if not isinstance(session, dict):
             raise RecordingError("the configuration does not say how the grid was made")
-        named = (session.get("object_resolution"), session.get("object_padding"))
+        named = (session.get("object_resolution", 0.0), session.get("object_padding"))
         resolution, padding = (float(x) if isinstance(x, int | float) else 0.0 for x in named)
-        return SdfGrid.from_mesh(mesh, resolution, padding=padding)
+        return object_grid(mesh, None if named[0] is None else resolution, padding=padding)
 
     def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
         try:

@@ -157,6 +157,7 @@ def _curve_views(*, pose_known: bool, timed: bool) -> list[rrb.View | rrb.Contai
         rrb.Tabs(
             rrb.Vertical(*spreads, name="Spread"),
             curves_view("distinct", "Distinct"),
+            curves_view("trust", "Noise and spread [mm]"),
             curves_view("measured", "Other"),
         )
     )

@@ -24,6 +24,7 @@ SPREADS = {
 _CURVE_NAMES = ("lowest", "median", "highest")
 SHOWN_UNIT = {"position": 1e3, "rotation": math.degrees(1.0)}
 """What turns metres and radians into the units shown, millimetres and degrees."""
+_OF_TRUST = ("estimated_noise", "set_spread")  # measured lengths, metres
 _AT_ONCE = 64  # blocks of iterations that are sent together
 
 
@@ -69,7 +70,10 @@ class Curves:
                 label, shown = text.replace(f" {kind} error", ""), SHOWN_UNIT[kind] * value
                 self._scalar(f"error/{kind}/{name}", label, shown)
                 return
-        self._scalar(f"measured/{name}", text, value)
+        if name in _OF_TRUST:
+            self._scalar(f"trust/{name}", text, SHOWN_UNIT["position"] * value)
+        else:
+            self._scalar(f"measured/{name}", text, value)
 
     def add_seconds(self, stage: str, seconds: float) -> None:
         """Wall-clock time of a stage."""

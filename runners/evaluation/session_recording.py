@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import Any
 
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.sdf_grid import SdfGrid
 from replay.environment import environment
 from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
 from runners.evaluation.configurations import SENSORS
@@ -42,9 +41,7 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
         for warning in check_size(model, session.workspace):
             warnings.warn(warning, stacklevel=2)
     try:
-        sdf = SdfGrid.from_mesh(
-            model.mesh, settings.object_resolution, padding=settings.object_padding
-        )
+        sdf = model.grid(settings)
         truth: FloatArray | None = session.world_from_object
         events: Iterable[Event] = session.probes()
         if log is not None:

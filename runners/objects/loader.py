@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from chsel.errors import SettingError, require_choice, require_positive
+from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import clean_mesh, load_mesh
+from chsel.problem.sdf_grid import SdfGrid
 from runners.objects.scans import scan_file
 
 if TYPE_CHECKING:
@@ -44,6 +47,18 @@ class ObjectConfig:
             raise SettingError("scan is missing; pass object.scan=FOLDER, such as 035_power_drill")
 
 
+class GridSettings(Protocol):
+    """What the settings of a session say about the grid of its object."""
+
+    @property
+    def object_resolution(self) -> float | None:
+        """Spacing of the nodes, metres; None: as `object_grid` chooses it."""
+
+    @property
+    def object_padding(self) -> float:
+        """Of the grid around the object, metres."""
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
     """An object as a session sees it: its mesh in metres, with the scale already applied."""
@@ -53,6 +68,24 @@ class ObjectModel:
     scale: float
     epsilon: float
     configuration: str
+    _grids: dict[tuple[float | None, float], SdfGrid] = field(default_factory=dict, repr=False)
+
+    def grid(
+        self, settings: GridSettings, progress: Callable[[str, int, int], None] = lambda *_: None
+    ) -> SdfGrid:
+        """The signed distance grid that a session's settings ask for, made once.
+
+        progress: gets a name, the number of nodes done and that of all.
+        """
+        key = settings.object_resolution, settings.object_padding
+        if key not in self._grids:
+            self._grids[key] = object_grid(
+                self.mesh,
+                settings.object_resolution,
+                padding=settings.object_padding,
+                progress=lambda done, total: progress("signed distance grid, nodes", done, total),
+            )
+        return self._grids[key]
 
 
 def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:

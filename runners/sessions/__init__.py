@@ -42,7 +42,7 @@ def open_session(
     Raises SessionError if it cannot be opened, or if a configuration is one of another object.
     """
     if kind == "points":
-        return PointsSession(settings, object_model)
+        return PointsSession(settings, object_model, progress)
     if kind == "recorded":
         return RecordedSession(settings)
     if kind == "sensors":

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 
 from chsel.errors import PointsError, SettingError, require_positive
+from chsel.problem.defaults import FREE_RESOLUTION, OBJECT_PADDING, workspace_around
 from chsel.problem.input_checks import check_points
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from replay.events import Probe
 from runners.objects.loader import ObjectModel
 from runners.sessions.point_files import read_points
+from runners.sessions.session import Progress, unwatched
 
 
 @dataclass(frozen=True)
@@ -21,16 +22,17 @@ class PointsSettings:
     """path: .npz, .csv, .ply, .off, .xyz or .stl. workspace: x, y, z bounds, metres
     [[x0, x1], [y0, y1], [z0, z1]]; by default the bounds of the points, padded by the object's
     diameter. free_resolution: voxel side of free space, metres. merge_free: keep one free point
-    a voxel, at its centre. object_resolution, object_padding: of the SDF grid, metres.
-    start_contacts, start_probe: a registration needs so many contacts and this probe index.
+    a voxel, at its centre. object_resolution, object_padding: of the SDF grid, metres; by default
+    the resolution that `object_grid` takes. start_contacts, start_probe: a registration needs so
+    many contacts and this probe index. With the defaults, `chsel.register` has the same bits.
     """
 
     path: str | None = None
     workspace: tuple[tuple[float, float], ...] | None = None
-    free_resolution: float = 0.01
+    free_resolution: float = FREE_RESOLUTION
     merge_free: bool = False
-    object_resolution: float = 0.005
-    object_padding: float = 0.05
+    object_resolution: float | None = None
+    object_padding: float = OBJECT_PADDING
     start_contacts: int = 0
     start_probe: int = 0
 
@@ -50,32 +52,25 @@ class PointsSession:
     Raises PointsError for points that cannot be those of the object.
     """
 
-    def __init__(self, settings: PointsSettings, object_model: ObjectModel) -> None:
+    def __init__(
+        self, settings: PointsSettings, object_model: ObjectModel, progress: Progress = unwatched
+    ) -> None:
+        """progress: gets that of the SDF grid, whose diameter pads the workspace."""
         assert settings.path is not None
         self._file = read_points(settings.path)
         self._steps = self._file.steps
         self._merge = settings.merge_free
         self.free_resolution = settings.free_resolution
-        self.workspace = self._workspace(settings, object_model)
         self.world_from_object = self._file.world_from_object
         self.initial_points = KnownPoints()
         self.count = len(self._steps)
-        self._check(settings.path, _diameter(object_model))
-
-    def _check(self, path: str, diameter: float) -> None:
-        """Before any work; warnings are given when the points become known."""
-        every = reduce(KnownPoints.merged, map(self._file.at, self._steps))
-        try:
-            check_points(every, diameter, self.free_resolution, self.workspace)
+        every = KnownPoints.joined([self._file.at(step) for step in self._steps])
+        given = _given_workspace(settings)
+        try:  # before any work; warnings are given when the points become known
+            check_points(every, _diameter(object_model), self.free_resolution, given)
         except PointsError as error:
-            raise PointsError(f"point file {path}: {error}") from None
-
-    def _workspace(self, settings: PointsSettings, object_model: ObjectModel) -> Workspace:
-        if settings.workspace is not None:
-            (x0, x1), (y0, y1), (z0, z1) = settings.workspace
-            return Workspace((x0, y0, z0), (x1, y1, z1))
-        points = np.concatenate([group.points for group in self._file.classes.values()])
-        return Workspace.around(points, _diameter(object_model))
+            raise PointsError(f"point file {settings.path}: {error}") from None
+        self.workspace = given or workspace_around(every, object_model.grid(settings, progress))
 
     def probes(self) -> Iterator[Probe]:
         """One probe per step of the file."""
@@ -91,6 +86,13 @@ class PointsSession:
 
     def close(self) -> None:
         """Nothing is held open."""
+
+
+def _given_workspace(settings: PointsSettings) -> Workspace | None:
+    if settings.workspace is None:
+        return None
+    (x0, x1), (y0, y1), (z0, z1) = settings.workspace
+    return Workspace((x0, y0, z0), (x1, y1, z1))
 
 
 def _diameter(object_model: ObjectModel) -> float:

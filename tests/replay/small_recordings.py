@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from chsel.methods import build_method
+from chsel.methods import build_method, trust_by
+from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints, Workspace
@@ -143,8 +144,11 @@ def _probe(random: np.random.Generator, step: int) -> Probe:
     return Probe(step, "contact", new, np.eye(4)[None].repeat(2, axis=0), surface, normals)
 
 
-def measured_again(events: Iterable[Event]) -> list[Event]:
-    """The events with the measured values that follow from their results by today's definition."""
+def measured_again(events: Iterable[Event], method: Method | None = None) -> list[Event]:
+    """The events with the measured values that follow from their results by today's definition.
+
+    method: that found them, for how far they are trusted; None: without.
+    """
     found: list[Event] = []
     start: Any = None
     problem: Any = None
@@ -158,6 +162,8 @@ def measured_again(events: Iterable[Event]) -> list[Event]:
             hypotheses = event.hypotheses
         elif isinstance(event, Measured):
             truth, symmetry = start.world_from_object, symmetry_for_errors(start)
-            event = Measured(event.step, result_numbers(hypotheses, problem, truth, symmetry))
+            trust = None if method is None else trust_by(method, problem, hypotheses)
+            numbers = result_numbers(hypotheses, problem, truth, symmetry, trust)
+            event = Measured(event.step, numbers)
         found.append(event)
     return found

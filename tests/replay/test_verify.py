@@ -13,9 +13,10 @@ import pytest
 
 from chsel.problem.registration_problem import Hypotheses
 from replay.__main__ import main
-from replay.events import Event, HypothesesFound, Probe, SessionStarted, Traced
+from replay.events import Event, HypothesesFound, Measured, Probe, SessionStarted, Traced
 from replay.file_verification import verified_files
 from replay.mcap.reader import read_recording
+from replay.registration import recorded_method
 from replay.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verify
 from tests.replay.small_recordings import measured_again
 
@@ -129,6 +130,26 @@ def test_a_changed_trace_names_its_iteration(write_today: Write) -> None:
     assert [verdict.outcome for verdict in found] == [DIFFERS, EQUAL, EQUAL, EQUAL]
     assert found[0].stage == "cma_mega, iteration 20"
     assert "12 recorded stages before it are equal" not in found[0].report()
+
+
+def test_how_far_a_result_is_trusted_is_computed_again(write: Write) -> None:
+    method = recorded_method(read_recording(DESCENT)).method
+    events = measured_again(events_of(DESCENT), method)
+    places = [i for i, event in enumerate(events) if isinstance(event, Measured)]
+    for change, place in zip(({}, {"verdict": 3.5}, {"modes": 0.0}, {}), places, strict=True):
+        event = events[place]
+        assert isinstance(event, Measured)
+        events[place] = Measured(event.step, {**event.values, **change})
+    last = events[places[3]]
+    assert isinstance(last, Measured)
+    without = {name: value for name, value in last.values.items() if name != "outlier_share"}
+    events[places[3]] = Measured(last.step, without)
+    found = verdicts(write(events))
+    assert [verdict.outcome for verdict in found] == [EQUAL, DIFFERS, DIFFERS, DIFFERS]
+    assert {verdict.stage for verdict in found[1:]} == {"the measured values"}
+    assert found[1].differences[0].startswith("measured verdict: 3.5 recorded, ")
+    assert found[2].differences[0].startswith("measured modes: 0.0 recorded, ")
+    assert found[3].differences[0].startswith("measured outlier_share: not recorded, ")
 
 
 def test_a_registration_that_was_interrupted_has_nothing_to_compare(

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,15 @@ import pytest
 import trimesh
 import yaml
 
+import chsel
 from chsel.errors import RecordingError
 from chsel.methods import METHODS, build_method
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import apply, axis_angle, compose
-from replay.events import Measured
+from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
+from runners.display import MEANINGS
 
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 QUICK = (
@@ -54,6 +57,7 @@ def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
         f"session.path={folder / 'box.npz'}",
         "object=mesh",
         f"object.path={folder / 'box.ply'}",
+        "session.object_resolution=0.005",
     )
 
 
@@ -88,8 +92,27 @@ def test_recorded_errors_are_modulo_symmetries(
     assert [event.step for event in measured] == [0, 1, 2]
     for event in measured:
         found, problem = recording.hypotheses(event.step), recording.problem(event.step)
-        expected = result_numbers(found, problem, recording.start.world_from_object, symmetry)
+        truth, trust = recording.start.world_from_object, chsel.trust_in(problem, found)
+        expected = result_numbers(found, problem, truth, symmetry, trust)
         assert event.values == pytest.approx(expected, abs=1e-6)
+
+
+def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
+    finished: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    folder, done = finished
+    recording = read_recording(folder / "recording.mcap")
+    trusts = [chsel.trust_in(recording.problem(n), recording.hypotheses(n)) for n in range(3)]
+    assert trusts[0].verdict in ("several modes", "wide")  # after five contacts
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["trust"] == pytest.approx(asdict(trusts[2]))
+    assert [step["verdict"] for step in summary["steps"]] == [trust.verdict for trust in trusts]
+    logged = [event.text for event in recording.events() if isinstance(event, Logged)]
+    assert logged[0] == f"probe 0: points, 5 contacts; {trusts[0]}"
+    table = [line for line in done.stdout.splitlines() if line.rstrip().endswith(trusts[0].verdict)]
+    assert table[0].split()[:2] == ["0", "5"]
+    shown = " ".join(done.stdout.split())
+    assert shown.rpartition(f"{trusts[2]}: ")[2] in set(MEANINGS.values())
 
 
 def test_a_run_leaves_recordings_config_and_summary(

@@ -148,7 +148,7 @@ def registration(
         "best_position_error": 0.01 * (step + 1),
         "best_rotation_error": 0.5 * (step + 1),
     }
-    yield Measured(step, {**errors, "coverage_mm2": 4.0})
+    yield Measured(step, {**errors, "coverage_mm2": 4.0, "set_spread": 0.003})
     yield Timed(step, {"gradient_descent": 0.25})
     yield Logged(step, "warning", f"line {step}")
 
@@ -376,6 +376,7 @@ def test_costs_of_the_search_are_on_the_timeline_of_iterations_alone(
         ("/spread/position", [1000.0 * SPREAD.position] * 3),
         ("/spread/rotation", [SPREAD.rotation * 180.0 / np.pi] * 3),
         ("/measured/coverage_mm2", [4.0] * 3),
+        ("/trust/set_spread", [3.0] * 3),
         ("/seconds/gradient_descent", [0.25] * 3),
     ],
 )

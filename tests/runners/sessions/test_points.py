@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from chsel.errors import PointsError, SettingError
+from chsel.problem.defaults import object_grid
 from runners.objects.loader import ObjectModel
 from runners.sessions.point_files import read_points
 from runners.sessions.points import PointsSession, PointsSettings
@@ -178,8 +179,10 @@ def test_workspace_is_that_of_the_points_padded_by_the_diameter(tmp_path: Path) 
     path = str(npz(tmp_path, surface=SURFACE, free=SURFACE - 1.0))
     session = PointsSession(PointsSettings(path), BOX)
     lower, upper = session.workspace.bounds
-    np.testing.assert_allclose(lower, -1.0 - 0.13)
-    np.testing.assert_allclose(upper, [0.23, 0.33, 0.13])
+    diameter = object_grid(BOX.mesh).diameter
+    assert 0.13 < diameter < 0.133
+    np.testing.assert_allclose(lower, -1.0 - diameter)
+    np.testing.assert_allclose(upper, np.array([0.1, 0.2, 0.0]) + diameter)
     chosen = PointsSettings(path, workspace=((0, 1), (0, 2), (0, 3)))
     assert PointsSession(chosen, BOX).workspace.upper == (1, 2, 3)
     with pytest.raises(PointsError, match="lower bound below"):

@@ -1,0 +1,121 @@
+"""Whether an object can be moved without its known points becoming unlikely.
+
+A set of hypotheses may leave out what its method has not found. So the best one is moved along the
+motions that contacts resist the least for how far they move the surface: the largest solutions of
+M v = lambda A v, with the mean squares v^T A v by which contacts leave the surface and v^T M v by
+which the surface leaves itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.noise import FOREIGN
+from chsel.problem.outline import (
+    in_order,
+    outline_distances,
+    outline_in_world,
+    signed_distances,
+)
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import Poses, compose, product, rotated, rotation_vector
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.subset import evenly_spaced
+
+MOST_WORSE = 12.6  # fall of twice the log-likelihood: 95 % of chi-squared, 6 degrees of freedom
+_SOFT = 1e-4  # added to A: of (m / m)^2
+_ROUNDS = 4  # of the power iteration
+_MOST_KNOWN, _MOST_FREE = 1000, 5000
+
+
+def can_be_moved(problem: RegistrationProblem, pose: Poses, sigma: float, distance: float) -> bool:
+    """Whether the points stay about as likely if the object's surface moves by a distance, metres.
+
+    pose: one. sigma: standard deviation of known points, metres; that of free and occupied points
+    is larger by half a voxel. Likely in the sense of Wilks (1938): by a likelihood ratio.
+    """
+    motions = _loosest_motions(problem, pose)
+    if len(motions) == 0:
+        return False
+    moved = _moved(problem, pose, distance * np.concatenate([motions, -motions]))
+    poses = Poses.joined([pose, moved])
+    unlikely = _unlikelihood(problem, poses, sigma)
+    apart = outline_distances(problem.sdf, poses)[0]  # not as far for turns that are symmetries
+    likely = (unlikely - unlikely[0] <= MOST_WORSE) & (apart >= 0.5 * distance)
+    return bool(likely[1:].any())
+
+
+def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:
+    """Twists (K, 6) as `_moved` takes them, K at most 6, by which the surface moves by 1."""
+    sdf, step = problem.sdf, 0.5 * problem.sdf.resolution
+    nearby = _moved(problem, pose, step * np.concatenate([np.eye(6), -np.eye(6)]))
+
+    def products(points: FloatArray) -> FloatArray:
+        """Mean products (6, 6) of the rates at which distances of world points change."""
+        distances = signed_distances(sdf, nearby, points)  # (12, N)
+        rates = (distances[:6] - distances[6:]) / (2.0 * step)
+        return in_order(rates[:, None] * rates) / max(len(points), 1)
+
+    known = problem.points.known[evenly_spaced(len(problem.points.known), _MOST_KNOWN)]
+    resisted = products(known) + _SOFT * np.eye(6)
+    metric = products(outline_in_world(sdf, pose)[0])
+    motions = np.eye(6)
+    for _ in range(_ROUNDS):
+        motions = _solved(resisted, in_order(metric * motions[:, None]))
+        size = np.sqrt(in_order(in_order(metric * motions[:, None]) * motions))
+        motions = motions[size > 0.0] / size[size > 0.0, None]
+    return motions
+
+
+def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Poses:
+    """A pose after motions (K, 6) of the object: shifts, and turns about its middle, metres.
+
+    Turns are lengths of arc at half a diameter.
+    """
+    centre = problem.sdf.bounds.mean(axis=0)
+    turn = rotation_vector(twists[:, 3:] / max(0.5 * problem.sdf.diameter, problem.sdf.resolution))
+    shift = centre + twists[:, :3] - rotated(turn, centre)
+    turned = product(turn, np.broadcast_to(pose.rotations, turn.shape))
+    return Poses.of(compose(turned, rotated(turn, pose.translations) + shift))
+
+
+def _unlikelihood(problem: RegistrationProblem, poses: Poses, sigma: float) -> FloatArray:
+    """Minus twice the log-likelihood (B,) of the points in poses, up to a constant.
+
+    Distances are normal up to FOREIGN deviations, and constant from there on.
+    """
+    points, coarse = problem.points, math.sqrt(sigma**2 + (0.5 * problem.free_resolution) ** 2)
+    total = np.zeros(len(poses))
+    for group, levels, most, deviation, sides in _groups(points, sigma, coarse):
+        some = evenly_spaced(len(group), most)
+        off = signed_distances(problem.sdf, poses, group[some]) - levels[some]
+        off = np.abs(off) if sides == 0.0 else np.maximum(sides * off, 0.0)
+        squares = np.minimum(off / deviation, FOREIGN) ** 2
+        total += in_order(squares) * (len(group) / max(len(some), 1))
+    return total
+
+
+def _groups(
+    points: KnownPoints, sigma: float, coarse: float
+) -> list[tuple[FloatArray, FloatArray, int, float, float]]:
+    """Points, levels, how many to take, deviation, and the sign of distances that are errors."""
+    zeros = np.zeros(max(len(points.free), len(points.occupied)))
+    return [
+        (points.known, points.sdf, _MOST_KNOWN, sigma, 0.0),
+        (points.free, zeros, _MOST_FREE, coarse, -1.0),
+        (points.occupied, zeros, _MOST_FREE, coarse, 1.0),
+    ]
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solutions x (K, 6) of matrix x = right (K, 6), positive definite, by elimination."""
+    rows = np.concatenate([matrix, right.T], axis=1)  # (6, 6 + K)
+    for i in range(6):
+        rows[i] = rows[i] / rows[i, i]
+        for j in range(6):
+            if j != i:
+                rows[j] = rows[j] - rows[j, i] * rows[i]
+    return np.ascontiguousarray(rows[:, 6:].T)

@@ -1,0 +1,65 @@
+"""The surface of an object in several poses: how far these are apart, whatever symmetry it has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import Poses, rotated
+from chsel.problem.sdf_grid import FARTHEST, SdfGrid
+from chsel.problem.sdf_lookup import distance_field
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.subset import distances_from_surface, evenly_spaced
+from chsel.problem.surface import has_surface, surface_points
+
+_POINTS = 100
+
+
+def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
+    """How far the object's surface in a pose is from that in another (B, B), metres.
+
+    Root mean square over points of both surfaces: 0 between poses that a symmetry maps to each
+    other. As exact as the grid's interpolation, a fraction of its resolution.
+    """
+    places = outline_in_world(sdf, poses)  # (B, Q, 3)
+    count, size = places.shape[:2]
+    distances = signed_distances(sdf, poses, places.reshape(-1, 3)).reshape(count, count, size)
+    squares = in_order(distances**2) / max(size, 1)
+    apart: FloatArray = np.sqrt(0.5 * (squares + squares.T))
+    np.fill_diagonal(apart, 0.0)
+    return apart
+
+
+def outline_in_world(sdf: SdfGrid, poses: Poses) -> FloatArray:
+    """Points (B, Q, 3) on the object's surface in each pose; Q is 0 for a grid without surface."""
+    outline = sdf.derived("outline", lambda: _outline(sdf))
+    turns = np.swapaxes(poses.rotations, 1, 2)
+    return rotated(turns[:, None], outline - poses.translations[:, None])
+
+
+def signed_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
+    """Signed distances (B, N), metres, of world points (N, 3), at most FARTHEST."""
+    field = distance_field(sdf, "trilinear", "surface_point")
+    signed = np.empty((len(poses), len(points)))
+    numbers, places = np.array(poses.numbers), np.array(points)
+    distances_from_surface(field, numbers, places, signed, 0, len(poses))
+    return np.minimum(signed, FARTHEST)
+
+
+def in_order(values: FloatArray) -> FloatArray:
+    """Sums along the last axis, added in their order, so that they are the same everywhere."""
+    if values.shape[-1] == 0:
+        return np.zeros(values.shape[:-1])
+    return np.cumsum(values, axis=-1)[..., -1]
+
+
+def _outline(sdf: SdfGrid) -> FloatArray:
+    """Points (Q, 3) on the object's surface, object frame; none if the grid has no surface."""
+    if has_surface(sdf):
+        return surface_points(sdf, _POINTS, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
+    near = np.argwhere(np.abs(sdf.values) < 2.0 * sdf.resolution)  # of objects thinner than that
+    near = near[evenly_spaced(len(near), _POINTS)]
+    i, j, k = near.T
+    away = sdf.values[i, j, k][:, None] * sdf.gradients[i, j, k]
+    points: FloatArray = sdf.origin + near * sdf.resolution - away
+    return points

@@ -1,0 +1,189 @@
+"""How far to trust hypotheses: whether they explain the points, and whether they are alike.
+
+The set is judged by the object's signed distances, whatever the method and its cost are.
+docs/trust.md has the model, and what its limits were chosen on.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from chsel.errors import PointsWarning, PoseError, require_positive
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.problem.freedom import can_be_moved
+from chsel.problem.noise import FOREIGN, estimate_noise
+from chsel.problem.outline import in_order, outline_distances, signed_distances
+from chsel.problem.poses import Poses
+from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
+from chsel.problem.sdf_grid import FARTHEST
+from chsel.problem.subset import evenly_spaced
+
+SENSOR_NOISE = 0.0005  # metres, of known points, where nothing is known about the sensor
+DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS
+
+# In diameters of the object:
+MOST_OFF = 0.04  # average error of points
+MOST_SYSTEMATIC = 0.015  # the same, if errors of neighbours are alike
+MOST_WIDTH = 0.03  # spread of a mode, and distance from a pose to the next one of its mode
+
+MOST_OUTLIERS = 0.3  # share
+MOST_MODES = 8  # sets of more are wide
+MOST_LEVELS = 10.0  # sensor noise levels that errors may have without a warning
+LEAST_LEVELS = 3.0  # sensor noise levels that errors and widths may have on small objects
+LEAST_GAP = 2.0  # noise levels, as estimated, between modes
+SYSTEMATIC = 0.5  # correlation of the errors of neighbours
+ALIKE = 2.0  # times the error of the best hypothesis: those of more do not count as explanations
+_GRID_ERROR = 0.3  # of interpolated distances, in spacings of nodes
+_NEIGHBOURS = 3
+_LEAST_CORRELATED = 8  # points
+
+_MOST_HYPOTHESES = 100  # that are compared, the best ones
+_MOST_KNOWN, _MOST_FREE = 1000, 5000  # points that they are compared by
+_MOST_CORRELATED = 300
+
+
+def trust_in(
+    problem: RegistrationProblem, hypotheses: Hypotheses, sensor_noise: float = SENSOR_NOISE
+) -> Trust:
+    """How far to trust the hypotheses of a problem; a pure function, the same bits everywhere.
+
+    sensor_noise: standard deviation of known points by the sensor's datasheet, metres. Of a set of
+    one hypothesis the verdict only says whether it explains the points.
+    Raises PoseError if there is no hypothesis or the best is not finite, and SettingError for noise
+    that is not above 0.
+    """
+    require_positive("sensor_noise", sensor_noise)
+    poses, sdf = _compared(hypotheses), problem.sdf
+    off = signed_distances(sdf, poses[:1], problem.points.known)[0] - problem.points.sdf
+    noise = estimate_noise(off, sensor_noise)
+    most = FOREIGN * noise.sigma
+    error = float(_mean_errors(problem, poses[:1], sensor_noise, most)[0])
+    alike = correlation(problem.points.known, np.clip(off, -most, most)) > SYSTEMATIC
+    share = MOST_SYSTEMATIC if alike else MOST_OFF
+    limit = max(share * sdf.diameter, _GRID_ERROR * sdf.resolution, LEAST_LEVELS * sensor_noise)
+
+    errors = _mean_errors(problem, poses, sensor_noise, most, thinned=True)
+    least = max(float(errors[0]), sensor_noise, _GRID_ERROR * sdf.resolution / ALIKE)
+    apart = outline_distances(sdf, poses[errors <= ALIKE * least])
+    width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
+    gap = max(width, LEAST_GAP * noise.sigma)
+    count, mode = connected_components(apart <= gap, directed=False)
+    spread = _root_mean_square(apart[0])
+    if error > limit or noise.outliers > MOST_OUTLIERS:
+        verdict = NOTHING
+    elif count == 1:
+        wide = spread > width or can_be_moved(problem, poses[:1], noise.sigma, width)
+        verdict = WIDE if wide else DETERMINED
+    else:
+        narrow = count <= MOST_MODES and _widest(apart, mode) <= width
+        verdict = SEVERAL if narrow else WIDE
+    return Trust(noise.sigma, noise.outliers, error / sensor_noise, int(count), spread, verdict)
+
+
+def check_trust(trust: Trust, sensor_noise: float | None = None) -> list[PointsWarning]:
+    """A warning if no hypothesis explains the points, or not with the sensor's noise.
+
+    sensor_noise: metres, where a method's settings state it; see `trust_in`.
+    """
+    if trust.verdict == NOTHING:
+        text = (
+            f"no hypothesis explains the points: at the best, they are {trust.misfit:.3g} noise "
+            f"levels of the sensor off on average, and {100.0 * trust.outliers:.0f} % of the known "
+            "points are outliers; check units, frames, the object and its scale, and whether it "
+            "moved"
+        )
+        return [PointsWarning("no_fit", text)]
+    if sensor_noise is None or trust.misfit <= MOST_LEVELS:
+        return []
+    text = (
+        f"points are {trust.misfit:.3g} noise levels off the best hypothesis on average: the "
+        f"sensor is less exact than the method's noise of {sensor_noise:g} m, perhaps "
+        f"{trust.noise:.2g} m, or the object is not quite this one"
+    )
+    return [PointsWarning("above_noise", text)]
+
+
+def correlation(points: FloatArray, errors: FloatArray) -> float:
+    """How alike the errors (N,) of points (N, 3) are to those of their nearest neighbours.
+
+    Moran's I about 0, at most 1: near 0 for noise, and near 1 for a wrong shape, whose errors are
+    those of whole sides. 0 for few points.
+    """
+    chosen = evenly_spaced(len(points), _MOST_CORRELATED)
+    points, errors = points[chosen], errors[chosen]
+    if len(points) < _LEAST_CORRELATED:
+        return 0.0
+    away = points[:, None] - points
+    squared = away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2
+    np.fill_diagonal(squared, np.inf)
+    near = np.argsort(squared, axis=1, kind="stable")[:, :_NEIGHBOURS]
+    own = math.fsum((errors**2).tolist())
+    shared = math.fsum((errors[:, None] * errors[near]).ravel().tolist())
+    return shared / (_NEIGHBOURS * own) if own > 0.0 else 0.0
+
+
+def has_pose(hypotheses: Hypotheses) -> bool:
+    """Whether the best hypothesis is a pose that can be judged: there, and within FARTHEST."""
+    poses = Poses.of(hypotheses.object_from_world[:1])
+    return len(poses) > 0 and bool(_within(poses).all())
+
+
+def _within(poses: Poses) -> BoolArray:
+    """Which poses (B,) have no number that is NaN or larger than kernels can read."""
+    return np.asarray((np.abs(poses.numbers) <= FARTHEST).all(axis=1))
+
+
+def _compared(hypotheses: Hypotheses) -> Poses:
+    """The best hypotheses that repeat no other."""
+    if not has_pose(hypotheses):
+        raise PoseError(
+            "there is no hypothesis, or the best is not finite; accepted: at least one pose, "
+            f"within {FARTHEST:g} m"
+        )
+    poses = Poses.of(hypotheses.object_from_world)
+    chosen = _within(poses) & ~hypotheses.duplicate
+    chosen[0] = True
+    return poses[np.flatnonzero(chosen)[:_MOST_HYPOTHESES]]
+
+
+def _mean_errors(
+    problem: RegistrationProblem,
+    poses: Poses,
+    sensor_noise: float,
+    most: float,
+    *,
+    thinned: bool = False,
+) -> FloatArray:
+    """Average error (B,), metres, of known points, and of all others that contradict a pose.
+
+    most: that a known point counts for. A free point contradicts a pose if it is deeper in the
+    object than a voxel and noise explain, an occupied one if it is as far outside; it counts with
+    its depth. thinned: by some of the points of each class, which count for all.
+    """
+    points, sdf = problem.points, problem.sdf
+    known = evenly_spaced(len(points.known), _MOST_KNOWN if thinned else len(points.known))
+    off = np.abs(signed_distances(sdf, poses, points.known[known]) - points.sdf[known])
+    total, count = in_order(np.minimum(off, most)), np.full(len(poses), float(len(known)))
+    tolerance = problem.free_resolution + LEAST_LEVELS * sensor_noise
+    known_share = len(known) / max(len(points.known), 1)
+    for sign, group in ((-1.0, points.free), (1.0, points.occupied)):
+        some = evenly_spaced(len(group), _MOST_FREE if thinned else len(group))
+        depth = sign * signed_distances(sdf, poses, group[some])
+        wrong = depth > tolerance
+        each = (known_share or 1.0) * len(group) / max(len(some), 1)
+        total += each * in_order(np.where(wrong, depth, 0.0))
+        count += each * wrong.sum(axis=1)
+    return total / np.maximum(count, 1.0)
+
+
+def _widest(apart: FloatArray, mode: IntArray) -> float:
+    """The largest spread of a mode about its best pose, of distances (B, B), metres."""
+    firsts = np.unique(mode, return_index=True)[1]
+    return max(_root_mean_square(apart[first][mode == mode[first]]) for first in firsts)
+
+
+def _root_mean_square(values: FloatArray) -> float:
+    return math.sqrt(math.fsum((values**2).tolist()) / len(values))

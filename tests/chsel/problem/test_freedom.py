@@ -1,0 +1,69 @@
+"""Whether the best hypothesis can be moved without its points becoming unlikely."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+import chsel
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.freedom import can_be_moved
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.streams import StreamKey
+
+BOX = trimesh.creation.box((0.1, 0.06, 0.16))
+CAN = trimesh.creation.cylinder(0.04, 0.12, sections=64)
+POSE = compose(
+    axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.7)), np.array([0.3, 0.2, 0.1])
+)  # world_from_object
+BEST = Poses.of(inverse(POSE[None]))
+SIGMA, DISTANCE = 0.001, 0.006
+
+
+def movable(mesh: trimesh.Trimesh, sigma: float = SIGMA, **points: FloatArray) -> bool:
+    """Of points in the object's frame."""
+    known = chsel.KnownPoints(**{name: apply(POSE, group) for name, group in points.items()})
+    sdf, room = chsel.SdfGrid.from_mesh(mesh, 0.004), chsel.Workspace((-1, -1, -1), (1, 1, 1))
+    problem = RegistrationProblem(sdf, known, BEST.matrices, room, 0.01, StreamKey(0, 0))
+    return can_be_moved(problem, BEST, sigma, DISTANCE)
+
+
+def on(mesh: trimesh.Trimesh, count: int) -> FloatArray:
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
+
+
+def on_sides() -> FloatArray:
+    """Contacts on the four long sides of the box, not near its ends."""
+    points = on(BOX, 80)
+    return points[np.abs(points[:, 2]) < 0.06]
+
+
+@pytest.mark.parametrize("mesh", [BOX, CAN])
+def test_contacts_all_around_hold_an_object_and_a_turn_of_a_can_is_no_motion(
+    mesh: trimesh.Trimesh,
+) -> None:
+    assert not movable(mesh, known=on(mesh, 40))
+    assert movable(mesh, known=on(mesh, 4))
+    assert movable(mesh, sigma=0.03, known=on(mesh, 40))  # far more than the distance
+
+
+def test_an_object_slides_along_the_sides_that_were_touched() -> None:
+    """By 14 mm, which moves the two ends by it and all else within itself: 6 mm on average."""
+    sides = on_sides()
+    assert movable(BOX, known=sides)
+    ends = np.array([[0.0, 0.0, 0.08], [0.02, 0.01, 0.08], [0.0, 0.0, -0.08]])
+    assert not movable(BOX, known=np.concatenate([sides, ends]))
+
+
+def test_free_space_holds_an_object_too() -> None:
+    sides = on_sides()
+    x, y = np.meshgrid(np.arange(-0.05, 0.051, 0.01), np.arange(-0.03, 0.031, 0.01))
+    beyond = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.083)], axis=1)
+    assert movable(BOX, known=sides, free=beyond)  # the other way
+    assert not movable(BOX, known=sides, free=np.concatenate([beyond, -beyond]))
+
+
+def test_nothing_known_nearby_holds_nothing() -> None:
+    assert movable(BOX, free=np.full((3, 3), 0.5))
