@@ -36,6 +36,7 @@ from runners.evaluation.sensor_logs import check_log, is_missing
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
 from runners.probe import PresetName
+from runners.sessions.faults import without_clean_faults
 
 _GATHER = 300.0  # s between tables of what is finished so far
 _OF_TRIAL = ("configuration", "logs")
@@ -145,10 +146,11 @@ def _plan(config: EvaluateConfig) -> Plan:
     chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
     chosen = drawn(chosen, config.draws)
     logs = config.session.get("logs")
+    session = without_clean_faults(config.session)
     return Plan(
         folder=Path(config.out).expanduser(),
         preset=config.preset.name,
-        session={key: value for key, value in config.session.items() if key not in _OF_TRIAL},
+        session={key: value for key, value in session.items() if key not in _OF_TRIAL},
         objects=config.objects,
         definition=config.definition,
         metrics=config.metrics,
