@@ -1,4 +1,4 @@
-"""Which configurations and seeds an evaluation has."""
+"""Which configurations, levels of faults and seeds an evaluation has."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 from chsel.errors import SettingError
 from runners.evaluation.configurations import TrialConfiguration
+from runners.sessions.faults import LEVELS
 
 MOST_SEEDS = 100_000
 SEED_LIMIT = 2**63  # a column of the table holds them
@@ -26,6 +27,24 @@ def chosen_configurations(
     listed = _listed("configurations", value)
     chosen = {name for text in listed for name in _named(text, existing)}
     return tuple(name for name in existing if name in chosen)
+
+
+def chosen_levels(value: Any) -> tuple[str, ...]:
+    """The levels of faults that a value names, in the order of LEVELS.
+
+    A name, a pattern such as noise_*, "all", or a list of these. Raises SettingError if one of them
+    names none.
+    """
+    chosen: set[str] = set()
+    for text in _listed("faults", value):
+        named = [name for name in LEVELS if text == "all" or fnmatchcase(name, str(text))]
+        if not named:
+            raise SettingError(
+                f"faults names {text!r}; accepted: all, a pattern such as noise_*, "
+                f"{', '.join(LEVELS)}"
+            )
+        chosen.update(named)
+    return tuple(name for name in LEVELS if name in chosen)
 
 
 def chosen_seeds(value: Any) -> tuple[int, ...]:
