@@ -32,12 +32,12 @@ from runners.evaluation.measure import MetricsConfig
 from runners.evaluation.outside import outside_file, outside_folders, read_outside
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
 from runners.evaluation.schedule import Progress, Schedule
-from runners.evaluation.selection import chosen_configurations, chosen_levels, chosen_seeds
+from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
 from runners.evaluation.sensor_logs import check_log, is_missing
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
 from runners.probe import PresetName
-from runners.sessions.faults import CLEAN, without_clean_faults
+from runners.sessions.faults import CLEAN, LEVELS, without_clean_faults
 
 _GATHER = 300.0  # s between tables of what is finished so far
 _OF_TRIAL = ("configuration", "logs")
@@ -101,7 +101,7 @@ def main(config: DictConfig) -> None:
         values["steps"] = str(values["steps"])
     checked = build_settings(EvaluateConfig, values, "evaluate")
     plan = _plan(checked)
-    levels = chosen_levels(checked.faults)
+    levels = chosen_names("faults", checked.faults, LEVELS)
     clean = {name: one for name, one in plan.configurations.items() if one.faults == CLEAN}
     chosen = chosen_configurations(checked.configurations, clean)
     configurations = [faulty_name(name, level) for name in chosen for level in levels]

@@ -9,7 +9,6 @@ from typing import Any
 
 from chsel.errors import SettingError
 from runners.evaluation.configurations import TrialConfiguration
-from runners.sessions.faults import LEVELS
 
 MOST_SEEDS = 100_000
 SEED_LIMIT = 2**63  # a column of the table holds them
@@ -29,22 +28,22 @@ def chosen_configurations(
     return tuple(name for name in existing if name in chosen)
 
 
-def chosen_levels(value: Any) -> tuple[str, ...]:
-    """The levels of faults that a value names, in the order of LEVELS.
+def chosen_names(setting: str, value: Any, existing: Iterable[str]) -> tuple[str, ...]:
+    """Which of the existing names a setting has, in the order of all of them.
 
     A name, a pattern such as noise_*, "all", or a list of these. Raises SettingError if one of them
     names none.
     """
-    chosen: set[str] = set()
-    for text in _listed("faults", value):
-        named = [name for name in LEVELS if text == "all" or fnmatchcase(name, str(text))]
+    names, chosen = list(existing), set()
+    for text in _listed(setting, value):
+        named = [name for name in names if text == "all" or fnmatchcase(name, str(text))]
         if not named:
             raise SettingError(
-                f"faults names {text!r}; accepted: all, a pattern such as noise_*, "
-                f"{', '.join(LEVELS)}"
+                f"{setting} names {text!r}; accepted: all, a pattern such as {names[0][:3]}*, "
+                f"{', '.join(names)}"
             )
         chosen.update(named)
-    return tuple(name for name in LEVELS if name in chosen)
+    return tuple(name for name in names if name in chosen)
 
 
 def chosen_seeds(value: Any) -> tuple[int, ...]:
