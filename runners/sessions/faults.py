@@ -153,6 +153,7 @@ class Faults:
         if self._settings.free_error == 0.0 or len(swept) == 0:
             return np.zeros((0, 3))
         lattice = self._free.lattice
+        swept = swept[self._in_bounds(swept, margin=2.0 * lattice.spacing)]
         beside = lattice.voxels(swept)[:, None] + _NEIGHBOURS
         voxels = np.unique(beside.reshape(-1, 3), axis=0)
         voxels = voxels[self._in_bounds(lattice.centres(voxels))]
@@ -191,10 +192,11 @@ class Faults:
         fitting &= self._distance(places) >= _OFF
         return places[np.argmax(fitting)] if fitting.any() else None
 
-    def _in_bounds(self, points: FloatArray) -> BoolArray:
-        """Which points (N, 3) in the world are in the bounding box of the probed mesh."""
+    def _in_bounds(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
+        """Which points (N, 3) are in the probed mesh's bounding box, padded by a margin, metres."""
         in_object, (lower, upper) = apply(self._object_from_world, points), self._mesh.bounds
-        inside: BoolArray = ((in_object >= lower) & (in_object <= upper)).all(axis=1)
+        inside: BoolArray = (in_object >= lower - margin).all(axis=1)
+        inside &= (in_object <= upper + margin).all(axis=1)
         return inside
 
     def _distance(self, points: FloatArray) -> FloatArray:
