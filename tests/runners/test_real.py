@@ -47,7 +47,9 @@ def test_rows_have_errors_to_the_pose_and_residuals_of_the_held_out_half(
 ) -> None:
     done = measured(data, tmp_path, "seeds=0..1")
     assert (done.returncode, done.stderr) == (0, "")
-    found = rows(tmp_path)
+    *found, published = rows(tmp_path)
+    assert (published["method"], published["points"]) == ("(published pose)", "all")
+    assert 0.5 * NOISE < float(published["residual"]) < 1.2 * NOISE
     places = [(row["seed"], row["points"], row["touches"]) for row in found]
     assert places == [(seed, *of) for seed in "01" for of in (("all", "41"), ("half", "21"))]
     for row in found:
@@ -64,7 +66,8 @@ def test_rows_have_errors_to_the_pose_and_residuals_of_the_held_out_half(
     assert any(line.split()[:4] == ["known", "icp", "41", "0"] for line in done.stdout.splitlines())
     again = measured(data, tmp_path / "again", "seeds=0..1")
     assert again.returncode == 0
-    assert [row["digest"] for row in rows(tmp_path / "again")] == [row["digest"] for row in found]
+    digests = [row["digest"] for row in rows(tmp_path / "again")]
+    assert digests[:-1] == [row["digest"] for row in found]
 
 
 def test_a_case_without_a_true_pose_has_residuals_alone(data: Path, tmp_path: Path) -> None:
@@ -108,7 +111,7 @@ def test_real_touches_and_a_depth_image_are_measured(real_directory: Path, tmp_p
     words = [f"data={folder}", f"out={tmp_path}", "methods=icp", "seeds=0", cases]
     done = run(real.main, *words)
     assert (done.returncode, done.stderr) == (0, "")
-    lines = {(row["case"], row["points"]): row for row in rows(tmp_path)}
+    lines = {(row["case"], row["points"]): row for row in rows(tmp_path) if row["method"] == "icp"}
     assert len(lines) == 4
     assert 0.004 < float(lines["icub_cylinder", "all"]["residual"]) < 0.007
     assert float(lines["gelatin_box", "all"]["residual"]) < 0.003
