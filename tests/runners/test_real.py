@@ -81,12 +81,10 @@ def test_a_case_without_a_true_pose_has_residuals_alone(data: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["data=null"], "data is None; accepted: a folder with real/"),
         (["data=nowhere"], "data is nowhere; accepted: a folder with real/"),
         (["only=lego"], "only names 'lego'; accepted: all, a pattern such as icu*, icub_lego"),
         (["~cases.known.mesh"], "cases.known lacks mesh"),
         (["cases.known.mesh=none.obj"], "none.obj"),
-        (["passes=0"], "passes is 0; accepted"),
         (["methods=magic"], "magic"),
     ],
 )
