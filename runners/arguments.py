@@ -26,6 +26,7 @@ _OPEN_GROUPS = {"evaluate": ("settings.", "outside.")}
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 _PATH_KEYS = (
     r"assets\.dir",
+    r"data",
     r"dir",
     r"file",
     r"logs",

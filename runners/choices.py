@@ -17,10 +17,14 @@ from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
 from runners.arguments import hydra_arguments
 from runners.sensors.rig import Rig
+from runners.sessions.faults import CLEAN, LEVELS
 from runners.sessions.probing import ProbingSettings
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-NESTED_GROUPS = ("session/rig",)  # choices of their own, not options of the group around them
+NESTED_GROUPS = (
+    "session/rig",
+    "session/faults",
+)  # choices of their own, not options of the group around them
 
 
 def prepared(config_name: str, words: list[str]) -> list[str]:
@@ -31,7 +35,7 @@ def prepared(config_name: str, words: list[str]) -> list[str]:
 
 
 def store_choices() -> None:
-    """Offer preset/PRESET, method/METHOD, definition/NAME and the simulated sessions.
+    """Offer preset/PRESET, method/METHOD, definition/NAME, simulated sessions and their faults.
 
     session/presets/rig/default has all keys of a rig, so that each can be changed by its name.
     """
@@ -42,7 +46,10 @@ def store_choices() -> None:
     for kind in ("simulated", "kinematic"):  # in PyBullet, and by geometry without an engine
         # configuration: a key of the top file, for short commands
         node = {"kind": kind, "configuration": "${configuration}"}
-        _store_with_presets("session", kind, partial(in_preset, ProbingSettings()), node)
+        settings = partial(in_preset, ProbingSettings())
+        _store_with_presets("session", kind, settings, node, {"faults": CLEAN})
+    for level, faults in LEVELS.items():
+        _store("session/faults", level, settings_mapping(faults))
     for name in DEFINITIONS:
         values = settings_mapping(plausible_settings(name, 1.0))
         # None: that of the object.
@@ -53,13 +60,21 @@ def store_choices() -> None:
 
 
 def _store_with_presets(
-    group: str, name: str, settings: Callable[[str], Any], node: dict[str, Any]
+    group: str,
+    name: str,
+    settings: Callable[[str], Any],
+    node: dict[str, Any],
+    *choices: dict[str, str],
 ) -> None:
-    """GROUP/NAME: its settings in the preset chosen, which are GROUP/presets/NAME/PRESET."""
+    """GROUP/NAME: its settings in the preset chosen, which are GROUP/presets/NAME/PRESET.
+
+    choices: of groups below GROUP, with their usual option.
+    """
     with suppress(SettingError):  # of an installed method; whoever chooses it gets the message
         for preset in PRESETS:
             _store(f"{group}/presets/{name}", preset, settings_mapping(settings(preset)))
-        node = {"defaults": [{f"presets/{name}@_here_": "${preset}"}, "_self_"], **node}
+        defaults = [{f"presets/{name}@_here_": "${preset}"}, *choices, "_self_"]
+        node = {"defaults": defaults, **node}
     _store(group, name, node)
 
 
@@ -80,7 +95,9 @@ def choices(group: str) -> list[str]:
         for file in files
         if not any((folder / file).is_relative_to(other) for other in nested)
     ]
-    stored = ConfigStore.instance().repo.get(group, {})
+    stored = ConfigStore.instance().repo
+    for part in group.split("/"):
+        stored = stored.get(part, {})
     names += [Path(name).stem for name in stored if name.endswith(".yaml")]
     return sorted(names, key=lambda name: (name.count("/"), name))
 

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from chsel.numerics.threads import require_threads
 from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.settings import build_settings
 from runners.cli import command, plain
-from runners.evaluation.configurations import SENSORS
+from runners.evaluation.configurations import SENSORS, faulty_name
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label
 from runners.evaluation.definition import definition_text
 from runners.evaluation.display import Display
@@ -31,11 +32,12 @@ from runners.evaluation.measure import MetricsConfig
 from runners.evaluation.outside import outside_file, outside_folders, read_outside
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
 from runners.evaluation.schedule import Progress, Schedule
-from runners.evaluation.selection import chosen_configurations, chosen_seeds
+from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
 from runners.evaluation.sensor_logs import check_log, is_missing
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
 from runners.probe import PresetName
+from runners.sessions.faults import CLEAN, LEVELS, without_clean_faults
 
 _GATHER = 300.0  # s between tables of what is finished so far
 _OF_TRIAL = ("configuration", "logs")
@@ -77,6 +79,8 @@ class EvaluateConfig:
     steps: str | None
     starts: str
     draws: int
+    faults: Any
+    plausible: bool
     recordings: bool
     workers: int | None
 
@@ -97,9 +101,13 @@ def main(config: DictConfig) -> None:
         values["steps"] = str(values["steps"])
     checked = build_settings(EvaluateConfig, values, "evaluate")
     plan = _plan(checked)
-    configurations = chosen_configurations(checked.configurations, plan.configurations)
+    levels = chosen_names("faults", checked.faults, LEVELS)
+    clean = {name: one for name, one in plan.configurations.items() if one.faults == CLEAN}
+    chosen = chosen_configurations(checked.configurations, clean)
+    configurations = [faulty_name(name, level) for name in chosen for level in levels]
     seeds = chosen_seeds(checked.seeds)
     trials = [Trial(seed, name) for seed in seeds for name in configurations]
+    _check_faults(plan, levels)
     _check(plan, trials)
     join_experiment(plan, checked.name, configurations, seeds)
     failed = evaluate(plan, trials, checked.workers or _cores())
@@ -135,6 +143,7 @@ def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
         if sys.exc_info()[0] is KeyboardInterrupt:
             display.say("interrupted: what is finished stays, and the same command goes on")
     display.summary(results, _labels(plan.folder), definition_text(plan.definition))
+    display.faults(plan.folder)
     display.true_poses(true_poses(plan.folder, read_experiment(plan.folder)))
     display.written(plan.folder, results)
     return any(text.startswith("failed") for text in results["status"].to_pylist())
@@ -145,10 +154,11 @@ def _plan(config: EvaluateConfig) -> Plan:
     chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
     chosen = drawn(chosen, config.draws)
     logs = config.session.get("logs")
+    session = without_clean_faults(config.session)
     return Plan(
         folder=Path(config.out).expanduser(),
         preset=config.preset.name,
-        session={key: value for key, value in config.session.items() if key not in _OF_TRIAL},
+        session={key: value for key, value in session.items() if key not in _OF_TRIAL},
         objects=config.objects,
         definition=config.definition,
         metrics=config.metrics,
@@ -161,7 +171,22 @@ def _plan(config: EvaluateConfig) -> Plan:
         outside=outside_folders(given),
         logs=Path(str(logs)).expanduser() if logs is not None else None,
         truth=config.truth,
+        plausible=config.plausible,
     )
+
+
+def _check_faults(plan: Plan, levels: Sequence[str]) -> None:
+    """Levels are of simulated sessions; other faults have no session without them beside."""
+    if plan.kind == SENSORS and levels != (CLEAN,):
+        raise SettingError(
+            f"faults is {', '.join(levels)}; accepted for session=sensors: {CLEAN}, others are of "
+            "session=kinematic and session=simulated"
+        )
+    if "faults" in plan.session and (plan.plausible or levels != (CLEAN,)):
+        raise SettingError(
+            "session.faults is changed; accepted here: faults=LEVEL, or plausible=false with "
+            f"faults={CLEAN}"
+        )
 
 
 def _check(plan: Plan, trials: list[Trial]) -> None:

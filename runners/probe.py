@@ -44,6 +44,7 @@ from runners.sensors.tally import Report
 from runners.session_run import Row, SessionRun
 from runners.sessions import open_session, session_settings
 from runners.sessions.depth_frame import DepthFrameSession
+from runners.sessions.faults import without_clean_faults
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
@@ -206,13 +207,15 @@ def session_started(
 ) -> SessionStarted:
     """The first event of the recording."""
     session = scene.session
+    recorded = {key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT}
+    recorded["session"] = without_clean_faults(values["session"])
     return SessionStarted(
         runner="probe",
         object=scene.object_name,
         session=str(config.session["kind"]),
         method=method_name,
         seed=config.seed,
-        config={key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT},
+        config=recorded,
         mesh=scene.mesh,
         sdf=scene.sdf,
         workspace=session.workspace,

@@ -200,5 +200,10 @@ class FreeVoxels:
         self._seen.update(new)
         return self.lattice.centres(np.array(new, dtype=np.int64).reshape(-1, 3))
 
+    def holds(self, points: FloatArray) -> BoolArray:
+        """Which points (N, 3) are in a voxel added so far."""
+        voxels = map(tuple, self.lattice.voxels(points).tolist())
+        return np.array([voxel in self._seen for voxel in voxels], dtype=bool)
+
     def __len__(self) -> int:
         return len(self._seen)

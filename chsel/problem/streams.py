@@ -35,6 +35,7 @@ class Purpose(IntEnum):
     CONTACT_POINTS = 14
     ANCHORS = 15
     WALKS = 16
+    FAULTS = 17
 
 
 @dataclass(frozen=True)

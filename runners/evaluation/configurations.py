@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from chsel.problem.settings import build_settings
 from runners.choices import CONF
 from runners.objects.loader import ObjectConfig
 from runners.sessions.configurations import CONFIGURATIONS
+from runners.sessions.faults import CLEAN, LEVELS
 from runners.twin.configurations import CABINET_CONFIGURATIONS
 
 SENSORS = "sensors"
@@ -27,13 +28,20 @@ class TrialConfiguration:
     """One configuration as evaluations know it.
 
     object: whose it is. probes: how many it has; None: its logs tell. log_folder: of recorded
-    logs, beside which OBJECT_FILE says what the object is; None where logs are simulated.
+    logs, beside which OBJECT_FILE says what the object is; None where logs are simulated. faults:
+    the level of faults in its sessions, see LEVELS; the name has it, too, unless it is CLEAN.
     """
 
     name: str
     object: str
     probes: int | None = None
     log_folder: Path | None = None
+    faults: str = CLEAN
+
+    @property
+    def clean_name(self) -> str:
+        """The name of the same configuration without faults."""
+        return self.name.removesuffix(f"+{self.faults}")
 
 
 def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialConfiguration]:
@@ -62,6 +70,22 @@ def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialCon
     if set(there) <= set(twin):
         return twin
     return {name: twin.get(name) or _recorded(name, path) for name, path in there.items()}
+
+
+def with_faults(
+    configurations: Mapping[str, TrialConfiguration],
+) -> dict[str, TrialConfiguration]:
+    """Configurations without faults, each followed by itself with every level of them."""
+    return {
+        (name := faulty_name(clean, level)): replace(one, name=name, faults=level)
+        for clean, one in configurations.items()
+        for level in LEVELS
+    }
+
+
+def faulty_name(configuration: str, level: str) -> str:
+    """The name of a configuration with a level of faults."""
+    return configuration if level == CLEAN else f"{configuration}+{level}"
 
 
 def object_values(name: str) -> dict[str, Any]:

@@ -17,6 +17,10 @@ from rich.table import Table
 from replay.console import Console, Progress, TextColumn
 from runners.evaluation import schedule
 from runners.evaluation.true_poses import FoundPose
+from runners.reporting.by_faults import tables_by_faults
+from runners.reporting.console_table import print_table
+from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.method_style import method_styles
 
 _SPARSE = 60.0  # s between lines where there is no terminal
 _MOST_SHOWN = 3  # units at work, failures
@@ -91,6 +95,13 @@ class Display:
         self.say("medians over all steps of all trials: PD in mm² by object, ms a registration")
         self._console.print(table)
         self._console.print(f"plausible sets: {definition}", markup=False)
+
+    def faults(self, folder: Path) -> None:
+        """By level of faults: whether sets hold the truth, and how far hypotheses are from it."""
+        evaluation = open_evaluation(folder)
+        styles = method_styles(evaluation.methods)
+        for table in tables_by_faults(evaluation.rows, styles):
+            print_table(self._console, table)
 
     def true_poses(self, found: Sequence[FoundPose]) -> None:
         """How far the true poses that were sought are from guesses, and from a simulated truth."""

@@ -31,7 +31,10 @@ _FIXED = (
     "iterations",
     "logs",
     "truth",
+    "plausible",
 )
+_BEFORE = {"plausible": True}
+"""What keys mean that folders from before there were any lack."""
 
 
 def join_experiment(
@@ -87,6 +90,7 @@ def _described(
         "iterations": {"every": plan.every},
         "logs": None if plan.logs is None else str(plan.logs),
         "truth": settings_mapping(plan.truth) if plan.kind == SENSORS else None,
+        "plausible": plan.plausible,
         "commands": [_command()],
         "environment": environment(),
         "other_environments": [],
@@ -102,7 +106,8 @@ def _command() -> str:
 
 
 def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
-    differing = [text for key in _FIXED for text in _differences(key, theirs.get(key), ours[key])]
+    before = {**_BEFORE, **theirs}
+    differing = [text for key in _FIXED for text in _differences(key, before.get(key), ours[key])]
     known = theirs.get("methods") or {}
     for label in known:
         if label in ours["methods"]:

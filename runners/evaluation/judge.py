@@ -7,17 +7,25 @@ from dataclasses import replace
 from typing import Any
 
 from chsel.errors import EvaluationError
+from chsel.methods.method import Method
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import PlausibleSet
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
 from runners.evaluation.iterations import hypotheses_of
 from runners.evaluation.measure import Measure
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.table import Row
-from runners.evaluation.trial_session import load_members, plausible_settings_of, read_session
+from runners.evaluation.trial_session import (
+    load_members,
+    open_recorded,
+    plausible_settings_of,
+    problems,
+    read_session,
+)
 from runners.session_run import one_line
 from runners.sessions.recorded import RecordedSession
 
@@ -26,25 +34,50 @@ class Judge:
     """Makes rows of the table of what was found at the steps of a trial."""
 
     def __init__(
-        self, plan: Plan, trial: Trial, session: RecordedSession, label: str, preset: str
+        self,
+        plan: Plan,
+        trial: Trial,
+        session: RecordedSession,
+        label: str,
+        preset: str,
+        method: Method | None = None,
     ) -> None:
+        """method: that made what is judged; one with `holds` tells whether its set has the truth.
+
+        A session with faults is judged by the plausible sets of the same probes without any.
+        """
         assert session.world_from_object is not None
         self._plan, self._trial, self._session = plan, trial, session
-        self._label, self._preset = label, preset
-        self._told = read_session(plan, trial)
+        self._label, self._preset, self._faults = label, preset, plan.faults(trial)
+        self._holds = getattr(method, "holds", None)
+        self._clean = trial.without_faults(plan)
+        self._clean_problems: dict[int, RegistrationProblem] | None = None
+        if self._clean != trial and plan.plausible:
+            self._session = open_recorded(plan, self._clean)
+            of_clean = problems(plan, self._clean, self._session)
+            self._clean_problems = {problem.key.step: problem for problem in of_clean}
+        self._told = read_session(plan, self._clean) if plan.plausible else None
         self._settings = plausible_settings_of(plan, session)
         mesh, truth = session.recorded.mesh, session.world_from_object
         self._measure, self._truth = Measure(plan.metrics, mesh, truth), truth
         self._symmetry = object_symmetry(mesh)
 
     def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
-        """The plausible set of a problem; else why there is none, as a status."""
-        missing = self._told.failures.get(problem.key.step)
+        """The plausible set of a problem; else why there is none, as a status.
+
+        "" where none is wanted.
+        """
+        if self._told is None:
+            return None, ""
+        step = problem.key.step
+        missing = self._told.failures.get(step)
+        if self._clean_problems is not None and step not in self._clean_problems:
+            missing = f"without faults there is no registration at step {step}"
         if missing is not None:
             return None, f"no plausible set: {missing}"
         try:
             of_session = self._of_session(problem)
-            return load_members(self._plan, self._trial, self._session, of_session), ""
+            return load_members(self._plan, self._clean, self._session, of_session), ""
         except EvaluationError as error:
             return None, f"no plausible set: {one_line(error)}"
 
@@ -64,6 +97,7 @@ class Judge:
             "method": self._label,
             "preset": self._preset,
             "definition": self._plan.definition_label,
+            "faults": self._faults,
             "step": problem.key.step,
             "contacts": len(points.contacts),
             "free_points": len(points.free),
@@ -80,21 +114,23 @@ class Judge:
             }
         if found is None:
             return row | {"status": f"failed: {status}"}
-        row |= self._numbers(found)
+        row |= self._numbers(problem, found)
         if members is None:
             return row
         limit = members.true_cost + self._settings.epsilon
-        cost = EvaluationCost(problem, self._settings.cost)
+        cost = EvaluationCost(self._of_session(problem), self._settings.cost)
         below = cost.evaluate(found.object_from_world, limit=limit) < limit
         exact = {"exact_members": float(below.mean())} if len(below) else {}
         return row | self._measure.of(self._of_session(problem), members, found) | exact
 
     def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
-        """The problem as all draws have it: measured are they by the same random numbers."""
+        """The problem without faults, with the same random numbers for all draws."""
+        if self._clean_problems is not None:
+            problem = self._clean_problems.get(problem.key.step, problem)
         return replace(problem, key=StreamKey(self._trial.seed, problem.key.step))
 
-    def _numbers(self, found: Hypotheses) -> dict[str, Any]:
-        """What hypotheses tell by themselves."""
+    def _numbers(self, problem: RegistrationProblem, found: Hypotheses) -> dict[str, Any]:
+        """What hypotheses tell without a plausible set."""
         row: dict[str, Any] = {
             "hypotheses": len(found.cost),
             "distinct": found.distinct,
@@ -102,13 +138,20 @@ class Judge:
         }
         if len(found.cost) == 0:
             return row
-        best = found.object_from_world[:1]
-        position, rotation = pose_errors(best, self._truth, self._symmetry)
+        nearest, distance = self._measure.nearest(self._of_session(problem), found)
+        chosen = found.object_from_world[[0, nearest]]
+        position, rotation = pose_errors(chosen, self._truth, self._symmetry)
+        if self._holds is not None:
+            held = self._holds(problem, found, inverse(self._truth[None]))
+            row["truth_held"] = bool(held[0])
         return row | {
             "best_cost": float(found.cost[0]),
             "mean_cost": float(found.cost.mean()),
             "position_error": float(position[0]),
             "rotation_error": float(rotation[0]),
+            "nearest_hypothesis": distance,
+            "nearest_position": float(position[1]),
+            "nearest_rotation": float(rotation[1]),
         }
 
     def iterations(

@@ -58,12 +58,9 @@ class Measure:
         """
         if found is None or len(found.cost) == 0:
             return {}
-        if self._distance is None:
-            key = StreamKey(problem.key.seed, 0)
-            points = surface_points(self._mesh, self._config.points, key)
-            self._distance = SurfaceDistance(problem.sdf, self._mesh, points, self._config.distance)
+        distance = self._surface_distance(problem)
         chosen = found.object_from_world[cheapest(found.cost, self._config.quantile)]
-        distances = self._distance.between(chosen, members.world_from_object)
+        distances = distance.between(chosen, members.world_from_object)
         metrics = plausible_diversity(distances)
         row: dict[str, float] = {
             "distinct": found.distinct,
@@ -73,5 +70,22 @@ class Measure:
             "root": metrics.root,
         }
         if ranked and len(chosen) > 1:
-            row["rank"] = calibration(self._distance, chosen, self._truth).rank
+            row["rank"] = calibration(distance, chosen, self._truth).rank
         return row
+
+    def nearest(self, problem: RegistrationProblem, found: Hypotheses) -> tuple[int, float]:
+        """Index of the hypothesis nearest to the true pose, and how far from it its surface is.
+
+        Root mean square distance in metres, which no symmetry of the object changes.
+        """
+        distance = self._surface_distance(problem)
+        squares = distance.between(found.object_from_world, self._truth[None])[:, 0]  # (B,), mm^2
+        nearest = int(np.argmin(squares))
+        return nearest, 1e-3 * float(np.sqrt(squares[nearest]))
+
+    def _surface_distance(self, problem: RegistrationProblem) -> SurfaceDistance:
+        if self._distance is None:
+            key = StreamKey(problem.key.seed, 0)
+            points = surface_points(self._mesh, self._config.points, key)
+            self._distance = SurfaceDistance(problem.sdf, self._mesh, points, self._config.distance)
+        return self._distance

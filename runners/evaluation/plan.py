@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,14 @@ from runners.evaluation.configurations import (
     configurations_of,
     object_values,
     recorded_object,
+    with_faults,
 )
 from runners.evaluation.contenders import Contender
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import MetricsConfig
 from runners.objects.loader import ObjectConfig
 from runners.sessions import session_settings
+from runners.sessions.faults import CLEAN, LEVELS, level_name
 
 SESSIONS = ("simulated", "kinematic", SENSORS)
 OWN = "own"
@@ -64,6 +66,7 @@ class Plan:
     outside: Mapping[str, Path]
     logs: Path | None = None
     truth: TruePoseSettings = field(default_factory=TruePoseSettings)
+    plausible: bool = True  # whether to make plausible sets; without them there is no PD
 
     @property
     def kind(self) -> str:
@@ -75,7 +78,8 @@ class Plan:
     @cached_property
     def configurations(self) -> dict[str, TrialConfiguration]:
         """All that there are, by name."""
-        return configurations_of(self.kind, self.logs)
+        found = configurations_of(self.kind, self.logs)
+        return found if self.kind == SENSORS else with_faults(found)
 
     @property
     def log_folder(self) -> Path:
@@ -104,13 +108,21 @@ class Plan:
         if self.kind == SENSORS:
             # A pose beside the log is a guess here, from which the true pose is sought.
             return {**self.session, "path": str(trial.log(self)), "pose": "none"}
-        return {**self.session, "configuration": trial.configuration}
+        of = self.configurations[trial.configuration]
+        values = {**self.session, "configuration": of.clean_name}
+        return values if of.faults == CLEAN else values | {"faults": asdict(LEVELS[of.faults])}
 
     def session_settings(self, trial: Trial) -> Any:
         """The same, checked."""
         config = self.session_config(trial)
         config.pop("kind")
         return session_settings(self.kind, config)
+
+    def faults(self, trial: Trial) -> str:
+        """The name of the level of faults in a trial's session."""
+        if self.kind == SENSORS:
+            return CLEAN
+        return level_name(self.session_settings(trial).faults)
 
     def plausible_settings(self, epsilon: float) -> PlausibleSettings:
         """The definition of the plausible sets of an object of this epsilon, metres."""
@@ -146,6 +158,10 @@ class Trial:
         """Where all about it is."""
         return plan.folder / "trials" / self.configuration / f"seed_{self.seed}"
 
+    def without_faults(self, plan: Plan) -> Trial:
+        """The trial of the same probes whose plausible sets are those of this one, too."""
+        return Trial(self.seed, plan.configurations[self.configuration].clean_name)
+
     def log(self, plan: Plan) -> Path:
         """Its raw log, in sessions of sensors: a rosbag2 folder, or else an .mcap file."""
         folder = plan.log_folder / self.configuration
@@ -166,6 +182,11 @@ class Unit:
     def __str__(self) -> str:
         what = self.label or "session"
         return f"{self.trial.configuration}, seed {self.trial.seed}: {what}"
+
+    @property
+    def claim(self) -> str:
+        """The name of the claim on it."""
+        return f"{self.trial.configuration}.{self.trial.seed}.{self.label or 'session'}"
 
     def finished(self, plan: Plan) -> Path:
         """The file that is there once the unit is finished."""

@@ -81,7 +81,7 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
             return leader.register(problem)
 
         steps = run.steps(register, Exception) if leader is None else run.steps(register_and_lead)
-        judge = Judge(plan, trial, session, contender.label, contender.preset)
+        judge = Judge(plan, trial, session, contender.label, contender.preset, method)
         for step, _ in steps:
             problem = step.problem
             if problem is None or step.step not in chosen:

@@ -136,6 +136,7 @@ class Schedule:
                 "method": unit.label,
                 "preset": preset,
                 "definition": plan.definition_label,
+                "faults": plan.faults(trial),
                 "step": step,
                 "status": f"failed: {reason}",
             }

@@ -1,4 +1,4 @@
-"""Which configurations and seeds an evaluation has."""
+"""Which configurations, levels of faults and seeds an evaluation has."""
 
 from __future__ import annotations
 
@@ -26,6 +26,24 @@ def chosen_configurations(
     listed = _listed("configurations", value)
     chosen = {name for text in listed for name in _named(text, existing)}
     return tuple(name for name in existing if name in chosen)
+
+
+def chosen_names(setting: str, value: Any, existing: Iterable[str]) -> tuple[str, ...]:
+    """Which of the existing names a setting has, in the order of all of them.
+
+    A name, a pattern such as noise_*, "all", or a list of these. Raises SettingError if one of them
+    names none.
+    """
+    names, chosen = list(existing), set()
+    for text in _listed(setting, value):
+        named = [name for name in names if text == "all" or fnmatchcase(name, str(text))]
+        if not named:
+            raise SettingError(
+                f"{setting} names {text!r}; accepted: all, a pattern such as {names[0][:3]}*, "
+                f"{', '.join(names)}"
+            )
+        chosen.update(named)
+    return tuple(name for name in names if name in chosen)
 
 
 def chosen_seeds(value: Any) -> tuple[int, ...]:

@@ -11,21 +11,26 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from chsel.errors import RecordingError
+from runners.sessions.faults import CLEAN
 from runners.whole_file import whole_file
 
 Row = Mapping[str, Any]
 
 DEFINITION = "definition"
 """The column with the label of the definition of the plausible sets behind a row's numbers."""
+FAULTS = "faults"
+"""The column with the level of faults in a row's session."""
 _KEYS = [("object", pa.string()), ("configuration", pa.string()), ("seed", pa.int64())]
 _KEYS += [("method", pa.string())]
 _INTEGERS = ("contacts", "free_points", "occupied_points")
+_TRUTH = ("nearest_hypothesis", "nearest_position", "nearest_rotation")
 _METRICS = ("coverage", "plausibility", "diversity", "root")
 RESULTS = pa.schema(
     [
         *_KEYS,
         ("preset", pa.string()),
         (DEFINITION, pa.string()),
+        (FAULTS, pa.string()),
         ("step", pa.int64()),
         *((name, pa.int64()) for name in _INTEGERS),
         ("status", pa.string()),
@@ -34,15 +39,19 @@ RESULTS = pa.schema(
         *((name, pa.int64()) for name in ("hypotheses", "distinct")),
         *((name, pa.float64()) for name in ("best_cost", "mean_cost", *_METRICS)),
         *((name, pa.float64()) for name in ("position_error", "rotation_error", "rank")),
-        *((name, pa.float64()) for name in ("exact_members", "seconds")),
+        ("truth_held", pa.bool_()),
+        *((name, pa.float64()) for name in (*_TRUTH, "exact_members", "seconds")),
         ("digest", pa.string()),
         ("problem_digest", pa.string()),
     ]
 )
 """A row a (configuration, seed, method, step). Lengths in metres, angles in radians, but coverage,
 plausibility and diversity (PD) in mm^2 and root, of PD, in mm. position_error, rotation_error: of
-the best hypothesis, modulo the object's symmetries, at its centre. status: "ok", "failed: REASON"
-or "no plausible set: REASON"; what a row does not have is null."""
+the best hypothesis, modulo the object's symmetries, at its centre. nearest_hypothesis: root mean
+square distance of the true pose's surface from that of the nearest hypothesis, whose errors are
+nearest_position and nearest_rotation. truth_held: whether the true pose lies in the set that the
+result stands for, where a method tells. faults: the level of the session's. status: "ok", "failed:
+REASON" or "no plausible set: REASON"; what a row does not have is null."""
 ITERATIONS = pa.schema(
     [
         *_KEYS[1:],
@@ -69,14 +78,16 @@ def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, about: str = 
 def read_part(path: Path, schema: pa.Schema, definition: str) -> pa.Table:
     """A part. Raises RecordingError if it is damaged, of another version or definition.
 
-    definition: label of that of the evaluation. A part from before there was a column of it has it.
+    definition: label of that of the evaluation. A part from before there was a column of it has it;
+    other columns of later versions are null, and no session had faults.
     """
+    later = {DEFINITION: definition, FAULTS: CLEAN} | dict.fromkeys(("truth_held", *_TRUTH))
     try:
         table = pa.parquet.read_table(path).replace_schema_metadata()
-        if DEFINITION not in table.column_names:
-            place = schema.get_field_index(DEFINITION)
-            labels = pa.array([definition] * table.num_rows, pa.string())
-            table = table.add_column(place, DEFINITION, labels)
+        for place, column in enumerate(schema):
+            if column.name in later and column.name not in table.column_names:
+                values = pa.array([later[column.name]] * table.num_rows, column.type)
+                table = table.add_column(place, column.name, values)
         table = table.cast(schema)
     except (pa.ArrowException, ValueError, OSError) as error:
         reason = " ".join(str(error).split())

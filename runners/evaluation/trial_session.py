@@ -15,7 +15,8 @@ from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.writer import McapRecorder
-from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.claims import claimed
+from runners.evaluation.plan import Plan, Trial, Unit
 from runners.evaluation.session_recording import TRUTH, record_session
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 from runners.whole_file import WritingError, whole_file
@@ -36,8 +37,17 @@ class TrialSession:
 
 
 def make_session(plan: Plan, trial: Trial) -> None:
-    """Probe, and make the plausible sets of all steps at which methods will register."""
-    folder, begun = trial.folder(plan), time.perf_counter()
+    """Probe, and make the plausible sets of all steps at which methods will register.
+
+    Those of a session with faults are the sets of the one without; it is made first. Raises
+    ClaimedError while another process makes it.
+    """
+    folder, clean = trial.folder(plan), trial.without_faults(plan)
+    if clean != trial and plan.plausible:
+        with claimed(plan.folder, Unit(clean).claim):
+            if not has_session(plan, clean):
+                make_session(plan, clean)
+    begun = time.perf_counter()
     if not (folder / "session.mcap").exists():
         with whole_file(folder / "session.mcap") as beside:
             record_session(plan, trial, McapRecorder(beside))
@@ -49,6 +59,8 @@ def make_session(plan: Plan, trial: Trial) -> None:
     for problem in problems(plan, trial, session):
         step = problem.key.step
         steps.append(step)
+        if clean != trial or not plan.plausible:
+            continue
         try:
             before = _made(plan, trial, session, problem, settings, before)
         except EvaluationError as error:

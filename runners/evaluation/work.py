@@ -56,9 +56,8 @@ def is_finished(plan: Plan, unit: Unit) -> bool:
 def do_unit(plan: Plan, unit: Unit, warm: set[str]) -> Outcome:
     """Do a unit, unless it is finished or claimed."""
     begun = time.perf_counter()
-    name = f"{unit.trial.configuration}.{unit.trial.seed}.{unit.label or 'session'}"
     try:
-        with claimed(plan.folder, name) as alone:
+        with claimed(plan.folder, unit.claim) as alone:
             if not is_finished(plan, unit):
                 if alone:
                     _clear(plan, unit)

@@ -16,6 +16,7 @@ from runners.reporting.completeness import (
 )
 from runners.reporting.cost_gradients import picture_of_gradients
 from runners.reporting.evaluation_folder import Evaluation, ReportError, Row, Trial
+from runners.reporting.faults_section import sections_on_faults
 from runners.reporting.method_style import MethodStyle, method_styles
 from runners.reporting.over_iterations import picture_over_iterations, tables_over_iterations
 from runners.reporting.over_probes import picture_over_probes
@@ -83,6 +84,7 @@ def sections_of(
             ),
         ),
         *true_pose_sections(evaluation),
+        *sections_on_faults(evaluation, styles),
         *([] if baseline is None else [section_against(evaluation, styles, baseline)]),
         _over_probes(evaluation, styles),
         _boxes(half, styles),

@@ -11,6 +11,7 @@ import numpy as np
 
 from runners.reporting.evaluation_folder import Row, Trial
 
+_NORMAL_95 = 1.959963984540054  # 97.5th percentile of the normal distribution
 Key = TypeVar("Key", bound=Hashable)
 
 
@@ -55,6 +56,15 @@ def spread(rows: Iterable[Row], name: str) -> Spread:
     values = [row.get(name) for row in rows]
     kept = [float(value) for value in values if value is not None]
     return Spread(tuple(kept), len(values) - len(kept))
+
+
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """The 95 % interval of a share of independent cases, total > 0 (Wilson's score interval)."""
+    share, z2 = count / total, _NORMAL_95**2
+    centre = (share + z2 / (2.0 * total)) / (1.0 + z2 / total)
+    spread_of = math.sqrt(share * (1.0 - share) / total + z2 / (4.0 * total**2))
+    half = _NORMAL_95 * spread_of / (1.0 + z2 / total)
+    return max(centre - half, 0.0), min(centre + half, 1.0)
 
 
 def grouped(rows: Iterable[Row], key: Callable[[Row], Key]) -> dict[Key, list[Row]]:

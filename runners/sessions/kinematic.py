@@ -13,6 +13,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 from runners.sessions import hand
 from runners.sessions.configurations import find_configuration
+from runners.sessions.faults import probed_mesh
 from runners.sessions.placement import laid_down
 from runners.sessions.probing import START, ProbingSession, ProbingSettings, Touch
 
@@ -29,7 +30,8 @@ def open_kinematic(
     Raises SessionError for an unknown configuration.
     """
     configuration = find_configuration(configuration_name)
-    engine = KinematicEngine(mesh, laid_down(mesh, configuration), settings)
+    probed = probed_mesh(mesh, settings.faults)
+    engine = KinematicEngine(probed, laid_down(mesh, configuration), settings)
     return ProbingSession(engine, mesh, configuration, settings, seed)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
@@ -18,6 +18,7 @@ from chsel.problem.streams import Purpose, StreamKey
 from replay.events import Probe
 from runners.sessions import hand
 from runners.sessions.configurations import WORKSPACE, Configuration
+from runners.sessions.faults import Faults, FaultSettings, probed_mesh
 from runners.sessions.free_space import box_shell, floor_slab, swept_voxels
 
 if TYPE_CHECKING:
@@ -51,7 +52,8 @@ class ProbingSettings:
     start_contacts, start_probe: registration begins when there are so many contacts, and after
     the probe of that index. step_length: of a control step at full command, m. push_steps: most
     control steps of a push. stop_force: ends a push, N. max_force: of the hand's holder, N.
-    noise: standard deviation of the noise on a command between -1 and 1.
+    noise: standard deviation of the noise on a command between -1 and 1. faults: of what is
+    reported, and of the registered mesh.
     """
 
     configuration: str | None = None
@@ -71,6 +73,7 @@ class ProbingSettings:
     stop_force: float = 5.0
     max_force: float = 30.0
     noise: float = 0.005
+    faults: FaultSettings = field(default_factory=FaultSettings)
 
     presets: ClassVar[Presets] = {
         "paper": {
@@ -141,7 +144,7 @@ class ProbingSession:
         settings: ProbingSettings,
         seed: int,
     ) -> None:
-        """mesh: in its own frame, metres. seed: of the noise on the gripper's commands."""
+        """mesh: the registered one, in its frame, metres. seed: of noise and faults."""
         self.configuration = configuration
         self.settings = settings
         self.workspace = choose_workspace(configuration, settings)
@@ -155,6 +158,16 @@ class ProbingSession:
         self._interior = hand.interior_points(settings.interior_spacing, settings.interior_depth)
         self._gripper = _Gripper(engine, settings, seed)
         self._engine = engine
+        self._faults: Faults | None = None
+        if settings.faults != FaultSettings():
+            self._faults = Faults(
+                settings.faults,
+                probed_mesh(mesh, settings.faults),
+                engine.world_from_object,
+                self._voxels,
+                self.workspace,
+                seed,
+            )
 
     def probes(self) -> Iterator[Probe]:
         """Move before the object, push, return; once for every point of the grid."""
@@ -174,15 +187,19 @@ class ProbingSession:
         path = np.array(self._gripper.path)
         ends = np.array(self._gripper.ends)
         contacts = np.array(self._gripper.contacts).reshape(-1, 3)
+        normals = np.array(self._gripper.normals).reshape(-1, 3)
         swept = path if self.settings.sweep == "mini_steps" else ends
         free = self._voxels.add(swept_voxels(self._voxels.lattice, self._interior, swept))
+        if self._faults is not None:
+            free = np.concatenate([free, self._faults.wrongly_free(step, free)])
+            contacts, normals = self._faults.reported(step, contacts, normals)
         return Probe(
             step=step,
             outcome="contact" if len(contacts) else "free",
             new_points=KnownPoints(free=free, known=contacts),
             gripper_path=hand.world_from_gripper(ends),
             contacts=contacts,
-            contact_normals=np.array(self._gripper.normals).reshape(-1, 3),
+            contact_normals=normals,
         )
 
     def _boundary(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> FloatArray:

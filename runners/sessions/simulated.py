@@ -17,6 +17,7 @@ from chsel.problem.poses import apply, compose, inverse
 from runners.physics_engine import connect, silent
 from runners.sessions import hand
 from runners.sessions.configurations import Configuration, find_configuration
+from runners.sessions.faults import probed_mesh
 from runners.sessions.placement import centre_of_mass, laid_down, lowest
 from runners.sessions.probing import START, ProbingSession, ProbingSettings, Touch
 
@@ -61,7 +62,8 @@ class PyBulletEngine:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 self.world_from_object = _settle(self._world, mesh, laid_down(mesh, configuration))
-                file = _collision_file(self._world, mesh, Path(folder), settings.collision_mesh)
+                probed = probed_mesh(mesh, settings.faults)
+                file = _collision_file(self._world, probed, Path(folder), settings.collision_mesh)
                 concave = settings.collision_mesh == "visual"
                 self._object = _fixed_object(self._world, file, self.world_from_object, concave)
                 self._hand = _hand(self._world, Path(folder))

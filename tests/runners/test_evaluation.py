@@ -15,6 +15,7 @@ import pytest
 
 from chsel.errors import ChselError, RecordingError
 from chsel.methods.icp import Icp
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.plausible_file import read_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import pose_errors
@@ -428,3 +429,39 @@ def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None
         recording = read_recording(TRIAL.folder(plan) / f"{label}.mcap")
         assert {verdict.outcome for verdict in verify(recording)} == {EQUAL}
         assert [snapshot.iteration for snapshot in recording.snapshots(4)] == [0, 20]
+
+
+def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without(
+    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, faulty = make_plan(steps="5"), Trial(0, "mustard+noise_3mm")
+    join_experiment(plan, "test", [faulty.configuration], [0])
+    asked: list[FloatArray] = []
+
+    def holds(self: Icp, problem: Any, found: Any, poses: FloatArray) -> BoolArray:
+        asked.append(poses)
+        return np.array([problem.key.step == 5])
+
+    monkeypatch.setattr(Icp, "holds", holds, raising=False)
+    for unit in (Unit(faulty), Unit(faulty, "icp"), Unit(TRIAL, "icp")):
+        assert do_unit(plan, unit, set()).kind == "done"
+    assert not (faulty.folder(plan) / "plausible").exists()
+    clean, noisy = results(plan)
+    assert [one["faults"] for one in (clean, noisy)] == ["clean", "noise_3mm"]
+    assert (clean["members"], clean["true_cost"]) == (noisy["members"], noisy["true_cost"])
+    assert clean["status"] == noisy["status"] == "ok"
+    assert clean["problem_digest"] != noisy["problem_digest"]
+    assert clean["truth_held"] is noisy["truth_held"] is True
+
+    recording = read_recording(faulty.folder(plan) / "icp.mcap")
+    start, truth = recording.start, recording.start.world_from_object
+    assert start.config["session"]["faults"]["contact_noise"] == 0.003
+    without = read_recording(TRIAL.folder(plan) / "session.mcap").start
+    assert truth is not None
+    np.testing.assert_array_equal(truth, without.world_from_object)
+    np.testing.assert_allclose(asked[0][0] @ truth, np.eye(4), atol=1e-12)
+    found, symmetry = recording.hypotheses(5).object_from_world, object_symmetry(start.mesh)
+    position, rotation = pose_errors(found, truth, symmetry)
+    nearest = int(np.argmin(np.abs(position - noisy["nearest_position"])))
+    assert rotation[nearest] == pytest.approx(noisy["nearest_rotation"])
+    assert 0.0 < noisy["nearest_hypothesis"] < 0.1

@@ -16,7 +16,7 @@ from replay.verbs import VERBS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 COMMANDS = ("align", "benchmark", "evaluate", "fetch", "plausible", "probe", "published")
-COMMANDS += ("report", "simulate_rig")
+COMMANDS += ("real", "report", "simulate_rig")
 HEAVY = ("torch", "trimesh", "igl", "matplotlib", "pybullet", "networkx")
 LISTED = f"""
 import atexit, sys

@@ -1,0 +1,225 @@
+"""`python -m runners.real`: methods on real measurements, against published poses and held out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import degrees, pi
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+from omegaconf import DictConfig
+
+from chsel.errors import SettingError, require_positive
+from chsel.methods.method import Method
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.threads import require_threads, threads
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import object_symmetry
+from chsel.problem.online_registration import OnlineRegistration
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
+from chsel.problem.settings import build_settings
+from chsel.problem.streams import Purpose, StreamKey, uniforms
+from replay.console import Console, Progress
+from replay.events import Probe
+from runners.cli import command, plain
+from runners.compiling import Compiling
+from runners.evaluation.contenders import chosen_contenders
+from runners.evaluation.selection import chosen_names, chosen_seeds
+from runners.objects.loader import ObjectConfig, load_object
+from runners.probe import PresetName
+from runners.reporting.console_table import print_table
+from runners.reporting.section import Cell, Table, number
+from runners.reporting.statistics import grouped, spread
+from runners.sensors.depth_frame import SUFFIXES as FRAMES
+from runners.sensors.rig import Rig
+from runners.sessions import open_session
+from runners.sessions.points import PointsSettings
+from runners.sessions.sensors import SensorsSettings
+from runners.whole_file import whole_file
+
+_RIGHT = (0.005, pi / 36.0)  # m and radians (5 degrees): errors of a hypothesis that is right
+_EPSILON = 0.001  # m, of plausible sets, which are not made here
+_SPLIT = 1  # the random stream, of a seed, that halves the touches
+_ALL, _HALF = "all", "half"
+_MEDIANS = (  # column, which rows, heading, factor
+    ("residual", _ALL, "residual, mm", 1e3),
+    ("position_error", _ALL, "position, mm", 1e3),
+    ("rotation_error", _ALL, "rotation, °", degrees(1.0)),
+    ("held_out", _HALF, "held out, mm", 1e3),
+    ("seconds", _ALL, "ms", 1e3),
+)
+
+
+@dataclass(frozen=True)
+class CaseConfig:
+    """One real case: files in the folder of the data."""
+
+    path: str  # known points (.npz), or a depth image (.yaml)
+    mesh: str  # of the object, metres
+
+
+@dataclass(frozen=True)
+class RealConfig:
+    """conf/real.yaml, which has all defaults and says what they are, checked."""
+
+    data: str | None
+    cases: Any
+    only: Any
+    seeds: Any
+    methods: Any
+    settings: Any
+    passes: int
+    halves: bool
+    rig: Rig
+    preset: PresetName
+    out: str
+    threads: int
+
+    def __post_init__(self) -> None:
+        require_positive("passes", self.passes)
+        require_threads("threads", self.threads)
+
+
+@command("real")
+def main(config: DictConfig) -> None:
+    """Register every case with every method and seed, and print medians."""
+    checked = build_settings(RealConfig, plain(config), "real")
+    cases = chosen_names("only", checked.only, checked.cases)
+    seeds, console = chosen_seeds(checked.seeds), Console()
+    if checked.data is None or not (Path(checked.data).expanduser() / "real").is_dir():
+        raise SettingError(
+            f"data is {checked.data}; accepted: a folder with real/, by data=FOLDER or CHSEL_DATA"
+        )
+    contenders = chosen_contenders(checked.methods, checked.settings, checked.preset.name)
+    methods = {contender.label: contender.method() for contender in contenders}
+    rows: list[Mapping[str, Any]] = []
+    with threads(checked.threads):
+        with Compiling() as kernels:
+            opened = [RealCase(checked, name) for name in cases]
+            for method in methods.values():
+                kernels.rehearse(method, sensing=False)
+        waiting = Console(stderr=True)
+        with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as bar:
+            for case in bar.track(opened, description="cases"):
+                for label, method in methods.items():
+                    rows += case.rows(label, method, seeds)
+                rows += case.published()
+    file = Path(checked.out).expanduser() / "results.csv"
+    with whole_file(file) as beside:
+        pa.csv.write_csv(pa.Table.from_pylist(rows), beside)
+    print_table(console, _table(rows))
+    console.print(str(file), soft_wrap=True)
+
+
+class RealCase:
+    """A case with its object, its points and, where it is known, its true pose."""
+
+    def __init__(self, config: RealConfig, name: str) -> None:
+        """Raises SettingError if there are too few touches, and what opening a session raises."""
+        case = build_settings(CaseConfig, config.cases[name], f"cases.{name}")
+        folder = Path(config.data or "").expanduser() / "real"
+        path, mesh = str(folder / case.path), str(folder / case.mesh)
+        model = load_object(ObjectConfig(name, 1.0, _EPSILON, name, "file", mesh), folder)
+        frame = Path(path).suffix.lower() in FRAMES
+        kind, cls = ("sensors", SensorsSettings) if frame else ("points", PointsSettings)
+        more: dict[str, Any] = {"rig": config.rig, "images": False} if frame else {}
+        settings: Any = cls(path=path, **more)
+        self._session = open_session(kind, settings, model, 0)
+        resolution, padding = settings.object_resolution, settings.object_padding
+        self._sdf = SdfGrid.from_mesh(model.mesh, resolution, padding=padding)
+        probes = [event for event in self._session.probes() if isinstance(event, Probe)]
+        parts = [self._session.initial_points, *(probe.new_points for probe in probes)]
+        self._points = KnownPoints.joined(parts)
+        if len(self._points.contacts) < 2:
+            raise SettingError(f"{name} has {len(self._points.contacts)} touches; accepted: from 2")
+        self._mesh, self._symmetry = model.mesh, object_symmetry(model.mesh)
+        self._config, self._name = config, name
+
+    def rows(self, label: str, method: Method, seeds: Sequence[int]) -> Iterator[dict[str, Any]]:
+        """A row for every seed and, where wanted, another of its half of the touches."""
+        count = len(self._points.contacts)
+        for seed in seeds:
+            about = {"case": self._name, "method": label, "seed": seed, "points": _ALL}
+            yield about | self._numbers(method, seed, np.arange(count))
+            if self._config.halves:
+                stream = StreamKey(seed, 0).stream(Purpose.CONTACT_POINTS, _SPLIT)
+                order = np.argsort(uniforms(stream, 0.0, 1.0, count), kind="stable")
+                kept = np.sort(order[: (count + 1) // 2])
+                yield about | {"points": _HALF} | self._numbers(method, seed, kept)
+
+    def published(self) -> Iterator[dict[str, Any]]:
+        """A row of the true pose itself, where it is known: what residual there is to reach."""
+        if (truth := self._session.world_from_object) is not None:
+            about = {"case": self._name, "method": "(published pose)", "points": _ALL}
+            every = np.arange(len(self._points.contacts))
+            yield about | self._counts(every, inverse(truth[None])[0])
+
+    def _counts(self, kept: IntArray, pose: FloatArray) -> dict[str, Any]:
+        """Numbers of points, and how far all touches are from the surface in a pose (4, 4)."""
+        touches = self._points.contacts
+        away = np.abs(mesh_sdf(self._mesh, apply(pose, touches))[0])  # (C,), metres
+        rest = np.delete(np.arange(len(touches)), kept)
+        return {
+            "touches": len(kept),
+            "free_points": len(self._points.free),
+            "residual": float(away[kept].mean()),
+            "held_out": float(away[rest].mean()) if len(rest) else None,
+            **dict.fromkeys(("position_error", "rotation_error", "right", "truth_held")),
+        }
+
+    def _numbers(self, method: Method, seed: int, kept: IntArray) -> dict[str, Any]:
+        """What comes of registering these of the touches; lengths in metres, angles in radians."""
+        session = self._session
+        points = KnownPoints(free=self._points.free, known=self._points.contacts[kept])
+        place = (self._sdf, session.workspace, session.free_resolution)
+        online = OnlineRegistration(*place, method.online, seed=seed, points=points)
+        for step in range(self._config.passes):
+            problem, begun = online.pose(step), time.perf_counter()
+            found = method.register(problem)
+            seconds = time.perf_counter() - begun
+            online.remember(found)
+        best = found.object_from_world[:1]
+        numbers = {"best_cost": float(found.cost[0]), **self._counts(kept, best[0])}
+        if session.world_from_object is not None:
+            errors = pose_errors(best, session.world_from_object, self._symmetry)
+            position, rotation = (float(error[0]) for error in errors)
+            numbers |= {"position_error": position, "rotation_error": rotation}
+            numbers["right"] = position <= _RIGHT[0] and rotation <= _RIGHT[1]
+            if (holds := getattr(method, "holds", None)) is not None:
+                truth = inverse(session.world_from_object[None])
+                numbers["truth_held"] = bool(holds(problem, found, truth)[0])
+        return numbers | {"seconds": seconds, "digest": found.digest}
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Medians [quartiles] over seeds of every case and method."""
+    lines = []
+    for (case, method), own in grouped(rows, lambda row: (row["case"], row["method"])).items():
+        by_points = grouped(own, lambda row: row["points"])
+        right = [row["right"] for row in by_points[_ALL] if row["right"] is not None]
+        counts = (by_points[_ALL][0]["touches"], by_points[_ALL][0]["free_points"])
+        cells = [Cell(str(text)) for text in (case, method, *counts)]
+        cells.append(Cell(f"{sum(right)} of {len(right)}" if right else "-"))
+        for column, points, _, scale in _MEDIANS:
+            found = spread(by_points.get(points, ()), column)
+            low, median, high = (number(scale * value) for value in found.quartiles)
+            cells.append(Cell(median, between=f"[{low}, {high}]" if found.count else ""))
+        lines.append(tuple(cells))
+    header = ("case", "method", "touches", "free", "right", *(text for _, _, text, _ in _MEDIANS))
+    note = (
+        "Of the best hypothesis. Residual: mean |SDF| of all touches; held out: that of a random "
+        "half, registered on the other. Right: within 5 mm and 5 degrees of the published pose, "
+        "modulo symmetries."
+    )
+    return Table("Medians [quartiles] over seeds", header, tuple(lines), labels=2, note=note)
+
+
+if __name__ == "__main__":
+    main()

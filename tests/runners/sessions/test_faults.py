@@ -1,0 +1,214 @@
+"""Faults on a ball: what is reported against what was met."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.errors import SettingError
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import FreeVoxels, Lattice, Workspace
+from chsel.problem.settings import build_settings, settings_mapping
+from replay.events import Probe
+from runners.objects.models import MODELS
+from runners.sessions.faults import (
+    CLEAN,
+    LEVELS,
+    Faults,
+    FaultSettings,
+    level_name,
+    probed_mesh,
+    without_clean_faults,
+)
+from runners.sessions.kinematic import open_kinematic
+from runners.sessions.probing import ProbingSession, ProbingSettings
+
+RADIUS, SIDE = 0.1, 0.02
+CENTRE = np.array([0.3, 0.0, 0.2])
+WORKSPACE = Workspace((0.0, -0.3, 0.0), (0.6, 0.3, 0.5))
+
+
+def directions(count: int) -> FloatArray:
+    drawn = np.random.default_rng(0).normal(size=(count, 3))
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def of_ball(free: FreeVoxels | None = None, seed: int = 0, **settings: float) -> Faults:
+    pose = np.eye(4)
+    pose[:3, 3] = CENTRE
+    return Faults(
+        FaultSettings(**settings),
+        trimesh.creation.icosphere(subdivisions=4, radius=RADIUS),
+        pose,
+        free if free is not None else FreeVoxels(Lattice((0.0, 0.0, 0.0), SIDE)),
+        WORKSPACE,
+        seed,
+    )
+
+
+def reported(count: int, faults: Faults, steps: int = 1) -> tuple[FloatArray, FloatArray]:
+    """True contacts all over the ball, (C, 3), and those reported of them, (C', 3)."""
+    normals = directions(count)
+    contacts = CENTRE + RADIUS * normals
+    parts = zip(np.split(contacts, steps), np.split(normals, steps), strict=True)
+    found = [faults.reported(step, *part) for step, part in enumerate(parts)]
+    for places, normal in found:
+        assert len(places) == len(normal)
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0)
+    return contacts, np.concatenate([places for places, _ in found])
+
+
+def test_noise_has_its_deviation_along_each_axis_and_along_normals() -> None:
+    contacts, found = reported(4000, of_ball(contact_noise=0.003))
+    off = found - contacts
+    np.testing.assert_allclose(off.std(axis=0), 0.003, rtol=0.05)
+    assert (off * directions(4000)).sum(axis=1).std() == pytest.approx(0.003, rel=0.05)
+
+
+def test_noise_depends_on_seed_and_step_alone() -> None:
+    noisy = {"contact_noise": 0.003}
+    _, first = reported(8, of_ball(**noisy))
+    _, again = reported(8, of_ball(**noisy))
+    _, other = reported(8, of_ball(seed=1, **noisy))
+    _, late = reported(8, of_ball(**noisy), steps=2)
+    np.testing.assert_array_equal(first, again)
+    assert not (first == other).any()
+    assert not (first[4:] == late[4:]).any()  # of another step
+
+
+def test_rounded_contacts_are_on_the_lattice() -> None:
+    contacts, found = reported(50, of_ball(quantisation=0.005))
+    np.testing.assert_allclose(np.rint(found / 0.005) * 0.005, found, atol=1e-15)
+    assert 0.0015 < np.abs(found - contacts).max() <= 0.0025 + 1e-12
+
+
+def test_a_bias_is_the_same_shift_in_all_steps() -> None:
+    contacts, found = reported(20, of_ball(camera_bias=0.005), steps=4)
+    off = found - contacts
+    np.testing.assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-12)
+    assert np.linalg.norm(off[0]) == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2])
+def test_so_many_contacts_are_foreign_and_off_the_object(share: float) -> None:
+    _, found = reported(180, of_ball(foreign_contacts=share), steps=60)
+    off = np.linalg.norm(found - CENTRE, axis=1) - RADIUS
+    foreign = off > 1e-3
+    assert foreign.sum() == pytest.approx(180 * share / (1 - share), abs=1)
+    assert off[foreign].min() >= 0.0099  # the ball is a polyhedron
+    assert off[foreign].max() <= 0.1
+    assert (found[foreign] >= WORKSPACE.lower).all()
+
+
+def test_foreign_contacts_are_not_in_voxels_told_free() -> None:
+    free = FreeVoxels(Lattice((0.0, 0.0, 0.0), SIDE))
+    axes = np.arange(0, 30) * SIDE
+    everywhere = np.stack(np.meshgrid(axes, axes - 0.3, axes), axis=-1).reshape(-1, 3)
+    free.add(everywhere[everywhere[:, 2] > 0.2])  # above the ball's centre
+    _, found = reported(80, of_ball(free, foreign_contacts=0.2))
+    foreign = found[np.linalg.norm(found - CENTRE, axis=1) > RADIUS + 1e-3]
+    assert len(foreign) > 10
+    assert foreign[:, 2].max() < 0.2 + 1.5 * SIDE
+    full = FreeVoxels(free.lattice)
+    full.add(everywhere)
+    assert len(reported(20, of_ball(full, foreign_contacts=0.2))[1]) == 20  # nowhere to be
+
+
+@pytest.mark.parametrize("reach", [0.5, 1.0])
+def test_wrongly_free_voxels_are_inside_within_reach_and_told_once(reach: float) -> None:
+    free = FreeVoxels(Lattice((0.0, 0.0, 0.0), SIDE))
+    axes = np.arange(-8, 9) * SIDE
+    around = CENTRE + np.stack(np.meshgrid(axes, axes, axes), axis=-1).reshape(-1, 3)
+    swept = free.add(around[np.linalg.norm(around - CENTRE, axis=1) > RADIUS])
+    every = of_ball(free, free_error=1.0, free_reach=reach).wrongly_free(0, swept)
+    depth = RADIUS - np.linalg.norm(every - CENTRE, axis=1)
+    assert depth.min() > -1e-3
+    assert reach * SIDE - 2e-3 < depth.max() < reach * SIDE + 1e-3
+    assert free.holds(every).all()
+    some = of_ball(FreeVoxels(free.lattice), free_error=0.5, free_reach=reach)
+    told = some.wrongly_free(0, swept)
+    assert 0.35 < len(told) / len(every) < 0.65
+    assert len(some.wrongly_free(1, swept)) == 0  # each had its chance
+
+
+def test_no_fault_reports_what_was_met() -> None:
+    contacts, found = reported(20, of_ball())
+    np.testing.assert_array_equal(contacts, found)
+    assert len(of_ball().wrongly_free(0, contacts)) == 0
+
+
+def test_the_probed_mesh_is_smaller_about_the_same_centre() -> None:
+    mesh = trimesh.creation.box(
+        (0.1, 0.2, 0.3), np.array(trimesh.transformations.identity_matrix())
+    )
+    mesh.apply_translation([1.0, 2.0, 3.0])
+    probed = probed_mesh(mesh, FaultSettings(mesh_scale=1.02))
+    np.testing.assert_allclose(probed.extents, mesh.extents / 1.02)
+    np.testing.assert_allclose(probed.bounds.mean(axis=0), [1.0, 2.0, 3.0])
+    assert probed_mesh(mesh, FaultSettings()) is mesh
+
+
+def kinematic(**faults: float) -> tuple[ProbingSession, list[Probe]]:
+    settings = ProbingSettings(faults=FaultSettings(**faults))
+    session = open_kinematic(MODELS["cracker_box"]().apply_scale(1.5), "box", settings, 0)
+    return session, list(session.probes())
+
+
+@pytest.fixture(scope="module")
+def clean_session() -> tuple[ProbingSession, list[Probe]]:
+    return kinematic()
+
+
+def test_a_session_with_faults_is_the_same_session(
+    clean_session: tuple[ProbingSession, list[Probe]],
+) -> None:
+    clean, before = clean_session
+    faulty, after = kinematic(contact_noise=0.003, foreign_contacts=0.2, free_error=0.2)
+    np.testing.assert_array_equal(clean.world_from_object, faulty.world_from_object)
+    wrong = 0
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(one.gripper_path, other.gripper_path)
+        count = len(one.contacts)
+        assert (np.abs(other.contacts[:count] - one.contacts) < 0.02).all()
+        np.testing.assert_array_equal(other.contacts, other.new_points.known)
+        wrong += len(other.new_points.free) - len(one.new_points.free)
+    assert sum(len(probe.contacts) for probe in after) > sum(len(p.contacts) for p in before)
+    assert wrong > 0
+
+
+def test_a_smaller_object_is_met_later_at_the_same_pose(
+    clean_session: tuple[ProbingSession, list[Probe]],
+) -> None:
+    clean, before = clean_session
+    smaller, after = kinematic(mesh_scale=1.1)
+    np.testing.assert_array_equal(clean.world_from_object, smaller.world_from_object)
+    assert after[0].contacts[0, 0] > before[0].contacts[0, 0] + 0.002
+
+
+def test_levels_have_names_and_are_recorded_unless_clean() -> None:
+    assert [level_name(level) for level in LEVELS.values()] == list(LEVELS)
+    assert level_name(replace(LEVELS["mixed"], contact_noise=0.004)) == "own"
+    session = {"kind": "kinematic", "faults": settings_mapping(LEVELS[CLEAN])}
+    assert without_clean_faults(session) == {"kind": "kinematic"}
+    session["faults"] = settings_mapping(LEVELS["mixed"])
+    assert without_clean_faults(session) == session
+
+
+@pytest.mark.parametrize(
+    ("faults", "message"),
+    [
+        ({"contact_noise": -0.001}, "contact_noise is -0.001; accepted: 0 to 0.1 (m)"),
+        ({"contact_noise": float("nan")}, "contact_noise is nan; accepted"),
+        ({"foreign_contacts": 0.6}, "foreign_contacts is 0.6; accepted: 0 to 0.5"),
+        ({"mesh_scale": 0.0}, "mesh_scale is 0.0; accepted: 0.5 to 2"),
+        ({"noise": 0.1}, "session.faults.noise does not exist"),
+        ({"free_reach": "far"}, "session.faults.free_reach is 'far'; accepted: a number"),
+    ],
+)
+def test_faults_that_cannot_be_are_errors(faults: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message.replace("(", r"\(").replace(")", r"\)")):
+        build_settings(ProbingSettings, {"faults": faults}, "session")

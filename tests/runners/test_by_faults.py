@@ -1,0 +1,152 @@
+"""Evaluations of sessions with faults: their rows, tables and picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from chsel.errors import SettingError
+from runners import evaluate, report
+from runners.evaluation.configurations import configurations_of, with_faults
+from runners.evaluation.experiment import join_experiment
+from runners.evaluation.gathering import gather
+from runners.evaluation.plan import Trial, Unit
+from runners.evaluation.selection import chosen_names
+from runners.evaluation.table import RESULTS, read_part, write_part
+from runners.evaluation.work import do_unit
+from runners.reporting.by_faults import tables_by_faults
+from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.method_style import method_styles
+from runners.reporting.statistics import share_interval
+from runners.sessions.faults import LEVELS
+from tests.runners.in_process import run
+from tests.runners.made_up_evaluations import row, write_evaluation
+from tests.runners.test_evaluation import TRIAL, plan_in
+from tests.runners.test_report import page_of
+
+FAULTY = Trial(0, "mustard+noise_3mm")
+HELD = "Steps with the true pose in the set"
+
+
+def test_configurations_are_followed_by_themselves_with_faults() -> None:
+    found = with_faults(configurations_of("kinematic"))
+    assert list(found)[:2] == ["drill", "drill+noise_1mm"]
+    assert len(found) == 17 * len(LEVELS)
+    faulty = found["box_fallen+mixed"]
+    assert (faulty.object, faulty.faults, faulty.clean_name) == (
+        "cracker_box",
+        "mixed",
+        "box_fallen",
+    )
+    assert found["can"].clean_name == "can"
+
+
+def test_levels_are_named_alone_by_patterns_or_all() -> None:
+    assert chosen_names("faults", "all", LEVELS) == tuple(LEVELS)
+    assert chosen_names("faults", ["mixed", "clean"], LEVELS) == ("clean", "mixed")
+    assert chosen_names("faults", "noise_*", LEVELS) == ("noise_1mm", "noise_3mm", "noise_7mm")
+    with pytest.raises(SettingError, match=r"faults names 'loud'; accepted: all, .*, clean, noise"):
+        chosen_names("faults", "loud", LEVELS)
+
+
+def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(
+    tmp_path: Path,
+) -> None:
+    plan = plan_in(tmp_path / "out", steps="5", plausible=False)
+    join_experiment(plan, "test", [FAULTY.configuration], [0])
+    for unit in (Unit(FAULTY), Unit(FAULTY, "icp")):
+        assert do_unit(plan, unit, set()).kind == "done"
+    (found,) = gather(plan.folder).to_pylist()
+    assert (found["status"], found["members"], found["diversity"]) == ("ok", None, None)
+    assert found["nearest_hypothesis"] > 0.0
+    assert found["truth_held"] is None  # ICP has no set
+    assert not TRIAL.folder(plan).exists()
+    with pytest.raises(SettingError, match="plausible is True, was False"):
+        join_experiment(plan_in(tmp_path / "out", steps="5"), "test", ["mustard"], [0])
+
+
+def test_parts_of_earlier_versions_have_no_faults(tmp_path: Path) -> None:
+    later = ("faults", "truth_held", "nearest_hypothesis", "nearest_position", "nearest_rotation")
+    fields = [field for field in RESULTS if field.name not in later]
+    path = tmp_path / "old.parquet"
+    write_part(
+        path,
+        [{"method": "icp", "definition": "paper"}],
+        RESULTS.empty_table().select([field.name for field in fields]).schema,
+    )
+    (found,) = read_part(path, RESULTS, "paper").to_pylist()
+    assert found["faults"] == "clean"
+    assert found["truth_held"] is found["nearest_hypothesis"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["faults=loud"], "faults names 'loud'; accepted: all, a pattern such as cle*, clean"),
+        (
+            ["session=sensors", "session/rig=cabinet", "faults=mixed"],
+            "accepted for session=sensors",
+        ),
+        (
+            ["session.faults.contact_noise=0.001"],
+            "session.faults is changed; accepted here: faults=",
+        ),
+        (
+            ["session/faults=mixed", "faults=mixed", "plausible=false"],
+            "or plausible=false with faults=clean",
+        ),
+    ],
+)
+def test_faults_that_cannot_be_evaluated_are_one_line(
+    tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    session_words = [] if "session=sensors" in arguments else ["session=kinematic"]
+    done = run(evaluate.main, f"out={tmp_path}", *session_words, *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_interval_of_a_share_is_wilsons() -> None:
+    low, high = share_interval(9, 10)
+    assert (low, high) == (pytest.approx(0.5958, abs=1e-4), pytest.approx(0.9821, abs=1e-4))
+    assert share_interval(0, 5)[0] == 0.0
+    assert share_interval(5, 5)[1] == 1.0
+
+
+@pytest.fixture
+def made_up(tmp_path: Path) -> Path:
+    """Two levels; "own" tells whether it holds the truth, in 3 of 4 steps and in 1 of 4."""
+    rows = []
+    for level, count in (("clean", 3), ("mixed", 1)):
+        name = "can" if level == "clean" else "can+mixed"
+        for step in range(4):
+            numbers = {"diversity": 10.0 + step, "faults": level, "position_error": 0.002}
+            own = {**numbers, "truth_held": step < count, "nearest_hypothesis": 0.001 * step}
+            rows += [row(name, 0, "own", step, **own), row(name, 0, "icp", step, **numbers)]
+    return write_evaluation(tmp_path / "evaluation", rows)
+
+
+def test_tables_have_a_line_a_level_and_one_of_all(made_up: Path) -> None:
+    done = run(report.main, str(made_up))
+    assert done.returncode == 0
+    tables = page_of(made_up / "report").tables
+    assert tables[HELD] == [
+        ["faults", "own"],
+        ["clean", "75 % [30, 95] n 4"],
+        ["mixed", "25 % [5, 70] n 4"],
+        ["all levels", "50 % [22, 78] n 8"],
+    ]
+    nearest = tables["From the true pose to the nearest hypothesis, mm"]
+    assert nearest[1][:2] == ["clean", "4"]
+    assert nearest[1][2].startswith("-")
+    assert nearest[1][3] == "1.5 [0.75, 2.25]"
+    assert tables["PD in mm²"][3][:2] == ["all levels", "8"]
+    assert (made_up / "report" / "truth_held.png").stat().st_size > 5000
+
+
+def test_evaluations_without_faults_have_no_such_section(tmp_path: Path) -> None:
+    folder = write_evaluation(tmp_path, [row("can", 0, "icp", 4, diversity=1.0)])
+    evaluation = open_evaluation(folder)
+    assert tables_by_faults(evaluation.rows, method_styles(evaluation.methods)) == ()
