@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from chsel.errors import SettingError, require_choice, require_positive
 from chsel.problem.mesh import clean_mesh, load_mesh
 from runners.objects.scans import scan_file
@@ -53,6 +55,11 @@ class ObjectModel:
     scale: float
     epsilon: float
     configuration: str
+
+    @property
+    def diameter(self) -> float:
+        """Diagonal of the mesh's bounding box, metres: no two points are further apart."""
+        return float(np.sqrt((np.asarray(self.mesh.extents) ** 2).sum()))
 
 
 def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import Workspace
 from chsel.sensing.free_space import FreeGrid
+from runners.sensors.gate_rig import GateRig
 from runners.sensors.remarks import Remarks
 from runners.sensors.tally import Tally
 from runners.sensors.transforms import TransformError, TransformTree
@@ -54,13 +55,15 @@ class FreeMap:
 
 @dataclass(frozen=True)
 class Cell:
-    """world: the frame of all known points. gap: seconds over which no pose is interpolated."""
+    """The frames, the free space, and what holds for all sensors."""
 
-    world: str
+    world: str  # the frame of all known points
     tree: TransformTree
-    gap: float
+    gap: float  # seconds over which no pose is interpolated
     free: FreeMap
     remarks: Remarks
+    gate: GateRig = field(default_factory=GateRig)
+    diameter: float | None = None  # of the object, metres; None: not known
 
     @property
     def spacing(self) -> float:

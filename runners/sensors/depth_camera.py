@@ -5,6 +5,7 @@ from __future__ import annotations
 from chsel.numerics.arrays import BoolArray
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.regions import depth_regions, small_regions
 from replay.events import SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.depth_source import DepthSource, View, intrinsics_of, recorded
@@ -43,6 +44,7 @@ class DepthCamera:
             )
             tally.edges += int(edges.sum())
             counts = view.valid & ~edges
+        counts = self._connected(view, counts, tally)
         if not counts.any():
             tally.unusable += 1
             self._cell.remarks.warn(f"{self._rig.name}: an image without a pixel that counts")
@@ -67,6 +69,14 @@ class DepthCamera:
             intrinsics_of(self._source.camera),
             view.world_from_camera,
         )
+
+    def _connected(self, view: View, counts: BoolArray, tally: Tally) -> BoolArray:
+        """Without speckles: few pixels whose depth is another than all around them."""
+        gate = self._cell.gate
+        regions = depth_regions(view.metres, counts, self._source.camera, gate.jump)
+        speckles = small_regions(regions, gate.speckle)
+        tally.small += int(speckles.sum())
+        return counts & ~speckles
 
     def _too_soon(self, time: int) -> bool:
         if self._rig.rate is None or self._last_time is None:

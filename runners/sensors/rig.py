@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
+from runners.sensors.gate_rig import GateRig
 
 _LARGEST_HAND = 100.0  # metres
 _LONGEST = 1e9  # seconds; they are counted in nanoseconds
@@ -222,6 +223,7 @@ class Rig:
     says where probes begin and end, with texts "begin N" and "end", integers (below 0: end), or
     true and false. probes: their times in place of markers; without either the whole log is one.
     surface_resolution: metres; one surface point a voxel of this side is kept of clouds and masks.
+    gate: which pixels and points are left out, as they are not connected with the others.
     """
 
     name: str
@@ -238,6 +240,7 @@ class Rig:
     clock: ClockRig = field(default_factory=ClockRig)
     annotations: Annotations = field(default_factory=Annotations)
     surface_resolution: float = 0.005
+    gate: GateRig = field(default_factory=GateRig)
 
     def __post_init__(self) -> None:
         require_choice("boundary", self.boundary, ("box_shell", "none"))

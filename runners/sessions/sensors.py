@@ -76,16 +76,24 @@ def open_sensors(
             free_resolution=settings.free_resolution,
             images=settings.images,
         )
-    return SensorsSession(settings, seed, progress)
+    return SensorsSession(settings, seed, progress, diameter=object_model.diameter)
 
 
 class SensorsSession:
     """Reads a log twice: what is small at once, images one after the other; see `Session`."""
 
     def __init__(
-        self, settings: SensorsSettings, seed: int, progress: Progress = unwatched
+        self,
+        settings: SensorsSettings,
+        seed: int,
+        progress: Progress = unwatched,
+        *,
+        diameter: float | None = None,
     ) -> None:
-        """seed: of the choice of contact pixels. Raises SessionError for a log without use."""
+        """seed: of the choice of contact pixels. diameter: of the object, metres, where known.
+
+        Raises SessionError for a log without use.
+        """
         path = Path(settings.path or "").expanduser()
         rig = settings.rig
         self.report = Report()
@@ -93,7 +101,7 @@ class SensorsSession:
         self.free_resolution = settings.free_resolution
         self.world_from_object: FloatArray | None = None
         self._rig, self._seed, self._images = rig, seed, settings.images
-        self._progress = progress
+        self._progress, self._diameter = progress, diameter
         self._opening = Remarks()
         self._hand = HandModel(rig.hand) if rig.hand else None
         self._log = RawLog(path, progress=self._shown("looking for topics"))
@@ -113,7 +121,15 @@ class SensorsSession:
         """The probes of the log, in their order; its images are read as they go."""
         rig, survey, remarks = self._rig, self._survey, Remarks(self._opening)
         self.report.tallies.clear()
-        cell = Cell(rig.world, survey.tree, rig.clock.gap, self._free_map()[0], remarks)
+        cell = Cell(
+            rig.world,
+            survey.tree,
+            rig.clock.gap,
+            self._free_map()[0],
+            remarks,
+            rig.gate,
+            self._diameter,
+        )
         reading = LogReading(
             rig, survey, cell, self.report, self._hand, seed=self._seed, images=self._images
         )
@@ -125,6 +141,8 @@ class SensorsSession:
         for text, count in self._log.faults.items():
             remarks.warn(text, count)
         for name, tally in self.report.total().items():
+            if left_out := tally.left_out():
+                remarks.tell(f"{name}: {left_out}")
             if tally.edges > _MANY * tally.pixels:
                 remarks.warn(
                     f"{name}: {100 * tally.edges // tally.pixels} % of its pixels are left out as "
