@@ -10,8 +10,8 @@ import yaml
 
 from chsel.errors import SessionError
 from replay.mcap.texts import one_line
+from replay.raw.raw_file import ACCEPTED
 
-ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
 _METADATA = "metadata.yaml"
 _METADATA_ERRORS = (
     OSError,

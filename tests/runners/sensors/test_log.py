@@ -15,8 +15,9 @@ from mcap.writer import Writer as McapWriter
 
 from chsel.errors import SessionError
 from replay.file_digest import file_digest
-from runners.sensors import raw_file, raw_reading
-from runners.sensors.catalogue import Channel
+from replay.raw import raw_file, raw_reading
+from replay.raw.catalogue import Channel
+from replay.raw.raw_reading import RawMessage
 from runners.sensors.file_merge import merged, most_at_once
 from runners.sensors.log import RawLog
 from runners.sensors.messages import (
@@ -29,7 +30,6 @@ from runners.sensors.messages import (
     Received,
     TransformMessage,
 )
-from runners.sensors.raw_reading import RawMessage
 from runners.twin.schemas import encode, schema_text
 from tests.runners.sensors.small_logs import (
     BEGIN,
