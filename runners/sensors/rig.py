@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
+from runners.sensors.force_rig import ForceRig
 from runners.sensors.gate_rig import GateRig
 
 _LARGEST_HAND = 100.0  # metres
@@ -235,6 +236,7 @@ class Rig:
     contact: ContactRig = field(default_factory=ContactRig)
     hand: HandRig | None = None
     clouds: tuple[CloudRig, ...] = ()
+    forces: tuple[ForceRig, ...] = ()
     markers: str | None = None
     probes: tuple[ProbeTimes, ...] | None = None
     clock: ClockRig = field(default_factory=ClockRig)
@@ -250,6 +252,11 @@ class Rig:
         names = [sensor.name for sensor in self.sensors]
         if len(set(names)) < len(names):
             raise SettingError(f"sensors are named {', '.join(names)}; accepted: each name once")
+        if self.forces and (self.hand is None or not (self.hand.boxes or self.hand.urdf)):
+            raise SettingError(
+                "forces need the solids of the hand, on which they act; accepted: hand.boxes, "
+                "hand.urdf"
+            )
 
     @property
     def sensors(self) -> tuple[CameraRig | BubbleRig, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
+import numpy as np
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
@@ -17,6 +18,7 @@ from runners.sensors.messages import (
     ImageMessage,
     PoseMessage,
     TransformMessage,
+    WrenchMessage,
 )
 from runners.sensors.packed_points import named_fields, packed_points
 from runners.sensors.quaternions import rigid
@@ -161,6 +163,15 @@ def _point(message: Any) -> Iterator[Said]:
     return _one(message, positions(message.header.frame_id, [message.point]))
 
 
+def _wrench(message: Any) -> Iterator[Said]:
+    parts = [(part.x, part.y, part.z) for part in (message.wrench.force, message.wrench.torque)]
+    force, torque = np.array(parts, dtype=np.float64)
+    if not np.isfinite(parts).all():
+        raise UnusableMessage("a force or torque is not finite")
+    frame = frame_name(message.header.frame_id)
+    return _one(message, WrenchMessage(frame, force, torque))
+
+
 def _cloud(message: Any) -> Iterator[Said]:
     fields = named_fields((field.name, field.offset, field.datatype) for field in message.fields)
     points = packed_points(
@@ -195,6 +206,7 @@ _CONTENTS: dict[str, Callable[[Any], Iterator[Said]]] = {
     "geometry_msgs/PoseStamped": _pose,
     "geometry_msgs/PoseArray": _poses,
     "geometry_msgs/PointStamped": _point,
+    "geometry_msgs/WrenchStamped": _wrench,
     **{
         name: _marker
         for name in DEFINITIONS

@@ -15,6 +15,7 @@ from runners.sensors.cell import Cell, FreeMap
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.hand import HandModel
 from runners.sensors.log import RawLog
+from runners.sensors.messages import Received
 from runners.sensors.pose_file import beside, read_pose
 from runners.sensors.reading import LogReading
 from runners.sensors.remarks import Remarks
@@ -135,7 +136,9 @@ class SensorsSession:
         )
         hand = self._hand.solids(survey.joints.first()) if self._hand else None
         yield RigDescribed(-1, rig.name, self.source, hand)
-        messages = self._log.messages(survey.bulky, progress=self._shown("reading images"))
+        messages: Iterator[Received] = iter(())
+        if survey.bulky:
+            messages = self._log.messages(survey.bulky, progress=self._shown("reading images"))
         yield from reading.events(in_time_order(messages, survey.clocks.time))
         reading.check()
         for text, count in self._log.faults.items():

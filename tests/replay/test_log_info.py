@@ -45,7 +45,7 @@ def test_topics_types_counts_rates_and_frames_of_a_ros2_log(tmp_path: Path, chec
     assert is_other_programs(path)
     info = log_info(path, check=check)
     topics = by_topic(info)
-    assert (info.damage, info.checked, info.count) == (None, check, 9 * 14)
+    assert (info.damage, info.checked, info.count) == (None, check, 9 * 15)
     assert (info.begin, info.end) == (BEGIN + 10**6, BEGIN + 8 * SECOND + 10**6)
     depth = topics["/depth"]
     assert (depth.type, depth.encoding, depth.count) == ("sensor_msgs/msg/Image", "cdr", 9)
@@ -113,7 +113,7 @@ def test_unfinished_logs_are_counted_as_far_as_they_go(
     info = log_info(path)
     assert info.checked
     assert info.damage is not None
-    assert 0 < info.count < 9 * 14
+    assert 0 < info.count < 9 * 15
     assert main(["info", str(path)]) == 1
     output = " ".join(capsys.readouterr().out.split())
     assert "damaged or unfinished: log.mcap is cut or damaged" in output
@@ -238,7 +238,7 @@ def test_json_and_lines_of_several_files(
     assert main(["info", *[str(path)] * 4]) == 0
     lines = capsys.readouterr().out.strip().splitlines()
     assert len(lines) == 4
-    assert "log of another program, 14 topics, 56 messages, 3.000 s" in lines[0]
+    assert "log of another program, 15 topics, 60 messages, 3.000 s" in lines[0]
 
 
 @pytest.mark.parametrize("data", [b"", b"text", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n\x01"])

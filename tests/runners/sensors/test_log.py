@@ -29,6 +29,7 @@ from runners.sensors.messages import (
     PoseMessage,
     Received,
     TransformMessage,
+    WrenchMessage,
 )
 from runners.twin.schemas import encode, schema_text
 from tests.runners.sensors.small_logs import (
@@ -64,7 +65,11 @@ def test_a_ros2_log_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert {topic.count for topic in log.topics.values()} == {4}
     assert (log.begin, log.end) == (BEGIN + 10**6, BEGIN + 3 * SECOND + 10**6)
     last = by_topic(tmp_path / "log.mcap")
-    assert len(last) == 14
+    assert len(last) == 15
+    wrench = last["/wrench"].content
+    assert isinstance(wrench, WrenchMessage)
+    assert (wrench.frame, wrench.force.tolist()) == ("hand", [1.0, 2.0, -3.0])
+    assert wrench.torque.tolist() == [0.25, 0.0, 0.5]
     assert not log.faults
     assert not log.remarks
     stamp = BEGIN + 3 * SECOND
@@ -445,7 +450,7 @@ def rosbag(folder: Path, metadata: str | None = None) -> None:
     folder.mkdir()
     sent = ros2_sent(11)
     for step in range(11):
-        write_ros2(folder / f"bag_{step}.mcap", sent[14 * step : 14 * (step + 1)])
+        write_ros2(folder / f"bag_{step}.mcap", sent[15 * step : 15 * (step + 1)])
     names = "".join(f"\n    - bag_{step}.mcap" for step in range(11))
     usual = (
         "rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: mcap\n"
