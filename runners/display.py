@@ -177,6 +177,8 @@ def _sensor_table(report: Report) -> Table:
         "outline": [str(tally.outline or "") for _, _, tally in rows],
         "small": [str(tally.small or "") for _, _, tally in rows],
         "far": [str(tally.far or "") for _, _, tally in rows],
+        "spikes": [str(tally.spikes or "") for _, _, tally in rows],
+        "out of reach": [str(tally.outside or "") for _, _, tally in rows],
         "points": [str(tally.contacts or "") for _, _, tally in rows],
         "new voxels": [str(tally.free or "") for _, _, tally in rows],
     }

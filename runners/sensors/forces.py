@@ -69,7 +69,6 @@ class Forces:
         self._within = within
         if within and self._tare is not None:
             tally.used += 1
-            tally.pixels += 1
             beyond = numbers - self._tare
             newtons = float(np.sqrt((beyond[:3] ** 2).sum()))
             self._look(_Sample(newtons, time, message.frame, tuple(beyond.tolist())), tally)
@@ -125,7 +124,7 @@ class Forces:
 
     def _end_row(self, tally: Tally) -> None:
         """The force is no longer above the threshold, or its probe is over."""
-        tally.small += len(self._row)
+        tally.spikes += len(self._row)
         self._row.clear()
         self._in_contact = False
 

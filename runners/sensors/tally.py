@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 class Tally:
     """Counts of one sensor in one probe."""
 
-    images: int = 0  # that came, or clouds, or poses of the hand
+    images: int = 0  # that came, or clouds, forces, poses of the hand
     used: int = 0  # of them, that gave free space or contacts
     spared: int = 0  # left out by the rig's rate, or as nothing had moved
     lost: int = 0  # without a transform
@@ -20,13 +20,14 @@ class Tally:
     outline: int = 0  # pixels at the outline of the object's label
     small: int = 0  # pixels or points in regions that are too small
     far: int = 0  # pixels or points in regions too far from the largest to be of one object
-    outside: int = 0  # points of a cloud that are out of reach
+    outside: int = 0  # points of a cloud, or lines of force, that are out of reach
+    spikes: int = 0  # forces above the threshold in too few messages in a row
     touching: int = 0  # pixels in contact
     contacts: int = 0  # points
     free: int = 0  # voxels that it was the first to mark as free
 
     def left_out(self) -> str:
-        """How many pixels or points were left out, by reason; "" if none were."""
+        """How many pixels, points or forces were left out, by reason; "" if none were."""
         reasons = {
             "without a value in range": self.invalid,
             "at edges of depth": self.edges,
@@ -34,9 +35,11 @@ class Tally:
             "in regions too small": self.small,
             "in regions too far from the largest": self.far,
             "out of reach": self.outside,
+            "of forces that do not last": self.spikes,
         }
         counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
-        return f"left out of {self.pixels} pixels or points: {counts}" if counts else ""
+        total = f"{self.pixels} pixels or points" if self.pixels else f"{self.images} messages"
+        return f"left out of {total}: {counts}" if counts else ""
 
     def add(self, other: Tally) -> None:
         """Add the counts of another one."""

@@ -100,8 +100,8 @@ def test_a_contact_is_where_the_line_of_force_enters_the_hand(log: Path) -> None
     assert ((in_hand[:, 2] > TIP[2] - 0.0055) & (in_hand[:, 2] < TIP[2] + 1e-6)).all()
     np.testing.assert_allclose(probe.contact_normals, [[-1.0, 0.0, 0.0]] * 2, atol=1e-6)
     assert probe.outcome == "contact"
-    assert (tally.images, tally.used, tally.small) == (401, 201, 1)  # the spike
-    assert "/wrench: left out of 201 pixels or points: 1 in regions too small" in told
+    assert (tally.images, tally.used, tally.spikes) == (401, 201, 1)  # the spike
+    assert "/wrench: left out of 401 messages: 1 of forces that do not last" in told
 
 
 def test_free_space_is_what_the_hand_swept_and_none_behind_the_contact(log: Path) -> None:

@@ -522,6 +522,20 @@ def test_a_missing_file_of_a_bag_is_said(tmp_path: Path) -> None:
     assert log.remarks == ["file bag_4.mcap, which metadata.yaml names, is missing"]
 
 
+@pytest.mark.parametrize(
+    ("name", "start"), [("a.bag", b"#ROSBAG V2.0\n"), ("a", b"#ROSBAG V2.0\n"), ("b.bag", b"")]
+)
+def test_a_ros_1_bag_is_an_error_that_names_the_converter(
+    tmp_path: Path, name: str, start: bytes
+) -> None:
+    (tmp_path / name).write_bytes(start)
+    with pytest.raises(SessionError, match=r"is a ROS 1 bag; accepted: .*`rosbags-convert --src"):
+        RawLog(tmp_path / name)
+    whole = write_ros2(tmp_path / "whole.mcap", ros2_sent(1))
+    (tmp_path / name).write_bytes(whole)
+    assert len(RawLog(tmp_path / name).topics) == 15
+
+
 def test_bags_of_other_storage_are_errors(tmp_path: Path) -> None:
     folder = tmp_path / "bag"
     rosbag(folder)
