@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
 
 import numpy as np
 from scipy.ndimage import label
@@ -11,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.sensing.depth_camera import PinholeCamera
+from chsel.sensing.depth_camera import PinholeCamera, nearest_around
 
 _STEEPEST = 4.0  # tangent of the angle between a surface's normal and the ray: 76 degrees
 _SPACINGS = 4.0  # random points on a surface are one region up to so many typical distances
@@ -99,6 +100,19 @@ def small_regions(regions: IntArray, least: int) -> BoolArray:
     small[0] = False
     found: BoolArray = small[regions]
     return found
+
+
+def speckle_free(
+    depth: FloatArray, valid: BoolArray, regions: IntArray, least: int
+) -> tuple[FloatArray, int]:
+    """Depths (H, W) up to which rays are free, and how many pixels are in regions too small.
+
+    Pixels in regions of fewer than `least` pixels have the least depth of all valid ones (H, W)
+    around them, so far that some are not of their region: if those are right, no ray is too long.
+    """
+    speckles = small_regions(regions, least)
+    reach = isqrt(least) // 2 + 2
+    return nearest_around(depth, valid, speckles, reach=reach), int(speckles.sum())
 
 
 def _linked(one: FloatArray, other: FloatArray, share: float) -> BoolArray:

@@ -15,7 +15,7 @@ from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import occlusion_edges, valid_pixels
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.regions import depth_regions, main_regions, small_regions
+from chsel.sensing.regions import depth_regions, main_regions, speckle_free
 from runners.sensors.depth_frame import DepthFrame
 from runners.sensors.rig import CameraRig, Rig
 from runners.sensors.tally import Tally
@@ -66,14 +66,12 @@ def depth_frame_points(
         surface = _connected(frame, rig, surface, measured, diameter, labelled)
         rays &= surface | ~frame.label
         tally.outline, tally.far = labelled.outline, labelled.far
-    speckles = small_regions(
-        depth_regions(frame.depth, rays, frame.camera, rig.gate.jump), rig.gate.speckle
-    )
-    rays &= ~speckles
-    tally.small = int(speckles.sum()) + (0 if labelled is None else labelled.small)
+    regions = depth_regions(frame.depth, rays, frame.camera, rig.gate.jump)
+    ends, small = speckle_free(frame.depth, valid, regions, rig.gate.speckle)
+    tally.small = small + (0 if labelled is None else labelled.small)
     on_object = apply(frame.world_from_camera, measured[surface])
     workspace = _workspace(rig, on_object, diameter)
-    free = _free_voxels(frame, camera, workspace, free_resolution, rays)
+    free = _free_voxels(frame, ends, camera, workspace, free_resolution, rays)
     points = KnownPoints(
         free=_outside_of(on_object, free, free_resolution),
         known=one_per_voxel(on_object, rig.surface_resolution),
@@ -149,14 +147,15 @@ def _workspace(rig: Rig, on_object: FloatArray, diameter: float | None) -> Works
 
 def _free_voxels(
     frame: DepthFrame,
+    ends: FloatArray,
     camera: CameraRig,
     workspace: Workspace,
     free_resolution: float,
     pixels: BoolArray,
 ) -> FloatArray:
-    """Centres (N, 3) of the voxels that rays of pixels passed."""
+    """Centres (N, 3) of the voxels that rays of pixels passed on their way to `ends` (H, W)."""
     grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
-    view = (frame.depth, frame.camera, frame.world_from_camera, pixels)
+    view = (ends, frame.camera, frame.world_from_camera, pixels)
     if camera.rays == "scaled_images":
         grid.scaled_images(*view)
     else:

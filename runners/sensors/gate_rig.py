@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from chsel.errors import SettingError, require_at_most, require_positive
 
-_MOST_PIXELS = 1_000_000
+_MOST = 1_000_000  # pixels, metres, shares
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,14 @@ class GateRig:
     out; 0: none is for its size."""
 
     speckle: int = 100
-    """Rays of a camera are left out where fewer pixels than this are connected; 0: none is."""
+    """Where fewer pixels than this are connected, a camera's rays are free up to the least depth
+    around them alone; 0: nowhere."""
 
     def __post_init__(self) -> None:
         for name in ("jump", "gap"):
             require_positive(name, getattr(self, name))
+            require_at_most(name, getattr(self, name), _MOST)
         if not 0.0 <= self.part <= 1.0:
             raise SettingError(f"part is {self.part}; accepted: from 0 to 1")
         require_positive("speckle", self.speckle, zero=True)
-        require_at_most("speckle", self.speckle, _MOST_PIXELS)
+        require_at_most("speckle", self.speckle, _MOST)

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from chsel.sensing.depth_camera import PinholeCamera
-from chsel.sensing.regions import depth_regions, main_regions, point_regions, small_regions
+from chsel.sensing.regions import (
+    depth_regions,
+    main_regions,
+    point_regions,
+    small_regions,
+    speckle_free,
+)
 
 CAMERA = PinholeCamera(60, 40, 600.0, 600.0, 29.5, 19.5)
 
@@ -56,6 +62,20 @@ def test_small_regions_are_those_of_fewer_pixels() -> None:
     depth[10:13, 10:13] = 0.9
     for least, count in ((9, 0), (10, 9), (0, 0), (10**6, 40 * 60)):
         assert int(small_regions(regions(depth), least).sum()) == count
+
+
+@pytest.mark.parametrize("side", [1, 5, 9])
+def test_rays_of_small_regions_end_at_the_least_depth_around(side: int) -> None:
+    depth = np.full((40, 60), 0.6)
+    depth[10 : 10 + side, 20 : 20 + side] = 0.9
+    ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
+    assert small == side**2
+    np.testing.assert_array_equal(ends, np.full((40, 60), 0.6))
+    nearer = depth.copy()
+    nearer[30, 30] = 0.4  # ends at itself
+    ends, small = speckle_free(nearer, depth > 0.0, regions(nearer), 100)
+    assert (small, ends[30, 30], ends[30, 31]) == (side**2 + 1, 0.4, 0.6)
+    assert speckle_free(depth, depth > 0.0, regions(depth), 0)[1] == 0
 
 
 def surface(count: int, size: float, centre: tuple[float, float, float]) -> np.ndarray:
