@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from chsel.errors import require_at_most, require_choice, require_positive
+from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 
 _MOST_POINTS = 1000
+_LEAST_FORCE = 0.001  # N
 _LONGEST = 1e6  # seconds, newtons, metres
 
 
@@ -35,6 +36,10 @@ class ForceRig:
         for name in ("threshold", "tare", "reach"):
             require_positive(name, getattr(self, name))
             require_at_most(name, getattr(self, name), _LONGEST)
+        if self.threshold < _LEAST_FORCE:
+            raise SettingError(
+                f"threshold is {self.threshold:g} N; accepted: from {_LEAST_FORCE:g} N"
+            )
         for name in ("samples", "points"):
             require_positive(name, getattr(self, name))
             require_at_most(name, getattr(self, name), _MOST_POINTS)

@@ -39,6 +39,7 @@ _ERRORS = (ValueError, struct.error, IndexError, OverflowError, MemoryError)  # 
 _SMALL = 2**20  # bytes; what has no pixels or points is smaller
 _BULKY = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud2")
 _HEAD = 2**12  # bytes of a cloud that must hold all before its points
+_LARGEST_FORCE = 1e6  # N, Nm
 _TEXT_AT = 8  # bytes before the text of std_msgs/String
 
 
@@ -166,8 +167,8 @@ def _point(message: Any) -> Iterator[Said]:
 def _wrench(message: Any) -> Iterator[Said]:
     parts = [(part.x, part.y, part.z) for part in (message.wrench.force, message.wrench.torque)]
     force, torque = np.array(parts, dtype=np.float64)
-    if not np.isfinite(parts).all():
-        raise UnusableMessage("a force or torque is not finite")
+    if not (np.abs(parts) <= _LARGEST_FORCE).all():  # NaN is not
+        raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
     frame = frame_name(message.header.frame_id)
     return _one(message, WrenchMessage(frame, force, torque))
 
