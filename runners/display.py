@@ -188,11 +188,16 @@ def _sensor_table(report: Report) -> Table:
         "bad": [str(tally.unusable or "") for _, _, tally in rows],
         "invalid": [_share(tally.invalid, tally.pixels) for _, _, tally in rows],
         "edge": [_share(tally.edges, tally.pixels) for _, _, tally in rows],
+        "outline": [str(tally.outline or "") for _, _, tally in rows],
+        "small": [str(tally.small or "") for _, _, tally in rows],
+        "far": [str(tally.far or "") for _, _, tally in rows],
+        "spikes": [str(tally.spikes or "") for _, _, tally in rows],
+        "out of reach": [str(tally.outside or "") for _, _, tally in rows],
         "points": [str(tally.contacts or "") for _, _, tally in rows],
         "new voxels": [str(tally.free or "") for _, _, tally in rows],
     }
     columns = {name: cells for name, cells in columns.items() if any(cells)}
-    title = "sensors; invalid, edge: % of pixels"
+    title = "sensors; left out: invalid, edge in % of pixels, others in pixels or points"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
     table.add_column("probe", justify="right")
     table.add_column("sensor", no_wrap=True)

@@ -271,15 +271,15 @@ def run(
     except KeyboardInterrupt:
         outcome = "interrupted"
     except SystemExit:  # whoever read the output has had enough of it
-        _finish(folder, recorder, session_run, started, rows, "interrupted")
+        _finish(folder, recorder, session_run, started, rows, scene.report, "interrupted")
         raise
     except Exception as error:
         with suppress(OSError, WritingError):  # the first error is the one to tell
-            _finish(folder, recorder, session_run, started, rows, f"failed: {error}")
+            _finish(folder, recorder, session_run, started, rows, scene.report, f"failed: {error}")
         raise
     finally:
         display.close()
-    _finish(folder, recorder, session_run, started, rows, outcome)
+    _finish(folder, recorder, session_run, started, rows, scene.report, outcome)
     if scene.report is not None:
         display.sensed(scene.report)
     display.table(rows)
@@ -296,6 +296,7 @@ def _finish(
     session_run: SessionRun,
     started: SessionStarted,
     rows: list[Row],
+    report: Report | None,
     outcome: str,
 ) -> None:
     """End the recording, and write the summary even if the recording is what has failed."""
@@ -305,9 +306,9 @@ def _finish(
             _end(recorder, session_run.step, "info" if finished else "warning", outcome)
     except RecordingError as error:
         with suppress(OSError, WritingError):  # the first error is the one to tell
-            _summarise(folder, started, rows, session_run, f"failed: {error}")
+            _summarise(folder, started, rows, session_run, report, f"failed: {error}")
         raise
-    _summarise(folder, started, rows, session_run, outcome)
+    _summarise(folder, started, rows, session_run, report, outcome)
 
 
 def _end(recorder: Recorder, step: int, level: str, outcome: str) -> None:
@@ -323,10 +324,12 @@ def _summarise(
     started: SessionStarted,
     rows: list[Row],
     session_run: SessionRun,
+    report: Report | None,
     outcome: str,
 ) -> None:
     """Write summary.json: the outcome, warnings, and the numbers of every step, times included."""
     trust = session_run.trust
+    sensors = report.total().items() if report else ()
     summary = {
         "runner": started.runner,
         "object": started.object,
@@ -337,6 +340,7 @@ def _summarise(
         "recording_digest": recording_digest(folder / "recording.mcap"),
         "trust": None if trust is None else asdict(trust),  # of the last result
         "warnings": [asdict(warning) for warning in session_run.warnings],
+        "sensors": {name: asdict(tally) for name, tally in sensors},
         "steps": rows,
         "bytes": _sizes(folder),
         "environment": dict(started.environment),

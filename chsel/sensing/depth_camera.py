@@ -99,6 +99,20 @@ def occlusion_edges(
     return valid & ((furthest - depth > jump) | (depth - nearest > jump))
 
 
+def nearest_around(
+    depth: FloatArray, valid: BoolArray, pixels: BoolArray, *, reach: int
+) -> FloatArray:
+    """Depths (H, W) in which `pixels` (H, W) have the least of all valid ones around them.
+
+    depth (H, W): metres. valid (H, W): pixels that count, those of `pixels` among them. reach: how
+    many pixels away others are looked at, along rows and columns.
+    """
+    depth = np.asarray(depth, np.float64)
+    if not pixels.any():
+        return depth
+    return np.where(pixels, _least_around(np.where(valid, depth, np.inf), reach), depth)
+
+
 def _least_around(image: FloatArray, reach: int) -> FloatArray:
     """The least (H, W) of the pixels up to `reach` away from each, along rows and columns."""
     least = np.pad(image, reach, constant_values=np.inf)

@@ -1,5 +1,6 @@
 """Show what is in recordings: session, steps, points, results, sizes, versions, integrity.
 
+Of MCAP files of other programs, such as robots' logs: topics, types, counts, rates, frames.
 Status 0 if all files are whole, 1 if one is unfinished or damaged, 2 if one cannot be used.
 """
 
@@ -16,8 +17,10 @@ from rich.box import SIMPLE_HEAD
 from rich.filesize import decimal
 from rich.table import Table
 
-from chsel.errors import RecordingError
+from chsel.errors import RecordingError, SessionError
 from replay.console import Console, print_error
+from replay.raw.log_display import fact_table, log_overview, show_log
+from replay.raw.log_info import LogInfo, is_other_programs, log_info
 from replay.recording_info import RecordingInfo, recording_info
 
 _IN_FULL = 3  # files; of more, each is a line
@@ -26,21 +29,22 @@ _EITHER_END = 5  # steps that are shown of many
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Files, how thoroughly, how much, and as what."""
-    parser.add_argument("files", nargs="+", metavar="FILE", help="recordings")
+    parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or any MCAP files")
     parser.add_argument("--check", action="store_true", help="read everything, check every digest")
-    parser.add_argument("--steps", action="store_true", help="show all steps, however many")
+    parser.add_argument("--steps", action="store_true", help="show all steps or topics")
     parser.add_argument("--json", action="store_true", help="print all as one JSON document")
 
 
 def run(given: argparse.Namespace) -> int:
     """Print what is in the files; a list in JSON if there are several."""
-    infos: list[RecordingInfo] = []
+    infos: list[RecordingInfo | LogInfo] = []
     documents: list[dict[str, Any]] = []
     status = 0
     for file in given.files:
         try:
-            info = recording_info(file, check=given.check)
-        except RecordingError as error:
+            read = log_info if is_other_programs(file) else recording_info
+            info = read(file, check=given.check)
+        except (RecordingError, SessionError) as error:
             print_error(str(error))
             documents.append({"path": file, "error": str(error)})
             status = 2
@@ -56,19 +60,26 @@ def run(given: argparse.Namespace) -> int:
     return status
 
 
-def _show(console: Console, infos: Sequence[RecordingInfo], *, brief: bool, all_: bool) -> None:
+def _show(
+    console: Console, infos: Sequence[RecordingInfo | LogInfo], *, brief: bool, all_: bool
+) -> None:
     for info in infos:
         if brief:
             console.print(_overview(info), soft_wrap=True)
-        else:
-            console.print(str(info.path), style="bold", soft_wrap=True)
-            console.print(_facts(info))
-            if info.steps:
-                console.print(_step_table(info.steps, all_=all_))
+            continue
+        console.print(str(info.path), style="bold", soft_wrap=True)
+        if isinstance(info, LogInfo):
+            show_log(console, info, all_=all_)
+            continue
+        console.print(_facts(info))
+        if info.steps:
+            console.print(_step_table(info.steps, all_=all_))
 
 
-def _overview(info: RecordingInfo) -> str:
+def _overview(info: RecordingInfo | LogInfo) -> str:
     """One line about a file."""
+    if isinstance(info, LogInfo):
+        return log_overview(info)
     session = info.session
     facts = [
         f"{session['object']}, {session['session']}, {session['method']}",
@@ -101,13 +112,7 @@ def _facts(info: RecordingInfo) -> Table:
         "digest": info.digest,
         "integrity": info.integrity,
     }
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="dim", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, fact in facts.items():
-        if fact:
-            table.add_row(f"  {name}", fact)
-    return table
+    return fact_table(facts)
 
 
 def _messages(info: RecordingInfo) -> str:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from chsel.errors import SettingError, require_choice, require_positive
 from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import clean_mesh, load_mesh
@@ -86,6 +88,11 @@ class ObjectModel:
                 progress=lambda done, total: progress("signed distance grid, nodes", done, total),
             )
         return self._grids[key]
+
+    @property
+    def diameter(self) -> float:
+        """Diagonal of the mesh's bounding box, metres: no two points are further apart."""
+        return float(np.sqrt((np.asarray(self.mesh.extents) ** 2).sum()))
 
 
 def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:

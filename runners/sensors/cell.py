@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import sqrt
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import Workspace
 from chsel.sensing.free_space import FreeGrid
+from runners.sensors.gate_rig import GateRig
 from runners.sensors.remarks import Remarks
 from runners.sensors.tally import Tally
 from runners.sensors.transforms import TransformError, TransformTree
+
+_NONE = np.zeros((0, 3))
 
 
 class FreeMap:
@@ -31,9 +36,21 @@ class FreeMap:
         yield self.grid
         tally.free += self.grid.count - before
 
-    def new(self) -> FloatArray:
-        """Centres (N, 3) of the voxels that became free since the last call."""
+    def new(self, contacts: FloatArray = _NONE, normals: FloatArray = _NONE) -> FloatArray:
+        """Centres (N, 3) of the voxels that became free since the last call.
+
+        Left out are those less than a voxel's diagonal from contacts (C, 3) with a rigid hand, and
+        behind them by the object's outward normals (C, 3): the hand passed such a voxel, but not
+        its centre.
+        """
         centres = self.grid.new()
+        if len(contacts) and len(centres):
+            reach = sqrt(3.0) * self.grid.lattice.spacing
+            away, nearest = cKDTree(contacts).query(centres, distance_upper_bound=reach)
+            near = np.flatnonzero(away <= reach)
+            beside = nearest[near]
+            ahead = ((centres[near] - contacts[beside]) * normals[beside]).sum(axis=1)
+            centres = np.delete(centres, near[ahead < 0.0], axis=0)
         self._told[tuple(self.grid.lattice.voxels(centres).T)] = True
         return centres
 
@@ -54,13 +71,15 @@ class FreeMap:
 
 @dataclass(frozen=True)
 class Cell:
-    """world: the frame of all known points. gap: seconds over which no pose is interpolated."""
+    """The frames, the free space, and what holds for all sensors."""
 
-    world: str
+    world: str  # the frame of all known points
     tree: TransformTree
-    gap: float
+    gap: float  # seconds over which no pose is interpolated
     free: FreeMap
     remarks: Remarks
+    gate: GateRig = field(default_factory=GateRig)
+    diameter: float | None = None  # of the object, metres; None: not known
 
     @property
     def spacing(self) -> float:

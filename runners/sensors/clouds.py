@@ -7,6 +7,7 @@ import numpy as np
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
+from chsel.sensing.regions import main_regions, point_regions
 from runners.sensors.cell import Cell
 from runners.sensors.messages import CloudMessage
 from runners.sensors.rig import CloudRig
@@ -54,7 +55,7 @@ class Clouds:
             with self._cell.free.by(tally) as grid:
                 grid.along_rays(origin, origin + self._rig.fraction * (points - origin))
         else:
-            self._new.append(self._unseen(points[within_reach]))
+            self._new.append(self._unseen(points[within_reach], tally))
 
     def check(self, total: Tally) -> str | None:
         """What is suspicious about the tally of a whole log: that no point was within reach."""
@@ -79,10 +80,20 @@ class Clouds:
         within: BoolArray = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
         return within
 
-    def _unseen(self, points: FloatArray) -> FloatArray:
-        """The first point of every voxel that had none."""
+    def _unseen(self, points: FloatArray, tally: Tally) -> FloatArray:
+        """The first point of every voxel that had none, of those that are the object's."""
         _, first = np.unique(self._lattice.voxels(points), axis=0, return_index=True)
         points = points[np.sort(first)]
+        gate = self._cell.gate
+        found = main_regions(
+            point_regions(points, gate.gap),
+            part=gate.part,
+            points=points,
+            diameter=self._cell.diameter,
+        )
+        tally.small += found.small
+        tally.far += found.far
+        points = points[found.kept]
         voxels = [tuple(voxel) for voxel in self._lattice.voxels(points).tolist()]
         new = [voxel not in self._seen for voxel in voxels]
         self._seen.update(voxels)

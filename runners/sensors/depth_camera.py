@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from chsel.numerics.arrays import BoolArray
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.regions import depth_regions, speckle_free
 from replay.events import SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.depth_source import DepthSource, View, intrinsics_of, recorded
@@ -47,7 +48,7 @@ class DepthCamera:
             tally.unusable += 1
             self._cell.remarks.warn(f"{self._rig.name}: an image without a pixel that counts")
             return
-        self._mark(view, counts, tally)
+        self._mark(view, self._ends(view, counts, tally), counts, tally)
         tally.used += 1
         self._last_time, self._last = time, (view, counts)
 
@@ -68,15 +69,23 @@ class DepthCamera:
             view.world_from_camera,
         )
 
+    def _ends(self, view: View, counts: BoolArray, tally: Tally) -> FloatArray:
+        """Depths (H, W) up to which rays are free: of speckles the least of what is around them."""
+        gate = self._cell.gate
+        regions = depth_regions(view.metres, counts, self._source.camera, gate.jump)
+        ends, small = speckle_free(view.metres, view.valid, regions, gate.speckle)
+        tally.small += small
+        return ends
+
     def _too_soon(self, time: int) -> bool:
         if self._rig.rate is None or self._last_time is None:
             return False
         return 0 <= time - self._last_time < _EARLY * 1e9 / self._rig.rate
 
-    def _mark(self, view: View, counts: BoolArray, tally: Tally) -> None:
+    def _mark(self, view: View, ends: FloatArray, counts: BoolArray, tally: Tally) -> None:
         with self._cell.free.by(tally) as grid:
             target = grid if self._own is None else self._own
-            arguments = (view.metres, self._source.camera, view.world_from_camera, counts)
+            arguments = (ends, self._source.camera, view.world_from_camera, counts)
             if self._rig.rays == "scaled_images":
                 target.scaled_images(*arguments)
             else:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
@@ -13,27 +15,24 @@ from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply
 from chsel.sensing.depth_camera import occlusion_edges, valid_pixels
 from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.regions import depth_regions, main_regions, speckle_free
 from runners.sensors.depth_frame import DepthFrame
 from runners.sensors.rig import CameraRig, Rig
+from runners.sensors.tally import Tally
 
 LABEL_MARGIN = 2  # pixels: by so much a label's outline may be off the depth image's
-EDGE_REACH = 3  # pixels: many cameras leave a gap of invalid pixels at an edge of depth
 
 
 @dataclass(frozen=True, eq=False)
 class FramePoints:
-    """points: free voxels' centres, and surface points. workspace: where the object can be.
+    """What a frame tells, and how many of its pixels do not count."""
 
-    rays (H, W): the pixels whose rays are free. surface (H, W): those on the object. invalid,
-    edges: how many pixels told nothing, and how many lie at an edge of depth.
-    """
-
-    points: KnownPoints
-    workspace: Workspace
-    rays: BoolArray
-    surface: BoolArray
-    invalid: int
-    edges: int
+    points: KnownPoints  # free voxels' centres, and surface points; metres, world
+    workspace: Workspace  # where the object can be
+    rays: BoolArray  # (H, W), pixels whose rays are free
+    surface: BoolArray  # (H, W), pixels on the object
+    tally: Tally  # of the whole image
+    labelled: Tally | None  # of the pixels of the object's label, if there is one
 
 
 def depth_frame_points(
@@ -56,23 +55,29 @@ def depth_frame_points(
             f"no pixel of depth lies in the range of camera {camera.name}, {nearest:g} m to "
             f"{furthest:g} m; its median is {typical:.4g} m: check depth_scale"
         )
-    edges = _edges(frame, camera, valid, 1)
-    surface = _surface_pixels(frame, camera, valid)
+    edges = _edges(frame, camera, valid)
     measured = frame.camera.back_project(frame.depth)
+    tally = Tally(images=1, used=1, pixels=valid.size, invalid=int((~valid).sum()))
+    tally.edges = int(edges.sum())
+    rays = valid & ~edges
+    surface, labelled = np.zeros_like(valid), None
+    if frame.label is not None:
+        surface, labelled = _surface_pixels(frame.label, valid, edges)
+        surface = _connected(frame, rig, surface, measured, diameter, labelled)
+        rays &= surface | ~frame.label
+        tally.outline, tally.far = labelled.outline, labelled.far
+    regions = depth_regions(frame.depth, rays, frame.camera, rig.gate.jump)
+    ends, small = speckle_free(frame.depth, valid, regions, rig.gate.speckle)
+    tally.small = small + (0 if labelled is None else labelled.small)
     on_object = apply(frame.world_from_camera, measured[surface])
     workspace = _workspace(rig, on_object, diameter)
-    free = _free_voxels(frame, camera, workspace, free_resolution, valid & ~edges)
-    return FramePoints(
-        points=KnownPoints(
-            free=_outside_of(on_object, free, Lattice(workspace.lower, free_resolution)),
-            known=one_per_voxel(on_object, rig.surface_resolution),
-        ),
-        workspace=workspace,
-        rays=valid & ~edges,
-        surface=surface,
-        invalid=int((~valid).sum()),
-        edges=int(edges.sum()),
+    free = _free_voxels(frame, ends, camera, workspace, free_resolution, rays)
+    points = KnownPoints(
+        free=_outside_of(on_object, free, free_resolution),
+        known=one_per_voxel(on_object, rig.surface_resolution),
     )
+    tally.contacts, tally.free = len(points.known), len(points.free)
+    return FramePoints(points, workspace, rays, surface, tally, labelled)
 
 
 def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
@@ -85,25 +90,48 @@ def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
     return points[np.sort(nearest_first[first])]
 
 
-def _edges(frame: DepthFrame, camera: CameraRig, valid: BoolArray, reach: int) -> BoolArray:
+def _edges(frame: DepthFrame, camera: CameraRig, valid: BoolArray) -> BoolArray:
     if camera.edge is None:
         return np.zeros_like(valid)
-    return occlusion_edges(frame.depth, valid, camera.edge, reach=reach)
+    return occlusion_edges(frame.depth, valid, camera.edge, reach=camera.edge_reach)
 
 
-def _surface_pixels(frame: DepthFrame, camera: CameraRig, valid: BoolArray) -> BoolArray:
-    """The object's pixels, but for those at its outline, where others are mixed in."""
-    if frame.label is None:
-        return np.zeros_like(valid)
+def _surface_pixels(
+    label: BoolArray, valid: BoolArray, edges: BoolArray
+) -> tuple[BoolArray, Tally]:
+    """The object's pixels (H, W) but for those at its outline, where others are mixed in."""
     square = np.ones((3, 3), dtype=bool)
-    within = binary_erosion(frame.label, square, iterations=LABEL_MARGIN, border_value=1)
-    surface = within & valid & ~_edges(frame, camera, valid, EDGE_REACH)
+    within = binary_erosion(label, square, iterations=LABEL_MARGIN, border_value=1)
+    surface = within & valid & ~edges
     if not surface.any():
         raise SessionError(
-            f"none of the {int(frame.label.sum())} pixels of label tells of the surface: outlines "
+            f"none of the {int(label.sum())} pixels of label tells of the surface: outlines "
             "and edges of depth are left out, and pixels out of range"
         )
-    return surface
+    counted = Tally(images=1, used=1, pixels=int(label.sum()))
+    counted.invalid = int((label & ~valid).sum())
+    counted.edges = int((label & edges).sum())
+    counted.outline = int((label & valid & ~edges & ~within).sum())
+    return surface, counted
+
+
+def _connected(
+    frame: DepthFrame,
+    rig: Rig,
+    surface: BoolArray,
+    measured: FloatArray,
+    diameter: float | None,
+    labelled: Tally,
+) -> BoolArray:
+    """Surface pixels (H, W) in regions that can be the object's, the others counted by reason."""
+    regions = depth_regions(frame.depth, surface, frame.camera, rig.gate.jump)
+    found = main_regions(
+        regions[surface], part=rig.gate.part, points=measured[surface], diameter=diameter
+    )
+    labelled.small, labelled.far = found.small, found.far
+    connected = surface.copy()
+    connected[surface] = found.kept
+    return connected
 
 
 def _workspace(rig: Rig, on_object: FloatArray, diameter: float | None) -> Workspace:
@@ -119,14 +147,15 @@ def _workspace(rig: Rig, on_object: FloatArray, diameter: float | None) -> Works
 
 def _free_voxels(
     frame: DepthFrame,
+    ends: FloatArray,
     camera: CameraRig,
     workspace: Workspace,
     free_resolution: float,
     pixels: BoolArray,
 ) -> FloatArray:
-    """Centres (N, 3) of the voxels that rays of pixels passed."""
+    """Centres (N, 3) of the voxels that rays of pixels passed on their way to `ends` (H, W)."""
     grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
-    view = (frame.depth, frame.camera, frame.world_from_camera, pixels)
+    view = (ends, frame.camera, frame.world_from_camera, pixels)
     if camera.rays == "scaled_images":
         grid.scaled_images(*view)
     else:
@@ -134,8 +163,14 @@ def _free_voxels(
     return grid.new()
 
 
-def _outside_of(on_object: FloatArray, free: FloatArray, lattice: Lattice) -> FloatArray:
-    """Free centres (N, 3) but for voxels in which the surface was measured."""
-    taken = {tuple(voxel) for voxel in lattice.voxels(on_object).tolist()}
-    kept = [tuple(voxel) not in taken for voxel in lattice.voxels(free).tolist()]
-    return free[np.array(kept, dtype=bool)]
+def _outside_of(on_object: FloatArray, free: FloatArray, spacing: float) -> FloatArray:
+    """Free centres (N, 3) but for those that a measured surface point can lie behind.
+
+    A ray that passes a voxel passes its centre at up to half the voxel's diagonal, so that nearer
+    to the surface than this a centre may be inside the object.
+    """
+    if len(on_object) == 0 or len(free) == 0:
+        return free
+    margin = sqrt(0.75) * spacing
+    nearest = cKDTree(on_object).query(free, distance_upper_bound=margin)[0]
+    return free[~(nearest <= margin)]

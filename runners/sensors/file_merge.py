@@ -6,7 +6,7 @@ import heapq
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 
-from runners.sensors.raw_reading import RawMessage
+from replay.raw.raw_reading import RawMessage
 
 Span = tuple[int, int]
 """First and last log time of a file, nanoseconds."""

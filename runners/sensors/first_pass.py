@@ -12,6 +12,7 @@ from runners.sensors.messages import (
     ImageMessage,
     MarkerMessage,
     Received,
+    WrenchMessage,
 )
 from runners.sensors.movements import Movements
 from runners.sensors.rig import Rig
@@ -26,7 +27,8 @@ class FirstPass:
     """All that is small, and of what is large when it came.
 
     infos: by topic, the first; changed_infos: how many others there were. sightings: by the topics
-    of images and clouds. units: a check by the name of a sensor. first_images: by a pad's topic.
+    of images, clouds and forces. units: a check by the name of a sensor. first_images: by a pad's
+    topic.
     """
 
     def __init__(self, rig: Rig, joint_names: Sequence[str]) -> None:
@@ -38,11 +40,14 @@ class FirstPass:
         self.markers: list[Received] = []
         sensors = rig.sensors
         self.sightings = {sensor.depth: Sightings(sensor.depth) for sensor in sensors}
-        self.sightings |= {cloud.topic: Sightings(cloud.topic) for cloud in rig.clouds}
         self.units = {sensor.name: UnitCheck(sensor) for sensor in sensors}
         self.first_images: dict[str, list[Received]] = {pad.depth: [] for pad in rig.bubbles}
         self._images = {sensor.depth for sensor in sensors}
-        self._clouds = {cloud.topic for cloud in rig.clouds}
+        self._others = [
+            *(cloud.topic for cloud in rig.clouds),
+            *(part.topic for part in rig.forces),
+        ]
+        self.sightings |= {topic: Sightings(topic) for topic in self._others}
         self._infos = {sensor.info for sensor in sensors}
         self._held = 0
 
@@ -54,7 +59,7 @@ class FirstPass:
             topic, content = received.topic, received.content
             if isinstance(content, ImageMessage) and topic in self._images:
                 self._see(received, content)
-            elif isinstance(content, CloudMessage) and topic in self._clouds:
+            elif isinstance(content, CloudMessage | WrenchMessage) and topic in self._others:
                 self.sightings[topic].add(received, content)
             elif isinstance(content, CameraInfoMessage) and topic in self._infos:
                 if self.infos.setdefault(topic, content) != content:

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from chsel.errors import SessionError
 from replay.mcap.texts import one_line
-from runners.sensors.catalogue import Channel
+from replay.raw.catalogue import Channel
+from replay.raw.raw_file import RawFile
+from replay.raw.raw_reading import Fault, RawMessage, Wanted
 from runners.sensors.decoding import Decode, decoder
 from runners.sensors.file_merge import Span, merged, most_at_once
 from runners.sensors.log_files import log_files
 from runners.sensors.messages import Received
-from runners.sensors.raw_file import RawFile
-from runners.sensors.raw_reading import Fault, RawMessage, Wanted
 from runners.sensors.unusable import UnusableMessage
 
 Progress = Callable[[int, int], None]  # bytes so far, and of all

@@ -41,15 +41,17 @@ def named_topics(rig: Rig) -> dict[str, str]:
         named[sensor.depth] = f"depth of {sensor.name}"
         named[sensor.info] = f"camera info of {sensor.name}"
     named |= {cloud.topic: "points" for cloud in rig.clouds}
+    named |= {force.topic: "forces" for force in rig.forces}
     if rig.hand is not None and rig.hand.pose:
         named[rig.hand.pose] = "pose of the hand"
     if rig.hand is not None and rig.hand.joints:
         named[rig.hand.joints] = "joints of the hand"
     if rig.markers and rig.probes is None:
         named[rig.markers] = "markers of probes"
-    if not (rig.cameras or rig.bubbles or rig.clouds):
+    if not (rig.cameras or rig.bubbles or rig.clouds or rig.hand):
         raise SettingError(
-            f"rig {rig.name} has no sensor; accepted: at least one of cameras, bubbles, clouds"
+            f"rig {rig.name} has no sensor; accepted: at least one of cameras, bubbles, clouds, "
+            "hand"
         )
     return named
 
@@ -99,6 +101,9 @@ class LogChecks:
         for cloud in self._rig.clouds:
             self._require_messages(cloud.topic, cloud.topic, "points")
             self._require_poses(cloud.topic, cloud.topic, None)
+        for force in self._rig.forces:
+            self._require_messages(force.topic, force.topic, "forces")
+            self._require_poses(force.topic, force.topic, force.frame)
         if self._rig.hand is not None:
             self._require_hand(self._rig.hand.frame)
 

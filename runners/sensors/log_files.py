@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
 from replay.mcap.texts import one_line
+from replay.raw.raw_file import ACCEPTED
 
-ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
 _METADATA = "metadata.yaml"
+_ROS1_BAG = b"#ROSBAG "  # as long as MCAP0_MAGIC
 _METADATA_ERRORS = (
     OSError,
     yaml.YAMLError,
@@ -34,6 +36,7 @@ def log_files(path: Path, remarks: list[str]) -> list[Path]:
         raise SessionError(f"log {path} does not exist; {ACCEPTED}")
     if path.is_file():
         _require_mcap([path])
+        _refuse_ros1_bag(path)
         return [path]
     if not path.is_dir():
         raise SessionError(f"log {path} is neither a file nor a folder; {ACCEPTED}")
@@ -96,6 +99,16 @@ def _require_mcap(files: list[Path]) -> None:
             raise SessionError(
                 f"log {file} is compressed as a whole; accepted: .mcap: unpack it with `zstd -d`"
             )
+
+
+def _refuse_ros1_bag(path: Path) -> None:
+    with path.open("rb") as file:
+        start = file.read(len(_ROS1_BAG))
+    if start == _ROS1_BAG or (path.suffix == ".bag" and start != MCAP0_MAGIC):
+        raise SessionError(
+            f"log {path} is a ROS 1 bag; {ACCEPTED}: convert it with `pip install rosbags`, "
+            "`rosbags-convert --src LOG.bag --dst LOG --dst-storage mcap`, and pass the folder LOG"
+        )
 
 
 def _natural(path: Path) -> list[Any]:

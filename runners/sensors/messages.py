@@ -68,6 +68,15 @@ class CloudMessage:
     points: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class WrenchMessage:
+    """A force and a torque in a frame and about its origin."""
+
+    frame: str
+    force: FloatArray  # (3,), newtons
+    torque: FloatArray  # (3,), newton metres
+
+
 @dataclass(frozen=True)
 class MarkerMessage:
     """A text such as "begin 3" or "end", a number, or true and false, as text."""
@@ -82,6 +91,7 @@ Content = (
     | PoseMessage
     | JointsMessage
     | CloudMessage
+    | WrenchMessage
     | MarkerMessage
 )
 

@@ -11,6 +11,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.poses import apply, inverse, rotated, rotation_angle
 from chsel.sensing.contact_patch import contact_mask, deformation, smooth
 from chsel.sensing.depth_camera import PinholeCamera
+from chsel.sensing.regions import depth_regions, main_regions, small_regions
 from replay.events import SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.depth_source import DepthSource, View, intrinsics_of, recorded
@@ -88,12 +89,10 @@ class Pad:
         return imprint
 
     def strongest(self, tally: Tally) -> Imprint | None:
-        """The image of the contact since the last call; with too few pixels it touches nothing."""
+        """The image of the contact since the last call."""
         best, self._best = self._best, None
         if best is None:
             return None
-        if best.size < self._contact.pixels:
-            return Imprint(best.view, best.pressed, np.zeros_like(best.touching))
         tally.touching += best.size
         if self._inside:
             self._mark(best.view, tally)
@@ -139,9 +138,11 @@ class Pad:
             depth = self._reference - pressed
             nearest, furthest = self._rig.range
             valid = told & (depth >= nearest) & (depth <= furthest)
-            view = View(depth, valid, view.world_from_camera)
+            kept = self._main(depth, valid, tally)
+            pressed[valid & ~kept] = 0.0
+            valid, view = kept, View(depth, kept, view.world_from_camera)
         else:
-            valid = view.valid & known
+            valid = self._main(view.metres, view.valid & known, tally)
             pressed = deformation(self._reference, view.metres, valid=valid)
         if not valid.any():
             tally.unusable += 1
@@ -154,7 +155,22 @@ class Pad:
             threshold=self._contact.threshold,
             valid=valid,
         )
+        touching = self._main(view.metres, touching, tally, least=self._contact.pixels)
         return Imprint(view, pressed, touching)
+
+    def _main(
+        self, depth: FloatArray, counts: BoolArray, tally: Tally, *, least: int = 0
+    ) -> BoolArray:
+        """Of pixels (H, W) those in regions without a jump of depth that are not too small.
+
+        least: pixels of a region.
+        """
+        gate = self._cell.gate
+        regions = depth_regions(depth, counts, self._camera, gate.jump)
+        kept = counts & ~small_regions(regions, least)
+        kept[kept] = main_regions(regions[kept], part=gate.part).kept
+        tally.small += int((counts & ~kept).sum())
+        return kept
 
     def _mark(self, view: View, tally: Tally) -> None:
         """The pad's inside is free, less half a voxel's diagonal before what it may touch."""

@@ -13,9 +13,10 @@ from runners.sensors.cell import Cell
 from runners.sensors.clouds import Clouds
 from runners.sensors.contacts import ContactFinder, Contacts
 from runners.sensors.depth_camera import DepthCamera
+from runners.sensors.forces import Forces
 from runners.sensors.hand import HandModel
 from runners.sensors.hand_path import HandPath
-from runners.sensors.messages import CloudMessage, ImageMessage, Received
+from runners.sensors.messages import CloudMessage, ImageMessage, Received, WrenchMessage
 from runners.sensors.pad import Imprint, Pad
 from runners.sensors.push_end import PushWatch
 from runners.sensors.rig import BubbleRig, Rig
@@ -57,7 +58,13 @@ class LogReading:
         }
         self._contacts = ContactFinder(rig, self._pads, cell, seed)
         self._hand, self._push_end = None, None
+        self._forces: dict[str, Forces] = {}
         if rig.hand is not None and hand is not None:
+            parts = rig.hand, hand, survey.joints
+            self._forces = {
+                force.topic: Forces(force, parts, cell, rig.surface_resolution)
+                for force in rig.forces
+            }
             self._hand = HandPath(rig.hand, hand, survey.joints, survey.transform_times, cell)
             if self._asks_for_push_end():
                 self._push_end = PushWatch(rig.hand.frame, cell)
@@ -65,8 +72,9 @@ class LogReading:
     def events(self, messages: Iterator[tuple[int, Received]]) -> Iterator[Event]:
         """Events of the probes, from messages with their times, ascending."""
         message = next(messages, None)
+        sensors = (*self._cameras, *self._pads, *self._clouds, *self._forces)
         for window in self._windows:
-            for name in (*self._cameras, *self._pads, *self._clouds, *[HAND] * bool(self._hand)):
+            for name in (*sensors, *[HAND] * bool(self._hand)):
                 self._report.of(window.step, name)  # in this order they are shown
             while message is not None and message[0] < window.closes:
                 self._take(window, *message)
@@ -102,6 +110,8 @@ class LogReading:
             content = message.content
             if isinstance(content, CloudMessage) and sensor in self._clouds:
                 self._clouds[sensor].take(time, content, tally, within=within)
+            elif isinstance(content, WrenchMessage) and sensor in self._forces:
+                self._forces[sensor].take(time, content, tally, within=within)
             elif isinstance(content, ImageMessage) and sensor in self._cameras:
                 self._cameras[sensor].take(time, content, tally)
             elif isinstance(content, ImageMessage) and sensor in self._pads:
@@ -127,10 +137,12 @@ class LogReading:
         felt = self._contacts.felt(step, imprints, tallies)
         added = self._contacts.annotated(step, push_end)
         scanned = self._scanned(step, contacts=True)
-        contacts = Contacts.joined([felt, added, Contacts.without_normals(scanned)])
+        pushed = self._pushed(step)
+        contacts = Contacts.joined([felt, added, Contacts.without_normals(scanned), pushed])
         surface = self._scanned(step, contacts=False)
         new = KnownPoints(
-            free=self._cell.free.new(), known=np.concatenate([contacts.points, surface])
+            free=self._cell.free.new(pushed.points, pushed.normals),
+            known=np.concatenate([contacts.points, surface]),
         )
         if self._images:
             yield from self._seen(step, imprints)
@@ -155,6 +167,13 @@ class LogReading:
                 self._report.of(step, topic).contacts += len(points)
                 found.append(points)
         return np.concatenate(found)
+
+    def _pushed(self, step: int) -> Contacts:
+        """Contacts by the forces on the hand."""
+        found = [
+            force.contacts(self._report.of(step, name)) for name, force in self._forces.items()
+        ]
+        return Contacts.joined([] if step in self._rig.annotations.exclude else found)
 
     def _seen(self, step: int, imprints: dict[str, Imprint]) -> Iterator[SensorImage]:
         """The images by which a person can follow what became known."""
@@ -193,10 +212,10 @@ class LogReading:
 
 
 def _by_topic(rig: Rig) -> dict[str, list[str]]:
-    """The names of the sensors that read a topic; a cloud's name is its topic."""
+    """The names of the sensors that read a topic; that of a cloud or of forces is its topic."""
     sensors: dict[str, list[str]] = {}
     for sensor in rig.sensors:
         sensors.setdefault(sensor.depth, []).append(sensor.name)
-    for cloud in rig.clouds:
-        sensors.setdefault(cloud.topic, []).append(cloud.topic)
+    for topic in [*(cloud.topic for cloud in rig.clouds), *(part.topic for part in rig.forces)]:
+        sensors.setdefault(topic, []).append(topic)
     return sensors

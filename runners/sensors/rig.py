@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
+from runners.sensors.force_rig import ForceRig
+from runners.sensors.gate_rig import GateRig
 
 _LARGEST_HAND = 100.0  # metres
 _LONGEST = 1e9  # seconds; they are counted in nanoseconds
@@ -222,6 +224,7 @@ class Rig:
     says where probes begin and end, with texts "begin N" and "end", integers (below 0: end), or
     true and false. probes: their times in place of markers; without either the whole log is one.
     surface_resolution: metres; one surface point a voxel of this side is kept of clouds and masks.
+    gate: which pixels and points are left out, as they are not connected with the others.
     """
 
     name: str
@@ -233,11 +236,13 @@ class Rig:
     contact: ContactRig = field(default_factory=ContactRig)
     hand: HandRig | None = None
     clouds: tuple[CloudRig, ...] = ()
+    forces: tuple[ForceRig, ...] = ()
     markers: str | None = None
     probes: tuple[ProbeTimes, ...] | None = None
     clock: ClockRig = field(default_factory=ClockRig)
     annotations: Annotations = field(default_factory=Annotations)
     surface_resolution: float = 0.005
+    gate: GateRig = field(default_factory=GateRig)
 
     def __post_init__(self) -> None:
         require_choice("boundary", self.boundary, ("box_shell", "none"))
@@ -247,6 +252,11 @@ class Rig:
         names = [sensor.name for sensor in self.sensors]
         if len(set(names)) < len(names):
             raise SettingError(f"sensors are named {', '.join(names)}; accepted: each name once")
+        if self.forces and (self.hand is None or not (self.hand.boxes or self.hand.urdf)):
+            raise SettingError(
+                "forces need the solids of the hand, on which they act; accepted: hand.boxes, "
+                "hand.urdf"
+            )
 
     @property
     def sensors(self) -> tuple[CameraRig | BubbleRig, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
+import numpy as np
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
@@ -17,6 +18,7 @@ from runners.sensors.messages import (
     ImageMessage,
     PoseMessage,
     TransformMessage,
+    WrenchMessage,
 )
 from runners.sensors.packed_points import named_fields, packed_points
 from runners.sensors.quaternions import rigid
@@ -37,6 +39,7 @@ _ERRORS = (ValueError, struct.error, IndexError, OverflowError, MemoryError)  # 
 _SMALL = 2**20  # bytes; what has no pixels or points is smaller
 _BULKY = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud2")
 _HEAD = 2**12  # bytes of a cloud that must hold all before its points
+_LARGEST_FORCE = 1e6  # N, Nm
 _TEXT_AT = 8  # bytes before the text of std_msgs/String
 
 
@@ -161,6 +164,15 @@ def _point(message: Any) -> Iterator[Said]:
     return _one(message, positions(message.header.frame_id, [message.point]))
 
 
+def _wrench(message: Any) -> Iterator[Said]:
+    parts = [(part.x, part.y, part.z) for part in (message.wrench.force, message.wrench.torque)]
+    force, torque = np.array(parts, dtype=np.float64)
+    if not (np.abs(parts) <= _LARGEST_FORCE).all():  # NaN is not
+        raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
+    frame = frame_name(message.header.frame_id)
+    return _one(message, WrenchMessage(frame, force, torque))
+
+
 def _cloud(message: Any) -> Iterator[Said]:
     fields = named_fields((field.name, field.offset, field.datatype) for field in message.fields)
     points = packed_points(
@@ -195,6 +207,7 @@ _CONTENTS: dict[str, Callable[[Any], Iterator[Said]]] = {
     "geometry_msgs/PoseStamped": _pose,
     "geometry_msgs/PoseArray": _poses,
     "geometry_msgs/PointStamped": _point,
+    "geometry_msgs/WrenchStamped": _wrench,
     **{
         name: _marker
         for name in DEFINITIONS

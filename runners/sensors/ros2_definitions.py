@@ -24,6 +24,8 @@ DEFINITIONS = {
     "geometry_msgs/Pose": "geometry_msgs/Point position; geometry_msgs/Quaternion orientation",
     "geometry_msgs/PoseStamped": f"{_HEADER}; {_POSE}",
     "geometry_msgs/PoseArray": f"{_HEADER}; geometry_msgs/Pose[] poses",
+    "geometry_msgs/Wrench": "geometry_msgs/Vector3 force; geometry_msgs/Vector3 torque",
+    "geometry_msgs/WrenchStamped": f"{_HEADER}; geometry_msgs/Wrench wrench",
     "geometry_msgs/PointStamped": f"{_HEADER}; geometry_msgs/Point point",
     "geometry_msgs/TransformStamped": f"{_HEADER}; string child_frame_id; "
     "geometry_msgs/Transform transform",

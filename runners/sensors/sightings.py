@@ -9,7 +9,13 @@ import numpy as np
 
 from chsel.numerics.arrays import IntArray
 from runners.sensors.clocks import ClockCorrection
-from runners.sensors.messages import CloudMessage, ImageMessage, MarkerMessage, Received
+from runners.sensors.messages import (
+    CloudMessage,
+    ImageMessage,
+    MarkerMessage,
+    Received,
+    WrenchMessage,
+)
 
 _LATE = 1.5  # median intervals after which an image is missing
 _MOST_SIZES = 100
@@ -28,7 +34,7 @@ class Sightings:
         self.sizes: Counter[tuple[int, int]] = Counter()
         self._log_times, self._stamps = array("q"), array("q")
 
-    def add(self, received: Received, content: ImageMessage | CloudMessage) -> None:
+    def add(self, received: Received, content: ImageMessage | CloudMessage | WrenchMessage) -> None:
         """Take note of one."""
         self._log_times.append(received.log_time)
         self._stamps.append(received.stamp or 0)

@@ -7,28 +7,39 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Tally:
-    """Counts of one sensor in one probe.
+    """Counts of one sensor in one probe."""
 
-    images: that came. used: that told of free space or of contacts. spared: left out by the rig's
-    rate, or as nothing had moved. lost: without a transform. unusable: of another size than the
-    camera's, or without a single pixel that counts. pixels: of the images that were looked at;
-    invalid, edges: of these without a depth within range, and beside an occluding edge. touching:
-    pixels in contact. outside: points of a cloud that are out of reach. contacts: points. free:
-    voxels that it was the first to tell of.
-    """
+    images: int = 0  # that came, or clouds, forces, poses of the hand
+    used: int = 0  # of them, that gave free space or contacts
+    spared: int = 0  # left out by the rig's rate, or as nothing had moved
+    lost: int = 0  # without a transform
+    unusable: int = 0  # of another size than the camera's, or without a pixel that counts
+    pixels: int = 0  # of the images that were looked at, or points of clouds
+    invalid: int = 0  # pixels without a depth within range
+    edges: int = 0  # pixels beside a jump of depth
+    outline: int = 0  # pixels at the outline of the object's label
+    small: int = 0  # pixels or points in regions that are too small
+    far: int = 0  # pixels or points in regions too far from the largest to be of one object
+    outside: int = 0  # points of a cloud, or lines of force, that are out of reach
+    spikes: int = 0  # forces above the threshold in too few messages in a row
+    touching: int = 0  # pixels in contact
+    contacts: int = 0  # points
+    free: int = 0  # voxels that it was the first to mark as free
 
-    images: int = 0
-    used: int = 0
-    spared: int = 0
-    lost: int = 0
-    unusable: int = 0
-    pixels: int = 0
-    invalid: int = 0
-    edges: int = 0
-    touching: int = 0
-    outside: int = 0
-    contacts: int = 0
-    free: int = 0
+    def left_out(self) -> str:
+        """How many pixels, points or forces were left out, by reason; "" if none were."""
+        reasons = {
+            "without a value in range": self.invalid,
+            "at edges of depth": self.edges,
+            "at the label's outline": self.outline,
+            "in regions too small": self.small,
+            "in regions too far from the largest": self.far,
+            "out of reach": self.outside,
+            "of forces that do not last": self.spikes,
+        }
+        counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
+        total = f"{self.pixels} pixels or points" if self.pixels else f"{self.images} messages"
+        return f"left out of {total}: {counts}" if counts else ""
 
     def add(self, other: Tally) -> None:
         """Add the counts of another one."""

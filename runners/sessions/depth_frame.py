@@ -16,7 +16,7 @@ from runners.sensors.depth_frame import DepthFrame, read_depth_frame
 from runners.sensors.depth_frame_points import FramePoints, depth_frame_points
 from runners.sensors.depth_source import intrinsics_of, recorded
 from runners.sensors.rig import Rig
-from runners.sensors.tally import Report, Tally
+from runners.sensors.tally import Report
 from runners.sessions.session import SessionEvent
 
 
@@ -38,7 +38,7 @@ class DepthFrameSession:
         self.count = 1
         self._rig, self._path, self._images = rig, path, images
         self._frame: DepthFrame = read_depth_frame(path)
-        diameter = float(np.sqrt((np.asarray(object_model.mesh.extents) ** 2).sum()))
+        diameter = object_model.diameter
         self._points: FramePoints = depth_frame_points(
             self._frame, rig, free_resolution=free_resolution, diameter=diameter
         )
@@ -49,28 +49,24 @@ class DepthFrameSession:
     def probes(self) -> Iterator[SessionEvent]:
         """The image, and what follows from it."""
         found, (camera,) = self._points, self._rig.cameras
-        self.report.tallies[0] = {
-            camera.name: Tally(
-                images=1,
-                used=1,
-                pixels=found.rays.size,
-                invalid=found.invalid,
-                edges=found.edges,
-                contacts=len(found.points.known),
-                free=len(found.points.free),
-            )
-        }
+        self.report.tallies[0] = {camera.name: found.tally}
         yield RigDescribed(-1, self._rig.name, file_digest(self._path))
         if self._images:
             yield self._image(camera.name)
         count = len(found.points.known)
         text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
         yield Logged(0, "info", text)
+        tallies = {camera.name: found.tally, "label": found.labelled}
+        self.report.lines.clear()
+        for name, tally in tallies.items():
+            if tally is not None and (left_out := tally.left_out()):
+                self.report.lines.append(("info", f"{name}: {left_out}"))
+                yield Logged(0, "info", f"{name}: {left_out}")
         lower, upper = self.workspace.bounds
         outside = ((found.points.known < lower) | (found.points.known > upper)).any(axis=1).sum()
         if outside:
             text = f"{outside} of {count} surface points are out of the workspace"
-            self.report.lines = [("warning", text)]
+            self.report.lines.append(("warning", text))
             yield Logged(0, "warning", text)
         yield Probe(0, "points", found.points)
 

@@ -15,6 +15,7 @@ from runners.sensors.cell import Cell, FreeMap
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.hand import HandModel
 from runners.sensors.log import RawLog
+from runners.sensors.messages import Received
 from runners.sensors.pose_file import beside, read_pose
 from runners.sensors.reading import LogReading
 from runners.sensors.remarks import Remarks
@@ -76,16 +77,24 @@ def open_sensors(
             free_resolution=settings.free_resolution,
             images=settings.images,
         )
-    return SensorsSession(settings, seed, progress)
+    return SensorsSession(settings, seed, progress, diameter=object_model.diameter)
 
 
 class SensorsSession:
     """Reads a log twice: what is small at once, images one after the other; see `Session`."""
 
     def __init__(
-        self, settings: SensorsSettings, seed: int, progress: Progress = unwatched
+        self,
+        settings: SensorsSettings,
+        seed: int,
+        progress: Progress = unwatched,
+        *,
+        diameter: float | None = None,
     ) -> None:
-        """seed: of the choice of contact pixels. Raises SessionError for a log without use."""
+        """seed: of the choice of contact pixels. diameter: of the object, metres, where known.
+
+        Raises SessionError for a log without use.
+        """
         path = Path(settings.path or "").expanduser()
         rig = settings.rig
         self.report = Report()
@@ -93,7 +102,7 @@ class SensorsSession:
         self.free_resolution = settings.free_resolution
         self.world_from_object: FloatArray | None = None
         self._rig, self._seed, self._images = rig, seed, settings.images
-        self._progress = progress
+        self._progress, self._diameter = progress, diameter
         self._opening = Remarks()
         self._hand = HandModel(rig.hand) if rig.hand else None
         self._log = RawLog(path, progress=self._shown("looking for topics"))
@@ -113,18 +122,30 @@ class SensorsSession:
         """The probes of the log, in their order; its images are read as they go."""
         rig, survey, remarks = self._rig, self._survey, Remarks(self._opening)
         self.report.tallies.clear()
-        cell = Cell(rig.world, survey.tree, rig.clock.gap, self._free_map()[0], remarks)
+        cell = Cell(
+            rig.world,
+            survey.tree,
+            rig.clock.gap,
+            self._free_map()[0],
+            remarks,
+            rig.gate,
+            self._diameter,
+        )
         reading = LogReading(
             rig, survey, cell, self.report, self._hand, seed=self._seed, images=self._images
         )
         hand = self._hand.solids(survey.joints.first()) if self._hand else None
         yield RigDescribed(-1, rig.name, self.source, hand)
-        messages = self._log.messages(survey.bulky, progress=self._shown("reading images"))
+        messages: Iterator[Received] = iter(())
+        if survey.bulky:
+            messages = self._log.messages(survey.bulky, progress=self._shown("reading images"))
         yield from reading.events(in_time_order(messages, survey.clocks.time))
         reading.check()
         for text, count in self._log.faults.items():
             remarks.warn(text, count)
         for name, tally in self.report.total().items():
+            if left_out := tally.left_out():
+                remarks.tell(f"{name}: {left_out}")
             if tally.edges > _MANY * tally.pixels:
                 remarks.warn(
                     f"{name}: {100 * tally.edges // tally.pixels} % of its pixels are left out as "

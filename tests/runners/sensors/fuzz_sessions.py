@@ -21,6 +21,8 @@ import numpy as np
 from chsel.errors import ChselError
 from chsel.problem.poses import check_rigid
 from replay.events import Logged, Probe, RigDescribed, SensorImage
+from runners.sensors.force_rig import ForceRig
+from runners.sensors.gate_rig import GateRig
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, ProbeTimes, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from runners.twin.log_writer import LogWriter
@@ -377,6 +379,11 @@ def other_threshold(rig: Rig, random: Random) -> Rig:
         lambda: {"clock": replace(clock, jump=value)},
         lambda: {"clock": replace(clock, stamp="log")},
         lambda: {"surface_resolution": value},
+        lambda: {"gate": GateRig(jump=value)},
+        lambda: {"gate": GateRig(gap=value)},
+        lambda: {"gate": GateRig(part=value)},
+        lambda: {"gate": GateRig(speckle=whole)},
+        lambda: {"forces": (ForceRig("/pad/depth", threshold=value),)},
         lambda: {"boundary": "none"},
     ]
     return replace(rig, **changes[int(random.integers(len(changes)))]())

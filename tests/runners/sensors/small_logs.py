@@ -198,6 +198,17 @@ def ros2_sent(count: int = 4) -> list[Sent]:
                 {"header": header("base", stamp), "point": {"x": 1.0, "y": 0.0, "z": 2.0}},
             ),
             (
+                "/wrench",
+                "geometry_msgs/WrenchStamped",
+                {
+                    "header": header("hand", stamp),
+                    "wrench": {
+                        "force": {"x": 1.0, "y": 2.0, "z": -3.0},
+                        "torque": {"x": 0.25, "y": 0.0, "z": 0.5},
+                    },
+                },
+            ),
+            (
                 "/joints",
                 "sensor_msgs/JointState",
                 {

@@ -24,6 +24,7 @@ from runners.objects.loader import ObjectModel
 from runners.sensors import depth_frame_points as module
 from runners.sensors.depth_frame import DepthFrame, read_depth_frame
 from runners.sensors.depth_frame_points import depth_frame_points, one_per_voxel
+from runners.sensors.gate_rig import GateRig
 from runners.sensors.rig import Rig
 from runners.sessions.depth_frame import DepthFrameSession
 
@@ -207,9 +208,13 @@ def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path: Path) 
     np.testing.assert_allclose(in_camera[:, 2], FRONT, atol=1e-12)
     assert in_camera[:, 0].min() == pytest.approx((33 - 39.5) / 100 * FRONT)
     assert in_camera[:, 1].max() == pytest.approx((36 - 29.5) / 110 * FRONT)
-    assert found.invalid == HEIGHT * 5
-    assert found.edges == 96 + 104  # inside and outside of the outline
-    assert int(found.rays.sum()) == HEIGHT * WIDTH - found.invalid - found.edges
+    assert found.labelled is not None
+    assert found.labelled.edges == 600 - 14 * 24  # inside of the outline
+    assert found.tally.edges == found.labelled.edges + 26 * 36 - 600  # and outside
+    assert found.tally.invalid == HEIGHT * 5
+    assert (
+        int(found.rays.sum()) == HEIGHT * WIDTH - HEIGHT * 5 - found.tally.edges
+    )  # no outline is wider
     points = frame_points(frame, found)
     bounds = [points.min(axis=0) - 0.3, points.max(axis=0) + 0.3]
     np.testing.assert_allclose(found.workspace.bounds, bounds)
@@ -225,6 +230,53 @@ def test_a_labels_outline_is_left_out_two_pixels_deep_where_no_edge_of_depth_is(
     for chosen in (rig(), rig(edge=None)):
         found = depth_frame_points(flat, chosen, free_resolution=0.01, diameter=0.3)
         np.testing.assert_array_equal(found.surface, expected)
+
+
+@pytest.mark.parametrize(
+    ("blob", "depth", "kept", "reason"),
+    [
+        ((slice(28, 32), slice(40, 44)), 0.55, False, "small"),  # 50 mm behind, at once
+        ((slice(28, 32), slice(40, 44)), 0.515, True, "none"),  # as an inclined surface could be
+        ((slice(20, 40), slice(30, 41)), 0.56, True, "none"),  # a part beside an occluder
+        ((slice(20, 40), slice(30, 41)), WALL, False, "far"),  # further than the object is long
+    ],
+)
+def test_pixels_of_a_label_that_are_not_connected_are_left_out(
+    tmp_path: Path, blob: tuple[slice, slice], depth: float, kept: bool, reason: str
+) -> None:
+    frame = read_depth_frame(written(tmp_path))
+    frame.depth[blob] = depth
+    found = depth_frame_points(frame, rig(edge_reach=1), free_resolution=0.01, diameter=0.3)
+    labelled = found.labelled
+    assert labelled is not None
+    assert bool(found.surface[blob].any()) is kept
+    assert {"small": labelled.small > 0, "far": labelled.far > 0, "none": kept}[reason]
+    assert (labelled.small > 0) + (labelled.far > 0) == (not kept)
+    if not kept:  # and no ray passes through the object there
+        assert not found.rays[blob].any()
+        free = np.abs(found.points.free - [0.0, 0.0, 0.56]).max(axis=1) < 0.03
+        assert not free.any() or reason == "far"
+    assert found.points.known[:, 2].max() == pytest.approx(depth if kept else FRONT)
+
+
+def test_no_free_voxel_is_so_near_to_the_surface_that_it_may_lie_behind(tmp_path: Path) -> None:
+    frame = read_depth_frame(written(tmp_path))
+    found = depth_frame_points(frame, rig(fraction=1.0), free_resolution=0.01, diameter=0.3)
+    on_object = frame_points(frame, found)
+    distances = np.linalg.norm(found.points.free[:, None] - on_object[None, ::5], axis=-1)
+    assert distances.min() > np.sqrt(0.75) * 0.01
+
+
+def test_few_pixels_of_another_depth_give_no_rays(tmp_path: Path) -> None:
+    frame = read_depth_frame(written(tmp_path, label=None, object_class=None))
+    bounds = ((-0.3, 0.3), (-0.3, 0.3), (0.3, 1.5))
+    own = dataclasses.replace(rig(), workspace=bounds)
+    frame.depth[0:9, 60:69] = 1.4
+    found = depth_frame_points(frame, own, free_resolution=0.02)
+    assert found.tally.small == 6 * 3  # but for the edge around them
+    assert found.points.free[:, 2].max() < WALL
+    every = dataclasses.replace(own, gate=GateRig(speckle=18))
+    assert depth_frame_points(frame, every, free_resolution=0.02).points.free[:, 2].max() > 1.3
 
 
 def frame_points(frame: DepthFrame, found: module.FramePoints) -> np.ndarray:
@@ -314,6 +366,7 @@ def test_the_real_frame_registers_near_its_published_pose(real_directory: Path) 
     points = found.points
     truth = inverse(frame.world_from_object)
     distance = mesh_sdf(mesh, apply(truth, points.known))[0]
+    assert found.labelled is not None
     assert np.abs(distance).mean() < 0.0008
     assert np.abs(distance).max() < 0.0035  # no pixel of the background is among them
     assert mesh_sdf(mesh, apply(truth, points.free))[0].min() > -0.002  # free space is outside
@@ -327,3 +380,21 @@ def test_the_real_frame_registers_near_its_published_pose(real_directory: Path) 
     centre = mesh.bounds.mean(axis=0)[None]  # the same place, whichever way round the box is found
     miss = apply(inverse(best), centre) - apply(frame.world_from_object, centre)
     assert np.linalg.norm(miss) < 0.015
+
+
+def test_the_real_frame_of_a_brick_has_no_point_off_it_and_no_free_voxel_in_it(
+    real_directory: Path,
+) -> None:
+    path = real_directory / "ycbv_000001" / "frame_foam_brick.yaml"
+    if not path.is_file():
+        pytest.skip("optional data directory has no real/ycbv_000001/frame_foam_brick.yaml")
+    frame, mesh = read_depth_frame(path), load_mesh(real_directory / "ycbv_foam_brick.obj")
+    assert frame.world_from_object is not None
+    diameter = float(np.linalg.norm(mesh.extents))
+    found = depth_frame_points(frame, rig(), free_resolution=0.01, diameter=diameter)
+    assert found.labelled is not None
+    assert found.labelled.small == 50  # a patch 26 mm behind the brick, at its upper edge
+    truth = inverse(frame.world_from_object)
+    assert np.abs(mesh_sdf(mesh, apply(truth, found.points.known))[0]).max() < 0.0035
+    assert mesh_sdf(mesh, apply(truth, found.points.free))[0].min() > 0.0
+    assert len(found.points.known) > 500

@@ -15,8 +15,9 @@ from mcap.writer import Writer as McapWriter
 
 from chsel.errors import SessionError
 from replay.file_digest import file_digest
-from runners.sensors import raw_file, raw_reading
-from runners.sensors.catalogue import Channel
+from replay.raw import raw_file, raw_reading
+from replay.raw.catalogue import Channel
+from replay.raw.raw_reading import RawMessage
 from runners.sensors.file_merge import merged, most_at_once
 from runners.sensors.log import RawLog
 from runners.sensors.messages import (
@@ -28,8 +29,8 @@ from runners.sensors.messages import (
     PoseMessage,
     Received,
     TransformMessage,
+    WrenchMessage,
 )
-from runners.sensors.raw_reading import RawMessage
 from runners.twin.schemas import encode, schema_text
 from tests.runners.sensors.small_logs import (
     BEGIN,
@@ -64,7 +65,11 @@ def test_a_ros2_log_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert {topic.count for topic in log.topics.values()} == {4}
     assert (log.begin, log.end) == (BEGIN + 10**6, BEGIN + 3 * SECOND + 10**6)
     last = by_topic(tmp_path / "log.mcap")
-    assert len(last) == 14
+    assert len(last) == 15
+    wrench = last["/wrench"].content
+    assert isinstance(wrench, WrenchMessage)
+    assert (wrench.frame, wrench.force.tolist()) == ("hand", [1.0, 2.0, -3.0])
+    assert wrench.torque.tolist() == [0.25, 0.0, 0.5]
     assert not log.faults
     assert not log.remarks
     stamp = BEGIN + 3 * SECOND
@@ -445,7 +450,7 @@ def rosbag(folder: Path, metadata: str | None = None) -> None:
     folder.mkdir()
     sent = ros2_sent(11)
     for step in range(11):
-        write_ros2(folder / f"bag_{step}.mcap", sent[14 * step : 14 * (step + 1)])
+        write_ros2(folder / f"bag_{step}.mcap", sent[15 * step : 15 * (step + 1)])
     names = "".join(f"\n    - bag_{step}.mcap" for step in range(11))
     usual = (
         "rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: mcap\n"
@@ -515,6 +520,20 @@ def test_a_missing_file_of_a_bag_is_said(tmp_path: Path) -> None:
     log = RawLog(tmp_path / "bag")
     assert log.topics["/probe"].count == 10
     assert log.remarks == ["file bag_4.mcap, which metadata.yaml names, is missing"]
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("a.bag", b"#ROSBAG V2.0\n"), ("a", b"#ROSBAG V2.0\n"), ("b.bag", b"")]
+)
+def test_a_ros_1_bag_is_an_error_that_names_the_converter(
+    tmp_path: Path, name: str, start: bytes
+) -> None:
+    (tmp_path / name).write_bytes(start)
+    with pytest.raises(SessionError, match=r"is a ROS 1 bag; accepted: .*`rosbags-convert --src"):
+        RawLog(tmp_path / name)
+    whole = write_ros2(tmp_path / "whole.mcap", ros2_sent(1))
+    (tmp_path / name).write_bytes(whole)
+    assert len(RawLog(tmp_path / name).topics) == 15
 
 
 def test_bags_of_other_storage_are_errors(tmp_path: Path) -> None:

@@ -421,7 +421,7 @@ def test_a_topic_whose_points_are_all_out_of_reach_is_a_warning(tmp_path: Path, 
         ({}, ("/tf", "/tf_static"), r"camera: frame world is in no transform; there are none"),
         ({"world": "map"}, (), r"camera: frame map is in no transform; there are camera_frame, ha"),
         ({"workspace": None}, (), r"workspace is missing"),
-        ({"cameras": (), "bubbles": ()}, (), r"rig sphere has no sensor"),
+        ({"cameras": (), "bubbles": (), "hand": None}, (), r"rig sphere has no sensor"),
     ],
 )
 def test_a_log_that_lacks_something_says_so(

@@ -9,12 +9,13 @@ from mcap.opcode import Opcode
 
 from replay.mcap.texts import one_line
 
+_ROS_TEXTS = ("ros2msg", "ros1msg")
 _SCHEMA, _CHANNEL, _LENGTH = struct.Struct("<H"), struct.Struct("<HH"), struct.Struct("<I")
 
 
 @dataclass(frozen=True)
 class Channel:
-    """Messages of one topic and schema. definition: the schema's text, where it has one."""
+    """Messages of one topic and schema. definition: the schema's text, if it is one of ROS."""
 
     topic: str
     encoding: str
@@ -35,7 +36,7 @@ class Catalogue:
             (number,) = _SCHEMA.unpack_from(body)
             name, place = _text(body, _SCHEMA.size)
             encoding, place = _text(body, place)
-            definition = _text(body, place)[0] if encoding == "ros2msg" else None
+            definition = _text(body, place)[0] if encoding in _ROS_TEXTS else None
             self._schemas.setdefault(number, (name, definition))
             return
         number, schema = _CHANNEL.unpack_from(body)

@@ -15,8 +15,8 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from replay.mcap.texts import one_line
-from runners.sensors.catalogue import Catalogue, Channel
-from runners.sensors.chunks import LARGEST_CHUNK, UNPACKING_ERRORS, records, unpacked
+from replay.raw.catalogue import Catalogue, Channel
+from replay.raw.chunks import LARGEST_CHUNK, UNPACKING_ERRORS, records, unpacked
 
 Fault = Callable[[str], None]
 

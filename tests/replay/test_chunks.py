@@ -8,7 +8,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from runners.sensors.chunks import UNPACKING_ERRORS, records, unpacked
+from replay.raw.chunks import UNPACKING_ERRORS, records, unpacked
 
 DATA = bytes(range(256)) * 8
 PACKERS: dict[str, Callable[[bytes], bytes]] = {

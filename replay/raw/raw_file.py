@@ -12,10 +12,9 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
-from runners.sensors.catalogue import Catalogue
-from runners.sensors.chunks import UNPACKING_ERRORS, records
-from runners.sensors.log_files import ACCEPTED
-from runners.sensors.raw_reading import (
+from replay.raw.catalogue import Catalogue
+from replay.raw.chunks import UNPACKING_ERRORS, records
+from replay.raw.raw_reading import (
     MOST_HELD,
     RECORD_HEAD,
     ChunkPlace,
@@ -27,6 +26,7 @@ from runners.sensors.raw_reading import (
     reason,
 )
 
+ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, offsets' start, checksum
 _STATISTICS = struct.Struct("<QHIIIIQQI")
 _COUNT, _PLACE = struct.Struct("<HQ"), struct.Struct("<HQ")
@@ -41,8 +41,8 @@ class RawFile:
 
     catalogue: of its channels, complete where there is an index. counts: of messages by id, where
     the index tells. times: first and last log time, likewise. is_indexed: whether messages come in
-    order of their log time; otherwise they come in the file's. Raises SessionError for what is no
-    MCAP.
+    order of their log time; otherwise they come in the file's. index_fault: what is wrong with its
+    index; "" also where it never had one. Raises SessionError for what is no MCAP.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,6 +51,7 @@ class RawFile:
         self.counts: dict[int, int] | None = None
         self.times: tuple[int, int] | None = None
         self.is_indexed = False
+        self.index_fault = ""
         self.remarks: list[str] = []
         self._chunks: list[ChunkPlace] = []
         try:
@@ -80,14 +81,49 @@ class RawFile:
         except OSError as error:
             fault(f"{self.path.name}: it cannot be read on: {error.strerror or error}")
 
+    def written(self, fault: Fault) -> Iterator[RawMessage]:
+        """All messages in the order of the file, whether or not an index tells where they are."""
+        with self.path.open("rb") as file:
+            catalogue = Catalogue()
+            yield from RawReading(
+                file, catalogue, Wanted(), fault, self.remarks, _unwatched
+            ).as_written()
+            for number, channel in catalogue.channels.items():
+                self.catalogue.channels.setdefault(number, channel)
+
+    def samples(self, fault: Fault, most: int) -> Iterator[RawMessage]:
+        """The messages of at most so many chunks, in which as many topics as possible are."""
+        chosen: list[ChunkPlace] = []
+        seen: set[int] = set()
+        for chunk in sorted(self._chunks):
+            if len(chosen) < most and (not chunk.channels or chunk.channels - seen):
+                chosen.append(chunk)
+                seen |= chunk.channels
+        with self.path.open("rb") as file:
+            reading = RawReading(file, self.catalogue, Wanted(), fault, self.remarks, _unwatched)
+            yield from reading.ordered(chosen, MOST_HELD)
+
+    def spans(self) -> dict[int, tuple[int, int]]:
+        """By channel, first and last log time of the chunks that have its messages, nanoseconds."""
+        found: dict[int, tuple[int, int]] = {}
+        for chunk in self._chunks:
+            for number in chunk.channels:
+                first, last = found.get(number, (chunk.first, chunk.last))
+                found[number] = min(first, chunk.first), max(last, chunk.last)
+        return found
+
     def _read_index(self, file: IO[bytes]) -> None:
         """Look at the end of the file; without a whole index there, it is as if there was none."""
         try:
             summary = _summary(file, self.size)
+            if not summary:
+                self.remarks.append("it is read without its index: it has none")
+                return
             self._take_summary(summary)
             self._compare_with_chunks(file)
         except UNPACKING_ERRORS as error:
-            self.remarks.append(f"it is read without its index: {reason(error)}")
+            self.index_fault = reason(error)
+            self.remarks.append(f"it is read without its index: {self.index_fault}")
             self.catalogue, self.counts, self.times = Catalogue(), None, None
             self._chunks = []
         else:
@@ -135,8 +171,12 @@ class RawFile:
         return ChunkPlace(first, offset, last, length, alike.setdefault(channels, channels))
 
 
+def _unwatched(done: int) -> None:
+    """Nobody is shown how far reading is."""
+
+
 def _summary(file: IO[bytes], size: int) -> bytes:
-    """The summary's bytes, its checksum compared; ValueError if there is none."""
+    """The summary's bytes, its checksum compared; none if the file was written without one."""
     end = _FOOTER.size + len(MCAP0_MAGIC)
     file.seek(max(0, size - end))
     footer = file.read(end)
@@ -146,7 +186,7 @@ def _summary(file: IO[bytes], size: int) -> bytes:
     if opcode != Opcode.FOOTER or length != _FOOTER.size - RECORD_HEAD.size:
         raise ValueError("its end is damaged")
     if start == 0:
-        raise ValueError("it has none")
+        return b""
     if not 0 < size - end - start <= _LARGEST_SUMMARY:
         raise ValueError("its end is damaged")
     file.seek(start)

@@ -1,0 +1,164 @@
+"""A force sensor: contacts where the line of force enters the hand."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.errors import SettingError
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import Lattice
+from chsel.problem.poses import apply, inverse, rotated
+from chsel.sensing.force_contact import contact_ahead, contact_on_axis
+from runners.sensors.cell import Cell
+from runners.sensors.contacts import Contacts
+from runners.sensors.force_rig import ForceRig
+from runners.sensors.hand import HandModel
+from runners.sensors.joint_history import JointHistory
+from runners.sensors.messages import WrenchMessage
+from runners.sensors.rig import HandRig
+from runners.sensors.tally import Tally
+
+_MOST_KEPT = 50  # samples of a probe, the strongest
+_MOST_TARED = 4096  # samples
+_NANOSECONDS = 1e9
+
+
+@dataclass(frozen=True, order=True)
+class _Sample:
+    """Force and torque beyond the tare; ordered by strength."""
+
+    newtons: float
+    time: int
+    frame: str
+    numbers: tuple[float, ...]  # force, N; torque, Nm
+
+
+class Forces:
+    """The forces of one topic; of each probe, where the strongest act."""
+
+    def __init__(
+        self,
+        rig: ForceRig,
+        hand: tuple[HandRig, HandModel, JointHistory],
+        cell: Cell,
+        resolution: float,
+    ) -> None:
+        """resolution: metres; of the contacts of a probe one a voxel of this side is kept."""
+        self._rig, self._cell = rig, cell
+        self._hand, self._model, self._joints = hand
+        self._lattice = Lattice(cell.free.workspace.lower, resolution)
+        self._shape: tuple[dict[str, float], FloatArray] | None = None
+        self._idle: deque[tuple[int, FloatArray]] = deque(maxlen=_MOST_TARED)
+        self._tare: FloatArray | None = None
+        self._within = self._has_torque = self._in_contact = False
+        self._row: list[_Sample] = []  # not yet long enough for a contact
+        self._strongest: list[_Sample] = []
+
+    def take(self, time: int, message: WrenchMessage, tally: Tally, *, within: bool) -> None:
+        """Use a message; `within` a probe's begin and end, forces are of contacts."""
+        tally.images += 1
+        numbers = np.concatenate([message.force, message.torque])
+        numbers = numbers if self._rig.acts == "on_hand" else -numbers
+        self._has_torque |= bool(message.torque.any())
+        if within and not self._within:
+            self._set_tare(time)
+        self._within = within
+        if within and self._tare is not None:
+            tally.used += 1
+            beyond = numbers - self._tare
+            newtons = float(np.sqrt((beyond[:3] ** 2).sum()))
+            self._look(_Sample(newtons, time, message.frame, tuple(beyond.tolist())), tally)
+            return
+        self._end_row(tally)
+        self._idle.append((time, numbers))
+        tally.spared += 1
+        if within and time - self._idle[0][0] >= self._rig.tare * _NANOSECONDS:
+            self._cell.remarks.warn(
+                f"{self._rig.topic}: nothing came before the first probe: its first "
+                f"{self._rig.tare:g} s are its tare"
+            )
+            self._set_tare(time)
+
+    def contacts(self, tally: Tally) -> Contacts:
+        """The contacts since the last call, the strongest first."""
+        self._end_row(tally)
+        samples, self._strongest = sorted(self._strongest, reverse=True), []
+        found: dict[tuple[int, ...], tuple[FloatArray, FloatArray]] = {}
+        for sample in samples:
+            contact = self._contact(sample, tally)
+            if contact is not None:
+                voxel = tuple(self._lattice.voxels(contact[0][None])[0].tolist())
+                found.setdefault(voxel, contact)
+            if len(found) == self._rig.points:
+                break
+        tally.contacts += len(found)
+        points, normals = [point for point, _ in found.values()], [n for _, n in found.values()]
+        return Contacts(np.reshape(points, (-1, 3)), np.reshape(normals, (-1, 3)))
+
+    def _set_tare(self, time: int) -> None:
+        """The median of what came last; without any, the tare stays what it was."""
+        since = time - self._rig.tare * _NANOSECONDS
+        idle = [numbers for moment, numbers in self._idle if moment >= since]
+        self._idle.clear()
+        if idle:
+            self._tare = np.median(idle, axis=0)
+
+    def _look(self, sample: _Sample, tally: Tally) -> None:
+        """Keep a sample if it is of a contact, and strong."""
+        if sample.newtons <= self._rig.threshold:
+            self._end_row(tally)
+            return
+        self._row.append(sample)
+        if not self._in_contact and len(self._row) < self._rig.samples:
+            return
+        self._in_contact = True
+        for strong in self._row:
+            heapq.heappush(self._strongest, strong)
+            if len(self._strongest) > _MOST_KEPT:
+                heapq.heappop(self._strongest)
+        self._row.clear()
+
+    def _end_row(self, tally: Tally) -> None:
+        """The force is no longer above the threshold, or its probe is over."""
+        tally.spikes += len(self._row)
+        self._row.clear()
+        self._in_contact = False
+
+    def _contact(self, sample: _Sample, tally: Tally) -> tuple[FloatArray, FloatArray] | None:
+        """Where a force acts, and the object's outward normal there (3,), world; None, counted."""
+        sensor = self._rig.frame or sample.frame
+        world_from_sensor = self._cell.world_from(sensor, sample.time, self._rig.topic)
+        world_from_hand = self._cell.world_from(self._hand.frame, sample.time, self._rig.topic)
+        if world_from_sensor is None or world_from_hand is None:
+            tally.lost += 1
+            return None
+        triangles = self._triangles(sample.time)
+        sensor_from_hand = inverse(world_from_sensor) @ world_from_hand
+        triangles = apply(sensor_from_hand, triangles.reshape(-1, 3)).reshape(-1, 3, 3)
+        force, torque = np.array(sample.numbers[:3]), np.array(sample.numbers[3:])
+        if self._rig.torque and self._has_torque:
+            found = contact_on_axis(force, torque, triangles)
+        else:
+            found = contact_ahead(force, triangles)
+        point = apply(world_from_sensor, found.point[None])
+        if found.miss > self._rig.reach or not self._cell.free.within(point)[0]:
+            tally.outside += 1
+            return None
+        return point[0], -rotated(world_from_sensor[:3, :3], found.normal[None])[0]
+
+    def _triangles(self, time: int) -> FloatArray:
+        """Of the hand's solids as they were (F, 3, 3), in its frame, metres."""
+        joints = self._joints.during(time, time + 1)[0][1]
+        if self._shape is None or self._shape[0] != joints:
+            solids = self._model.solids(joints)
+            if solids is None:
+                raise SettingError(
+                    f"{self._rig.topic}: no link of hand.urdf is solid; accepted: hand.boxes, or a "
+                    "URDF with collision shapes"
+                )
+            self._shape = joints, np.asarray(solids.triangles, dtype=np.float64)
+        return self._shape[1]
