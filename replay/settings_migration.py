@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
-from chsel.methods.anchored.anchored import AnchoredSettings
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.chsel import ChselSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.qd.selection import OutputSettings

@@ -23,7 +23,7 @@ from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, inverse
-from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
+from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from replay.console import Console, Progress
@@ -132,8 +132,7 @@ class RealCase:
         more: dict[str, Any] = {"rig": config.rig, "images": False} if frame else {}
         settings: Any = cls(path=path, **more)
         self._session = open_session(kind, settings, model, 0)
-        resolution, padding = settings.object_resolution, settings.object_padding
-        self._sdf = SdfGrid.from_mesh(model.mesh, resolution, padding=padding)
+        self._sdf = model.grid(settings)
         probes = [event for event in self._session.probes() if isinstance(event, Probe)]
         parts = [self._session.initial_points, *(probe.new_points for probe in probes)]
         self._points = KnownPoints.joined(parts)

@@ -15,7 +15,8 @@ from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError
 from chsel.methods.anchored.anchor_sampling import anchored_poses, most_informative_first
-from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Search
+from chsel.methods.anchored.anchored import Anchored, Search
+from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.problem.registration_problem import NullObserver, RegistrationProblem

@@ -9,7 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings, Effort
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.problem.poses import apply, inverse
 from replay.mcap.reader import read_recording
 from runners.reporting import panels

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.cost.cost_settings import uncertain_depth
-from chsel.errors import require_at_most
 from chsel.methods.anchored.anchor_sampling import (
-    AnchorSettings,
     anchored_poses,
     most_informative_first,
 )
+from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
 from chsel.methods.anchored.energy import Energy, NoiseLevel
 from chsel.methods.anchored.fit_kernels import Loss
 from chsel.methods.method import ConfiguredMethod
-from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.problem.online_registration import OnlineSettings
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -26,8 +23,7 @@ from chsel.problem.registration_problem import (
     Observer,
     RegistrationProblem,
 )
-from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
-from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
+from chsel.problem.search_space import origin_bounds, search_space
 from chsel.problem.subset import (
     evenly_spaced,
     farthest_points,
@@ -37,7 +33,6 @@ from chsel.problem.subset import (
 from chsel.qd.archive import Evaluated
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
-    ArchiveSettings,
     measure_range,
     ranked,
     repeated,
@@ -45,114 +40,14 @@ from chsel.qd.selection import (
     sized_archive,
 )
 
-MOST_SAMPLES = 1_000_000_000
-MOST_POSES = 1_000_000
-MOST_MOVES = 100_000
-MOST_WORK = 1_000_000_000  # of the two
 _MOST_ROUNDS = 12
 _REACH = 0.03  # metres beyond which a known point costs no more while minima are sought
-_OUTLYING = 0.01  # and then, at least
+_OUTLYING, _ALL_OUTLYING = 0.01, 0.2  # and then, at least: the second by their number, if less
 _COARSE, _FINE = Loss(0.01, 0.06, 0.0), Loss(0.002, 0.03, 0.0)  # of fits
 _AS_WELL = 1.5  # a tolerance explains points as well if its energy is at most so much higher
 _FAR = 0.01  # metres between outlines of different modes, at least
 _KEPT = 6  # states of a chain
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
-_ARCHIVE = ArchiveSettings(bins=40, outliers="none")
-_ONLINE = OnlineSettings(update="own")
-
-
-@dataclass(frozen=True)
-class Effort(CheckedSettings):
-    """How much is computed."""
-
-    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 60_000  # poses drawn
-    kept: Annotated[int, positive, at_most(MOST_POSES)] = 200  # the best of them, which are fitted
-    first_steps: Annotated[int, not_negative, at_most(MOST_MOVES)] = 6  # of these fits
-    refined: Annotated[int, positive, at_most(MOST_POSES)] = 100  # of these, fitted further
-    steps: Annotated[int, not_negative, at_most(MOST_MOVES)] = 15  # of these fits
-    descents: Annotated[int, positive, at_most(MOST_POSES)] = 96  # chains that descend to the limit
-    descent_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 266
-    chains: Annotated[int, positive, at_most(MOST_POSES)] = 96  # chains that spread below it
-    moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
-    polished: Annotated[int, not_negative, at_most(MOST_POSES)] = 16  # the lowest, to their minima
-    polish_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
-    # How many evaluations may be spent in rounds of all stages up to the descent: a second one, and
-    # further ones while the last found a new mode; 0: one round. While the lowest energy is above
-    # `enough` noise levels of the sensor, a round tries a larger penetration_tolerance.
-    evaluations: Annotated[int, not_negative, at_most(MOST_SAMPLES)] = 0
-    enough: Annotated[float, positive] = 2.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_most("descents x descent_moves", self.descents * self.descent_moves, MOST_WORK)
-        require_at_most("polished x polish_moves", self.polished * self.polish_moves, MOST_WORK)
-        require_at_most("chains x moves", self.chains * self.moves, MOST_WORK)
-
-
-_SMALL = Effort(
-    samples=40_000,
-    kept=64,
-    first_steps=12,
-    refined=40,
-    descents=24,
-    descent_moves=60,
-    chains=24,
-    moves=150,
-    polished=8,
-)
-_LARGE = Effort(
-    samples=250_000,
-    kept=504,
-    refined=150,
-    descents=120,
-    descent_moves=500,
-    chains=120,
-    moves=1000,
-    polished=32,
-    polish_moves=1000,
-)
-EFFORTS = {
-    "small": _SMALL,
-    "medium": Effort(),
-    "large": _LARGE,
-    "adaptive": replace(_SMALL, chains=96, moves=300, evaluations=600_000),
-}
-
-
-@dataclass(frozen=True)
-class AnchoredSettings(CheckedSettings):
-    """All settings of the contact-anchored search, the same in all presets.
-
-    The method is neither in the paper nor in its authors' code.
-    """
-
-    size: Annotated[str, one_of(*EFFORTS)] = "adaptive"
-    effort: Effort | None = None  # in place of the one that `size` names
-    # Of the sensor, as in its data sheet: standard deviation of known points, metres. The noise
-    # that is estimated from the points is no less.
-    noise: Annotated[float, positive] = 0.0005
-    # tau, of free points, metres; None: none, unless nothing fits with less than half a voxel of
-    # free space, or one.
-    penetration_tolerance: Annotated[float | None, not_negative] = None
-    # Most candidates have energies below the larger of limit_noise noise levels, and
-    # limit_ratio x lowest energy + limit_slack noise levels.
-    limit_noise: Annotated[float, not_negative] = 1.0
-    limit_ratio: Annotated[float, not_negative] = 1.3
-    limit_slack: Annotated[float, not_negative] = 0.5
-    # Share of the chains whose limit is outer_noise noise levels higher.
-    outer_share: Annotated[float, not_negative, at_most(1.0)] = 0.25
-    outer_noise: Annotated[float, not_negative] = 1.0
-    # What contacts are off that no residual shows, metres: calibration of hand and camera, scale
-    # of the mesh.
-    shared_error: Annotated[float, not_negative] = 0.004
-    anchors: AnchorSettings = field(default_factory=AnchorSettings)
-    archive: ArchiveSettings = _ARCHIVE
-    online: OnlineSettings = _ONLINE
-    plane: PlaneSettings | None = None  # restricts the poses to SE(2)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        measure_named(self.archive.measure, planar=self.plane is not None)
 
 
 class RatedPoses(NamedTuple):
@@ -278,15 +173,19 @@ class Search:
                 break
             self.energy = self.energy.at(self._wide(raised))
         self._settle(found, raised)
-        polished = self._walked_down(
-            self._costed(found),
-            0.0,
-            effort.polished,
-            effort.polish_moves,
-            index=3,
-        ).ordered()
+        polished = self._polished(self._costed(found).ordered())
         self._show("descend", polished)
         return polished
+
+    def _polished(self, rated: RatedPoses) -> RatedPoses:
+        """All, of which the lowest, and some candidates far apart, are taken to their minima."""
+        effort = self._effort
+        rated = self._refined(rated, self.energy.loss)
+        candidates = rated.energies <= self._limit(rated.energies)
+        apart = farthest_poses(self._problem.sdf, rated.poses[candidates], effort.polished)
+        which = np.union1d(apart, np.arange(min(effort.polished, len(rated.energies))))
+        walked = self._walked_down(rated, which, 0.0, effort.polish_moves, index=3).ordered()
+        return self._refined(walked, self.energy.loss)
 
     def holds(self, best: Poses, poses: Poses) -> BoolArray:
         """Which poses have energies that the noise and shared errors allow beside the best pose."""
@@ -332,20 +231,24 @@ class Search:
         settings = self._settings
         noise = self.energy.noise(poses.ordered().poses[:1], settings.noise)
         sigma = min(noise.sigma, max(_REACH, settings.noise))
-        self.energy = self.energy.at(NoiseLevel(sigma, self.energy.level.tolerance, _OUTLYING))
+        cap = min(_OUTLYING, _ALL_OUTLYING / max(len(self._known.known), 1))
+        self.energy = self.energy.at(NoiseLevel(sigma, self.energy.level.tolerance, cap))
 
     def _fitted(self, poses: Poses) -> RatedPoses:
         """All fitted by a few steps, and the better part of them by more; the lowest first."""
         effort, energy = self._effort, self.energy
         fitted = self._costed(energy.fitted(poses, effort.first_steps, _COARSE)).ordered()
-        better = fitted.chosen(slice(effort.refined))
-        refined = self._costed(energy.fitted(better.poses, effort.steps, _FINE))
-        lower = refined.energies < better.energies
-        fitted = RatedPoses.joined(
-            refined.chosen(lower), better.chosen(~lower), fitted.chosen(slice(effort.refined, None))
-        ).ordered()
+        fitted = self._refined(fitted, _FINE)
         self._show("fit", fitted)
         return fitted
+
+    def _refined(self, rated: RatedPoses, loss: Loss) -> RatedPoses:
+        """The better part of them, the lowest first, fitted where that lowers their energies."""
+        before = rated.chosen(slice(self._effort.refined))
+        after = self._costed(self.energy.fitted(before.poses, self._effort.steps, loss))
+        lower = after.energies < before.energies
+        others = rated.chosen(slice(self._effort.refined, None))
+        return RatedPoses.joined(after.chosen(lower), before.chosen(~lower), others).ordered()
 
     def _descended(self, fitted: RatedPoses, index: int) -> RatedPoses:
         """The lowest walk down to the limit that holds so far."""
@@ -353,19 +256,18 @@ class Search:
         self._estimate(fitted)
         fitted = self._costed(fitted.poses).ordered()
         limit = self._limit(fitted.energies)
-        return self._walked_down(
-            fitted, limit, effort.descents, effort.descent_moves, index=2 + 2 * index
-        )
+        lowest = np.arange(min(effort.descents, len(fitted.energies)))
+        return self._walked_down(fitted, lowest, limit, effort.descent_moves, index=2 + 2 * index)
 
     def _walked_down(
-        self, candidates: RatedPoses, floor: float, count: int, moves: int, *, index: int
+        self, rated: RatedPoses, which: IntArray, floor: float, moves: int, *, index: int
     ) -> RatedPoses:
-        """RatedPoses of which the `count` lowest walked down to a floor, these first."""
-        candidates = candidates.ordered()
-        first = candidates.chosen(slice(count))
-        chains = self.energy.walked(*first, floor, moves, kept=0, index=index)
-        walked = RatedPoses(Poses(chains.poses), chains.energies)
-        return RatedPoses.joined(walked, candidates.chosen(slice(count, None)))
+        """All, of which those of some indices walked down to a floor, these first."""
+        chains = self.energy.walked(*rated.chosen(which), floor, moves, kept=0, index=index)
+        others = np.setdiff1d(np.arange(len(rated.energies)), which)
+        return RatedPoses.joined(
+            RatedPoses(Poses(chains.poses), chains.energies), rated.chosen(others)
+        )
 
     def _limit(self, energies: FloatArray) -> float:
         """The energy below which poses are candidates."""

@@ -95,7 +95,7 @@ class Energy:
         self._model = self._cost.at_level(self._sdf, -level.tolerance)
         self._fitting = self._cost.at_level(self._sdf, _FIT_LEVEL - level.tolerance)
         cap = max(_FOREIGN * level.sigma, level.least_cap)
-        self._loss = Loss(level.sigma, cap, _WRONG * level.sigma / max(len(self._known.known), 1))
+        self.loss = Loss(level.sigma, cap, _WRONG * level.sigma / max(len(self._known.known), 1))
 
     def at(self, level: NoiseLevel) -> Energy:
         """The energy at another level of noise."""
@@ -116,7 +116,7 @@ class Energy:
 
         def run(first: int, last: int, near: Any) -> None:
             energies_below(
-                self._model, self._loss, poses.numbers, np.inf, energies, first, last, near
+                self._model, self.loss, poses.numbers, np.inf, energies, first, last, near
             )
 
         spread(run, len(poses), lambda: surrounding_for(self._model), least=50)
@@ -152,9 +152,7 @@ class Energy:
         stream = self._key.stream(Purpose.WALKS, index)
 
         def run(first: int, last: int, near: Any) -> None:
-            walk_below(
-                self._model, self._loss, self._stride, floor, block, draws, first, last, near
-            )
+            walk_below(self._model, self.loss, self._stride, floor, block, draws, first, last, near)
 
         for before in range(0, len(poses), _BLOCK):
             block = Chains._make(part[before : before + _BLOCK] for part in chains)

@@ -10,7 +10,8 @@ import pytest
 import trimesh
 
 from chsel.errors import ChselError, SettingError
-from chsel.methods.anchored.anchored import EFFORTS, Anchored, AnchoredSettings, Effort, Search
+from chsel.methods.anchored.anchored import Anchored, Search
+from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings, Effort
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors

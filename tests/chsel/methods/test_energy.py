@@ -119,7 +119,7 @@ def test_energies_above_a_limit_are_infinite_and_others_as_they_are() -> None:
     energies, limited = energy.of(poses), np.empty(len(poses))
     limit = float(np.sort(energies)[30])
     near = surrounding_for(model)
-    energies_below(model, energy._loss, poses.numbers, limit, limited, 0, len(poses), near)
+    energies_below(model, energy.loss, poses.numbers, limit, limited, 0, len(poses), near)
     np.testing.assert_array_equal(limited, np.where(energies <= limit, energies, np.inf))
 
 
