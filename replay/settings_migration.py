@@ -20,7 +20,7 @@ LEFT_OUT: Mapping[type, Mapping[str, Any]] = {
     OutputSettings: {"choice": "lowest", "margin": None},
     ChselSettings: {"starts": None},
     # The search changed with these; recordings without them were accepted anew at these values.
-    AnchoredSettings: {"outer_share": 0.25, "outer_noise": 1.0},
+    AnchoredSettings: {"outer_share": 0.25, "outer_noise": 1.0, "shared_error": 0.004},
 }
 
 

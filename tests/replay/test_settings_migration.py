@@ -24,7 +24,7 @@ STORED = {
     "points_two_passes": {"starts", "output.choice", "output.margin"},
     "clamp_medial_constraint_cma_me": {"output.choice", "output.margin"},
     "cracker_box_gradient_descent": {"online.update"},
-    "mustard_anchored": {"outer_share", "outer_noise"},
+    "mustard_anchored": {"outer_share", "outer_noise", "shared_error"},
     "points_default_chsel": set(),
 }
 """Stored recordings, and what each leaves out."""

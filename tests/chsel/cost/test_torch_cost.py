@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -34,7 +36,8 @@ def sphere() -> SdfGrid:
 def value_and_translation_gradient(
     sphere: SdfGrid, points: KnownPoints, **changes: object
 ) -> tuple[float, np.ndarray]:
-    cost = RelaxedCost(sphere, points, CostSettings(**changes))  # type: ignore[arg-type]
+    ours = replace(CostSettings(penetration_tolerance=-0.01), **changes)  # type: ignore[arg-type]
+    cost = RelaxedCost(sphere, points, ours)
     translation = ORIGIN.clone().requires_grad_()
     value = cost(EYE, translation)
     (gradient,) = torch.autograd.grad(value.sum(), translation)
@@ -63,7 +66,10 @@ def test_terms_of_a_sphere_have_their_closed_form(
     found, slope = value_and_translation_gradient(sphere, points, lookup=lookup)
     assert found == pytest.approx(value, abs=1e-9)
     np.testing.assert_allclose(slope, gradient, atol=1e-9)
-    objective = Objective(CompiledCost(sphere, points, CostSettings(lookup=lookup)), SE3Space())
+    objective = Objective(
+        CompiledCost(sphere, points, CostSettings(penetration_tolerance=-0.01, lookup=lookup)),
+        SE3Space(),
+    )
     costs, gradients = objective.costs_and_gradients(SE3Space().encode(Poses.of(np.eye(4)[None])))
     assert costs[0] == pytest.approx(value, abs=1e-9)
     np.testing.assert_allclose(gradients[0, 6:], gradient, atol=1e-9)
@@ -106,7 +112,7 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
         known=stream.uniform(-0.2, 0.2, (9, 3)),
         known_sdf=stream.uniform(-0.02, 0.02, 9),
     )
-    changes = CostSettings(free_term=free_term, lookup="nearest")
+    changes = CostSettings(penetration_tolerance=-0.01, free_term=free_term, lookup="nearest")
     cost = RelaxedCost(sphere, points, changes, free_resolution=0.02)
     compiled = CompiledCost(sphere, points, changes, free_resolution=0.02)
     space = SE3Space()
@@ -166,7 +172,7 @@ def test_interior_term_counts_interior_points_in_free_voxels(sphere: SdfGrid) ->
     """A half space of free voxels over half of the ball: half of sum -s over its deep nodes."""
     axis = np.arange(-12, 13) * 0.01
     free = np.stack(np.meshgrid(axis[axis > 0], axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    settings_ = CostSettings(free_term="interior", lookup="nearest")
+    settings_ = CostSettings(penetration_tolerance=-0.01, free_term="interior", lookup="nearest")
     cost = RelaxedCost(sphere, KnownPoints(free=free), settings_, free_resolution=0.01)
     nodes = np.stack(np.meshgrid(*[np.arange(-25, 26) * 0.01] * 3, indexing="ij"), -1)
     s = np.sqrt((nodes**2).sum(-1)) - RADIUS
@@ -180,7 +186,7 @@ def test_volume_normalise_weighs_interior_points_by_their_voxel_share(sphere: Sd
         RelaxedCost(
             sphere,
             points,
-            CostSettings(free_term="interior", volume_normalise=on),
+            CostSettings(penetration_tolerance=-0.01, free_term="interior", volume_normalise=on),
             free_resolution=0.04,
         ).evaluate(np.eye(4)[None])[0]
         for on in (False, True)
@@ -197,7 +203,9 @@ def test_free_term_leaves_no_violated_point_out(seed: int, count: int, poses: in
     free = stream.uniform(-0.15, 0.15, (count, 3))
     free[: count // 2] = np.round(free[: count // 2], 2)  # onto nodes and voxel borders
     for lookup in ("nearest", "trilinear"):
-        cost = RelaxedCost(grid, KnownPoints(free=free), CostSettings(lookup=lookup))
+        cost = RelaxedCost(
+            grid, KnownPoints(free=free), CostSettings(penetration_tolerance=-0.01, lookup=lookup)
+        )
         expected = []
         for transform in transforms:
             moved = free @ transform[:3, :3].T + transform[:3, 3]

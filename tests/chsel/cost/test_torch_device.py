@@ -23,9 +23,11 @@ from tests.chsel.problem.torch_spaces import decode
 
 needs_gpu = pytest.mark.skipif(gpus() == 0, reason="torch finds no GPU here")
 SETTINGS = [
-    CostSettings(),
-    CostSettings(lookup="nearest", outside="bounding_box", gradient="exact"),
-    CostSettings(free_term="interior", known_tolerance=0.002),
+    CostSettings(penetration_tolerance=-0.01),
+    CostSettings(
+        penetration_tolerance=-0.01, lookup="nearest", outside="bounding_box", gradient="exact"
+    ),
+    CostSettings(penetration_tolerance=-0.01, free_term="interior", known_tolerance=0.002),
 ]
 PRETENDED = torch.device("meta")
 
@@ -221,7 +223,11 @@ def test_matrices_that_stretch_leave_no_violated_point_out(
         for transform in transforms:
             s, _ = grid.query(points.free @ transform[:3, :3].T + transform[:3, 3])
             expected.append(20.0 * np.maximum(0.0, -0.01 - s.numpy()).sum())
-        cost = RelaxedCost(grid, KnownPoints(points.free), CostSettings(lookup="nearest"))
+        cost = RelaxedCost(
+            grid,
+            KnownPoints(points.free),
+            CostSettings(penetration_tolerance=-0.01, lookup="nearest"),
+        )
         assert np.max(expected) > 0.1
         np.testing.assert_allclose(cost.evaluate(transforms), expected, rtol=1e-9, atol=1e-12)
 
