@@ -26,7 +26,7 @@ DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS
 
 # In diameters of the object:
 MOST_OFF = 0.04  # average error of points
-MOST_SYSTEMATIC = 0.015  # the same, if errors of neighbours are alike
+MOST_SYSTEMATIC = 0.012  # the same, if errors of neighbours are alike
 MOST_WIDTH = 0.03  # spread of a mode, and distance from a pose to the next one of its mode
 
 MOST_OUTLIERS = 0.3  # share
