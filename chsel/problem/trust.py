@@ -50,8 +50,7 @@ def trust_in(
 ) -> Trust:
     """How far to trust the hypotheses of a problem; a pure function, the same bits everywhere.
 
-    sensor_noise: standard deviation of known points by the sensor's datasheet, metres. Of a set of
-    one hypothesis the verdict only says whether it explains the points.
+    sensor_noise: standard deviation of known points by the sensor's datasheet, metres.
     Raises PoseError if there is no hypothesis or the best is not finite, and SettingError for noise
     that is not above 0.
     """

@@ -19,6 +19,7 @@ from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import VERDICTS
+from replay.console import Console
 from runners.objects.models import MODELS
 
 TRUTH = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.9)), np.array([0.3, 0.1, 0.2]))
@@ -122,25 +123,26 @@ def counted(
     return counts
 
 
-def table(counts: dict[tuple[str, str], Counter[str]]) -> str:
-    """The counts as a table of Markdown."""
+def table(counts: dict[tuple[str, str], Counter[str]]) -> list[str]:
+    """The counts as the lines of a table of Markdown."""
     lines = ["| fault | method | " + " | ".join(VERDICTS) + " |", "|---|---|" + "--:|" * 4]
     for (fault, method), verdicts in counts.items():
         cells = " | ".join(str(verdicts[verdict] or "") for verdict in VERDICTS)
         lines.append(f"| {fault} | {method} | {cells} |")
-    return "\n".join(lines)
+    return lines
 
 
 def main() -> int:
-    """Print the table; progress goes to the error stream."""
+    """Print the table."""
     parser = argparse.ArgumentParser(prog="runners.benchmarks.verdicts", description=__doc__)
     parser.add_argument("--objects", nargs="+", choices=tuple(MODELS), default=list(MODELS))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=["chsel", "anchored"])
     given = parser.parse_args()
-    counts = counted(
-        given.objects, given.methods, FAULTS, lambda text: print(text, file=sys.stderr)
-    )
-    print(table(counts))
+    console = Console()
+    with console.status("making points") as status:
+        counts = counted(given.objects, given.methods, FAULTS, status.update)
+    for line in table(counts):
+        console.print(line, soft_wrap=True)
     return 0
 
 

@@ -12,7 +12,7 @@ def test_a_fault_is_told_from_points_that_are_right() -> None:
     counts = counted(["clamp"], ["anchored"], faults, told.append)
     assert [tuple(count) for count in counts.values()] == [("determined",), ("nothing fits",)]
     assert told == ["clamp, none, anchored", "clamp, mesh 1.2 times too large, anchored"]
-    lines = table(counts).splitlines()
+    lines = table(counts)
     assert lines[0].split(" | ")[2:] == [*VERDICTS[:3], "nothing fits |"]
     assert lines[2] == "| none | anchored | 1 |  |  |  |"
     assert lines[3] == "| mesh 1.2 times too large | anchored |  |  |  | 1 |"
