@@ -122,14 +122,13 @@ class Display:
                 "best hypothesis, closest one"
             )
         table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
-        names = ["probe", "contacts", "best cost", "distinct"]
+        names = ["probe", "contacts", "best cost"]
         errors = ["mm", "°", "mm", "°"] if truth else []
         for name in [*names, *errors, "time"]:
             table.add_column(name, justify="right")
-        table.add_column("verdict")
+        table.add_column("verdict", no_wrap=True)
         for row in rows:
             cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
-            cells.append(str(row["distinct"]))
             if truth:
                 cells += [*_errors(row, "best"), *_errors(row, "closest")]
             table.add_row(*cells, f"{row['seconds']:.2f} s", row.get("verdict", ""))

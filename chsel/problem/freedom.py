@@ -27,7 +27,8 @@ from chsel.problem.subset import evenly_spaced
 
 MOST_WORSE = 12.6  # fall of twice the log-likelihood: 95 % of chi-squared, 6 degrees of freedom
 _SOFT = 1e-4  # added to A: of (m / m)^2
-_ROUNDS = 4  # of the power iteration
+_ROUNDS = 4  # of the subspace iteration
+_LEAST_LENGTH = 1e-3  # of a motion of the surface, of the object's motion
 _MOST_KNOWN, _MOST_FREE = 1000, 5000
 
 
@@ -65,9 +66,24 @@ def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:
     motions = np.eye(6)
     for _ in range(_ROUNDS):
         motions = _solved(resisted, in_order(metric * motions[:, None]))
-        size = np.sqrt(in_order(in_order(metric * motions[:, None]) * motions))
-        motions = motions[size > 0.0] / size[size > 0.0, None]
+        motions = _orthonormal(motions, metric)
     return motions
+
+
+def _orthonormal(vectors: FloatArray, metric: FloatArray) -> FloatArray:
+    """Vectors (K, 6) of length 1 by a metric (6, 6), each without its part along those before it.
+
+    Vectors of next to no length are left out, such as turns that are symmetries of the object.
+    """
+    found: list[FloatArray] = []
+    for vector in vectors:
+        size = float(np.abs(vector).max())
+        for other in found:
+            vector = vector - in_order(in_order(metric * other) * vector) * other
+        length = math.sqrt(max(float(in_order(in_order(metric * vector) * vector)), 0.0))
+        if length > _LEAST_LENGTH * size:
+            found.append(vector / length)
+    return np.array(found).reshape(-1, 6)
 
 
 def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Poses:

@@ -26,7 +26,7 @@ DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS
 
 # In diameters of the object:
 MOST_OFF = 0.04  # average error of points
-MOST_SYSTEMATIC = 0.015  # the same, if errors of neighbours are alike
+MOST_SYSTEMATIC = 0.012  # the same, if errors of neighbours are alike
 MOST_WIDTH = 0.03  # spread of a mode, and distance from a pose to the next one of its mode
 
 MOST_OUTLIERS = 0.3  # share
@@ -50,8 +50,7 @@ def trust_in(
 ) -> Trust:
     """How far to trust the hypotheses of a problem; a pure function, the same bits everywhere.
 
-    sensor_noise: standard deviation of known points by the sensor's datasheet, metres. Of a set of
-    one hypothesis the verdict only says whether it explains the points.
+    sensor_noise: standard deviation of known points by the sensor's datasheet, metres.
     Raises PoseError if there is no hypothesis or the best is not finite, and SettingError for noise
     that is not above 0.
     """

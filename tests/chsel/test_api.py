@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import re
 import warnings
 from pathlib import Path
@@ -262,6 +263,17 @@ def test_single_settings_and_whole_settings_are_both_taken() -> None:
     assert a.digest == b.digest
 
 
+def test_a_result_says_how_far_to_trust_it_and_its_digest_does_not() -> None:
+    found = register(surface=SURFACE[:3])
+    assert found.trust is not None
+    assert found.trust.verdict in ("several modes", "wide")
+    bare = dataclasses.replace(found, trust=None)
+    assert bare.digest == found.digest
+    assert register(surface=SURFACE, previous=found, step=1).digest == (
+        register(surface=SURFACE, previous=bare, step=1).digest
+    )
+
+
 def test_own_starts_are_used() -> None:
     starts = np.tile(inverse(POSE), (4, 1, 1))
     found = register(surface=SURFACE, initial_set=starts, method="gradient_descent", settings=None)
@@ -284,7 +296,8 @@ def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
     examples = re.findall(r"```python\n(import chsel.*?)```", readme, re.DOTALL)
     examples += re.findall(r"```python\n(cost = chsel.*?)```", readme, re.DOTALL)
     examples += re.findall(r"```python\n(method = build_method.*?)```", readme, re.DOTALL)
-    assert len(examples) == 3
+    examples += re.findall(r"```python\n(trust = hypotheses.*?)```", readme, re.DOTALL)
+    assert len(examples) == 4
     BOX.export(tmp_path / "drill.obj")
     names = {
         "contacts": SURFACE,
@@ -301,6 +314,7 @@ def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
     for example in examples:
         exec(example.replace('"drill.obj"', repr(str(tmp_path / "drill.obj"))), names)
     assert names["best"].shape == (4, 4)
+    assert names["trust"].verdict == "determined"
     assert np.abs(inverse(names["best"])[:3, 3] - POSE[:3, 3]).max() < 0.005
     assert names["online"].previous is names["step"].hypotheses
     assert names["step"].problem.points.count == len(SURFACE)

@@ -103,7 +103,6 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
     folder, done = finished
     recording = read_recording(folder / "recording.mcap")
     trusts = [chsel.trust_in(recording.problem(n), recording.hypotheses(n)) for n in range(3)]
-    assert trusts[0].verdict in ("several modes", "wide")  # after five contacts
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["trust"] == pytest.approx(asdict(trusts[2]))
     assert [step["verdict"] for step in summary["steps"]] == [trust.verdict for trust in trusts]
