@@ -19,6 +19,8 @@ from runners.sensors.rig import Rig
 from runners.sensors.tally import Report
 from runners.sessions.session import SessionEvent
 
+_MANY = 0.2  # of a label's pixels left out: rather a wrong label
+
 
 class DepthFrameSession:
     """What a depth image tells, as a single probe; see `Session`."""
@@ -62,6 +64,15 @@ class DepthFrameSession:
             if tally is not None and (left_out := tally.left_out()):
                 self.report.lines.append(("info", f"{name}: {left_out}"))
                 yield Logged(0, "info", f"{name}: {left_out}")
+        label = found.labelled
+        if label is not None and label.small + label.far > _MANY * label.pixels:
+            share = 100 * (label.small + label.far) // label.pixels
+            text = (
+                f"{share} % of the label's pixels are left out, as they are not connected with the "
+                "largest region; check label, object_class and gate.jump"
+            )
+            self.report.lines.append(("warning", text))
+            yield Logged(0, "warning", text)
         lower, upper = self.workspace.bounds
         outside = ((found.points.known < lower) | (found.points.known > upper)).any(axis=1).sum()
         if outside:

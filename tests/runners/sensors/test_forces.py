@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
+from chsel.problem.settings import build_settings
 from replay.events import Logged, Probe
+from runners.choices import CONF
 from runners.sensors.force_rig import ForceRig
 from runners.sensors.rig import Annotations, BoxRig, HandRig, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
@@ -197,6 +200,13 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
             ForceRig("/wrench", threshold=threshold)
     with pytest.raises(SettingError, match=r"rig pusher has no sensor; accepted: .*clouds, hand"):
         read(without, replace(RIG, hand=None, forces=()))
+
+
+def test_the_rig_to_start_from_is_read() -> None:
+    values = yaml.safe_load((CONF / "session" / "rig" / "wrist_force.yaml").read_text())
+    rig = build_settings(Rig, values, "session.rig")
+    assert rig.forces == (ForceRig("/wrist/wrench"),)
+    assert rig.hand is not None
 
 
 def test_forces_that_are_not_finite_are_passed_by(tmp_path: Path) -> None:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from PIL import Image
 
 from chsel.errors import SettingError
 from replay.events import Logged, Probe
+from replay.mcap.reader import read_recording
 from runners.display import Display
+from runners.probe import main
 from runners.sensors.gate_rig import GateRig
 from runners.sensors.rig import CloudRig, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
+from tests.runners.in_process import run
 from tests.runners.sensors import sphere_log
 from tests.runners.sensors.small_logs import ros2_cloud, ros2_transform, write_ros2
 from tests.runners.sensors.sphere_log import BEGIN, CENTRE, RADIUS, RIG, SphereLog
+from tests.runners.sensors.test_depth_frame import scene, written
 
 PLAIN_MEMBRANE, PLAIN_SEEN = sphere_log.membrane, sphere_log.seen
 WITHOUT = GateRig(jump=1e6, part=0.0, speckle=0)
@@ -154,6 +161,40 @@ def test_the_table_shows_what_was_left_out(
     output = capsys.readouterr().out
     assert "small" in output
     assert "in regions too small" in " ".join(output.split())
+
+
+def test_counts_stand_in_the_table_the_recording_and_the_summary(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    depth = scene()[0]
+    depth[22:38, 30:45] = 520 + 40 * (np.indices((16, 15)).sum(axis=0) % 2)  # of no surface
+    Image.fromarray(depth).save(tmp_path / "depth.png")
+    trimesh.creation.box((0.15, 0.1, 0.05)).export(tmp_path / "box.ply")
+    done = run(
+        main,
+        "session=sensors",
+        f"session.path={path}",
+        "session/rig=depth_frame",
+        "session.rig.cameras.0.edge=null",
+        "session.object_resolution=0.02",
+        "object=mesh",
+        f"object.path={tmp_path / 'box.ply'}",
+        "method=icp",
+        "recording=mcap",
+        f"logs={tmp_path / 'logs'}",
+    )
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "logs" / "probe").iterdir()
+    counts = json.loads((folder / "summary.json").read_text())["sensors"]["camera"]
+    assert (counts["images"], counts["far"], counts["outline"]) == (1, 0, 600 - 16 * 26)
+    assert counts["small"] == 16 * 13 - 8  # but for those beside the front that are near it
+    recorded = read_recording(folder / "recording.mcap").events(images=False)
+    told = [event.text for event in recorded if isinstance(event, Logged)]
+    label = next(text for text in told if text.startswith("label: "))
+    assert label.endswith("184 at the label's outline, 200 in regions too small")
+    assert any("33 % of the label's pixels are left out" in text for text in told)
+    output = " ".join(done.stdout.split())
+    for text in ("outline small", label, "warning: 33 % of the label's pixels"):
+        assert text in output
 
 
 @pytest.mark.parametrize(
