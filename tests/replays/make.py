@@ -86,6 +86,8 @@ def cases() -> dict[str, list[str]]:
             ]
     for method in _FULL:
         found[f"points_default_{method}"] = ["object=spam_can", f"method={method}", *_FEW]
+    for method in _CHSEL:
+        found[f"points_default_{method}"].append("session.start_probe=3")  # one step, for its size
     points = [*_OF_POINTS, "session.object_resolution=0.01"]
     plane = "method.plane={plane_height: 0.0}"
     return found | {
