@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
@@ -22,6 +23,7 @@ from replay.console import Console, print_error
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.headless import headless_viewer
 from replay.screenshot import save_screenshot
+from runners.reporting.fault_pictures import KINDS
 from runners.reporting.small_picture import animation, small_png
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -70,6 +72,13 @@ def anchored_png(sessions: Sessions) -> bytes:
     return png.read_bytes()
 
 
+def fault_png(sessions: Sessions, *, level: str) -> bytes:
+    """What method=anchored makes of contacts with faults of one level."""
+    folder = sessions.folder / "faults"
+    _run("runners.reporting.fault_pictures", str(folder), "--levels", level)
+    return (folder / f"{level}.png").read_bytes()
+
+
 def robot_log_png(sessions: Sessions) -> bytes:
     """The viewer on the log of a simulated robot."""
     log = sessions.folder / "drill.mcap"
@@ -85,6 +94,7 @@ PICTURES: dict[str, Callable[[Sessions], bytes]] = {
     "replay/session.webp": session_webp,
     "replay/comparison.png": comparison_png,
     "docs/anchored.png": anchored_png,
+    **{f"docs/real_data/{level}.png": partial(fault_png, level=level) for level in KINDS},
     "docs/robot_log.png": robot_log_png,
 }
 """What makes the content of each file."""
