@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError, SettingError, require_choice
-from chsel.methods.anchored.anchored import Anchored, AnchoredSettings
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.noise import FOREIGN
 from chsel.problem.online_registration import OnlineRegistration

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from chsel.methods.anchored.anchored import AnchoredSettings, Effort
+from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from runners.reporting import fault_pictures, panels
 from runners.reporting.fault_pictures import KINDS, faulty_case, picture_of
 from runners.sessions.faults import LEVELS
