@@ -38,6 +38,7 @@ _CONTACTS: Any = {
 }
 _MARGIN = 0.05  # metres around what is in view
 _IN_VIEW = (0.02, 0.98)  # quantiles of the sampled poses' corners
+_LEAST = 0.01  # millimetres: median energies that are told as numbers
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,8 @@ def _figure(
 
 def _label(panel: Axes, stage: Stage, frame: Frame, *, first: bool) -> None:
     median = 1e3 * float(np.median(stage.energies))
-    panel.set_title(f"{len(stage.poses)} {stage.title}\nmedian energy {median:.2g} mm")
+    energy = f"{median:.2g} mm" if median >= _LEAST else f"below {_LEAST:g} mm"
+    panel.set_title(f"{len(stage.poses)} {stage.title}\nmedian energy {energy}")
     panel.set_xlim(frame.lower[0], frame.upper[0])
     panel.set_ylim(frame.lower[1], frame.upper[1])
     panel.set_aspect("equal")

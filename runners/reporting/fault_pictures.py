@@ -98,8 +98,8 @@ def faulty_case(
     if not 0 <= probe < session.count:
         raise SettingError(f"probe is {probe}; accepted: 0 to {session.count - 1}")
     for event in islice(session.probes(), probe + 1):
-        if isinstance(event, Probe):  # as all events of these sessions are
-            online.points.add(event.new_points)
+        assert isinstance(event, Probe)  # as all events of these sessions are
+        online.points.add(event.new_points)
     problem = online.pose(probe)
     contacts, free = problem.points.known, problem.points.free
     if truth is None or len(contacts) == 0:
