@@ -55,7 +55,7 @@ _LARGE -= {
     "drill_svgd",
     "hammer_icp",
 }  # are not stored, as their objects' meshes and grids are large
-_FULL = ("chsel", "chsel_cma_me", "gradient_descent", "cvo", "cvo_no_free_space")
+_FULL = ("chsel", "chsel_cma_me", "gradient_descent", "svgd", "cvo", "cvo_no_free_space")
 _FULL += ("medial_constraint", "medial_constraint_cma_me", "anchored")  # not brief in any other
 
 

@@ -39,7 +39,7 @@ def ball() -> SdfGrid:
 
 
 def test_gradients_of_points_near_a_ball_are_those_of_the_paper(ball: SdfGrid) -> None:
-    settings = CostSettings(lookup="nearest", free_term="interior")
+    settings = CostSettings(-0.01, lookup="nearest", free_term="interior")
     outside, inside = [[0.08, 0.02, 0.0]], [[0.0, 0.02, 0.03]]  # s = 0.03 and -0.02
     free = point_gradients(ball, settings, np.array(outside + inside), "free")
     np.testing.assert_allclose(free, [[0, 0, 0], [0, 0, -20.0 * 0.01]], atol=1e-9)

@@ -174,6 +174,8 @@ class Search:
             self.energy = self.energy.at(self._wide(raised))
         self._settle(found, raised)
         polished = self._polished(self._costed(found).ordered())
+        self._estimate(polished)
+        polished = self._costed(polished.poses).ordered()
         self._show("descend", polished)
         return polished
 

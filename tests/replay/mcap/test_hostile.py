@@ -440,7 +440,7 @@ def test_settings_have_upper_bounds(make: Callable[[], Any], message: str) -> No
 def test_a_spacing_too_fine_for_the_grid_is_refused(events: list[Event]) -> None:
     sdf: SdfGrid = events[0].sdf  # type: ignore[union-attr]
     with pytest.raises(SettingError, match=r"interior_spacing 1e-06 m makes 3\.0e\+15 nodes"):
-        interior_points(sdf, CostSettings(free_term="interior", interior_spacing=1e-6))
+        interior_points(sdf, CostSettings(-0.01, free_term="interior", interior_spacing=1e-6))
 
 
 def test_grids_whose_nodes_cannot_be_told_apart_are_refused(events: list[Event]) -> None:
