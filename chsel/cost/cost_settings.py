@@ -17,8 +17,8 @@ GRADIENTS = ("defined", "exact")
 class CostSettings(CheckedSettings):
     """Settings of the relaxed cost, with the paper's symbols."""
 
-    # alpha, the level that free points may reach, metres; None: half a voxel of free space, or half
-    # of the object's greatest depth where that is less.
+    # alpha, the level that free points may reach, metres; None: a quarter of a voxel of free space,
+    # or half of the object's greatest depth where that is less.
     penetration_tolerance: float | None = None
     free_scale: Annotated[float, not_negative] = 20.0  # lambda
     occupied_scale: Annotated[float, not_negative] = 20.0  # lambda
@@ -62,7 +62,7 @@ class CostSettings(CheckedSettings):
         """The settings with alpha for an object, and free voxels of that side in metres."""
         if self.penetration_tolerance is not None:
             return self
-        return replace(self, penetration_tolerance=-uncertain_depth(sdf, 0.5 * free_resolution))
+        return replace(self, penetration_tolerance=-uncertain_depth(sdf, 0.25 * free_resolution))
 
     @property
     def alpha(self) -> float:
