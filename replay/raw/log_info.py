@@ -228,7 +228,7 @@ class _Gathered:
 
 
 def _indexed(file: RawFile) -> dict[Channel, tuple[int, tuple[int, int]]]:
-    """Counts, and first and last time, by what an index tells of each channel."""
+    """Counts, first and last time of each channel, from an index."""
     found: dict[Channel, tuple[int, tuple[int, int]]] = {}
     spans = file.spans()
     for number, channel in file.catalogue.channels.items():

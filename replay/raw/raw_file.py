@@ -42,7 +42,7 @@ class RawFile:
     catalogue: of its channels, complete where there is an index. counts: of messages by id, where
     the index tells. times: first and last log time, likewise. is_indexed: whether messages come in
     order of their log time; otherwise they come in the file's. index_fault: what is wrong with its
-    index; "" also where it never had one. Raises SessionError for what is no MCAP.
+    index; "" also where it never had one. Raises SessionError if it is not MCAP.
     """
 
     def __init__(self, path: Path) -> None:

@@ -38,7 +38,7 @@ _CONTACTS: Any = {
 }
 _MARGIN = 0.05  # metres around what is in view
 _IN_VIEW = (0.02, 0.98)  # quantiles of the sampled poses' corners
-_LEAST = 0.01  # millimetres: median energies that are told as numbers
+_LEAST = 0.01  # millimetres: below it a median energy is not written as a number
 
 
 @dataclass(frozen=True)

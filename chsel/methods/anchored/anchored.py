@@ -167,9 +167,7 @@ class Search:
                 raised += 1
                 self.energy = self.energy.at(self._wide(raised))
                 continue
-            if spent >= effort.evaluations or not (
-                index == 0 or self._new_modes(before, descended)
-            ):
+            if spent >= effort.evaluations or (index and not self._new_modes(before, descended)):
                 break
             self.energy = self.energy.at(self._wide(raised))
         self._settle(found, raised)
@@ -221,7 +219,7 @@ class Search:
         rated = [RatedPoses(found, energy.of(found)).ordered() for energy in levels]
         least = [float(one.energies[0]) for one in rated]
         most = _AS_WELL * least[-1] + self._settings.noise
-        chosen = next(n for n, energy in enumerate(least) if energy <= most or n == raised)
+        chosen = next(n for n, value in enumerate(least) if value <= most or n == raised)
         self.energy = levels[chosen]
         self._estimate(rated[chosen])
 

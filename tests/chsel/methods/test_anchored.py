@@ -307,6 +307,12 @@ def test_updates_on_the_same_points_never_lose_the_best() -> None:
     assert (np.diff(lowest) <= 1e-12).all()
 
 
+def test_stages_that_do_nothing_are_left_out() -> None:
+    effort = replace(EFFORT, first_steps=0, steps=0, descent_moves=0, moves=0, polished=0)
+    method = anchored(effort)
+    registered(method, posed(method))
+
+
 def test_a_limit_below_the_best_still_gives_hypotheses() -> None:
     method = anchored(limit_noise=0.0, limit_ratio=0.5, limit_slack=0.0)
     registered(method, posed(method))
