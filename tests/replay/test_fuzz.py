@@ -12,7 +12,8 @@ from replay.events import Event
 from replay.mcap.reader import read_recording
 from replay.verification import verify
 from tests.replay.conftest import same_bits
-from tests.replay.fuzz import Original, Tally, main, originals, peak_memory, quiet, run_case
+from tests.tools.fuzz_recordings import Original, main, originals, run_case
+from tests.tools.fuzzing import Tally, peak_memory, quiet
 
 CASES = 500  # of each of six blocks
 SEED = 20

@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 
 from replay.__main__ import main
 from replay.mcap.reader import read_recording
-from tests.replay.kill import PROBES, points_session, reported_probes
+from tests.tools.kill_sessions import PROBES, points_session, reported_probes
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 SEEDS = (1, 2)  # one for each of two processes
@@ -25,7 +25,7 @@ KILLS = 105  # in each
 
 def test_every_reported_probe_survives_hundreds_of_kills() -> None:
     """In processes of their own: a fork needs one without the threads of other tests."""
-    command = [sys.executable, "-m", "tests.replay.kill", "--count", str(KILLS), "--seed"]
+    command = [sys.executable, "-m", "tests.tools.kill_sessions", "--count", str(KILLS), "--seed"]
     running = [
         subprocess.Popen(
             [*command, str(seed)],

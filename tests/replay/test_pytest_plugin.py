@@ -13,7 +13,7 @@ import pytest
 from chsel.problem.settings import settings_mapping
 from replay.events import Event, HypothesesFound
 from replay.mcap.reader import read_recording
-from tests.replay.small_recordings import measured_again
+from tests.tools.small_recordings import measured_again
 
 pytest_plugins = ["pytester"]
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"

@@ -14,7 +14,7 @@ from replay.blessing import write_blessed
 from replay.events import RigDescribed, SensorImage
 from replay.mcap.reader import read_recording
 from tests.replay.conftest import same_bits
-from tests.replay.small_recordings import robot_session, write_recording
+from tests.tools.small_recordings import robot_session, write_recording
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from replay.mcap.schemas import RECORDS
 from replay.measured import _close
 from replay.recording_info import recording_digest, recording_info
 from replay.verification import DIFFERS, EQUAL, verify
-from tests.replay.mutations import (
+from tests.tools.mutations import (
     changed_messages,
     file_of,
     joined,
@@ -33,8 +33,8 @@ from tests.replay.mutations import (
     topics_of,
     unpacked,
 )
-from tests.replay.seals import reseal_file
-from tests.replay.small_recordings import registered_session, robot_session, write_recording
+from tests.tools.seals import reseal_file
+from tests.tools.small_recordings import registered_session, robot_session, write_recording
 
 Change = Callable[[str, bytes], bytes | None]
 

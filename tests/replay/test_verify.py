@@ -18,7 +18,7 @@ from replay.file_verification import verified_files
 from replay.mcap.reader import read_recording
 from replay.registration import recorded_method
 from replay.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verify
-from tests.replay.small_recordings import measured_again
+from tests.tools.small_recordings import measured_again
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 DESCENT = REPLAYS / "cracker_box_gradient_descent.mcap"

@@ -19,7 +19,7 @@ from replay.mcap.reader import Recording, read_recording
 from replay.recorder import NullRecorder
 from runners.pictures import CheckedPictures
 from runners.recording import RecordingConfig, open_recorder
-from tests.replay.kill import points_session, reported_probes
+from tests.tools.kill_sessions import points_session, reported_probes
 
 PROBES = 6
 TIMEOUT = 120

@@ -42,8 +42,8 @@ from replay.mcap.plain_config import DEEPEST, config_from_json, config_to_json
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import RECORDS, message_class
 from replay.mcap.writer import McapRecorder
-from tests.replay.mutations import file_of, joined, packed, split, unpacked
-from tests.replay.seals import resealed
+from tests.tools.mutations import file_of, joined, packed, split, unpacked
+from tests.tools.seals import resealed
 
 Records = list[tuple[int, bytes]]
 Change = Callable[[Records], None]

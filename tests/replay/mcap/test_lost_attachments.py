@@ -17,7 +17,7 @@ from replay.mcap.reader import read_recording
 from replay.mcap.recovery import Recovered, recover
 from replay.verification import EQUAL, verify
 from tests.replay.conftest import same_bits
-from tests.replay.small_recordings import registered_session, write_recording
+from tests.tools.small_recordings import registered_session, write_recording
 
 HOW_MADE = {"object_resolution": 0.02, "object_padding": 0.03}  # as `registered_session` does it
 STORED = Path(__file__).parents[2] / "replays" / "points_exact_descent.mcap"

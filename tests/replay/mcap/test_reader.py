@@ -25,7 +25,7 @@ from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SnapshotT
 from replay.mcap.encoding import decode, encode
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS, message_class
-from tests.replay.seals import reseal_file
+from tests.tools.seals import reseal_file
 
 Change = Callable[[str, bytes], bytes | None]
 

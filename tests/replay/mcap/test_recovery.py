@@ -30,8 +30,8 @@ from replay.mcap.recovery import Recovered, recover, tells_loss
 from replay.mcap.whole_records import WholeRecords
 from replay.mcap.writer import McapRecorder
 from replay.verification import EQUAL, NO_RESULT, verify
-from tests.replay.kill import PROBES, quick_session
-from tests.replay.mutations import joined, packed, split, unpacked
+from tests.tools.kill_sessions import PROBES, quick_session
+from tests.tools.mutations import joined, packed, split, unpacked
 
 PAGE = 4096
 Same = Callable[[object, object], None]

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from tests.runners.sensors.fuzz_logs import originals, run_case
-from tests.runners.sensors.fuzzing import Tally
+from tests.tools.fuzz_logs import originals, run_case
+from tests.tools.fuzzing import Tally
 
 CASES = 160
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from tests.runners.sensors.fuzz_sessions import run_case, whole_log
-from tests.runners.sensors.fuzzing import Tally
+from tests.tools.fuzz_sessions import run_case, whole_log
+from tests.tools.fuzzing import Tally
 
 CASES = 16
 

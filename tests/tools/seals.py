@@ -17,7 +17,7 @@ from replay.mcap.chunk_records import DAMAGE
 from replay.mcap.encoding import decode, encode
 from replay.mcap.schemas import STEP_TIME
 from replay.mcap.seal import CONTENTS, SEAL, Chain
-from tests.replay.mutations import Record, file_of, joined, packed, split, unpacked
+from tests.tools.mutations import Record, file_of, joined, packed, split, unpacked
 
 _HEAD = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
 _MALFORMED = (*DAMAGE, ChselError, KeyError)

@@ -1,4 +1,4 @@
-"""`python -m tests.replay.kill --count N --seed S`: kills sessions at random moments, and recovers.
+"""`python -m tests.tools.kill_sessions --count N --seed S`: kills sessions, and recovers them.
 
 Each session runs in a fork of this process, where all is imported and compiled, through the code
 of `runners.probe`, and says on a pipe what its display says. At a random moment it gets SIGKILL.
@@ -245,7 +245,7 @@ def _count_of_reported(events: list[Event], reported: int) -> int:
 
 def main() -> None:
     """Kill, and print the figures."""
-    parser = argparse.ArgumentParser(prog="tests.replay.kill", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()

@@ -1,4 +1,4 @@
-"""`python -m tests.replay.fuzz --cases N --seed S`: changed recordings, and what reading them does.
+"""`python -m tests.tools.fuzz_recordings --cases N --seed S`: changed recordings, and reading them.
 
 Every case must end in one clear RecordingError, in a reading equal to the original, or in a verdict
 that is right: "equal" only if registering the problem that was read gives the result that was read.
@@ -6,20 +6,13 @@ that is right: "equal" only if registering the problem that was read gives the r
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import faulthandler
 import re
-import resource
 import struct
 import sys
-import tempfile
 import time
-import traceback
-import warnings
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +25,10 @@ from replay.recording_info import recording_info
 from replay.registration import recorded_method
 from replay.verification import DIFFERS, EQUAL, Verdict, verify
 from tests.replay.conftest import same_bits
-from tests.replay.mutations import LAYERS, Random, file_of, meaning, split
-from tests.replay.seals import resealed
-from tests.replay.small_recordings import (
+from tests.tools.fuzzing import Tally, WrongOutcome, run_cases
+from tests.tools.mutations import LAYERS, Random, file_of, meaning, split
+from tests.tools.seals import resealed
+from tests.tools.small_recordings import (
     METHODS,
     registered_session,
     robot_session,
@@ -45,11 +39,6 @@ MEANING = "meaning"
 SHARES = {"raw": 0.2, "records": 0.2, "messages": 0.25, "tampered": 0.1, MEANING: 0.25}
 RESEALED = {"records": 0.5, "messages": 1.0}  # how often the seals of a changed file are right
 HANGS_AFTER = 60.0  # seconds of one case: the process ends with a traceback
-_WARM = 200  # cases after which memory should grow no more
-
-
-class WrongOutcome(Exception):
-    """A case ended in another way than it may."""
 
 
 @dataclass
@@ -59,16 +48,6 @@ class Original:
     name: str
     data: bytes
     events: list[Event]
-
-
-@dataclass
-class Tally:
-    """What the cases came to."""
-
-    outcomes: Counter[str] = field(default_factory=Counter)
-    errors: Counter[str] = field(default_factory=Counter)
-    slowest: float = 0.0
-    slowest_case: int = -1
 
 
 def originals(folder: Path) -> list[Original]:
@@ -102,10 +81,8 @@ def run_case(index: int, seed: int, whole: Sequence[Original], folder: Path, tal
             judge_partial(path, original, prefix=layer in ("raw", "records"))
         elif index % 3 == 1:
             ask(path, folder / f"{original.name}.mcap", outcome)
-    seconds = time.perf_counter() - begun
     tally.outcomes[f"{layer}: {outcome}"] += 1
-    if seconds > tally.slowest:
-        tally.slowest, tally.slowest_case = seconds, index
+    tally.timed(index, time.perf_counter() - begun)
 
 
 def changed(original: Original, layer: str, path: Path, random: Random) -> bytes | None:
@@ -225,69 +202,14 @@ def _check_message(error: RecordingError, path: Path) -> None:
         raise WrongOutcome(f"an error is not one line that names the file: {text!r}")
 
 
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Without the warnings that absurd numbers cause."""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        yield
-
-
-def peak_memory() -> float:
-    """Most megabytes that this process has held."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run cases, and print what they came to; 1 if any ended otherwise than it may."""
-    parser = argparse.ArgumentParser(prog="tests.replay.fuzz", description=__doc__)
-    parser.add_argument("--cases", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--first", type=int, default=0, help="index of the first case")
-    parser.add_argument("--keep", type=Path, help="folder for files of cases that went wrong")
-    given = parser.parse_args(arguments)
-    tally, wrong = Tally(), 0
-    with tempfile.TemporaryDirectory() as name, quiet():
-        folder = Path(name)
+
+    def prepare(folder: Path, tally: Tally) -> Callable[[int, int], None]:
         whole = originals(folder)
-        before = 0.0
-        begun = time.perf_counter()
-        for index in range(given.first, given.first + given.cases):
-            faulthandler.dump_traceback_later(HANGS_AFTER, exit=True, file=sys.__stderr__)
-            try:
-                run_case(index, given.seed, whole, folder, tally)
-            except Exception as error:
-                wrong += 1
-                where = traceback.extract_tb(error.__traceback__)[-1]
-                place = f"{Path(where.filename).name}:{where.lineno}"
-                print(f"case {index}: {type(error).__name__}: {error} ({place})"[:500], flush=True)
-                _keep(folder, given.keep, index)
-            done = index - given.first + 1
-            if done == min(_WARM, given.cases):
-                before = peak_memory()
-            if done % 1000 == 0 and sys.stderr.isatty():
-                print(f"\r{done} of {given.cases} cases", end="", file=sys.stderr)
-        faulthandler.cancel_dump_traceback_later()
-        seconds = time.perf_counter() - begun
-    _print_table(tally, given.cases, seconds, wrong, peak_memory() - before)
-    return 1 if wrong else 0
+        return lambda index, seed: run_case(index, seed, whole, folder, tally)
 
-
-def _keep(folder: Path, kept: Path | None, index: int) -> None:
-    case = folder / "case.mcap"
-    if kept is not None and case.exists():
-        kept.mkdir(parents=True, exist_ok=True)
-        (kept / f"{index}.mcap").write_bytes(case.read_bytes())
-
-
-def _print_table(tally: Tally, cases: int, seconds: float, wrong: int, grown: float) -> None:
-    print(f"\n{cases} cases in {seconds:.0f} s, {cases / seconds:.0f} a second; {wrong} wrong")
-    print(f"slowest: case {tally.slowest_case}, {tally.slowest:.2f} s")
-    print(f"memory: {peak_memory():.0f} MB at most, {grown:.0f} MB more than after {_WARM} cases")
-    for title, counts in (("outcomes", tally.outcomes), ("errors", tally.errors)):
-        print(f"\n{title}")
-        for text, count in counts.most_common(60):
-            print(f"{count:8}  {text}")
+    return run_cases(__doc__, arguments, prepare, cases=10_000, hangs_after=HANGS_AFTER)
 
 
 if __name__ == "__main__":

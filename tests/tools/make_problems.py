@@ -1,9 +1,11 @@
-"""Makes problems.npz: `python -m tests.determinism.make_problems`. New problems need new digests.
+"""Makes problems.npz: `python -m tests.tools.make_problems`. New problems need new digests.
 
 The numbers are stored because a mesh's signed distance, or a sine, may differ by machine.
 """
 
 from __future__ import annotations
+
+import argparse
 
 import numpy as np
 
@@ -97,6 +99,7 @@ def points(name: str, world_from_object: FloatArray, contacts: int) -> dict[str,
 
 def main() -> None:
     """Write the file."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     parts = {
         **{f"grid/{name}": grid(name) for name in BODIES},
         "points/bracket": points("bracket", TILT, 20),

@@ -1,4 +1,4 @@
-"""`python -m tests.runners.sensors.fuzz_sessions --cases N --seed S`: sessions of changed logs.
+"""`python -m tests.tools.fuzz_sessions --cases N --seed S`: sessions of changed logs.
 
 Messages, bytes and rigs are changed. Every case must end in events whose values are finite and
 inside the workspace, or in one line of a ChselError, within seconds and bounded memory.
@@ -26,20 +26,15 @@ from runners.sensors.gate_rig import GateRig
 from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, ProbeTimes, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from runners.twin.log_writer import LogWriter
-from tests.replay.fuzz import peak_memory
-from tests.replay.mutations import Random, raw
-from tests.runners.sensors.fuzzing import Tally, run_cases
 from tests.runners.sensors.sphere_log import BEGIN, RIG, SECOND, SphereLog
+from tests.tools.fuzzing import Tally, WrongOutcome, peak_memory, run_cases
+from tests.tools.mutations import Random, raw
 
 HANGS_AFTER = 10.0  # seconds of one case: the process ends with a traceback
 SLOWEST = 8.0  # seconds
 MOST_MEMORY = 1024  # MB above that of the first case
 _TIMES = (1, 10**6, 10**8, SECOND, 20 * SECOND, 10**14, 2**62)  # ns
 _NUMBERS = (0.0, -1.0, 1e-300, 1e-3, 0.5, 1.0, 3.0, 1e6, 1e300, np.nan, np.inf, -np.inf)
-
-
-class WrongOutcome(Exception):
-    """A case ended in another way than it may."""
 
 
 @dataclass
@@ -108,8 +103,7 @@ def run_case(index: int, seed: int, whole: Sequence[Message], folder: Path, tall
         raise WrongOutcome(f"{', '.join(changes)}: {error}") from error
     tally.outcomes[outcome] += 1
     seconds = time.perf_counter() - begun
-    if seconds > tally.slowest:
-        tally.slowest, tally.slowest_case = seconds, index
+    tally.timed(index, seconds)
     if seconds > SLOWEST:
         raise WrongOutcome(f"{', '.join(changes)}: it took {seconds:.1f} s")
     tally.memory = tally.memory or peak_memory()
@@ -463,8 +457,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         whole = whole_log()
         return lambda index, seed: run_case(index, seed, whole, folder, tally)
 
-    name = "tests.runners.sensors.fuzz_sessions"
-    return run_cases(name, arguments, prepare, cases=1000, hangs_after=HANGS_AFTER)
+    return run_cases(__doc__, arguments, prepare, cases=1000, hangs_after=HANGS_AFTER)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from chsel.problem.points import KnownPoints
 from replay.events import Event, Probe, ProblemPosed, SessionStarted
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.schemas import RECORDS, message_class
-from tests.replay.small_recordings import write_recording
+from tests.tools.small_recordings import write_recording
 
 Random = np.random.Generator
 Record = tuple[int, bytes]  # opcode, content

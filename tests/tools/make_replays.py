@@ -1,4 +1,4 @@
-"""Makes stored replays: `python -m tests.replays.make [NAME ...]`, of today's code.
+"""Makes stored replays: `python -m tests.tools.make_replays [NAME ...]`, of today's code.
 
 Existing files stay as they are, as the bits that later code must give; to accept new bits, use
 `python -m replay bless`. Needs PyBullet for simulated sessions.
@@ -23,7 +23,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import PRESETS
 from runners.objects.loader import ObjectConfig, load_object
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).parents[1] / "replays"
 MOST_BYTES = 2**20
 _POINTS = "points.npz"
 _BRIEF = ["recording=mcap", "recording.snapshot_interval=0"]

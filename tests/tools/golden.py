@@ -1,4 +1,4 @@
-"""The golden digests: `python -m tests.determinism.golden [--write] [--all]`.
+"""The golden digests: `python -m tests.tools.golden [--write] [--all]`.
 
 Without options: what differs from golden.json here. --write: make it anew, and say what changed.
 --all: compare every setting of the matrix, and say which libraries each setting changes.

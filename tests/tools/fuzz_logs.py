@@ -1,4 +1,4 @@
-"""`python -m tests.runners.sensors.fuzz_logs --cases N --seed S`: changed logs, and reading them.
+"""`python -m tests.tools.fuzz_logs --cases N --seed S`: changed logs, and reading them.
 
 Every case must end in one clear SessionError or in messages that are well formed, all else counted
 in faults; where checksums tell, no message may say what the original did not.
@@ -32,18 +32,14 @@ from runners.sensors.messages import (
 )
 from runners.sensors.rig import ClockRig
 from runners.sensors.transforms import TransformError, TransformTree
-from tests.replay.fuzz import HANGS_AFTER
-from tests.replay.mutations import Random, file_of, joined, packed, raw, records, split, unpacked
-from tests.runners.sensors.fuzzing import Tally, run_cases
 from tests.runners.sensors.small_logs import foxglove_sent, ros2_sent, write_foxglove, write_ros2
+from tests.tools.fuzzing import Tally, WrongOutcome, run_cases
+from tests.tools.mutations import Random, file_of, joined, packed, raw, records, split, unpacked
 
+HANGS_AFTER = 60.0  # seconds of one case: the process ends with a traceback
 LAYERS = ("raw", "cut", "records", "messages")
 _MESSAGE_HEAD = 22  # bytes
 _MOST_FAULTS = 401
-
-
-class WrongOutcome(Exception):
-    """A case ended in another way than it may."""
 
 
 @dataclass
@@ -77,9 +73,7 @@ def run_case(index: int, seed: int, whole: Sequence[Original], folder: Path, tal
     path.write_bytes(changed(original.data, layer, random))
     begun = time.perf_counter()
     tally.outcomes[f"{layer}: {judge(path, original, layer)}"] += 1
-    seconds = time.perf_counter() - begun
-    if seconds > tally.slowest:
-        tally.slowest, tally.slowest_case = seconds, index
+    tally.timed(index, time.perf_counter() - begun)
 
 
 def changed(data: bytes, layer: str, random: Random) -> bytes:
@@ -208,8 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         whole = originals(folder)
         return lambda index, seed: run_case(index, seed, whole, folder, tally)
 
-    name = "tests.runners.sensors.fuzz_logs"
-    return run_cases(name, arguments, prepare, cases=5000, hangs_after=HANGS_AFTER)
+    return run_cases(__doc__, arguments, prepare, cases=5000, hangs_after=HANGS_AFTER)
 
 
 if __name__ == "__main__":
