@@ -19,7 +19,7 @@ from rich.table import Table
 from chsel.errors import InputWarning
 from chsel.problem.registration_problem import Trust
 from replay.console import Console, Progress, TextColumn
-from runners.sensors.tally import Report, Tally
+from runners.sensors.session_report import Report, Tally
 from runners.step_warning import FROM_SESSION, StepWarning
 
 MEANINGS = {

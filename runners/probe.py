@@ -40,7 +40,7 @@ from runners.recording import (
     open_recorder,
     write_in_run_folder,
 )
-from runners.sensors.tally import Report
+from runners.sensors.session_report import Report
 from runners.session_run import Row, SessionRun
 from runners.sessions import open_session, session_settings
 from runners.sessions.depth_frame import DepthFrameSession

@@ -19,9 +19,9 @@ from replay.console import Console, Progress, TextColumn
 from runners.cli import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
-from runners.twin.configurations import CabinetConfiguration, find_cabinet_configuration
-from runners.twin.settings import TwinSettings
-from runners.twin.simulation import Push, SimulatedLog, probe_count, simulate_log
+from runners.simulated_robot.configurations import CabinetConfiguration, find_cabinet_configuration
+from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
 from runners.whole_file import WritingError, whole_file
 
 EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here

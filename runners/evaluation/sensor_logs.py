@@ -12,8 +12,8 @@ from chsel.problem.poses import compose, roll_pitch_yaw
 from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
-from runners.twin.configurations import CABINET_CONFIGURATIONS
-from runners.twin.settings import TwinSettings
+from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS
+from runners.simulated_robot.settings import TwinSettings
 
 TRUTH = ".truth.yaml"
 _POSITION_STEP = 0.01  # metres: about as well as a person sets a pose by hand
@@ -40,7 +40,7 @@ def ensure_log(plan: Plan, trial: Trial) -> Path:
     log = trial.log(plan)
     if not is_missing(plan, trial):
         return log
-    from runners.twin.simulation import simulate_log  # imports the physics engine
+    from runners.simulated_robot.simulation import simulate_log  # imports the physics engine
 
     log.parent.mkdir(parents=True, exist_ok=True)
     model = load_object(plan.object_config(trial.configuration), plan.assets)

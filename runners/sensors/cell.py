@@ -13,10 +13,9 @@ from scipy.spatial import cKDTree
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import Workspace
 from chsel.sensing.free_space import FreeGrid
-from runners.sensors.gate_rig import GateRig
-from runners.sensors.remarks import Remarks
-from runners.sensors.tally import Tally
-from runners.sensors.transforms import TransformError, TransformTree
+from runners.sensors.log.transforms import TransformError, TransformTree
+from runners.sensors.rig import GateRig
+from runners.sensors.session_report import Remarks, Tally
 
 _NONE = np.zeros((0, 3))
 

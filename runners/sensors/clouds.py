@@ -9,9 +9,9 @@ from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
 from chsel.sensing.regions import main_regions, point_regions
 from runners.sensors.cell import Cell
-from runners.sensors.messages import CloudMessage
+from runners.sensors.log.messages import CloudMessage
 from runners.sensors.rig import CloudRig
-from runners.sensors.tally import Tally
+from runners.sensors.session_report import Tally
 
 FARTHEST = 100.0  # m: no robot that probes an object measures rays of this length
 

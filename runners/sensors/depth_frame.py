@@ -15,7 +15,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray, frozen
 from chsel.problem.file_checks import refuse_special_file
 from chsel.problem.poses import nearest_rigid
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.sensors.image_file import read_image
+from runners.sensors.log.image_file import read_image
 
 SUFFIXES = (".yaml", ".yml")
 MOST_BYTES = 2**16

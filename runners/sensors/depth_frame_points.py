@@ -18,7 +18,7 @@ from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.regions import depth_regions, main_regions, speckle_free
 from runners.sensors.depth_frame import DepthFrame
 from runners.sensors.rig import CameraRig, Rig
-from runners.sensors.tally import Tally
+from runners.sensors.session_report import Tally
 
 LABEL_MARGIN = 2  # pixels: by so much a label's outline may be off the depth image's
 

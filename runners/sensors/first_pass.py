@@ -1,84 +1,137 @@
-"""What a first pass over a log gathers."""
+"""The first pass over a log: all that is small, and whether the rig fits."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-from runners.sensors.clocks import Clocks
-from runners.sensors.log import RawLog
-from runners.sensors.messages import (
-    CameraInfoMessage,
-    CloudMessage,
-    ImageMessage,
-    MarkerMessage,
-    Received,
-    WrenchMessage,
-)
-from runners.sensors.movements import Movements
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.sensing.depth_camera import PinholeCamera
+from runners.sensors.log.clocks import ClockCorrection
+from runners.sensors.log.messages import ImageMessage, MarkerMessage
+from runners.sensors.log.motion import JointHistory, Movements
+from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed_windows, whole_log
+from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.transforms import TransformTree
+from runners.sensors.log_checks import LogChecks, named_topics, require_topics, transform_topics
+from runners.sensors.log_scan import FirstPass
+from runners.sensors.pad import membrane_reference
 from runners.sensors.rig import Rig
-from runners.sensors.sightings import Sightings
-from runners.sensors.unit_check import UnitCheck
+from runners.sensors.session_report import Remarks
 
-_MOST_MARKERS = 1_000_000
-_MOST_BYTES = 2**28  # of images that references are made of
+Progress = Callable[[int, int], None]
 
 
-class FirstPass:
-    """All that is small, and of what is large when it came.
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What is known of a log before its images are read.
 
-    infos: by topic, the first; changed_infos: how many others there were. sightings: by the topics
-    of images, clouds and forces. units: a check by the name of a sensor. first_images: by a pad's
-    topic.
+    transform_times (T,): nanoseconds, ascending. cameras, references: by the names of sensors, the
+    latter (H, W) in metres of the untouched membranes of pads. bulky: topics for the second pass.
     """
 
-    def __init__(self, rig: Rig, joint_names: Sequence[str]) -> None:
-        self.rig = rig
-        self.moving = Movements(rig, joint_names)
-        self.clocks = Clocks(rig.clock)
-        self.infos: dict[str, CameraInfoMessage] = {}
-        self.changed_infos: dict[str, int] = {}
-        self.markers: list[Received] = []
-        sensors = rig.sensors
-        self.sightings = {sensor.depth: Sightings(sensor.depth) for sensor in sensors}
-        self.units = {sensor.name: UnitCheck(sensor) for sensor in sensors}
-        self.first_images: dict[str, list[Received]] = {pad.depth: [] for pad in rig.bubbles}
-        self._images = {sensor.depth for sensor in sensors}
-        self._others = [
-            *(cloud.topic for cloud in rig.clouds),
-            *(part.topic for part in rig.forces),
+    tree: TransformTree
+    transform_times: IntArray
+    joints: JointHistory
+    clocks: ClockCorrection
+    windows: list[ProbeWindow]
+    cameras: dict[str, PinholeCamera]
+    references: dict[str, FloatArray]
+    bulky: tuple[str, ...]
+
+
+def survey_log(
+    log: RawLog, rig: Rig, joint_names: Sequence[str], remarks: Remarks, progress: Progress
+) -> Survey:
+    """Look through a log. joint_names: of the joints that move the hand.
+
+    Raises SessionError if topics, camera infos or transforms are missing, or depths are no depths.
+    """
+    require_topics(log, rig)
+    seen = FirstPass(rig, joint_names)
+    topics = {*named_topics(rig), *transform_topics(log)}
+    seen.read(log, topics, progress)
+    clocks = seen.clocks.correction()
+    moving = Movements(rig, joint_names)
+    if seen.moving.differs(clocks):
+        again = {topic for topic in topics if topic in seen.moving.topics}
+        for received in log.messages(again, progress=progress):
+            moving.add(received, clocks.time(received))
+    else:
+        moving = seen.moving
+    for text in (*log.remarks, *clocks.remarks):
+        remarks.warn(text)
+    for text, count in moving.tree.faults.items():
+        remarks.warn(text, count)
+    checks = LogChecks(log, rig, seen, moving, clocks, remarks)
+    checks.sensors()
+    windows = _windows(log, rig, seen, clocks, checks.times, remarks)
+    cameras = checks.cameras()
+    return Survey(
+        tree=moving.tree,
+        transform_times=moving.times(),
+        joints=moving.joints,
+        clocks=clocks,
+        windows=windows,
+        cameras=cameras,
+        references=_references(log, rig, seen, cameras, windows, clocks, remarks),
+        bulky=tuple(seen.sightings),
+    )
+
+
+def _windows(
+    log: RawLog,
+    rig: Rig,
+    seen: FirstPass,
+    clocks: ClockCorrection,
+    times: dict[str, IntArray],
+    remarks: Remarks,
+) -> list[ProbeWindow]:
+    """The probes of the log; all of it is one if nothing tells them apart."""
+    begin = log.begin + clocks.typical
+    first = min([begin, *(int(of[0]) for of in times.values())])
+    last = max([log.end + clocks.typical, *(int(of[-1]) for of in times.values())])
+    if rig.probes is not None:
+        windows = timed_windows(rig.probes, begin, last, remarks)
+        return windows or whole_log(first, last)
+    if rig.markers:
+        markers = [
+            (clocks.time(received), received.content.text)
+            for received in seen.markers
+            if isinstance(received.content, MarkerMessage)
         ]
-        self.sightings |= {topic: Sightings(topic) for topic in self._others}
-        self._infos = {sensor.info for sensor in sensors}
-        self._held = 0
+        windows = marked_windows(markers, first, last, remarks)
+        if windows:
+            return windows
+        remarks.warn(f"topic {rig.markers} marks no probe: the whole log is one")
+    return whole_log(first, last)
 
-    def read(self, log: RawLog, topics: set[str], progress: Callable[[int, int], None]) -> None:
-        """Go through the log once."""
-        for received in log.messages(topics, progress=progress):
-            self.clocks.add(received)
-            self.moving.add(received, received.stamp or received.log_time)
-            topic, content = received.topic, received.content
-            if isinstance(content, ImageMessage) and topic in self._images:
-                self._see(received, content)
-            elif isinstance(content, CloudMessage | WrenchMessage) and topic in self._others:
-                self.sightings[topic].add(received, content)
-            elif isinstance(content, CameraInfoMessage) and topic in self._infos:
-                if self.infos.setdefault(topic, content) != content:
-                    self.changed_infos[topic] = self.changed_infos.get(topic, 0) + 1
-            elif (
-                isinstance(content, MarkerMessage)
-                and topic == self.rig.markers
-                and len(self.markers) < _MOST_MARKERS
-            ):
-                self.markers.append(received)
 
-    def _see(self, received: Received, content: ImageMessage) -> None:
-        topic = received.topic
-        self.sightings[topic].add(received, content)
-        for sensor in self.rig.sensors:
-            if sensor.depth == topic:
-                self.units[sensor.name].add(content.values)
-        first = self.first_images.get(topic)
-        if first is not None and len(first) < self.rig.contact.reference_images:
-            self._held += content.values.nbytes
-            if self._held <= _MOST_BYTES:
-                first.append(received)
+def _references(
+    log: RawLog,
+    rig: Rig,
+    seen: FirstPass,
+    cameras: dict[str, PinholeCamera],
+    windows: list[ProbeWindow],
+    clocks: ClockCorrection,
+    remarks: Remarks,
+) -> dict[str, FloatArray]:
+    """Depth images of the untouched membranes, by the names of pads."""
+    references = {}
+    for pad in rig.bubbles:
+        camera, first = cameras[pad.name], seen.first_images[pad.depth]
+        size = (camera.height, camera.width)
+        fitting = [
+            (clocks.time(received), received.content.values)
+            for received in first
+            if isinstance(received.content, ImageMessage) and received.content.values.shape == size
+        ]
+        untouched = [values for time, values in fitting if time < windows[0].begin]
+        if pad.reference is None and pad.kind == "depth" and not untouched:
+            untouched = [values for _, values in fitting]
+            remarks.warn(
+                f"{pad.name}: no image before the first probe; its reference is made of the first "
+                f"{len(untouched)} of the probe"
+            )
+        references[pad.name] = membrane_reference(pad, untouched, camera, log.path.parent)
+    return references

@@ -15,12 +15,11 @@ from chsel.problem.poses import apply, inverse, rotated
 from chsel.sensing.force_contact import contact_ahead, contact_on_axis
 from runners.sensors.cell import Cell
 from runners.sensors.contacts import Contacts
-from runners.sensors.force_rig import ForceRig
 from runners.sensors.hand import HandModel
-from runners.sensors.joint_history import JointHistory
-from runners.sensors.messages import WrenchMessage
-from runners.sensors.rig import HandRig
-from runners.sensors.tally import Tally
+from runners.sensors.log.messages import WrenchMessage
+from runners.sensors.log.motion import JointHistory
+from runners.sensors.rig import ForceRig, HandRig
+from runners.sensors.session_report import Tally
 
 _MOST_KEPT = 50  # samples of a probe, the strongest
 _MOST_TARED = 4096  # samples

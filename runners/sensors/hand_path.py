@@ -12,12 +12,12 @@ from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse
 from chsel.sensing.swept import between, interior_lattice
 from runners.sensors.cell import Cell
+from runners.sensors.contacts import PushEnd
 from runners.sensors.hand import HandModel
-from runners.sensors.joint_history import JointHistory
-from runners.sensors.push_end import PushEnd
+from runners.sensors.log.motion import JointHistory
+from runners.sensors.log.probe_windows import ProbeWindow
 from runners.sensors.rig import HandRig
-from runners.sensors.tally import Tally
-from runners.sensors.windows import ProbeWindow
+from runners.sensors.session_report import Tally
 
 if TYPE_CHECKING:
     import trimesh

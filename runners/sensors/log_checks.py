@@ -5,14 +5,13 @@ from __future__ import annotations
 from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import IntArray
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.sensors.clocks import ClockCorrection
-from runners.sensors.first_pass import FirstPass
-from runners.sensors.log import RawLog
-from runners.sensors.movements import Movements
-from runners.sensors.remarks import Remarks
+from runners.sensors.log.clocks import ClockCorrection
+from runners.sensors.log.motion import Movements
+from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.transforms import TransformError
+from runners.sensors.log_scan import FirstPass, missing_images
 from runners.sensors.rig import Rig
-from runners.sensors.sightings import missing_images
-from runners.sensors.transforms import TransformError
+from runners.sensors.session_report import Remarks
 
 _TRANSFORMS = ("TFMessage", "TransformStamped", "FrameTransform", "FrameTransforms")
 

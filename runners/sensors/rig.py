@@ -1,4 +1,4 @@
-"""A rig: which topics, frames and thresholds turn a raw log into known points."""
+"""A rig: which topics, frames and thresholds turn a robot's log into known points."""
 
 from __future__ import annotations
 
@@ -7,8 +7,79 @@ from dataclasses import dataclass, field
 from chsel.errors import SettingError, require_at_most, require_choice, require_positive
 from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
-from runners.sensors.force_rig import ForceRig
-from runners.sensors.gate_rig import GateRig
+
+_MOST = 1_000_000  # pixels, metres, shares
+
+
+@dataclass(frozen=True)
+class GateRig:
+    """When pixels and points are connected, and which of their regions are left out."""
+
+    jump: float = 0.01
+    """Neighbouring pixels are connected unless their depths differ by more than this share of the
+    depth, besides what a surface inclined by up to 76 degrees explains."""
+
+    gap: float = 0.02
+    """Points of clouds are connected up to this distance, metres, or up to four times the typical
+    distance between neighbours where that is more."""
+
+    part: float = 0.05
+    """Of an object, regions with fewer pixels or points than this share of the largest are left
+    out; 0: none is for its size."""
+
+    speckle: int = 100
+    """Where fewer pixels than this are connected, a camera's rays are free up to the least depth
+    around them alone; 0: nowhere."""
+
+    def __post_init__(self) -> None:
+        for name in ("jump", "gap"):
+            require_positive(name, getattr(self, name))
+            require_at_most(name, getattr(self, name), _MOST)
+        if not 0.0 <= self.part <= 1.0:
+            raise SettingError(f"part is {self.part}; accepted: from 0 to 1")
+        require_positive("speckle", self.speckle, zero=True)
+        require_at_most("speckle", self.speckle, _MOST)
+
+
+_MOST_POINTS = 1000
+_LEAST_FORCE = 0.001  # N
+_LARGEST = 1e6  # seconds, newtons, metres
+
+
+@dataclass(frozen=True)
+class ForceRig:
+    """A topic of forces and torques on the hand."""
+
+    topic: str
+    frame: str | None = None  # in which, and about whose origin, they are; null: the messages'
+    threshold: float = 3.0  # newtons beyond the tare, above which there is a contact
+    samples: int = 3  # so many in a row; fewer are a spike
+    acts: str = "on_hand"
+    """Whether forces are those "on_hand", as the object pushes it, or "by_hand", as it pushes."""
+
+    torque: bool = True
+    """Whether torques tell where the contact is; otherwise it is where the hand is furthest against
+    the force. Also used while all torques are 0."""
+
+    tare: float = 1.0
+    """Seconds before a probe's begin, whose median is subtracted: the hand's weight and drift."""
+
+    reach: float = 0.01  # metres by which the line of force may miss the hand
+    points: int = 5  # of a probe at most, the strongest of those in different voxels
+
+    def __post_init__(self) -> None:
+        for name in ("threshold", "tare", "reach"):
+            require_positive(name, getattr(self, name))
+            require_at_most(name, getattr(self, name), _LARGEST)
+        if self.threshold < _LEAST_FORCE:
+            raise SettingError(
+                f"threshold is {self.threshold:g} N; accepted: from {_LEAST_FORCE:g} N"
+            )
+        for name in ("samples", "points"):
+            require_positive(name, getattr(self, name))
+            require_at_most(name, getattr(self, name), _MOST_POINTS)
+        require_choice("acts", self.acts, ("on_hand", "by_hand"))
+
 
 _LARGEST_HAND = 100.0  # metres
 _LONGEST = 1e9  # seconds; they are counted in nanoseconds

@@ -12,11 +12,11 @@ from chsel.problem.points import KnownPoints
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from replay.file_digest import file_digest
 from runners.objects.loader import ObjectModel
+from runners.sensors.depth_camera import intrinsics_of, recorded
 from runners.sensors.depth_frame import DepthFrame, read_depth_frame
 from runners.sensors.depth_frame_points import FramePoints, depth_frame_points
-from runners.sensors.depth_source import intrinsics_of, recorded
 from runners.sensors.rig import Rig
-from runners.sensors.tally import Report
+from runners.sensors.session_report import Report
 from runners.sessions.session import SessionEvent
 
 _MANY = 0.2  # of a label's pixels left out: rather a wrong label

@@ -13,16 +13,15 @@ from replay.events import Logged, RigDescribed
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import Cell, FreeMap
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
+from runners.sensors.first_pass import survey_log
 from runners.sensors.hand import HandModel
-from runners.sensors.log import RawLog
-from runners.sensors.messages import Received
+from runners.sensors.log.clocks import in_time_order
+from runners.sensors.log.messages import Received
+from runners.sensors.log.raw_log import RawLog
 from runners.sensors.pose_file import beside, read_pose
-from runners.sensors.reading import LogReading
-from runners.sensors.remarks import Remarks
 from runners.sensors.rig import Rig
-from runners.sensors.survey import survey_log
-from runners.sensors.tally import Report
-from runners.sensors.time_order import in_time_order
+from runners.sensors.second_pass import LogReading
+from runners.sensors.session_report import Remarks, Report
 from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.free_space import box_shell
 from runners.sessions.session import Progress, Session, SessionEvent, unwatched

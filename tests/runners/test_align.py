@@ -21,8 +21,8 @@ from runners import align, plausible, probe
 from runners.evaluation import trial_truth
 from runners.objects.models import MODELS
 from runners.sensors.pose_file import beside, read_pose, read_pose_file
-from runners.twin.configurations import CABINET_CONFIGURATIONS
-from runners.twin.settings import TwinBubbles, TwinCamera, TwinSettings
+from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS
+from runners.simulated_robot.settings import TwinBubbles, TwinCamera, TwinSettings
 from tests.runners.in_process import Done, run
 
 YAW = 0.5
@@ -134,7 +134,7 @@ def test_plausible_sets_are_made_around_the_pose_beside_a_recording(path: Path) 
 
 def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    from runners.twin.simulation import simulate_log
+    from runners.simulated_robot.simulation import simulate_log
 
     log = tmp_path / "log.mcap"
     small = TwinSettings(probes=1, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=96))

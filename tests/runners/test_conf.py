@@ -18,7 +18,7 @@ from runners.reporting.sections import SequenceConfig
 from runners.sessions.points import PointsSettings
 from runners.sessions.recorded import RecordedSettings
 from runners.sessions.sensors import SensorsSettings
-from runners.twin.settings import TwinSettings
+from runners.simulated_robot.settings import TwinSettings
 
 SHOWN = [
     ("align", "search", TruePoseSettings),

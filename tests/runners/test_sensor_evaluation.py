@@ -183,7 +183,7 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
 ) -> None:
     pytest.importorskip("pybullet")
     from runners.evaluation import sensor_logs
-    from runners.twin.settings import TwinBubbles, TwinCamera, TwinSettings
+    from runners.simulated_robot.settings import TwinBubbles, TwinCamera, TwinSettings
 
     small = TwinSettings(probes=2, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=96))
     monkeypatch.setattr(sensor_logs, "TwinSettings", lambda: small)

@@ -16,15 +16,15 @@ from runners.cli import plain
 from runners.objects.models import MODELS
 from runners.sensors.rig import Rig
 from runners.simulate_rig import SimulateRigConfig
-from runners.twin import wrist
-from runners.twin.configurations import (
+from runners.simulated_robot import wrist
+from runners.simulated_robot.configurations import (
     CABINET_CONFIGURATIONS,
     CABINET_WORKSPACE,
     stood_on_shelf,
 )
-from runners.twin.membrane import CAP, CAP_BASE
-from runners.twin.recorder import WORLD, WRIST
-from runners.twin.settings import TwinSettings
+from runners.simulated_robot.recorder import WORLD, WRIST
+from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.wrist import CAP, CAP_BASE
 from tests.runners.in_process import run
 
 QUICK = (

@@ -18,9 +18,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
 from chsel.problem.poses import check_rigid
-from runners.sensors.clocks import Clocks
-from runners.sensors.log import RawLog
-from runners.sensors.messages import (
+from runners.sensors.log.clocks import Clocks
+from runners.sensors.log.messages import (
     CameraInfoMessage,
     CloudMessage,
     ImageMessage,
@@ -30,8 +29,9 @@ from runners.sensors.messages import (
     Received,
     TransformMessage,
 )
+from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.transforms import TransformError, TransformTree
 from runners.sensors.rig import ClockRig
-from runners.sensors.transforms import TransformError, TransformTree
 from tests.runners.sensors.small_logs import foxglove_sent, ros2_sent, write_foxglove, write_ros2
 from tests.tools.fuzzing import Tally, WrongOutcome, run_cases
 from tests.tools.mutations import Random, file_of, joined, packed, raw, records, split, unpacked

@@ -21,11 +21,17 @@ import numpy as np
 from chsel.errors import ChselError
 from chsel.problem.poses import check_rigid
 from replay.events import Logged, Probe, RigDescribed, SensorImage
-from runners.sensors.force_rig import ForceRig
-from runners.sensors.gate_rig import GateRig
-from runners.sensors.rig import Annotations, CloudRig, ExtraContacts, ProbeTimes, Rig
+from runners.sensors.rig import (
+    Annotations,
+    CloudRig,
+    ExtraContacts,
+    ForceRig,
+    GateRig,
+    ProbeTimes,
+    Rig,
+)
 from runners.sessions.sensors import SensorsSession, SensorsSettings
-from runners.twin.log_writer import LogWriter
+from runners.simulated_robot.log_writer import LogWriter
 from tests.runners.sensors.sphere_log import BEGIN, RIG, SECOND, SphereLog
 from tests.tools.fuzzing import Tally, WrongOutcome, peak_memory, run_cases
 from tests.tools.mutations import Random, raw

@@ -25,7 +25,7 @@ from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer
 from PIL import Image
 
-from runners.sensors.ros2_definitions import full_definition
+from runners.sensors.log.ros2_definitions import full_definition
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND

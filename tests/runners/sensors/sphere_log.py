@@ -10,10 +10,10 @@ import numpy as np
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose, inverse
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import BoxRig, BubbleRig, CameraRig, ContactRig, HandRig, Rig
-from runners.twin.log_writer import LogWriter
-from runners.twin.pinhole import Pinhole
-from runners.twin.ros_messages import camera_info, image, joint_state, transform
+from runners.simulated_robot.log_writer import LogWriter
+from runners.simulated_robot.ros_messages import camera_info, image, joint_state, transform
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
@@ -25,8 +25,8 @@ MEMBRANE = 0.06  # m: from the pad's camera to its untouched membrane, a plane
 PRESSED = 0.012  # m: how far the membrane's plane reaches into the sphere at the end of a push
 ASIDE = 0.12  # m: by which the second probe passes the sphere
 
-OUTER = Pinhole(96, 72, 90.0, 0.05, 3.0)
-INNER = Pinhole(48, 36, 50.0, 0.005, 0.5)
+OUTER = PinholeCamera(96, 72, 90.0, 90.0, 47.5, 35.5)
+INNER = PinholeCamera(48, 36, 50.0, 50.0, 23.5, 17.5)
 
 # The hand's z axis, and so that of the pad's camera, is the world's x axis.
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -125,7 +125,7 @@ class SphereLog:
         self,
         writer: Writer,
         name: str,
-        camera: Pinhole,
+        camera: PinholeCamera,
         values: np.ndarray,
         stamp: int,
         log: int,
@@ -162,24 +162,18 @@ def seen() -> FloatArray:
     return np.minimum(to_wall(OUTER, WORLD_FROM_CAMERA), to_sphere(OUTER, WORLD_FROM_CAMERA))
 
 
-def directions(camera: Pinhole) -> FloatArray:
-    """Where pixels look (H, W, 3), z = 1."""
-    x, y = camera.slopes()
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
-
-
-def to_sphere(camera: Pinhole, world_from_camera: FloatArray) -> FloatArray:
+def to_sphere(camera: PinholeCamera, world_from_camera: FloatArray) -> FloatArray:
     """Depth (H, W) at which rays meet the sphere, infinite if they do not."""
-    ways = directions(camera)
+    ways = camera.directions()
     centre = inverse(world_from_camera)[:3] @ [*CENTRE, 1.0]
     a, b = (ways**2).sum(axis=-1), ways @ centre
     root = b**2 - a * (centre @ centre - RADIUS**2)
     return np.where(root > 0.0, (b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
 
 
-def to_wall(camera: Pinhole, world_from_camera: FloatArray) -> FloatArray:
+def to_wall(camera: PinholeCamera, world_from_camera: FloatArray) -> FloatArray:
     """Depth (H, W) at which rays meet the wall."""
-    ways = directions(camera) @ world_from_camera[:3, :3].T
+    ways = camera.directions() @ world_from_camera[:3, :3].T
     return (WALL - world_from_camera[0, 3]) / ways[..., 0]
 
 

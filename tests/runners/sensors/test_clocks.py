@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from runners.sensors.clocks import Clocks
-from runners.sensors.messages import MarkerMessage, Received, TransformMessage
+from runners.sensors.log.clocks import Clocks
+from runners.sensors.log.messages import MarkerMessage, Received, TransformMessage
 from runners.sensors.rig import ClockRig
 
 SECOND = 10**9

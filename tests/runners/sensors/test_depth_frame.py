@@ -24,8 +24,7 @@ from runners.objects.loader import ObjectModel
 from runners.sensors import depth_frame_points as module
 from runners.sensors.depth_frame import DepthFrame, read_depth_frame
 from runners.sensors.depth_frame_points import depth_frame_points, one_per_voxel
-from runners.sensors.gate_rig import GateRig
-from runners.sensors.rig import Rig
+from runners.sensors.rig import GateRig, Rig
 from runners.sessions.depth_frame import DepthFrameSession
 
 REPOSITORY = Path(__file__).resolve().parents[3]

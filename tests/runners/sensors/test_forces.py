@@ -16,10 +16,9 @@ from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
 from chsel.problem.settings import build_settings
 from replay.events import Logged, Probe
 from runners.choices import CONF
-from runners.sensors.force_rig import ForceRig
-from runners.sensors.rig import Annotations, BoxRig, HandRig, Rig
+from runners.sensors.rig import Annotations, BoxRig, ForceRig, HandRig, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
-from runners.twin.ros_messages import header, transform
+from runners.simulated_robot.ros_messages import header, transform
 from tests.runners.sensors.small_logs import BEGIN, SECOND, write_ros2
 
 HAND = HandRig("hand", boxes=(BoxRig((0.04, 0.06, 0.1), (0.0, 0.0, 0.05)),))

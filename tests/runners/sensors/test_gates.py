@@ -16,8 +16,7 @@ from replay.events import Logged, Probe
 from replay.mcap.reader import read_recording
 from runners.display import Display
 from runners.probe import main
-from runners.sensors.gate_rig import GateRig
-from runners.sensors.rig import CloudRig, Rig
+from runners.sensors.rig import CloudRig, GateRig, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.runners.in_process import run
 from tests.runners.sensors import sphere_log

@@ -9,7 +9,7 @@ import trimesh
 
 from chsel.errors import SettingError
 from chsel.problem.poses import roll_pitch_yaw
-from runners.sensors import collision_mesh
+from runners.sensors import collision_shapes
 from runners.sensors import urdf as urdf_module
 from runners.sensors.hand import HandModel, hand_solids
 from runners.sensors.rig import BoxRig, HandRig
@@ -268,6 +268,6 @@ def test_meshes_and_faces_are_bounded(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(urdf_module, "MOST_FACES", 11)
     with pytest.raises(SettingError, match="has more than 11 faces"):
         HandModel(hand(path))
-    monkeypatch.setattr(collision_mesh, "MOST_BYTES", 683)
+    monkeypatch.setattr(collision_shapes, "MOST_BYTES", 683)
     with pytest.raises(SettingError, match="makes the meshes more than 683 bytes"):
         HandModel(hand(path))

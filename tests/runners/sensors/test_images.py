@@ -5,9 +5,9 @@ import struct
 import numpy as np
 import pytest
 
-from runners.sensors.images import compressed_pixels, pixel_rows, png_pixels
-from runners.sensors.packed_points import named_fields, packed_points
-from runners.sensors.unusable import UnusableMessage
+from runners.sensors.log.images import compressed_pixels, pixel_rows, png_pixels
+from runners.sensors.log.message_fields import named_fields, packed_points
+from runners.sensors.log.messages import UnusableMessage
 from tests.runners.sensors.small_logs import png
 
 VALUES = np.random.default_rng(0).integers(0, 2**16, (4, 7)).astype(np.uint16)

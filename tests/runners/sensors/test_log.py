@@ -18,9 +18,8 @@ from replay.file_digest import file_digest
 from replay.raw import raw_file, raw_reading
 from replay.raw.catalogue import Channel
 from replay.raw.raw_reading import RawMessage
-from runners.sensors.file_merge import merged, most_at_once
-from runners.sensors.log import RawLog
-from runners.sensors.messages import (
+from runners.sensors.log.log_files import merged, most_at_once
+from runners.sensors.log.messages import (
     CameraInfoMessage,
     CloudMessage,
     ImageMessage,
@@ -31,7 +30,8 @@ from runners.sensors.messages import (
     TransformMessage,
     WrenchMessage,
 )
-from runners.twin.schemas import encode, schema_text
+from runners.sensors.log.raw_log import RawLog
+from runners.simulated_robot.schemas import encode, schema_text
 from tests.runners.sensors.small_logs import (
     BEGIN,
     SECOND,

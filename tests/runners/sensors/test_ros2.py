@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 
-from runners.sensors.log import RawLog
-from runners.sensors.messages import CameraInfoMessage
-from runners.sensors.ros2 import ros2_decoder
-from runners.sensors.ros2_definitions import DEFINITIONS, is_laid_out
-from runners.sensors.unusable import UnusableMessage
-from runners.twin.schemas import TYPES, schema_text
+from runners.sensors.log.messages import CameraInfoMessage, UnusableMessage
+from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.ros2 import ros2_decoder
+from runners.sensors.log.ros2_definitions import DEFINITIONS, is_laid_out
+from runners.simulated_robot.schemas import TYPES, schema_text
 from tests.runners.sensors.small_logs import ros2_sent, write_ros2
 
 

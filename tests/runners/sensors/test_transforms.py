@@ -7,10 +7,9 @@ import pytest
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, rotation_angle
-from runners.sensors.messages import TransformMessage
-from runners.sensors.quaternions import rigid, unit_quaternion
-from runners.sensors.transforms import TransformError, TransformTree
-from runners.sensors.unusable import UnusableMessage
+from runners.sensors.log.messages import TransformMessage, UnusableMessage
+from runners.sensors.log.quaternions import rigid, unit_quaternion
+from runners.sensors.log.transforms import TransformError, TransformTree
 
 SECOND = 10**9
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])

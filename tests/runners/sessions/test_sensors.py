@@ -59,7 +59,6 @@ from tests.runners.sensors.sphere_log import (
     SECOND,
     WORLD_FROM_CAMERA,
     SphereLog,
-    directions,
     hand_pose,
     seen,
 )
@@ -122,7 +121,7 @@ def test_free_space_is_where_rays_passed_and_the_hand_went(events: list[Any], lo
     depth = seen()
     edges = maximum_filter(depth, 3) - minimum_filter(depth, 3) > 0.05
     for fraction in (0.3, 0.6, 0.94):
-        ways = (fraction * depth[..., None] * directions(OUTER))[~edges][::50]
+        ways = (fraction * depth[..., None] * OUTER.directions())[~edges][::50]
         points = ways @ WORLD_FROM_CAMERA[:3, :3].T + WORLD_FROM_CAMERA[:3, 3]
         lower, upper = np.array(RIG.workspace).T
         points = points[((points > lower) & (points < upper)).all(axis=1)]
@@ -580,9 +579,9 @@ def test_damaged_logs_give_points_or_one_clear_error(log: Path, tmp_path: Path) 
 
 def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    from runners.twin.configurations import find_cabinet_configuration
-    from runners.twin.settings import TwinBubbles, TwinCamera, TwinSettings
-    from runners.twin.simulation import simulate_log
+    from runners.simulated_robot.configurations import find_cabinet_configuration
+    from runners.simulated_robot.settings import TwinBubbles, TwinCamera, TwinSettings
+    from runners.simulated_robot.simulation import simulate_log
 
     mesh = load_object(ObjectConfig("mustard", 1.0, 0.0003, "mustard"), tmp_path).mesh
     small = TwinSettings(probes=1, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=64))

@@ -1,0 +1,1 @@
+"""Logs of robots: from the bytes of files to messages at times that can be compared."""

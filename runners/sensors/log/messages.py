@@ -1,0 +1,115 @@
+"""What a message of a log holds, whatever its encoding and schema were."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from chsel.errors import ChselError
+from chsel.numerics.arrays import FloatArray
+
+
+class UnusableMessage(ChselError):
+    """A message is malformed, or of a kind that is not read; it is passed by and counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMessage:
+    """A depth or deformation image as it was sent.
+
+    frame: of the camera's optical centre: x right, y down, z forward. values (H, W): uint16 (units
+    are for the reader to know, usually millimetres) or float32 (usually metres).
+    """
+
+    frame: str
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class CameraInfoMessage:
+    """Intrinsics of a camera, pixels. distorted: whether lens distortion was left in its images."""
+
+    frame: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distorted: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class TransformMessage:
+    """Pose (4, 4) of a child frame in its parent's; static ones hold for all times."""
+
+    parent: str
+    child: str
+    parent_from_child: FloatArray
+    static: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMessage:
+    """Pose (4, 4) of a body in a frame."""
+
+    frame: str
+    frame_from_body: FloatArray
+
+
+@dataclass(frozen=True)
+class JointsMessage:
+    """Positions of joints by name, radians or metres."""
+
+    positions: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class CloudMessage:
+    """Points (N, 3) in a frame, metres; those without a measurement are not finite."""
+
+    frame: str
+    points: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class WrenchMessage:
+    """A force and a torque in a frame and about its origin."""
+
+    frame: str
+    force: FloatArray  # (3,), newtons
+    torque: FloatArray  # (3,), newton metres
+
+
+@dataclass(frozen=True)
+class MarkerMessage:
+    """A text such as "begin 3" or "end", a number, or true and false, as text."""
+
+    text: str
+
+
+Content = (
+    ImageMessage
+    | CameraInfoMessage
+    | TransformMessage
+    | PoseMessage
+    | JointsMessage
+    | CloudMessage
+    | WrenchMessage
+    | MarkerMessage
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Received:
+    """One message. stamp: nanoseconds, by the sender's clock; None where it gave none.
+
+    log_time: nanoseconds, by the clock of whoever wrote the log. One message of transforms gives
+    one Received for each.
+    """
+
+    topic: str
+    log_time: int
+    stamp: int | None
+    content: Content

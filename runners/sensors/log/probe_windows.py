@@ -1,0 +1,179 @@
+"""Which time belongs to which probe, as markers in the log or the rig tell."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from chsel.errors import SettingError
+from runners.sensors.rig import ProbeTimes
+from runners.sensors.session_report import Remarks
+
+MOST_PROBES = 100_000
+_TEXT = re.compile(r"(begin|end)\s*(\d{1,6})?")
+_INTEGER = re.compile(r"\s*(-?\d{1,6})\s*")
+_SECOND = 1_000_000_000  # ns
+_Span = tuple[int, int, int | None]
+
+
+@dataclass(frozen=True)
+class ProbeWindow:
+    """Times of a probe, nanoseconds, in its clock.
+
+    step: its index. opens, closes: what is sensed from `opens` to before `closes` becomes known
+    with this probe. begin, end: contacts count within, both included.
+    """
+
+    step: int
+    opens: int
+    begin: int
+    end: int
+    closes: int
+
+    def holds(self, time: int) -> bool:
+        """Whether a time is between its begin and its end."""
+        return self.begin <= time <= self.end
+
+
+def marked_windows(
+    markers: Iterable[tuple[int, str]], first: int, last: int, remarks: Remarks
+) -> list[ProbeWindow]:
+    """The probes of markers (time, text) in a log from `first` to `last`; there may be none.
+
+    Texts are "begin N", "begin", "end N", "end", integers (below 0: end) and true or false.
+    Whatever else they say, and begins and ends that do not fit, is remarked.
+    """
+    spans = _Spans(remarks)
+    for time, text in sorted(markers, key=lambda marker: marker[0]):
+        said = _meaning(text)
+        if said is None:
+            remarks.warn(f"a marker says {text[:40]!r}; understood: begin N, end")
+        elif said.begins:
+            spans.begin(time, said)
+        else:
+            spans.end(time, said)
+    spans.close(last)
+    return _windows(spans.whole, first, last, remarks)
+
+
+def timed_windows(
+    probes: Sequence[ProbeTimes], first: int, last: int, remarks: Remarks
+) -> list[ProbeWindow]:
+    """The probes that a rig names by seconds since the first message.
+
+    Raises SettingError unless each begins before its end and after the end of the one before.
+    """
+    spans: list[_Span] = []
+    before = 0.0
+    for index, times in enumerate(probes):
+        if not before <= times.begin < times.end < 1e9:
+            raise SettingError(
+                f"probes[{index}] runs from {times.begin} to {times.end} s; accepted: a begin of "
+                f"at least {before} s, and a later end"
+            )
+        before = times.end
+        begin, end = (first + round(time * _SECOND) for time in (times.begin, times.end))
+        if begin > last:
+            remarks.warn(f"probe {index} begins after the end of the log")
+        spans.append((begin, end, index))
+    return _windows(spans, first, last, remarks)
+
+
+def whole_log(first: int, last: int) -> list[ProbeWindow]:
+    """All of a log as a single probe."""
+    return [ProbeWindow(0, first, first, last, last + 1)]
+
+
+@dataclass(frozen=True)
+class _Marker:
+    """index: of the probe, where told. repeated: such markers are sent all the time, as states."""
+
+    begins: bool
+    index: int | None
+    repeated: bool
+
+
+class _Spans:
+    """Spans (begin, end, index) of probes from markers in their order."""
+
+    def __init__(self, remarks: Remarks) -> None:
+        self.whole: list[_Span] = []
+        self._begun: tuple[int, int | None] | None = None
+        self._remarks = remarks
+
+    def begin(self, time: int, said: _Marker) -> None:
+        """A begin; within the same probe it says nothing new."""
+        if self._begun is not None:
+            index = self._begun[1]
+            if said.index == index and (said.repeated or index is not None):
+                if not said.repeated:
+                    self._remarks.warn(f"probe {index} begins twice without an end; taken as one")
+                return
+            if not said.repeated:
+                text = "has a begin and no end; the next begin ends it"
+                self._remarks.warn(f"{_name(index)} {text}")
+            self.whole.append((self._begun[0], time, index))
+        self._begun = (time, said.index)
+
+    def end(self, time: int, said: _Marker) -> None:
+        """An end of whatever probe has begun."""
+        if self._begun is None:
+            if not said.repeated:
+                self._remarks.warn(f"{_name(said.index)} has an end and no begin; ignored")
+            return
+        begin, index = self._begun
+        if said.index is not None and index is not None and said.index != index:
+            self._remarks.warn(f"the end of probe {said.index} is taken as that of probe {index}")
+        self.whole.append((begin, time, index))
+        self._begun = None
+
+    def close(self, last: int) -> None:
+        """The log ends."""
+        if self._begun is not None:
+            begin, index = self._begun
+            self._remarks.warn(f"{_name(index)} has a begin and no end; the log's end ends it")
+            self.whole.append((begin, max(last, begin), index))
+
+
+def _meaning(text: str) -> _Marker | None:
+    """What a marker says; None if that is not understood."""
+    lowered = text.strip().lower()
+    if lowered in ("true", "false"):
+        return _Marker(lowered == "true", None, True)
+    number = _INTEGER.fullmatch(text)
+    if number:
+        value = int(number.group(1))
+        return _Marker(value >= 0, value if value >= 0 else None, True)
+    said = _TEXT.fullmatch(lowered)
+    if said is None:
+        return None
+    return _Marker(said.group(1) == "begin", int(said.group(2)) if said.group(2) else None, False)
+
+
+def _name(index: int | None) -> str:
+    return "a probe" if index is None else f"probe {index}"
+
+
+def _windows(spans: list[_Span], first: int, last: int, remarks: Remarks) -> list[ProbeWindow]:
+    """Windows of spans (begin, end, index) in order of time; indices that do not rise are new."""
+    if len(spans) > MOST_PROBES:
+        remarks.warn(f"the log marks {len(spans)} probes; the first {MOST_PROBES} count")
+        spans = spans[:MOST_PROBES]
+    told = [index for _, _, index in spans if index is not None]
+    rising = all(a < b for a, b in itertools.pairwise(told))
+    steps = list(range(len(spans)))
+    if told and rising and len(told) == len(spans):
+        steps = told
+    elif told:
+        remarks.warn(
+            f"probes are marked {', '.join(map(str, told[:10]))}; as these do not rise, they are "
+            f"counted from 0 to {len(spans) - 1}"
+        )
+    opens = [min(first, spans[0][0]) if k == 0 else span[0] for k, span in enumerate(spans)]
+    closes = [*opens[1:], max(last, spans[-1][1]) + 1] if spans else []
+    return [
+        ProbeWindow(step, opened, begin, end, closed)
+        for step, opened, (begin, end, _), closed in zip(steps, opens, spans, closes, strict=True)
+    ]

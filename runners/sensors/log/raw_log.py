@@ -1,0 +1,226 @@
+"""Raw logs of robots: MCAP files and rosbag2 folders, as messages that say something."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from chsel.errors import SessionError
+from replay.mcap.texts import one_line
+from replay.raw.catalogue import Channel
+from replay.raw.raw_file import RawFile
+from replay.raw.raw_reading import Fault, RawMessage, Wanted
+from runners.sensors.log.decoding import Decode, decoder
+from runners.sensors.log.log_files import Span, log_files, merged, most_at_once
+from runners.sensors.log.messages import Received, UnusableMessage
+
+Progress = Callable[[int, int], None]  # bytes so far, and of all
+
+_PROGRESS_STEP = 2**22  # bytes
+_BLOCK = 2**22  # bytes
+_DIGEST_SIZE = 16  # bytes
+_MOST_FAULTS = 200  # different texts
+_MOST_LISTED = 60
+_END_OF_TIME = 2**63
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Its messages' schema and encoding as in the file, and how many there are."""
+
+    schema: str
+    encoding: str
+    count: int
+
+
+class RawLog:
+    """Reads one log, as often as wanted, in memory that does not grow with the log.
+
+    files: in their order. size: of all, bytes. topics: by name. begin, end: first and last log
+    time, nanoseconds, 0 without messages. faults: "topic: reason" of what had to be passed
+    by, with how often, as met so far; reading again does not count it again. Raises SessionError
+    for what is no log.
+    """
+
+    def __init__(self, path: str | Path, *, progress: Progress | None = None) -> None:
+        self.path = Path(path).expanduser()
+        self._remarks: list[str] = []
+        self.faults: Counter[str] = Counter()
+        self.topics: dict[str, Topic] = {}
+        self.begin = self.end = 0
+        try:
+            self.files = tuple(log_files(self.path, self._remarks))
+        except OSError as error:
+            reason = error.strerror or error
+            raise SessionError(f"log {self.path} cannot be read: {reason}") from None
+        self._parts = [RawFile(file) for file in self.files]
+        self.size = sum(part.size for part in self._parts)
+        self._spans: list[Span] = []
+        self._find_topics(progress)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a user should know of how the log is read; all of it once it has been."""
+        return self._remarks + [
+            f"{part.path.name}: {remark}" for part in self._parts for remark in part.remarks
+        ]
+
+    def messages(
+        self,
+        topics: Collection[str],
+        *,
+        begin: int | None = None,
+        end: int | None = None,
+        progress: Progress | None = None,
+    ) -> Iterator[Received]:
+        """The messages on topics, in order of log time where the files have an index.
+
+        begin, end: log times in nanoseconds, begin <= t < end. What cannot be read is passed by,
+        and counted in `faults`. Raises SessionError if the log has none of the topics.
+        """
+        known = frozenset(topics) & self.topics.keys()
+        if not known:
+            named = ", ".join(sorted(topics)) or "none"
+            raise SessionError(f"log {self.path} has no topic {named}; it has {self.listing()}")
+        wanted = Wanted(known, begin or 0, _END_OF_TIME if end is None else end)
+        return self._received(wanted, progress)
+
+    def listing(self) -> str:
+        """All topics with their schemas, for messages to the user."""
+        shown = sorted(f"{name} ({topic.schema})" for name, topic in self.topics.items())
+        more = [f"{len(shown) - _MOST_LISTED} more"] if len(shown) > _MOST_LISTED else []
+        damage = "".join(f" ({fault})" for fault, _ in self.faults.most_common(1))
+        return ", ".join(shown[:_MOST_LISTED] + more) or f"no topics{damage}"
+
+    def digest(self, progress: Progress | None = None) -> str:
+        """BLAKE2b (128 bit, hexadecimal) of the file, or of the digests of a folder's files."""
+        tell, done, digests = _seldom(progress, self.size), 0, []
+        for path in self.files:
+            state = hashlib.blake2b(digest_size=_DIGEST_SIZE)
+            try:
+                with path.open("rb") as file:
+                    while block := file.read(_BLOCK):
+                        state.update(block)
+                        done += len(block)
+                        tell(done)
+            except OSError as error:
+                raise SessionError(f"log {path} cannot be read: {error.strerror}") from None
+            digests.append(state.hexdigest())
+        if self.path.is_file():
+            return digests[0]
+        whole = "".join(f"{digest}\n" for digest in digests).encode()
+        return hashlib.blake2b(whole, digest_size=_DIGEST_SIZE).hexdigest()
+
+    def _received(self, wanted: Wanted, progress: Progress | None) -> Iterator[Received]:
+        fault, tell = self._new_faults(), _seldom(progress, self.size)
+        decoders: dict[Channel, Decode | UnusableMessage] = {}
+        for message in self._raw_messages(wanted, fault, tell):
+            channel = message.channel
+            if channel not in decoders:
+                decoders[channel] = _decoder(channel)
+            decode = decoders[channel]
+            try:
+                if isinstance(decode, UnusableMessage):
+                    raise decode
+                for stamp, content in decode(message.data):
+                    if isinstance(content, UnusableMessage):
+                        fault(f"{channel.topic}: {content}")
+                    else:
+                        yield Received(channel.topic, message.log_time, stamp, content)
+            except UnusableMessage as error:
+                fault(f"{channel.topic}: {error}")
+
+    def _raw_messages(
+        self, wanted: Wanted, fault: Fault, tell: Callable[[int], None]
+    ) -> Iterator[RawMessage]:
+        done = [0] * len(self._parts)
+        at_once = most_at_once(self._spans)
+
+        def read(number: int) -> Iterator[RawMessage]:
+            def told(of_file: int) -> None:
+                done[number] = of_file
+                tell(sum(done))
+
+            return self._parts[number].messages(wanted, fault, told, at_once=at_once)
+
+        yield from merged(self._spans, read)
+        tell(self.size)
+
+    def _find_topics(self, progress: Progress | None) -> None:
+        """From the indices of files; files without one are read through."""
+        told: list[int] = []
+        tell, done, fault = _seldom(progress, self.size), 0, self._new_faults()
+        for part in self._parts:
+            counts: dict[Channel, int] = {}
+            times = list(part.times or ())
+            if part.counts is not None:
+                for number, channel in part.catalogue.channels.items():
+                    counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
+            else:
+                for message in part.messages(Wanted(), fault, _after(done, tell)):
+                    counts[message.channel] = counts.get(message.channel, 0) + 1
+                    times = [min([message.log_time, *times]), max([message.log_time, *times])]
+                for channel in part.catalogue.channels.values():
+                    counts.setdefault(channel, 0)
+            for channel, count in counts.items():
+                self._add_topic(channel, count)
+            done += part.size
+            self._spans.append((min(times, default=0), max(times, default=0)))
+            told += times
+        if told:
+            self.begin, self.end = min(told), max(told)
+
+    def _add_topic(self, channel: Channel, count: int) -> None:
+        known = self.topics.get(channel.topic)
+        if known is None:
+            self.topics[channel.topic] = Topic(channel.schema, channel.encoding, count)
+            return
+        if (known.schema, known.encoding) != (channel.schema, channel.encoding):
+            self._remarks.append(
+                f"topic {channel.topic} carries {known.schema} and {channel.schema}"
+            )
+        total = known.count + count
+        self.topics[channel.topic] = Topic(known.schema, known.encoding, total)
+
+    def _new_faults(self) -> Fault:
+        """Counts the faults of one reading; those of an earlier one are not counted again."""
+        found: Counter[str] = Counter()
+
+        def fault(text: str) -> None:
+            text = one_line(text)
+            if text not in self.faults and len(self.faults) >= _MOST_FAULTS:
+                text = f"{text.partition(':')[0]}: further reasons"
+                if text not in self.faults and len(self.faults) >= 2 * _MOST_FAULTS:
+                    text = "further faults"
+            found[text] += 1
+            self.faults[text] = max(self.faults[text], found[text])
+
+        return fault
+
+
+def _decoder(channel: Channel) -> Decode | UnusableMessage:
+    try:
+        return decoder(channel.topic, channel.schema, channel.encoding, channel.definition)
+    except UnusableMessage as error:
+        return error
+
+
+def _after(before: int, tell: Callable[[int], None]) -> Callable[[int], None]:
+    """Tells of the bytes of one file as of those of all."""
+    return lambda done: tell(before + done)
+
+
+def _seldom(progress: Progress | None, total: int) -> Callable[[int], None]:
+    """Calls progress once in some megabytes, and at the end."""
+    told = 0
+
+    def tell(done: int) -> None:
+        nonlocal told
+        if progress is not None and (done >= told + _PROGRESS_STEP or done == total):
+            told = done
+            progress(done, total)
+
+    return tell

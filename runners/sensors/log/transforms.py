@@ -1,0 +1,223 @@
+"""The tree of frames over time, from the transforms of a log."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+
+import numpy as np
+
+from chsel.errors import SessionError
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.problem.poses import compose, inverse, rotation_matrices, slerp
+from runners.sensors.log.messages import TransformMessage
+from runners.sensors.log.quaternions import unit_quaternion
+
+_NANOSECONDS = 1e9
+_MOST_FRAMES = 1024
+_MOST_LISTED = 30
+_NUMBERS = 7  # of a pose: position, quaternion
+_SAME = 1e-6  # metres, and parts of a quaternion
+
+
+class TransformError(SessionError):
+    """A pose cannot be had from the transforms of a log."""
+
+
+class TransformTree:
+    """Poses of frames in one another at any time.
+
+    faults: transforms that contradict others, with how often; the ones that came first count.
+    """
+
+    def __init__(self) -> None:
+        self.faults: Counter[str] = Counter()
+        self._edges: dict[str, _Edge] = {}  # by child
+
+    @property
+    def frames(self) -> list[str]:
+        """The names of all frames."""
+        return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
+
+    def add(self, stamp_ns: int, message: TransformMessage) -> None:
+        """Take note of a transform at a time, in any order."""
+        edge = self._edges.get(message.child)
+        if edge is None:
+            fault = self._objection(message.parent, message.child)
+            if fault:
+                self.faults[fault] += 1
+                return
+            edge = self._edges[message.child] = _Edge(message.parent)
+        elif edge.parent != message.parent:
+            fault = f"frame {message.child} has two parents, {edge.parent} and {message.parent}"
+            is_new = fault not in self.faults and len(self.faults) >= _MOST_FRAMES
+            self.faults["more frames have two parents" if is_new else fault] += 1
+            return
+        if not edge.add(stamp_ns, message):
+            self.faults[f"frame {message.child} is said to be static in several places"] += 1
+
+    def lookup(self, target: str, source: str, stamp_ns: int, *, gap_s: float) -> FloatArray:
+        """target_from_source (4, 4) at a time, nanoseconds.
+
+        Linear in position and along the shorter arc of rotation between samples at most `gap_s`
+        seconds apart; before the first and after the last sample, by at most `gap_s`, as they are.
+        Raises TransformError if a frame is unknown, not connected, or not known at that time.
+        """
+        poses, valid = self.lookups(target, source, np.array([stamp_ns]), gap_s=gap_s)
+        if not valid[0]:
+            raise TransformError(self._missing(target, source, stamp_ns, gap_s))
+        pose: FloatArray = poses[0]
+        return pose
+
+    def lookups(
+        self, target: str, source: str, stamps_ns: IntArray, *, gap_s: float
+    ) -> tuple[FloatArray, BoolArray]:
+        """target_from_source (N, 4, 4) at times (N,), and whether (N,) it is known; NaN if not.
+
+        Raises TransformError if a frame is unknown or not connected to the other.
+        """
+        stamps = np.asarray(stamps_ns, dtype=np.int64).reshape(-1)
+        down, up = self._path(target, source)
+        poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+        valid = np.ones(len(stamps), dtype=bool)
+        # root_from_source, each transform to the left of those below it; then root_from_target
+        for chain, flip in ((up, False), (down, True)):
+            root = np.tile(np.eye(4), (len(stamps), 1, 1))
+            for child in chain:
+                parent_from_child, known = self._edges[child].at(stamps, gap_s)
+                root, valid = parent_from_child @ root, valid & known
+            poses = inverse(root) @ poses if flip else root @ poses
+        poses[~valid] = np.nan
+        return poses, valid
+
+    def _objection(self, parent: str, child: str) -> str | None:
+        """Why a frame cannot become the child of another, None if it can."""
+        if len(self._edges) >= _MOST_FRAMES:
+            return f"there are more than {_MOST_FRAMES} frames"
+        if child in self._ancestry(parent):
+            return f"frame {child} is its own ancestor, by way of {parent}"
+        return None
+
+    def _ancestry(self, frame: str) -> list[str]:
+        """A frame, its parent, and so on to the root of its tree."""
+        found = [frame]
+        while (edge := self._edges.get(found[-1])) is not None:
+            found.append(edge.parent)
+        return found
+
+    def _path(self, target: str, source: str) -> tuple[list[str], list[str]]:
+        """Children of the transforms up from each of the frames to where their ways meet."""
+        frames = self.frames
+        for name in (target, source):
+            if name not in frames and target != source:
+                raise TransformError(
+                    f"frame {name} is in no transform; there are {_listed(frames)}"
+                )
+        from_target, from_source = self._ancestry(target), self._ancestry(source)
+        if from_target[-1] != from_source[-1]:
+            trees = "; ".join(
+                f"{root}: {_listed([name for name in frames if self._ancestry(name)[-1] == root])}"
+                for root in dict.fromkeys((from_target[-1], from_source[-1]))
+            )
+            raise TransformError(
+                f"frames {target} and {source} are not connected, but in two trees: {trees}"
+            )
+        shared = set(from_target) & set(from_source)
+        return (
+            [name for name in from_target if name not in shared],
+            [name for name in from_source if name not in shared],
+        )
+
+    def _missing(self, target: str, source: str, stamp_ns: int, gap_s: float) -> str:
+        """Which transform is not known at a time, and when it is."""
+        stamps = np.array([stamp_ns])
+        for child in [name for path in self._path(target, source) for name in path]:
+            edge = self._edges[child]
+            if not edge.at(stamps, gap_s)[1][0]:
+                away = edge.nearest(stamp_ns)
+                side = "before" if away < 0 else "after"
+                return (
+                    f"{target} from {source}: {child} in {edge.parent} is not known at "
+                    f"{stamp_ns / _NANOSECONDS:.3f} s; the nearest is {abs(away):.3f} s {side}, "
+                    f"and gaps of up to {gap_s:g} s are bridged"
+                )
+        return f"{target} from {source} is not known at {stamp_ns / _NANOSECONDS:.3f} s"
+
+
+class _Edge:
+    """Poses of one frame in its parent's over time, 64 bytes each."""
+
+    def __init__(self, parent: str) -> None:
+        self.parent = parent
+        self._static: tuple[int, FloatArray] | None = None
+        self._stamps, self._numbers = array("q"), array("d")
+        self._is_sorted = True
+
+    def add(self, stamp: int, message: TransformMessage) -> bool:
+        """Whether the pose agrees with what was said before; of static ones the latest holds."""
+        rows = message.parent_from_child.tolist()
+        numbers = (rows[0][3], rows[1][3], rows[2][3], *unit_quaternion(rows))
+        if message.static:
+            pose = np.array(numbers)
+            before, self._static = self._static, self._static or (stamp, pose)
+            if stamp >= self._static[0]:
+                self._static = (stamp, pose)
+            return before is None or _agree(before[1], pose)
+        if self._stamps and stamp <= self._stamps[-1]:
+            if stamp == self._stamps[-1]:
+                return True
+            self._is_sorted = False
+        self._stamps.append(stamp)
+        self._numbers.extend(numbers)
+        return True
+
+    def at(self, stamps: IntArray, gap_s: float) -> tuple[FloatArray, BoolArray]:
+        """Poses (N, 4, 4) at times (N,), and whether (N,) they are known."""
+        known_at, numbers = self._sorted()
+        if len(known_at) == 0:
+            assert self._static is not None
+            poses = compose(rotation_matrices(self._static[1][None, 3:]), self._static[1][None, :3])
+            return np.repeat(poses, len(stamps), axis=0), np.ones(len(stamps), dtype=bool)
+        after = np.searchsorted(known_at, stamps)
+        left = np.clip(after - 1, 0, len(known_at) - 1)
+        right = np.clip(after, 0, len(known_at) - 1)
+        left = np.where(known_at[right] == stamps, right, left)
+        to_left = (stamps - known_at[left]) / _NANOSECONDS
+        span = (known_at[right] - known_at[left]) / _NANOSECONDS
+        near = np.where(left == right, np.abs(to_left) <= gap_s, span <= gap_s)
+        first, second = numbers[left], numbers[right]
+        fraction = np.where(span > 0.0, np.clip(to_left / np.where(span > 0.0, span, 1.0), 0, 1), 0)
+        position = first[:, :3] + fraction[:, None] * (second[:, :3] - first[:, :3])
+        return compose(
+            rotation_matrices(slerp(first[:, 3:], second[:, 3:], fraction)), position
+        ), near
+
+    def nearest(self, stamp: int) -> float:
+        """Seconds from a time to the nearest sample."""
+        away = (self._sorted()[0] - stamp) / _NANOSECONDS
+        return float(away[np.argmin(np.abs(away))])
+
+    def _sorted(self) -> tuple[IntArray, FloatArray]:
+        """Times (N,), rising, and poses (N, 7); of equal times the first that came."""
+        if not self._is_sorted:
+            stamps = np.frombuffer(self._stamps, dtype=np.int64)
+            times, chosen = np.unique(stamps, return_index=True)
+            numbers = np.frombuffer(self._numbers).reshape(-1, _NUMBERS)[chosen]
+            del stamps
+            self._stamps, self._numbers = array("q", times.tobytes()), array("d", numbers.tobytes())
+            self._is_sorted = True
+        stamps = np.frombuffer(self._stamps, dtype=np.int64)
+        return stamps, np.frombuffer(self._numbers).reshape(-1, _NUMBERS)
+
+
+def _agree(one: FloatArray, other: FloatArray) -> bool:
+    """Whether two poses (7,) are the same; a quaternion and its negative are."""
+    same_side = other[3:] if one[3:] @ other[3:] >= 0.0 else -other[3:]
+    return bool(
+        np.abs(one[:3] - other[:3]).max() < _SAME and np.abs(one[3:] - same_side).max() < _SAME
+    )
+
+
+def _listed(names: list[str]) -> str:
+    more = [f"{len(names) - _MOST_LISTED} more"] if len(names) > _MOST_LISTED else []
+    return ", ".join(names[:_MOST_LISTED] + more) or "none"

@@ -1,0 +1,107 @@
+"""What a session reports of its log: counts by sensor and probe, and warnings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Tally:
+    """Counts of one sensor in one probe."""
+
+    images: int = 0  # that came, or clouds, forces, poses of the hand
+    used: int = 0  # of them, that gave free space or contacts
+    spared: int = 0  # left out by the rig's rate, or as nothing had moved
+    lost: int = 0  # without a transform
+    unusable: int = 0  # of another size than the camera's, or without a pixel that counts
+    pixels: int = 0  # of the images that were looked at, or points of clouds
+    invalid: int = 0  # pixels without a depth within range
+    edges: int = 0  # pixels beside a jump of depth
+    outline: int = 0  # pixels at the outline of the object's label
+    small: int = 0  # pixels or points in regions that are too small
+    far: int = 0  # pixels or points in regions too far from the largest to be of one object
+    outside: int = 0  # points of a cloud, or lines of force, that are out of reach
+    spikes: int = 0  # forces above the threshold in too few messages in a row
+    touching: int = 0  # pixels in contact
+    contacts: int = 0  # points
+    free: int = 0  # voxels that it was the first to mark as free
+
+    def left_out(self) -> str:
+        """How many pixels, points or forces were left out, by reason; "" if none were."""
+        reasons = {
+            "without a value in range": self.invalid,
+            "at edges of depth": self.edges,
+            "at the label's outline": self.outline,
+            "in regions too small": self.small,
+            "in regions too far from the largest": self.far,
+            "out of reach": self.outside,
+            "of forces that do not last": self.spikes,
+        }
+        counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
+        total = f"{self.pixels} pixels or points" if self.pixels else f"{self.images} messages"
+        return f"left out of {total}: {counts}" if counts else ""
+
+    def add(self, other: Tally) -> None:
+        """Add the counts of another one."""
+        for name, value in vars(other).items():
+            setattr(self, name, getattr(self, name) + value)
+
+
+@dataclass
+class Report:
+    """Tallies of a session by step and by the name of a sensor, and its lines of text."""
+
+    tallies: dict[int, dict[str, Tally]] = field(default_factory=dict)
+    lines: list[tuple[str, str]] = field(default_factory=list)
+
+    def of(self, step: int, sensor: str) -> Tally:
+        """The tally to count in."""
+        return self.tallies.setdefault(step, {}).setdefault(sensor, Tally())
+
+    def total(self) -> dict[str, Tally]:
+        """By sensor, over all probes."""
+        totals: dict[str, Tally] = {}
+        for tallies in self.tallies.values():
+            for name, tally in tallies.items():
+                totals.setdefault(name, Tally()).add(tally)
+        return totals
+
+
+MOST_KINDS = 100  # a hostile log must not flood the recording
+LONGEST = 400  # characters of a line
+
+
+class Remarks:
+    """Lines of text in the order in which their kinds came up."""
+
+    def __init__(self, before: Remarks | None = None) -> None:
+        """before: whose lines come ahead."""
+        self._counts: dict[tuple[str, str], int] = dict(before._counts) if before else {}
+        self._further: int = before._further if before else 0
+
+    def warn(self, text: str, count: int = 1) -> None:
+        """Something is wrong, or was left out; `count` times."""
+        self._add("warning", text, count)
+
+    def tell(self, text: str) -> None:
+        """Something worth knowing."""
+        self._add("info", text, 1)
+
+    def lines(self) -> list[tuple[str, str]]:
+        """Level and text of every kind; "(12 times)" stands behind what happened repeatedly."""
+        lines = [
+            (level, text if count == 1 else f"{text} ({count} times)")
+            for (level, text), count in self._counts.items()
+        ]
+        if self._further:
+            lines.append(("warning", f"further kinds of trouble ({self._further} times)"))
+        return lines
+
+    def _add(self, level: str, text: str, count: int) -> None:
+        key = (level, text if len(text) <= LONGEST else text[: LONGEST - 1] + "…")
+        if count < 1:
+            return
+        if key not in self._counts and len(self._counts) >= MOST_KINDS:
+            self._further += count
+            return
+        self._counts[key] = self._counts.get(key, 0) + count

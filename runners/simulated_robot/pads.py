@@ -1,0 +1,133 @@
+"""The two soft-bubble pads: what their cameras see without noise, and whether they touch."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from scipy import ndimage
+
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply, inverse
+from chsel.sensing.depth_camera import PinholeCamera
+from runners.sensors.rig import ContactRig
+from runners.simulated_robot import wrist
+from runners.simulated_robot.scene import Scene
+from runners.simulated_robot.settings import RenderedCamera
+from runners.simulated_robot.wrist import CAP, CAP_BASE
+
+THICKNESS = 0.001  # m: how much nearer than its base it can never be pressed
+TAUTNESS = 0.003  # m: beside what presses, the dent falls by 1/e over this length
+_SWEEPS = 30  # of relaxation, which leave an error of 0.1 %
+_MARGIN = 0.025  # m: around what presses, beyond which there is no dent worth a number
+
+
+class Membrane:
+    """rest (H, W): depth of the untouched membrane, metres; beside it is the rigid base."""
+
+    def __init__(self, camera: PinholeCamera) -> None:
+        self.rest = _cap_depth(camera)
+        self._most = np.maximum(self.rest - (CAP_BASE + THICKNESS), 0.0)
+        pitch = (CAP_BASE + CAP[2]) / camera.fx  # m a pixel
+        self._margin = int(np.ceil(_MARGIN / pitch))
+        self._kept = 1.0 / (1.0 + (pitch / TAUTNESS) ** 2 / 4.0)
+
+    def pressed(self, beyond: FloatArray) -> FloatArray:
+        """Depth (H, W) of the membrane where depth `beyond` (H, W) of what is outside allows.
+
+        The dent w is the least with w >= rest - beyond that elsewhere hangs as a taut sheet on a
+        soft bed does, L^2 (w_xx + w_yy) = w with L = TAUTNESS, and ends where the base begins.
+        """
+        pressing = np.clip(self.rest - beyond, 0.0, self._most)
+        if not pressing.any():
+            return self.rest
+        rows, columns = _around(pressing > 0.0, self._margin)
+        least, most = pressing[rows, columns], self._most[rows, columns]
+        dent = self._hung(least, most)
+        depth = self.rest.copy()
+        depth[rows, columns] -= dent
+        return depth
+
+    def _hung(self, least: FloatArray, most: FloatArray) -> FloatArray:
+        """The dent (h, w) between bounds, by projected successive over-relaxation."""
+        over = 2.0 / (1.0 + np.sqrt(1.0 - self._kept**2))
+        rows, columns = np.indices(least.shape)
+        even = (rows + columns) % 2 == 0
+        dent = least
+        for half in [even, ~even] * _SWEEPS:
+            edged = np.pad(dent, 1)
+            around = edged[:-2, 1:-1] + edged[2:, 1:-1] + edged[1:-1, :-2] + edged[1:-1, 2:]
+            moved = dent + over * (self._kept / 4.0 * around - dent)
+            dent = np.where(half, np.clip(moved, least, most), dent)
+        return dent
+
+
+def _cap_depth(camera: PinholeCamera) -> FloatArray:
+    """Where the ray of every pixel (H, W) leaves the ellipsoid, or else meets the base; metres."""
+    x, y = camera.columns, camera.rows[:, None]
+    a, b, c = CAP
+    # (x s / a)^2 + (y s / b)^2 + ((s - base) / c)^2 = 1, the further of the two depths s
+    square = (x / a) ** 2 + (y / b) ** 2 + 1.0 / c**2
+    half = CAP_BASE / c**2
+    constant = (CAP_BASE / c) ** 2 - 1.0
+    inside = half**2 - square * constant
+    depth = (half + np.sqrt(np.maximum(inside, 0.0))) / square
+    return np.where(inside > 0.0, np.maximum(depth, CAP_BASE), CAP_BASE)
+
+
+def _around(pixels: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """The part of an image that holds these pixels (H, W) and a margin."""
+    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
+    return (
+        slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
+        slice(max(columns[0] - margin, 0), columns[-1] + margin + 1),
+    )
+
+
+_SPACING = 0.004  # m: between the points of the surface that are looked at first
+
+
+class Pads:
+    """Both membranes against one object; images are rendered only where it may touch them."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: RenderedCamera,
+        mesh: trimesh.Trimesh,
+        world_from_object: FloatArray,
+    ) -> None:
+        """mesh: in its own frame, metres."""
+        fine, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _SPACING, max_iter=20)
+        self._surface = apply(world_from_object, np.unique(fine, axis=0))
+        self._scene = scene
+        self._camera = camera
+        self._membrane = Membrane(camera)
+        self._contact = ContactRig()
+
+    def depths(self, world_from_wrist: FloatArray) -> dict[str, FloatArray]:
+        """Depth (H, W) in metres of each pad's membrane, pressed or not."""
+        return {pad: self._depth(world_from_wrist, pad) for pad in wrist.PADS}
+
+    def pressed(self, depths: dict[str, FloatArray]) -> dict[str, int]:
+        """How many pixels of each pad are dented beyond the robot's threshold, as it filters."""
+        counts = {}
+        for pad, depth in depths.items():
+            dent = ndimage.uniform_filter(self._membrane.rest - depth, self._contact.filter)
+            counts[pad] = int((dent > self._contact.threshold).sum())
+        return counts
+
+    def touches(self, depths: dict[str, FloatArray]) -> bool:
+        """Whether so many pixels of a pad are dented that the robot stops."""
+        return max(self.pressed(depths).values()) >= self._contact.pixels
+
+    def _depth(self, world_from_wrist: FloatArray, pad: str) -> FloatArray:
+        world_from_camera = world_from_wrist @ wrist.wrist_from_bubble_camera(pad)
+        if not self._near(world_from_camera):
+            return self._membrane.rest
+        return self._membrane.pressed(self._scene.depth(self._camera, world_from_camera))
+
+    def _near(self, world_from_camera: FloatArray) -> bool:
+        """Whether the object comes within _SPACING of a membrane."""
+        points = apply(inverse(world_from_camera), self._surface) - [0.0, 0.0, CAP_BASE]
+        near = ((points / (np.array(CAP) + _SPACING)) ** 2).sum(axis=1) < 1.0
+        return bool((near & (points[:, 2] > -_SPACING)).any())

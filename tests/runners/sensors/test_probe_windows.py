@@ -1,0 +1,94 @@
+"""Which time belongs to which probe."""
+
+from __future__ import annotations
+
+import pytest
+
+from runners.sensors.log.clocks import SLACK, in_time_order
+from runners.sensors.log.messages import JointsMessage, MarkerMessage, Received
+from runners.sensors.log.motion import MOST_OF_A_PROBE, JointHistory
+from runners.sensors.log.probe_windows import marked_windows
+from runners.sensors.session_report import MOST_KINDS, Remarks
+
+
+def spans(*texts: str) -> tuple[list[tuple[int, int, int, int, int]], list[str]]:
+    """Windows of markers at times 10, 20, ... in a log from 0 to 100, and the remarks."""
+    remarks = Remarks()
+    markers = [(10 * (index + 1), text) for index, text in enumerate(texts)]
+    windows = marked_windows(reversed(markers), 0, 100, remarks)
+    found = [(w.step, w.opens, w.begin, w.end, w.closes) for w in windows]
+    return found, [text for _, text in remarks.lines()]
+
+
+def test_a_window_reaches_to_the_next_begin_and_the_first_one_to_the_start() -> None:
+    found, said = spans("begin 0", "end 0", " Begin 1", "END 1")
+    assert found == [(0, 0, 10, 20, 30), (1, 30, 30, 40, 101)]
+    assert said == []
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ("4", "4", "4", "-1", "-1", "7", "7", "-1"),
+        ("false", "true", "true", "false", "false", "true", "true", "false"),
+    ],
+)
+def test_states_that_are_sent_all_the_time_say_nothing_new(texts: tuple[str, ...]) -> None:
+    found, said = spans(*texts)
+    assert said == []
+    assert [(end - begin) % 10 for _, _, begin, end, _ in found] == [0, 0]
+    assert [step for step, *_ in found] == ([4, 7] if texts[0] == "4" else [0, 1])
+
+
+def test_a_change_of_number_ends_a_probe() -> None:
+    found, said = spans("0", "0", "1", "-5")
+    assert (found, said) == ([(0, 0, 10, 30, 30), (1, 30, 30, 40, 101)], [])
+
+
+def test_begins_without_number_are_counted() -> None:
+    found, said = spans("begin", "begin", "end")
+    assert [step for step, *_ in found] == [0, 1]
+    assert said == ["a probe has a begin and no end; the next begin ends it"]
+
+
+def test_no_marker_that_is_understood_is_no_window() -> None:
+    found, said = spans("begin 99999999999", "stop", "")
+    assert found == []
+    assert len(said) == 3
+
+
+def test_lines_are_few_and_short_whatever_a_log_holds() -> None:
+    remarks = Remarks()
+    for index in range(1000):
+        remarks.warn(f"{index} " + 1000 * "x")
+    lines = remarks.lines()
+    assert len(lines) == MOST_KINDS + 1
+    assert lines[-1][1] == "further kinds of trouble (900 times)"
+    assert max(len(text) for _, text in lines) == 400
+
+
+def test_messages_come_in_the_order_of_their_times_if_they_are_not_too_late() -> None:
+    stamps = [3, 1, 2, 9, 5, 4, 30, 0]  # the last one comes long after its place
+    logged = [0, 0, 0, 1, 1, 1, 3 * SLACK, 3 * SLACK]
+    messages = [
+        Received("/t", log, stamp, MarkerMessage(""))
+        for log, stamp in zip(logged, stamps, strict=True)
+    ]
+    got = [time for time, _ in in_time_order(messages, lambda message: message.stamp or 0)]
+    assert got == [1, 2, 3, 4, 5, 9, 0, 30]
+
+
+def test_a_state_of_the_joints_holds_until_the_next() -> None:
+    joints = JointHistory(["finger"])
+    for time in range(0, 1000, 10):
+        moved = 0.1 if time >= 500 else 0.001 * (time % 20)
+        joints.add(time, JointsMessage({"finger": moved, "elbow": time}).positions)
+    assert joints.first() == {"finger": 0.0}
+    assert joints.during(100, 400) == [(100, {"finger": 0.0})]
+    assert joints.during(400, 600) == [(400, {"finger": 0.0}), (500, {"finger": 0.1})]
+    assert joints.during(600, 700) == [(600, {"finger": 0.1})]
+    assert JointHistory(["finger"]).during(0, 9) == [(0, {})]
+    busy = JointHistory(["finger"])
+    for time in range(1000):
+        busy.add(time, {"finger": float(time)})
+    assert len(busy.during(0, 1000)) <= MOST_OF_A_PROBE

@@ -1,0 +1,98 @@
+"""Noise whose size is known: where it is small, and how much worse it is at edges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from chsel.problem.streams import Purpose, StreamKey
+from runners.simulated_robot.noise import LOST, bubble_depth, stereo_depth
+from runners.simulated_robot.settings import TwinBubbles, TwinCamera
+
+CAMERA = TwinCamera(width=320)
+PINHOLE = CAMERA.pinhole
+NEAR, FAR = 0.5, 0.9
+LEFT, RIGHT = 120, 200  # columns of a bar before a wall
+
+
+def stream(index: int = 0) -> np.random.Generator:
+    return StreamKey(7, 0).stream(Purpose.SENSOR_NOISE, index)
+
+
+@pytest.fixture(scope="module")
+def bar() -> tuple[np.ndarray, np.ndarray]:
+    """True depths of a bar before a wall, metres, and measured ones, millimetres."""
+    depth = np.full((PINHOLE.height, PINHOLE.width), FAR)
+    depth[:, LEFT:RIGHT] = NEAR
+    return depth, stereo_depth(depth, PINHOLE, CAMERA, stream())
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0, 2.0])
+def test_noise_away_from_edges_grows_with_the_depth_squared(distance: float) -> None:
+    measured = stereo_depth(
+        np.full((PINHOLE.height, PINHOLE.width), distance), PINHOLE, CAMERA, stream()
+    )
+    assert measured.dtype == np.uint16
+    error = measured[measured > 0] / 1000.0 - distance
+    rounding = 0.001**2 / 12.0
+    assert error.std() == pytest.approx(
+        np.sqrt((CAMERA.noise * distance**2) ** 2 + rounding), rel=0.02
+    )
+    assert abs(error.mean()) < 1e-4
+    assert (measured == 0).mean() == pytest.approx(LOST, rel=0.2)
+
+
+def test_edges_are_where_the_camera_is_worst(bar: tuple[np.ndarray, np.ndarray]) -> None:
+    depth, measured = bar
+    wrong = (measured > 0) & (np.abs(measured / 1000.0 - depth) > 0.05)
+    columns = np.arange(PINHOLE.width)
+    band = (np.abs(columns - LEFT) < 3) | (np.abs(columns - RIGHT) < 3)
+    far_off = (np.abs(columns - LEFT) > 40) & (np.abs(columns - RIGHT) > 40)
+    assert wrong[:, band].mean() > 0.1
+    assert (measured[:, band] == 0).mean() > 0.2
+    assert wrong[:, far_off].mean() == 0.0
+    assert (measured[:, far_off] == 0).mean() < 0.01
+
+
+def test_edge_pixels_float_between_both_sides(bar: tuple[np.ndarray, np.ndarray]) -> None:
+    _, measured = bar
+    between = (measured > 1000 * (NEAR + 0.05)) & (measured < 1000 * (FAR - 0.05))
+    columns = np.flatnonzero(between.any(axis=0))
+    assert between.sum() > PINHOLE.height / 4
+    assert (np.minimum(np.abs(columns - LEFT), np.abs(columns - RIGHT)) < 12).all()
+
+
+def test_the_shadow_of_the_second_eye_is_as_wide_as_geometry_says(
+    bar: tuple[np.ndarray, np.ndarray],
+) -> None:
+    _, measured = bar
+    width = PINHOLE.fx * CAMERA.baseline * (1.0 / NEAR - 1.0 / FAR)
+    lost = (measured == 0).mean(axis=0)
+    inside = lost[round(LEFT - width) + 3 : LEFT - 3]
+    assert (inside > 0.6).all()
+    assert lost[round(LEFT - width) - 8] < 0.1
+    assert lost[RIGHT + 8] < 0.1  # only on the left, as the second eye is on the right
+
+
+def test_the_same_stream_gives_the_same_image() -> None:
+    depth = np.linspace(0.3, 4.0, PINHOLE.width) * np.ones((PINHOLE.height, 1))
+    images = [stereo_depth(depth, PINHOLE, CAMERA, stream(index)) for index in (1, 1, 2)]
+    assert (images[0] == images[1]).all()
+    assert (images[0] != images[2]).mean() > 0.5
+
+
+def test_depths_out_of_range_are_not_measured() -> None:
+    depth = np.full((PINHOLE.height, PINHOLE.width), 0.1)
+    depth[:, 160:] = 5.9
+    measured = stereo_depth(depth, PINHOLE, CAMERA, stream())
+    assert not np.delete(measured, slice(145, 175), axis=1).any()  # there they may be in between
+
+
+def test_a_bubble_camera_is_noisy_by_what_it_says() -> None:
+    bubbles = TwinBubbles()
+    measured = bubble_depth(np.full((171, 224), 0.07), bubbles, stream())
+    assert measured.dtype == np.float32
+    good = measured[measured > 0]
+    assert good.std() == pytest.approx(np.sqrt(bubbles.noise**2 + 0.0001**2 / 12), rel=0.02)
+    assert good.mean() == pytest.approx(0.07, abs=1e-5)
+    assert 0 < (measured == 0).sum() < 0.003 * measured.size

@@ -1,0 +1,114 @@
+"""The engine's depth images and contacts against exact geometry."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.errors import SessionError
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import apply
+from runners.objects.models import MODELS
+from runners.simulated_robot import cabinet, wrist
+from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS, REST, stood_on_shelf
+from runners.simulated_robot.scene import NEAR, Scene
+from runners.simulated_robot.settings import RenderedCamera, TwinBubbles, TwinCamera
+
+pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+
+MESH = MODELS["drill"]()
+POSE = stood_on_shelf(MESH, CABINET_CONFIGURATIONS["cabinet_drill"])
+HAND = wrist.world_from_wrist(np.add(REST, [0.12, 0.0, 0.0]))
+EXACT = 2e-5  # m
+
+
+@pytest.fixture(scope="module")
+def scene() -> Iterator[Scene]:
+    with closing(Scene(MESH, POSE)) as scene:
+        yield scene
+
+
+def solid(hand: bool) -> trimesh.Trimesh:
+    parts = [cabinet.boxes(cabinet.CABINET, cabinet.ROOM), MESH.copy().apply_transform(POSE)]
+    parts += [wrist.whole_mesh().apply_transform(HAND)] if hand else []
+    return trimesh.util.concatenate(parts)
+
+
+def cast(mesh: trimesh.Trimesh, camera: RenderedCamera, pose: FloatArray) -> FloatArray:
+    """Depth (H, W) of the first hit of every pixel's ray; camera.far where there is none."""
+    x, y, _ = camera.directions().reshape(-1, 3).T
+    directions = np.stack([x, y, np.ones(len(x))], axis=1) @ pose[:3, :3].T
+    origins = np.broadcast_to(pose[:3, 3], directions.shape)
+    places, rays, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    depth = np.full(len(x), camera.far)
+    depth[rays] = np.minimum((places - pose[:3, 3]) @ pose[:3, 2], camera.far)
+    return depth.reshape(camera.height, camera.width)
+
+
+def agreement(seen: FloatArray, exact: FloatArray) -> float:
+    """Part of the pixels that agree; along silhouettes a ray may pass on either side."""
+    return float((np.abs(seen - exact) < EXACT).mean())
+
+
+@pytest.mark.parametrize("hand", [False, True])
+def test_the_outer_camera_sees_exact_depths(scene: Scene, hand: bool) -> None:
+    camera, pose = TwinCamera(width=160).pinhole, cabinet.world_from_camera()
+    seen = scene.depth(camera, pose, HAND if hand else None)
+    assert agreement(seen, cast(solid(hand), camera, pose)) > 0.998
+
+
+def test_the_hand_hides_what_is_behind_it(scene: Scene) -> None:
+    camera, pose = TwinCamera(width=160).pinhole, cabinet.world_from_camera()
+    nearer = scene.depth(camera, pose, HAND) < scene.depth(camera, pose) - 0.01
+    assert 0.02 < nearer.mean() < 0.5
+
+
+def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene: Scene) -> None:
+    camera = TwinBubbles(width=112).pinhole
+    pose = HAND @ wrist.wrist_from_bubble_camera("right")
+    seen = scene.depth(camera, pose)
+    assert agreement(seen, cast(solid(False), camera, pose)) > 0.998
+    assert seen.min() > 0.06
+
+
+def test_the_object_is_seen_but_in_part() -> None:
+    camera, pose = TwinCamera(width=160).pinhole, cabinet.world_from_camera()
+    alone = cast(MESH.copy().apply_transform(POSE), camera, pose) < camera.far
+    whole = cast(solid(False), camera, pose)
+    visible = alone & (np.abs(whole - cast(solid(False), camera, pose)) < 1e-9)
+    hidden = alone & (whole < cast(MESH.copy().apply_transform(POSE), camera, pose) - 1e-6)
+    assert visible.any()
+    assert 0.1 < hidden.sum() / alone.sum() < 0.9
+
+
+def test_clearance_is_the_distance_to_what_is_nearest(scene: Scene) -> None:
+    side = apply(wrist.world_from_wrist(np.zeros(3)), wrist.rigid_mesh().vertices)[:, 1].max()
+    for gap in (0.010, 0.003, -0.002):
+        beside_wall = np.array([0.75, 0.22 - gap - side, 0.45])
+        seen = scene.clearance(wrist.world_from_wrist(beside_wall))
+        assert seen == pytest.approx(gap, abs=1e-4)
+    assert scene.clearance(wrist.world_from_wrist(np.array([0.2, 0.0, 0.9]))) == NEAR
+
+
+def test_the_hand_feels_the_object_too(scene: Scene) -> None:
+    front = apply(wrist.world_from_wrist(np.zeros(3)), wrist.rigid_mesh().vertices)[:, 0].max()
+    surface = apply(POSE, MESH.vertices)
+    pose = wrist.world_from_wrist(np.array([surface[:, 0].min() - front + 0.01, 0.0, 0.46]))
+    assert scene.clearance(pose) < 0.0
+    pose = wrist.world_from_wrist(np.array([surface[:, 0].min() - front - 0.01, 0.0, 0.46]))
+    assert 0.01 - 1e-4 < scene.clearance(pose) <= NEAR
+
+
+def test_no_corner_of_the_hand_touches_at_rest(scene: Scene) -> None:
+    assert scene.clearance(wrist.world_from_wrist(np.array(REST))) == NEAR
+
+
+def test_a_missing_engine_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(SessionError, match="PyBullet is not installed"):
+        Scene(MESH, POSE)
