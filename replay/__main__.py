@@ -8,12 +8,13 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from types import ModuleType
 from typing import NoReturn
 
 from chsel.errors import ChselError
 from replay.console import print_error, print_warning
 from replay.startup import ready
-from replay.verbs import VERBS
+from replay.verbs import ALIASES, VERBS
 
 TRACEBACK = "--traceback"
 
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         given = _parser(words[0] if words else "").parse_args(words)
         ready()
-        status: int = importlib.import_module(f"replay.verbs.{given.verb}").run(given)
+        status: int = _module(given.verb).run(given)
         sys.stdout.flush()
     except KeyboardInterrupt:
         return 130
@@ -61,13 +62,19 @@ def _parser(verb: str) -> Parser:
     parser = Parser(prog="replay", description=__doc__)
     parser.add_argument(TRACEBACK, action="store_true", help="show where an error came from")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    for name, what in VERBS.items():
-        module = importlib.import_module(f"replay.verbs.{name}") if name == verb else None
-        description = module.__doc__ if module else what
-        of = verbs.add_parser(name, help=what, description=description)
+    aliases = {name: [old for old, new in ALIASES.items() if new == name] for name in VERBS}
+    for name, summary in VERBS.items():
+        module = _module(name) if verb in (name, *aliases[name]) else None
+        described = module.__doc__ if module else summary
+        of = verbs.add_parser(name, aliases=aliases[name], help=summary, description=described)
         if module:
             module.add_arguments(of)
     return parser
+
+
+def _module(verb: str) -> ModuleType:
+    """The module of a verb, by its name or a former one."""
+    return importlib.import_module(f"replay.verbs.{ALIASES.get(verb, verb)}")
 
 
 def _message(error: Exception) -> str:

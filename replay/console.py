@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 import unicodedata
+from collections.abc import Sequence
 from typing import IO, Any
 
 import rich.console
 import rich.progress
+from rich.box import SIMPLE_HEAD
 from rich.status import Status
+from rich.table import Table
 from rich.text import Text
 
 # Control and format characters (such as those that reverse the direction of what follows), halves
@@ -78,6 +81,26 @@ class Console(rich.console.Console):
     def status(self, status: Any, **options: Any) -> Status:
         """A line that stays while something is done."""
         return _PlainStatus(_plain(status), console=self, **options)
+
+
+def plain_table(
+    title: str = "", *, texts: Sequence[str] = (), numbers: Sequence[str] = ()
+) -> Table:
+    """A table without lines between its columns, those of texts first."""
+    table = Table(
+        title=title or None,
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+        show_edge=False,
+    )
+    for name in texts:
+        table.add_column(name, overflow="fold")
+    for name in numbers:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
 
 
 class Progress(rich.progress.Progress):

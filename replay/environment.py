@@ -8,6 +8,8 @@ import subprocess
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from replay.events import SessionStarted
+
 PACKAGES = (
     "chsel-replay",
     "numpy",
@@ -33,6 +35,16 @@ def environment() -> dict[str, str]:
     offering = {point.dist.name for point in entry_points(group="chsel.methods") if point.dist}
     packages = [*PACKAGES, *sorted(offering.difference(PACKAGES))]
     return values | {f"package {name}": _version(name) for name in packages}
+
+
+def environment_differences(start: SessionStarted) -> tuple[str, ...]:
+    """What of the recorded environment is otherwise here."""
+    here = environment()
+    return tuple(
+        f"{name} {value} -> {here.get(name, 'unknown')}"
+        for name, value in start.environment.items()
+        if here.get(name) != value
+    )
 
 
 def _version(package: str) -> str:

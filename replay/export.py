@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chsel.errors import RecordingError, require_choice
+from replay.files import new_file
 from replay.mcap.reader import Recording
-from replay.new_file import new_file
 from replay.standard_json import standard
 
 FORMATS = ("npz", "csv", "json")

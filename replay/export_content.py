@@ -10,13 +10,13 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
+from replay.arguments import chosen_steps
 from replay.events import Measured, Timed
 from replay.export import Exported, require_any
 from replay.export_images import exported_images
 from replay.mcap.contents import Contents
 from replay.mcap.foxglove_messages import poses_in_world
 from replay.mcap.reader import Recording
-from replay.step_ranges import chosen_steps
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _ENTRIES = tuple(f"m{row}{column}" for row in range(4) for column in range(4))

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from replay.arguments import chosen_steps
 from replay.events import SensorImage
 from replay.export import Exported, require_any
 from replay.mcap.reader import Recording
-from replay.step_ranges import chosen_steps
 
 _NAMES = ("step", "sensor", "image", "kind", "height", "width", "counting", "unit")
 _INTRINSICS = ("fx", "fy", "cx", "cy")

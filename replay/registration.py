@@ -7,22 +7,65 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import yaml
 
 from chsel.errors import RecordingError, SettingError
 from chsel.methods import build_method, preset_settings, trust_by
 from chsel.methods.method import Method
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, digest
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
 from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.registration_problem import Hypotheses, Trust
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Trust
 from chsel.problem.settings import PRESETS, changed_settings, settings_mapping
-from replay.events import HypothesesFound, Measured, ProblemPosed, Recorder, SessionStarted
+from replay.events import (
+    HypothesesFound,
+    Measured,
+    ProblemPosed,
+    Recorder,
+    SessionStarted,
+    SnapshotTaken,
+    Traced,
+)
 from replay.lost_attachment import is_lost
 from replay.mcap.reader import Recording
 from replay.settings_migration import completed
-from replay.step_observer import StepObserver
+
+
+class StepObserver:
+    """Hands what happens within one registration to the recorder, and takes the time by stage."""
+
+    def __init__(
+        self,
+        recorder: Recorder,
+        step: int,
+        snapshot_interval: int,
+        show: Callable[[str, int, int], None],
+    ) -> None:
+        self.snapshot_interval = snapshot_interval
+        self.seconds: dict[str, float] = {}
+        self._recorder = recorder
+        self._step = step
+        self._show = show
+        self._mark = time.perf_counter()
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        """Show it, and count the time since the last report to the stage."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
+        self._mark = now
+        self._show(stage, iteration, total)
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        """Record where the stage stands."""
+        costs = (float(cost.min()), float(np.median(cost)), float(cost.max()))
+        event = Traced(self._step, stage, iteration, digest(vectors, cost), costs)
+        self._recorder.record(event)
+
+    def snapshot(self, archive: ArchiveSnapshot) -> None:
+        """Record the archive."""
+        self._recorder.record(SnapshotTaken(self._step, archive))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +153,12 @@ def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
 def recorded_symmetry(start: SessionStarted) -> ObjectSymmetry:
     """The symmetries of a session's object; only the centre of its grid if the mesh is lost."""
     return grid_symmetry(start.sdf) if is_lost(start.mesh) else object_symmetry(start.mesh)
+
+
+def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
+    """Iterations between recorded snapshots; 0 if there are the first and the last alone."""
+    iterations = sorted({archive.iteration for archive in snapshots})
+    return iterations[1] if len(iterations) > 2 else 0
 
 
 def register_recorded(

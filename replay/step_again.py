@@ -12,12 +12,15 @@ from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.comparing.contenders import recorded_or_none
 from replay.environment import environment
 from replay.events import Event, Probe, ProblemPosed, SessionEnded, SessionStarted
-from replay.file_digest import file_digest
+from replay.files import file_digest, new_file
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.writer import McapRecorder
-from replay.new_file import new_file
-from replay.registration import NamedMethod, register_recorded, symmetry_for_errors
-from replay.verification import snapshot_interval
+from replay.registration import (
+    NamedMethod,
+    register_recorded,
+    snapshot_interval,
+    symmetry_for_errors,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,67 +2,57 @@
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from itertools import tee
-
-import numpy as np
-from numpy.typing import NDArray
+from multiprocessing import get_context
+from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
+from chsel.numerics.threads import threads
 from chsel.problem.online_registration import OnlineStep
-from chsel.problem.points import KnownPoints
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from replay.differences import apart, difference
-from replay.environment import environment
-from replay.events import (
-    Event,
-    HypothesesFound,
-    Measured,
-    Probe,
-    ProblemPosed,
-    SessionStarted,
-    SnapshotTaken,
-    Traced,
+from replay.comparing.results import (
+    RecordedRegistration,
+    ResultDifferences,
+    has_measured,
+    recorded_registrations,
+    result_in,
+    stage_name,
 )
+from replay.environment import environment_differences
+from replay.events import Event, SnapshotTaken, Traced
 from replay.lost_attachment import LostAttachment
-from replay.mcap.reader import Recording
-from replay.mcap.recovery import tells_loss
-from replay.mcap.schemas import SEALED_SINCE
-from replay.measured import measured_differences
+from replay.mcap.reader import Recording, read_recording
 from replay.recorder import ListRecorder
 from replay.registration import (
     NamedMethod,
     recorded_method,
     recorded_online,
     register_recorded,
+    snapshot_interval,
     symmetry_for_errors,
 )
 
 EQUAL, DIFFERS, NO_RESULT = "equal", "differs", "no result"
 _PATIENCE = 10  # times the recorded iterations of a stage; more are not worth waiting for
-_ARCHIVE = ("lower", "upper", "cells", "solutions", "objectives", "measures")
-_HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell", "elites")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What verifying one step showed.
-
-    outcome: "equal", "differs", or "no result" where the recorded registration did not end.
-    stage: the first that differs. before: how many stages before it are equal. differences: of
-    the recorded numbers, line by line. largest_ulps: over all of them. seconds: of registering.
-    """
+    """What verifying one step showed."""
 
     step: int
     method: str
-    outcome: str
-    stage: str = ""
-    before: int = 0
-    differences: tuple[str, ...] = ()
-    largest_ulps: int = 0
-    environment: tuple[str, ...] = ()
-    seconds: float = 0.0
+    outcome: str  # "equal", "differs", or "no result" where the recorded registration did not end
+    stage: str = ""  # the first that differs
+    before: int = 0  # how many recorded stages before it are equal
+    differences: tuple[str, ...] = ()  # of the recorded numbers, line by line
+    largest_ulps: int = 0  # over all of them
+    environment: tuple[str, ...] = ()  # what of it is not as recorded
+    seconds: float = 0.0  # of registering
 
     def report(self) -> str:
         """The verdict for people; several lines if it is "differs"."""
@@ -77,19 +67,44 @@ class Verdict:
         ]
         return "\n  ".join(lines)
 
+    @classmethod
+    def of(
+        cls,
+        step: int,
+        method: str,
+        found: ResultDifferences,
+        *,
+        environment: tuple[str, ...],
+        seconds: float = 0.0,
+    ) -> Verdict:
+        """The verdict that follows from the differences of a result."""
+        if not found.stage:
+            return cls(step, method, EQUAL, before=found.before, seconds=seconds)
+        return cls(
+            step,
+            method,
+            DIFFERS,
+            found.stage,
+            found.before,
+            tuple(found.lines),
+            found.largest_ulps,
+            environment,
+            seconds,
+        )
+
 
 def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator[Verdict]:
     """Verdicts on steps of a recording (None: on all that pose a problem), in their order.
 
-    Raises RecordingError if the recording does not tell its method, lacks a step, or has lost its
-    SDF grid.
+    Raises RecordingError if the recording does not have its method's settings, lacks a step, or has
+    lost its SDF grid.
     """
     method = recorded_method(recording)
     wanted = set(recording.checked_steps(steps))
     if isinstance(recording.start.sdf, LostAttachment):
         raise RecordingError(f"recording {recording.path}: {recording.start.sdf.error()}")
     differing = environment_differences(recording.start)
-    registrations, again = tee(_registrations(recording))
+    registrations, again = tee(recorded_registrations(recording))
     perceived = ((one.posed.step, one.new_points) for one in again)
     online = recorded_online(recording, method.method)
     walked = online.steps(perceived, catch=ChselError)
@@ -100,170 +115,58 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
             online.remember(recorded.last_result)
 
 
-def environment_differences(start: SessionStarted) -> tuple[str, ...]:
-    """What of the recorded environment is otherwise here."""
-    here = environment()
-    return tuple(
-        f"{name} {value} -> {here.get(name, 'unknown')}"
-        for name, value in start.environment.items()
-        if here.get(name) != value
-    )
-
-
-def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:
-    """Iterations between recorded snapshots; 0 if there are the first and the last alone."""
-    iterations = sorted({archive.iteration for archive in snapshots})
-    return iterations[1] if len(iterations) > 2 else 0
-
-
-@dataclass(frozen=True, eq=False)
-class _Registration:
-    """A recorded problem with the events up to the next one."""
-
-    posed: ProblemPosed
-    new_points: KnownPoints  # since the problem before
-    follows: bool  # whether E_0 and E_l are of results in this recording, none of them lost
-    events: list[Event]
-
-    @property
-    def last_result(self) -> Hypotheses | None:
-        """The result that is known when the next problem is posed."""
-        return _result(self.events[::-1])
-
-
-def _registrations(recording: Recording) -> Iterator[_Registration]:
-    events = recording.events(images=False)
-    before, posed = _until_next_problem(events)
-    lost = False
-    while posed is not None:
-        for event in before:
-            lost = tells_loss(event) or (lost and not isinstance(event, HypothesesFound))
-        new = [event.new_points for event in before if isinstance(event, Probe)]
-        of_step, following = _until_next_problem(events)
-        follows = not recording.start.source and not lost
-        yield _Registration(posed, KnownPoints.joined([KnownPoints(), *new]), follows, of_step)
-        before, posed = of_step, following
-
-
-def _until_next_problem(events: Iterator[Event]) -> tuple[list[Event], ProblemPosed | None]:
-    of_step: list[Event] = []
-    for event in events:
-        if isinstance(event, ProblemPosed):
-            return of_step, event
-        of_step.append(event)
-    return of_step, None
-
-
-def _events_of(step: int, events: Sequence[Event]) -> tuple[list[Event], bool]:
-    """The events of a step, and whether all are there; its result alone if some may be lost."""
-    whole = True
-    for event in events:
-        if isinstance(event, HypothesesFound) and event.step == step:
-            break
-        whole = whole and not tells_loss(event)
-    own = [event for event in events if getattr(event, "step", None) == step]
-    return [event for event in own if whole or isinstance(event, HypothesesFound)], whole
-
-
 def _verified(
     recording: Recording,
-    registration: _Registration,
+    registration: RecordedRegistration,
     again: OnlineStep,
     method: NamedMethod,
     environment: tuple[str, ...],
 ) -> Verdict:
     """Register a recorded problem again, and compare; again: the problem, posed today."""
-    start, posed, events = recording.start, registration.posed, registration.events
-    step = posed.step
-    recorded, whole = _events_of(step, events)
-    expected = _result(recorded)
-    if expected is None:
-        return Verdict(step, method.name, NO_RESULT)
-    comparison = _Comparison()
-    if registration.follows:
-        _compare_sets(comparison, posed.problem, again)
-    watching = _Watching(recorded) if whole else ListRecorder()
-    snapshots = [event.archive for event in recorded if isinstance(event, SnapshotTaken)]
-    found, failure, seconds = None, "", 0.0
+    start, posed, recorded = recording.start, registration.posed, registration.events
+    if result_in(recorded) is None:
+        return Verdict(posed.step, method.name, NO_RESULT)
+    found = ResultDifferences()
+    if registration.follows and again.problem is not None:
+        found.add_sets(posed.problem, again.problem)
+    elif registration.follows:  # such as after a result whose poses are not finite
+        found.fail("making E_0", f"E_0 and E_l cannot be made again: {again.failure}")
+    recorder = _PatientRecorder(recorded) if registration.complete else ListRecorder()
+    failure, seconds = "", 0.0
     try:
-        registered = register_recorded(
+        seconds = register_recorded(
             posed,
             method.method,
-            watching,
+            recorder,
             start.world_from_object,
             symmetry_for_errors(start),
-            snapshot_interval=snapshot_interval(snapshots),
-        )
-        found, seconds = registered.hypotheses, registered.total_seconds
+            snapshot_interval=snapshot_interval(recording.snapshots(posed.step)),
+        ).total_seconds
     except (_FarBeyondError, ChselError) as error:
         failure = str(error)
-    _compare_stages(comparison, recorded, watching.events, ended=found is not None)
-    if found is not None:
-        _compare_results(comparison, expected, found)
-    else:
-        comparison.stage_is("the end of the registration", equal=False)
-        comparison.differences.append(f"today's registration does not end: {failure}")
-    numbers = [event for event in recorded if isinstance(event, Measured)]
-    measured = recording.version >= SEALED_SINCE  # before, numbers may be others than today's
-    if measured and (numbers or not any(map(tells_loss, events))):
-        lines = measured_differences(start, posed.problem, expected, numbers, method.method)
-        comparison.stage_is("the measured values", equal=not lines)
-        comparison.differences += lines
-    return comparison.verdict(step, method.name, environment, seconds)
-
-
-@dataclass
-class _Comparison:
-    """Collects differences; the first names the stage."""
-
-    stage: str = ""
-    before: int = 0
-    differences: list[str] = field(default_factory=list)
-    largest: int = 0
-
-    def stage_is(self, name: str, *, equal: bool) -> None:
-        """A stage is compared."""
-        if equal and not self.stage:
-            self.before += 1
-        elif not equal and not self.stage:
-            self.stage = name
-
-    def arrays(self, pairs: dict[str, tuple[NDArray, NDArray]]) -> bool:
-        """Whether pairs of arrays, recorded and found, are equal; keeps how they are not."""
-        texts = [difference(name, *pair) for name, pair in pairs.items()]
-        self.differences += [text for text in texts if text is not None]
-        self.largest = max([self.largest, *(apart(*pair) for pair in pairs.values())])
-        return not any(texts)
-
-    def verdict(
-        self, step: int, method: str, environment: tuple[str, ...], seconds: float
-    ) -> Verdict:
-        """What all comparisons say."""
-        if not self.stage:
-            return Verdict(step, method, EQUAL, before=self.before, seconds=seconds)
-        return Verdict(
-            step,
-            method,
-            DIFFERS,
-            self.stage,
-            self.before,
-            tuple(self.differences),
-            self.largest,
-            environment,
-            seconds,
-        )
+    found.add_stages(recorded, recorder.events)
+    if failure:
+        reason = f"today's registration does not end: {failure}"
+        found.fail("the end of the registration", reason)
+    if has_measured(recording, registration):
+        found.add_measured(recording, recorded, recorder.events)
+    return Verdict.of(posed.step, method.name, found, environment=environment, seconds=seconds)
 
 
 class _FarBeyondError(Exception):
     """A registration goes on long after the recorded one had ended."""
 
 
-class _Watching(ListRecorder):
+class _PatientRecorder(ListRecorder):
     """Keeps events, and stops a registration that goes on far beyond the recorded one."""
 
     def __init__(self, recorded: Sequence[Event]) -> None:
         super().__init__()
-        self._last = _last_iterations(recorded)
+        traces = [event for event in recorded if isinstance(event, Traced)]
+        self._last = {
+            stage: max(event.iteration for event in traces if event.stage == stage)
+            for stage in {event.stage for event in traces}
+        }
         snapshots = [event.archive for event in recorded if isinstance(event, SnapshotTaken)]
         self._snapshots = {archive.iteration for archive in snapshots}
 
@@ -275,97 +178,86 @@ class _Watching(ListRecorder):
             last = self._last.get(event.stage, 0)
             if event.iteration > _PATIENCE * last + 1000:
                 raise _FarBeyondError(
-                    f"{_stage_name(event)} is far beyond the last recorded one, {last}"
+                    f"{stage_name(event)} is far beyond the last recorded one, {last}"
                 )
         super().record(event)
 
 
-def _compare_sets(comparison: _Comparison, problem: RegistrationProblem, again: OnlineStep) -> None:
-    """Whether E_0 and E_l follow from the step before as recorded (CHSEL, Alg. 2)."""
-    if again.problem is None:  # such as after a result whose poses are not finite
-        comparison.stage_is("making E_0", equal=False)
-        comparison.differences.append(f"E_0 and E_l cannot be made again: {again.failure}")
+@dataclass
+class FileVerdict:
+    """What verifying one file showed."""
+
+    path: Path
+    verdicts: list[Verdict] = field(default_factory=list)
+    unusable: str = ""  # why the file could not be verified
+    digest: str = ""  # of the recording; empty before format version 3
+    seconds: float = 0.0  # from reading the file to its last verdict, summed over processes
+
+    @property
+    def status(self) -> int:
+        """0 if all steps are equal, 1 if one differs, 2 if the file cannot be used."""
+        if self.unusable:
+            return 2
+        return int(any(verdict.outcome == DIFFERS for verdict in self.verdicts))
+
+    @property
+    def equal(self) -> int:
+        """How many steps are equal."""
+        return sum(verdict.outcome == EQUAL for verdict in self.verdicts)
+
+
+def recordings_in(paths: Sequence[str | Path]) -> list[Path]:
+    """The files named, and for each folder the recordings in it and below, by name."""
+    found: list[Path] = []
+    for path in map(Path, paths):
+        inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
+        if not inside:
+            raise RecordingError(f"folder {path} has no recordings; accepted: files *.mcap in it")
+        found += inside
+    return found
+
+
+def verified_files(
+    paths: Sequence[Path], steps: Sequence[int] | None = None, *, jobs: int = 1
+) -> Iterator[FileVerdict]:
+    """Verdicts on files, in their order, on as many processes as `jobs`; a thread in each."""
+    if jobs == 1:
+        for path in paths:
+            yield _verified_part(path, steps, 0, 1)
         return
-    for name, field_name in (("E_0", "initial_set"), ("E_l", "low_cost_set")):
-        pair = (getattr(problem, field_name), getattr(again.problem, field_name))
-        comparison.stage_is(f"making {name}", equal=comparison.arrays({name: pair}))
+    parts = -(-jobs // max(len(paths), 1))
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        waiting: dict[int, list[Future[FileVerdict]]] = defaultdict(list)
+        for index, path in enumerate(paths):
+            for part in range(parts):
+                waiting[index].append(pool.submit(_verified_part, path, steps, part, parts))
+        for futures in waiting.values():
+            yield _joined([future.result() for future in futures])
 
 
-def _compare_stages(
-    comparison: _Comparison, recorded: Sequence[Event], found: Sequence[Event], *, ended: bool
-) -> None:
-    """Compare traces and snapshots in the order in which they were recorded.
-
-    ended: whether the registration ended; if not, what it did not come to is not compared.
-    """
-    here = _by_stage(found)
-    for name, event in _by_stage(recorded).items():
-        other = here.get(name)
-        if other is None and ended:
-            comparison.stage_is(f"{name}, which does not come about", equal=False)
-        elif isinstance(event, Traced):
-            comparison.stage_is(name, equal=event == other)
-        elif isinstance(event, SnapshotTaken) and isinstance(other, SnapshotTaken):
-            first = not comparison.stage
-            equal = _snapshot_bits(event.archive) == _snapshot_bits(other.archive)
-            comparison.stage_is(name, equal=equal)
-            if first and not equal:
-                comparison.arrays(_archive_pairs(name, event.archive, other.archive))
-
-
-def _compare_results(comparison: _Comparison, expected: Hypotheses, found: Hypotheses) -> None:
-    pairs = {name: (getattr(expected, name), getattr(found, name)) for name in _HYPOTHESES}
-    equal = comparison.arrays(pairs)
-    comparison.stage_is("choosing the hypotheses", equal=equal)
-    kept, ours = expected.archive, found.archive
-    if (kept is None) is not (ours is None):
-        comparison.stage_is("the last archive", equal=False)
-    elif kept is not None and ours is not None:
-        same = _snapshot_bits(kept) == _snapshot_bits(ours)
-        comparison.stage_is("the last archive", equal=same)
-        if not same:
-            comparison.arrays(_archive_pairs("last archive", kept, ours))
+def _verified_part(path: Path, steps: Sequence[int] | None, part: int, parts: int) -> FileVerdict:
+    """Verdicts on one of several equal parts of the steps, by one thread."""
+    begun, verdict = time.perf_counter(), FileVerdict(path)
+    try:
+        recording = read_recording(path)
+        verdict.digest = recording.digest
+        wanted = recording.checked_steps(steps)
+        first, last = (len(wanted) * part // parts, len(wanted) * (part + 1) // parts)
+        if not any(recording.has_result(step) for step in wanted):
+            raise RecordingError(
+                f"recording {path} has no registration with a result to verify; accepted: a "
+                "recording of at least one"
+            )
+        with threads(1):
+            verdict.verdicts = list(verify(recording, wanted[first:last]))
+    except (ChselError, OSError, MemoryError) as error:
+        verdict.unusable = str(error) or f"recording {path} does not fit into memory"
+    verdict.seconds = time.perf_counter() - begun
+    return verdict
 
 
-def _by_stage(events: Sequence[Event]) -> dict[str, Traced | SnapshotTaken]:
-    """Traces and snapshots by a name; those of later passes are numbered."""
-    named: dict[str, Traced | SnapshotTaken] = {}
-    for event in events:
-        if isinstance(event, Traced | SnapshotTaken):
-            name, number = _stage_name(event), 1
-            while name in named:
-                number += 1
-                name = f"{_stage_name(event)} (pass {number})"
-            named[name] = event
-    return named
-
-
-def _stage_name(event: Traced | SnapshotTaken) -> str:
-    if isinstance(event, Traced):
-        return f"{event.stage}, iteration {event.iteration}"
-    return f"archive, iteration {event.archive.iteration}"
-
-
-def _archive_pairs(
-    name: str, recorded: ArchiveSnapshot, found: ArchiveSnapshot
-) -> dict[str, tuple[NDArray, NDArray]]:
-    return {f"{name}: {part}": (getattr(recorded, part), getattr(found, part)) for part in _ARCHIVE}
-
-
-def _snapshot_bits(archive: ArchiveSnapshot) -> tuple[object, ...]:
-    """All of a snapshot, range and names included."""
-    bytes_of = tuple(np.ascontiguousarray(getattr(archive, part)).tobytes() for part in _ARCHIVE)
-    return (archive.iteration, archive.refinement, archive.measure_names, archive.shape, *bytes_of)
-
-
-def _result(events: Sequence[Event]) -> Hypotheses | None:
-    return next((e.hypotheses for e in events if isinstance(e, HypothesesFound)), None)
-
-
-def _last_iterations(events: Sequence[Event]) -> dict[str, int]:
-    """The last recorded iteration of each stage."""
-    last: dict[str, int] = {}
-    for event in events:
-        if isinstance(event, Traced):
-            last[event.stage] = max(last.get(event.stage, 0), event.iteration)
-    return last
+def _joined(parts: Sequence[FileVerdict]) -> FileVerdict:
+    verdicts = [verdict for part in parts for verdict in part.verdicts]
+    unusable = next((part.unusable for part in parts if part.unusable), "")
+    seconds = sum(part.seconds for part in parts)
+    return FileVerdict(parts[0].path, verdicts, unusable, parts[0].digest, seconds)

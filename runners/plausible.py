@@ -23,8 +23,8 @@ from chsel.plausible.true_pose import find_true_pose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
+from replay.arguments import chosen_steps
 from replay.console import Console, Progress
-from replay.step_ranges import chosen_steps
 from runners.cli import command, plain
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import Measure, MetricsConfig

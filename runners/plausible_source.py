@@ -24,7 +24,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from replay.events import Event, Probe, RigDescribed, SessionStarted
-from replay.file_digest import file_digest
+from replay.files import file_digest
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.schemas import PROFILE
 from runners.objects.loader import ObjectConfig, load_object

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from chsel.errors import ChselError, RecordingError
-from replay.disk import sync_file, sync_folder
+from replay.files import sync_file, sync_folder
 
 
 class WritingError(ChselError):

@@ -9,7 +9,7 @@ from pathlib import Path
 from replay.comparing.columns import COLUMNS
 from replay.comparing.comparison import CommonCost, Outcome
 from replay.comparing.contenders import Contender
-from replay.new_file import new_file
+from replay.files import new_file
 
 
 def write_csv(

@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from chsel.errors import SettingError
 from replay.comparing.columns import Column, columns_in_table
 from replay.comparing.comparison import Outcome
-from replay.new_file import new_file
+from replay.files import new_file
 
 SUFFIXES = (".png", ".svg", ".pdf")
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito

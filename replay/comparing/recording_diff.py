@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import filecmp
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from chsel.errors import ChselError, RecordingError, SettingError
+from replay.comparing.differences import Difference, differences
 from replay.comparing.message_content import (
     Content,
     attachment_content,
@@ -20,7 +19,6 @@ from replay.comparing.message_content import (
     printable,
     step_of,
 )
-from replay.differences import apart, difference
 from replay.mcap.attachments import MESH, SDF_GRID
 from replay.mcap.encoding import decode
 from replay.mcap.file import McapFile, StoredMessage
@@ -29,8 +27,6 @@ from replay.mcap.schemas import MESSAGES, RECORDS, message_class
 from replay.mcap.seal import CONTENTS, SEAL
 
 BOTH, FIRST, SECOND = "both", "first", "second"
-_LONGEST_TEXT = 60
-_ABSENT = object()
 _BEFORE_ALL_STEPS = -1
 _MALFORMED = (ChselError, ValueError, RecursionError)
 
@@ -60,19 +56,12 @@ class Key(NamedTuple):
         return ", ".join(parts)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """One field that differs, or a message that one recording alone has (`field` is empty then).
-
-    having: "both", "first" or "second". text: what is different. ulps: units in the last place,
-    the most over an array; None for all but floating point.
-    """
+@dataclass(frozen=True, kw_only=True)
+class MessageDifference(Difference):
+    """A field that differs between two messages, or a message that one recording alone has."""
 
     key: Key
-    having: str
-    field: str
-    text: str
-    ulps: int | None = None
+    having: str = BOTH  # which of the recordings have the message: "both", "first" or "second"
 
     def __str__(self) -> str:
         return f"{self.key}: {self.text}"
@@ -110,7 +99,7 @@ class RecordingDiff:
 
     same_bytes: bool
     topics: dict[str, TopicDiff] = field(default_factory=dict)
-    differences: list[Difference] = field(default_factory=list)
+    differences: list[MessageDifference] = field(default_factory=list)
 
     @property
     def is_equal(self) -> bool:
@@ -254,7 +243,7 @@ def _about(message: StoredMessage) -> str:
 
 
 def _take(
-    found: RecordingDiff, key: Key, differences: Sequence[Difference], keep: int | None
+    found: RecordingDiff, key: Key, differences: Sequence[MessageDifference], keep: int | None
 ) -> None:
     """Count a message or attachment and its differences."""
     topic = found.topics.setdefault(key.topic, TopicDiff())
@@ -274,12 +263,12 @@ def _take(
             found.differences.append(item)
 
 
-def _compared_messages(pair: _Pair, ignored: Ignored) -> list[Difference]:
+def _compared_messages(pair: _Pair, ignored: Ignored) -> list[MessageDifference]:
     key, first, second, moved = pair
     if first is None or second is None:
         return [_lonely(key, FIRST if second is None else SECOND)]
-    order = [Difference(key, BOTH, "order", "order: it stands later in the second recording")]
-    found = order if moved else []
+    order = "order: it stands later in the second recording"
+    found = [MessageDifference(key=key, field="order", text=order)] if moved else []
     if first.data == second.data and key.topic in RECORDS:
         return found
     one, other = (dict(_read(message_content, message)) for message in (first, second))
@@ -292,7 +281,7 @@ def _compared_messages(pair: _Pair, ignored: Ignored) -> list[Difference]:
 
 def _compared_attachments(
     key: Key, first: bytes | None, second: bytes | None, ignored: Ignored
-) -> list[Difference]:
+) -> list[MessageDifference]:
     if first is None or second is None:
         return [_lonely(key, FIRST if second is None else SECOND)]
     if first == second:
@@ -301,76 +290,29 @@ def _compared_attachments(
     return _compared(key, one, _read(attachment_content, key.topic, second), ignored)
 
 
-def _read(read: Any, *what: Any) -> Content:
-    """What is said; the mere bytes of what is malformed, and why it is."""
+def _read(read: Callable[..., Content], *arguments: Any) -> Content:
+    """The content; of what is malformed, the mere bytes and why it is."""
     try:
-        content: Content = read(*what)
+        return read(*arguments)
     except _MALFORMED as error:
-        data = what[-1].data if isinstance(what[-1], StoredMessage) else what[-1]
+        data = arguments[-1]
+        data = data.data if isinstance(data, StoredMessage) else data
         return {"malformed": str(error), "bytes": data}
-    return content
 
 
 def _compared(
-    key: Key, first: Mapping[str, Any], second: Mapping[str, Any], ignored: Ignored
-) -> list[Difference]:
-    """What differs between two contents, in the order of the first."""
-    names = [*first, *(name for name in second if name not in first)]
-    found = []
-    for name in names:
-        if not ignored.field(name):
-            pair = (first.get(name, _ABSENT), second.get(name, _ABSENT))
-            text = _difference(name, *pair)
-            if text is not None:
-                found.append(Difference(key, BOTH, name, text, _ulps(name, *pair)))
-    return found
+    key: Key, first: Content, second: Content, ignored: Ignored
+) -> list[MessageDifference]:
+    return [
+        MessageDifference(key=key, **vars(found))
+        for found in differences(first, second)
+        if not ignored.field(found.field)
+    ]
 
 
-def _lonely(key: Key, having: str) -> Difference:
-    return Difference(key, having, "", f"only in the {having} recording")
-
-
-def _difference(name: str, first: Any, second: Any) -> str | None:
-    """How two values differ, or None if they have the same bits."""
-    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
-        if first.shape != second.shape or first.dtype != second.dtype:
-            return f"{name}: {_shown(first)} -> {_shown(second)}"
-        return difference(name, first, second)
-    if type(first) is type(second):
-        if isinstance(first, float):
-            if np.float64(first).tobytes() == np.float64(second).tobytes():
-                return None
-        elif first is second or first == second:
-            return None
-    if isinstance(first, bytes) and isinstance(second, bytes):
-        return f"{name}: {len(first)} bytes -> {len(second)} others"
-    text = f"{name}: {_shown(first)} -> {_shown(second)}"
-    steps = _ulps(name, first, second)
-    return text if steps is None else f"{text} ({steps} ulp)"
-
-
-def _ulps(name: str, first: Any, second: Any) -> int | None:
-    """Units in the last place between numbers; None of settings, and of all that is no number."""
-    if name.startswith("config"):
-        return None
-    if isinstance(first, float) and isinstance(second, float):
-        first, second = np.array([first]), np.array([second])
-    if not (isinstance(first, np.ndarray) and isinstance(second, np.ndarray)):
-        return None
-    if first.dtype != np.float64 or first.shape != second.shape or second.dtype != first.dtype:
-        return None
-    return apart(first, second)
-
-
-def _shown(value: Any) -> str:
-    if value is _ABSENT:
-        return "absent"
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype} {value.shape}"
-    if isinstance(value, bytes):
-        return f"{len(value)} bytes"
-    text = printable(value) if isinstance(value, str) else repr(value)
-    return text if len(text) <= _LONGEST_TEXT else f"{text[: _LONGEST_TEXT - 1]}…"
+def _lonely(key: Key, having: str) -> MessageDifference:
+    text = f"only in the {having} recording"
+    return MessageDifference(key=key, having=having, field="", text=text)
 
 
 def _is_topic(word: str, name: str) -> bool:

@@ -20,6 +20,7 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
+from replay.files import new_file
 from replay.lost_attachment import LostAttachment
 from replay.mcap.event_checks import RECOVERED
 from replay.mcap.event_order import EventOrder
@@ -34,7 +35,6 @@ from replay.mcap.sensor_messages import ImagePlace
 from replay.mcap.texts import one_line
 from replay.mcap.whole_records import Damage
 from replay.mcap.writer import McapRecorder
-from replay.new_file import new_file
 
 _OF_REGISTRATION = (Traced, SnapshotTaken, HypothesesFound)
 _OF_POINTS = ("/points/free", "/points/occupied", "/points/known", "/known_points")

@@ -18,7 +18,6 @@ from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import GrowingPoints, KnownPoints
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import ArchiveSnapshot
-from replay.disk import sync_folder
 from replay.events import (
     Event,
     HypothesesFound,
@@ -35,6 +34,7 @@ from replay.events import (
     Timed,
     Traced,
 )
+from replay.files import sync_folder
 from replay.lost_attachment import LostAttachment, is_lost
 from replay.mcap.attachments import MEDIA_TYPES, MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
 from replay.mcap.contents import Contents

@@ -12,8 +12,8 @@ import rerun as rr
 from chsel.errors import RecordingError
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay import events
-from replay.disk import sync_file, sync_folder
 from replay.events import Recorder
+from replay.files import sync_file, sync_folder
 from replay.rerun.archive import ArchiveMap, map_frame
 from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
 from replay.rerun.clock import Clock

@@ -17,6 +17,7 @@ from chsel.errors import RecordingError
 from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.plausible_settings import DEFINITIONS
 from chsel.problem.registration_problem import Hypotheses
+from replay.arguments import STEPS_HELP, chosen_steps, path_argument
 from replay.comparing.columns import PLAUSIBLE, Column, columns_in_table
 from replay.comparing.comparison import (
     CommonCost,
@@ -31,8 +32,6 @@ from replay.comparing.csv_file import write_csv
 from replay.comparing.plausible import PlausibleSets
 from replay.console import Console, Progress, TextColumn
 from replay.mcap.reader import Recording, read_recording
-from replay.path_argument import path_argument
-from replay.step_ranges import STEPS_HELP, chosen_steps
 
 _FEW_STEPS = 3
 

@@ -11,10 +11,10 @@ from collections.abc import Iterable
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from replay.arguments import path_argument
 from replay.comparing.message_content import printable
 from replay.comparing.recording_diff import Ignored, RecordingDiff, TopicDiff, recording_diff
 from replay.console import Console
-from replay.path_argument import path_argument
 
 _SHOWN = 20
 _MANY_ULPS = 10**6

@@ -9,12 +9,11 @@ from pathlib import Path
 from rich.filesize import decimal
 
 from chsel.errors import SettingError
+from replay.arguments import STEPS_HELP, path_argument
 from replay.console import Console
 from replay.export import FORMATS, write_export
 from replay.export_content import EXPORTS, exported_archive
 from replay.mcap.reader import read_recording
-from replay.path_argument import path_argument
-from replay.step_ranges import STEPS_HELP
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from replay.arguments import path_argument
 from replay.console import Console
 from replay.mcap.recovery import Recovered, recover
-from replay.path_argument import path_argument
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

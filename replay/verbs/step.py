@@ -17,10 +17,10 @@ from rich.table import Table
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import SettingError
 from chsel.methods import METHODS
+from replay.arguments import path_argument
 from replay.comparing.comparison import common_cost, numbers_under
 from replay.console import Console
 from replay.mcap.reader import Recording, read_recording
-from replay.path_argument import path_argument
 from replay.registration import other_method
 from replay.rerun.drawing import check_new, draw_recording
 from replay.step_again import StepAgain, register_step_again

@@ -10,8 +10,7 @@ import time
 
 from chsel.numerics.threads import require_threads
 from replay.console import Console, Progress, print_error
-from replay.file_verification import FileVerdict, recordings_in, verified_files
-from replay.verification import NO_RESULT
+from replay.verification import DIFFERS, NO_RESULT, FileVerdict, recordings_in, verified_files
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,6 +60,6 @@ def _tell(console: Console, file: FileVerdict) -> None:
         line += f", digest {file.digest}"
     console.print(line)
     for verdict in compared:
-        if file.status == 1 and verdict.outcome != "equal":
+        if verdict.outcome == DIFFERS:
             for line in verdict.report().split("\n"):
                 console.print(line)

@@ -9,9 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from chsel.errors import RecordingError
+from replay.arguments import path_argument
 from replay.console import Console
 from replay.mcap.reader import Recording, read_recording
-from replay.path_argument import path_argument
 from replay.rerun.drawing import check_new, draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
 

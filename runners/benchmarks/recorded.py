@@ -11,7 +11,7 @@ from pathlib import Path
 from chsel.problem.points import KnownPoints
 from replay.environment import environment
 from replay.events import HypothesesFound, Probe, ProblemPosed, Recorder, SessionStarted
-from replay.step_observer import StepObserver
+from replay.registration import StepObserver
 from runners.benchmarks.ours import Steps, method
 from runners.benchmarks.problems import PosedProblem, drill
 from runners.benchmarks.timing import in_turn

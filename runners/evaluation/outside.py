@@ -17,7 +17,7 @@ from chsel.problem.file_checks import read_npz
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.qd.selection import repeated
-from replay.file_digest import file_digest
+from replay.files import file_digest
 from runners.evaluation.draws import MOST_DRAWS, draw_label
 from runners.evaluation.judge import Judge
 from runners.evaluation.plan import Plan, Trial

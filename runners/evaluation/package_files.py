@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from replay.file_digest import file_digest
+from replay.files import file_digest
 from runners.evaluation.draws import draw_label
 from runners.evaluation.outside import DRAW_FOLDER
 from runners.evaluation.package_session import PackageSet

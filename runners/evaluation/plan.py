@@ -14,7 +14,7 @@ from chsel.methods.method import Method
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.settings import build_settings
-from replay.step_ranges import chosen_steps
+from replay.arguments import chosen_steps
 from runners.evaluation.configurations import (
     MOST_PROBES,
     SENSORS,

@@ -16,7 +16,7 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
-from replay.file_digest import file_digest
+from replay.files import file_digest
 from replay.mcap.writer import McapRecorder
 from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender

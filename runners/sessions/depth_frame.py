@@ -10,7 +10,7 @@ import numpy as np
 from chsel.problem.input_checks import check_points
 from chsel.problem.points import KnownPoints
 from replay.events import Logged, Probe, RigDescribed, SensorImage
-from replay.file_digest import file_digest
+from replay.files import file_digest
 from runners.objects.loader import ObjectModel
 from runners.sensors.depth_camera import intrinsics_of, recorded
 from runners.sensors.depth_frame import DepthFrame, read_depth_frame

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from chsel.numerics.arrays import digest
-from replay.differences import ulps
+from replay.comparing.differences import ulps
 from tests.determinism.stages import Stages
 
 GOLDEN_FILE = Path(__file__).with_name("golden.json")

@@ -15,7 +15,7 @@ from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
 from chsel.problem.settings import PRESETS
 from chsel.qd.emitters import SEARCHES
 from chsel.qd.measures import MEASURES
-from replay.differences import ulps
+from replay.comparing.differences import ulps
 from tests.determinism.cases import CASES
 from tests.determinism.comparison import condensed, differences, other_versions, read_golden
 from tests.determinism.environments import ENVIRONMENTS

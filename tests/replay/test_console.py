@@ -132,7 +132,7 @@ COMMANDS = {
     "view": ["view", "FILE", "--save", "OUT.rrd"],
     "recover": ["recover", "FILE", "-o", "OUT.mcap"],
     "export": ["export", "FILE", "--what", "points", "-o", "OUT.npz"],
-    "bless": ["bless", "FILE", "--yes"],
+    "accept": ["accept", "FILE", "--yes"],
 }
 
 
@@ -153,11 +153,11 @@ def test_every_verb_takes_files_of_any_name(
         assert SHOWN in printed.out
 
 
-@pytest.mark.parametrize("verb", ["info", "verify", "bless", "diff", "recover"])
+@pytest.mark.parametrize("verb", ["info", "verify", "accept", "diff", "recover"])
 def test_errors_name_files_of_any_name(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    more = {"bless": ["--yes"], "diff": [str(REPLAY)], "recover": ["-o", str(tmp_path / "out")]}
+    more = {"accept": ["--yes"], "diff": [str(REPLAY)], "recover": ["-o", str(tmp_path / "out")]}
     assert main([verb, str(tmp_path / HOSTILE), *more.get(verb, [])]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""

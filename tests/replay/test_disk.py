@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 from chsel.errors import RecordingError
+from chsel.problem import online_registration as online
 from replay.__main__ import main
+from replay.files import new_file
 from replay.mcap.writer import McapRecorder
-from replay.new_file import new_file
 from replay.rerun.recorder import RerunRecorder
 from runners.benchmarks import report
 from runners.recording import write_in_run_folder
@@ -108,25 +109,21 @@ def test_the_view_is_on_the_disk_when_it_is_closed(events, tmp_path, synced) -> 
     assert synced.holds(path)
 
 
-def test_recovered_and_blessed_recordings_are_on_the_disk(tmp_path, synced, monkeypatch) -> None:
+def test_recovered_and_accepted_recordings_are_on_the_disk(tmp_path, synced, monkeypatch) -> None:
     out = tmp_path / "out.mcap"
     assert main(["recover", str(STORED), "-o", str(out)]) == 0
     assert synced.holds(out)
     assert main(["export", str(STORED), "--what", "points", "-o", str(tmp_path / "a.npz")]) == 0
     assert synced.holds(tmp_path / "a.npz")
 
-    monkeypatch.setattr("replay.verbs.bless.changes", lambda *_: [_CHANGE])
-    monkeypatch.setattr("replay.verbs.bless._table", lambda *_: "")
-    blessed = Path(shutil.copy(STORED, tmp_path / "blessed.mcap"))
-    before = blessed.stat().st_ino
+    drawn = online.normals
+    monkeypatch.setattr(online, "normals", lambda stream, shape: -drawn(stream, shape))
+    accepted = Path(shutil.copy(STORED, tmp_path / "accepted.mcap"))
+    before = accepted.stat().st_ino
     synced.names.clear()
-    assert main(["bless", str(blessed), "--yes"]) == 0
-    assert blessed.stat().st_ino != before
-    assert synced.holds(blessed)
-
-
-class _CHANGE:
-    equal = False
+    assert main(["accept", str(accepted), "--yes"]) == 0
+    assert accepted.stat().st_ino != before
+    assert synced.holds(accepted)
 
 
 @pytest.mark.parametrize("make", [whole_file, new_file])

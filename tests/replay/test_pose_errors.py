@@ -15,7 +15,7 @@ from chsel.problem.poses import axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.blessing import _change
+from replay.accept import best_pose_moves
 from replay.comparing.comparison import numbers_under
 from replay.events import Measured, ProblemPosed, SessionStarted
 from replay.recorder import ListRecorder
@@ -42,7 +42,8 @@ def turned(degrees: float, shift: float = 0.0) -> np.ndarray:
 def found(*poses: np.ndarray) -> Hypotheses:
     count = len(poses)
     cost, duplicate = np.arange(float(count)), np.zeros(count, dtype=bool)
-    return Hypotheses(np.array(poses), cost, duplicate, np.full(count, -1), np.zeros((0, 4, 4)))
+    poses = np.array(poses).reshape(-1, 4, 4)
+    return Hypotheses(poses, cost, duplicate, np.full(count, -1), np.zeros((0, 4, 4)))
 
 
 class Fixed:
@@ -105,14 +106,14 @@ def test_compared_errors(start: SessionStarted) -> None:
     assert numbers["best_rotation_error"] == pytest.approx(np.deg2rad(10.0), abs=1e-6)
 
 
-def test_blessed_changes(start: SessionStarted) -> None:
+def test_how_far_the_best_pose_moves(start: SessionStarted) -> None:
     symmetry = object_symmetry(start.mesh)
     pair = found(turned(180.0)), found(turned(20.0, 0.004))
-    change = _change(1, *pair, TRUTH, [{}, {}], symmetry=symmetry, equal=False)
-    assert change.position == pytest.approx(0.004, abs=1e-9)
-    assert change.rotation == pytest.approx(np.deg2rad(20.0), abs=1e-6)
-    assert change.position_error == pytest.approx((0.0, 0.004), abs=1e-9)
-    assert change.rotation_error == pytest.approx((0.0, np.deg2rad(20.0)), abs=1e-6)
+    position, rotation = best_pose_moves(*pair, symmetry)
+    assert position == pytest.approx(0.004, abs=1e-9)
+    assert rotation == pytest.approx(np.deg2rad(20.0), abs=1e-6)
+    assert np.isnan(best_pose_moves(pair[0], found(), symmetry)).all()
+    assert np.isnan(best_pose_moves(found(), pair[0], symmetry)).all()
 
 
 def test_without_a_true_pose_no_symmetry_is_sought(start: SessionStarted) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from replay.__main__ import main
-from replay.blessing import write_blessed
+from replay.accept import write_accepted
 from replay.events import RigDescribed, SensorImage
 from replay.mcap.reader import read_recording
 from tests.replay.conftest import same_bits
@@ -34,8 +34,8 @@ def test_it_is_verified_stepped_and_compared(
     capsys.readouterr()
 
 
-def test_blessing_it_keeps_its_rig_and_images(path: Path, tmp_path: Path) -> None:
-    new = write_blessed(read_recording(path), tmp_path / "new.mcap")
+def test_accepting_it_keeps_its_rig_and_images(path: Path, tmp_path: Path) -> None:
+    new = write_accepted(read_recording(path), tmp_path / "new.mcap")
     kept, before = list(new.events()), list(read_recording(path).events())
     of_sensors = [event for event in before if isinstance(event, RigDescribed | SensorImage)]
     found = [event for event in kept if isinstance(event, RigDescribed | SensorImage)]

@@ -63,7 +63,7 @@ VERBS = {
     "view": ["--save", "out.rrd"],
     "recover": ["-o", "out.mcap"],
     "export": ["--what", "metrics"],
-    "bless": ["--yes"],
+    "accept": ["--yes"],
     "diff": [str(DESCENT)],
 }
 

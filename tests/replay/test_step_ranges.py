@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from chsel.errors import SettingError
-from replay.step_ranges import chosen_steps
+from replay.arguments import chosen_steps
 
 EXISTING = (2, 3, 5, 8, 9)
 

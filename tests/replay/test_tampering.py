@@ -15,13 +15,13 @@ from mcap.opcode import Opcode
 
 from chsel.errors import RecordingError
 from replay.__main__ import main
+from replay.comparing.results import is_close
 from replay.events import Event
 from replay.mcap.encoding import decode, encode
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover
 from replay.mcap.schemas import RECORDS
-from replay.measured import _close
 from replay.recording_info import recording_digest, recording_info
 from replay.verification import DIFFERS, EQUAL, verify
 from tests.tools.mutations import (
@@ -358,7 +358,7 @@ def test_recover_leaves_out_what_was_changed(whole: bytes, tmp_path: Path) -> No
 
 
 def test_pose_errors_may_differ_by_a_tenth_of_a_millimetre_and_nothing_else_may() -> None:
-    assert _close(0.01, 0.01 + 0.9e-4, "best_position_error")
-    assert not _close(0.01, 0.01 + 1.1e-4, "best_position_error")
-    assert not _close(0.01, 0.01 + 1e-6, "archive_coverage")
-    assert not _close(0.01, None, "best_position_error")
+    assert is_close(0.01, 0.01 + 0.9e-4, "best_position_error")
+    assert not is_close(0.01, 0.01 + 1.1e-4, "best_position_error")
+    assert not is_close(0.01, 0.01 + 1e-6, "archive_coverage")
+    assert not is_close(0.01, None, "best_position_error")

@@ -14,10 +14,9 @@ import pytest
 from chsel.problem.registration_problem import Hypotheses
 from replay.__main__ import main
 from replay.events import Event, HypothesesFound, Measured, Probe, SessionStarted, Traced
-from replay.file_verification import verified_files
 from replay.mcap.reader import read_recording
 from replay.registration import recorded_method
-from replay.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verify
+from replay.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verified_files, verify
 from tests.tools.small_recordings import measured_again
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
@@ -147,9 +146,9 @@ def test_how_far_a_result_is_trusted_is_computed_again(write: Write) -> None:
     found = verdicts(write(events))
     assert [verdict.outcome for verdict in found] == [EQUAL, DIFFERS, DIFFERS, DIFFERS]
     assert {verdict.stage for verdict in found[1:]} == {"the measured values"}
-    assert found[1].differences[0].startswith("measured verdict: 3.5 recorded, ")
-    assert found[2].differences[0].startswith("measured modes: 0.0 recorded, ")
-    assert found[3].differences[0].startswith("measured outlier_share: not recorded, ")
+    assert found[1].differences[0].startswith("measured verdict: 3.5 -> ")
+    assert found[2].differences[0].startswith("measured modes: 0.0 -> ")
+    assert found[3].differences[0].startswith("measured outlier_share: absent -> ")
 
 
 def test_a_registration_that_was_interrupted_has_nothing_to_compare(

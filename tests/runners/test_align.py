@@ -15,7 +15,7 @@ from chsel.plausible.plausible_settings import EvaluationCostSettings
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.poses import apply, axis_angle, compose, inverse, roll_pitch_yaw
-from replay.file_digest import file_digest
+from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from runners import align, plausible, probe
 from runners.evaluation import trial_truth

@@ -16,7 +16,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.events import Event, SnapshotTaken, Traced
 from replay.recorder import NullRecorder
-from replay.step_observer import StepObserver
+from replay.registration import StepObserver
 from runners.recording import RecordingConfig, make_run_folder, open_recorder
 
 

@@ -1,7 +1,7 @@
 """Makes stored replays: `python -m tests.tools.make_replays [NAME ...]`, of today's code.
 
 Existing files stay as they are, as the bits that later code must give; to accept new bits, use
-`python -m replay bless`. Needs PyBullet for simulated sessions.
+`python -m replay accept`. Needs PyBullet for simulated sessions.
 
 `points_default_METHOD` has the settings of preset `default` without any change: when the preset
 changes, it is made again. The others keep older settings, and many an older format.

@@ -123,12 +123,12 @@ VERBS: dict[str, tuple[str, ...]] = {
     "compare": ("compare", "FILE", "--methods", "gradient_descent"),
     "diff": ("diff", "FILE", "WHOLE"),
     "view": ("view", "FILE", "--save", "OUT.rrd"),
-    "bless": ("bless", "FILE", "--yes"),
+    "accept": ("accept", "FILE", "--yes"),
     "hypotheses": ("export", "FILE", "--what", "hypotheses", "-o", "OUT.npz"),
     "points": ("export", "FILE", "--what", "points", "-o", "OUT.npz"),
     "metrics": ("export", "FILE", "--what", "metrics", "-o", "OUT.csv"),
 }
-NEEDS = {"mesh.ply": {"view"}, "sdf_grid": {"verify", "step", "compare", "bless"}}
+NEEDS = {"mesh.ply": {"view"}, "sdf_grid": {"verify", "step", "compare", "accept"}}
 STATUS = {"diff": 1}  # the session's start says what is lost
 
 

@@ -14,7 +14,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from chsel.errors import SessionError
-from replay.file_digest import file_digest
+from replay.files import file_digest
 from replay.raw import raw_file, raw_reading
 from replay.raw.catalogue import Channel
 from replay.raw.raw_reading import RawMessage

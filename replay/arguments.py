@@ -1,9 +1,11 @@
-"""The steps that `--steps` names: "3", "2..5", "2..", "..5", or several of these with commas."""
+"""Arguments of commands: paths, and the steps that `--steps` names."""
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 from chsel.errors import SettingError
 
@@ -11,6 +13,11 @@ STEPS_HELP = "steps, such as 3, 2..5, 2.., ..5 or 0,4..6; left out: all"
 """For the help of a verb."""
 
 _PART = re.compile(r"(-?\d{1,10})|(-?\d{1,10})?\.\.(-?\d{1,10})?")
+
+
+def path_argument(text: str) -> Path:
+    """The path, with ~ for the home folder, which no shell expands in --save=~/FILE."""
+    return Path(os.path.expanduser(text))
 
 
 def chosen_steps(text: str | None, existing: Sequence[int]) -> tuple[int, ...]:

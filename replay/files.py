@@ -1,0 +1,95 @@
+"""Files that survive a power cut and are never overwritten, and the digest that names one."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from chsel.errors import RecordingError
+from chsel.problem.file_checks import refuse_special_file
+
+_DIGEST_SIZE = 16  # bytes
+
+
+def sync_file(path: Path) -> None:
+    """Wait until the content of a file is on the disk. Raises OSError if it does not get there."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk, where the system can do that."""
+    with suppress(OSError):  # of Windows, and of some network file systems
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+def disk_error(error: BaseException, path: Path) -> OSError | None:
+    """The failure to write `path` that is, or caused, an error; None if it is about other things.
+
+    A full disk is reported without the name of a file.
+    """
+    cause = error if isinstance(error, OSError) else error.__cause__
+    if isinstance(cause, OSError) and cause.filename in (None, path, str(path)):
+        return cause
+    return None
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A path beside `path` to write to; it becomes `path` if all went well, else it is removed.
+
+    It is on the disk then, for good. Raises RecordingError if there is such a file already, before
+    or after, and if it cannot be written.
+    """
+    require_new(path)
+    beside = path.with_name(f".{path.name[:100]}.{os.urandom(4).hex()}")
+    try:
+        yield beside
+        sync_file(beside)
+        _rename(beside, path)
+        sync_folder(path.parent)
+    except (OSError, RecordingError) as error:
+        reason = disk_error(error, beside)
+        if reason is None:
+            raise
+        raise RecordingError(f"{path} cannot be written: {reason.strerror or reason}") from error
+    finally:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+
+
+def require_new(path: Path) -> None:
+    """Raise RecordingError unless `path` is free and its folder exists."""
+    if os.path.lexists(path):
+        raise RecordingError(f"{path} exists; accepted: the name of a new file")
+    if not path.parent.is_dir():
+        raise RecordingError(f"folder {path.parent} does not exist; accepted: a file in one")
+
+
+def _rename(beside: Path, path: Path) -> None:
+    """Give a file its name, without ever taking it from another one."""
+    try:
+        path.hardlink_to(beside)
+    except FileExistsError:
+        require_new(path)
+    except OSError:  # a file system without links: reserve the name, then replace what is ours
+        with path.open("xb"):
+            beside.replace(path)
+
+
+def file_digest(path: Path) -> str:
+    """BLAKE2b (128 bit, hexadecimal) of a file's bytes, as `b2sum -l 128` prints it."""
+    refuse_special_file(str(path), path, RecordingError)
+    try:
+        with path.open("rb") as file:
+            state = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=_DIGEST_SIZE))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from error
+    return state.hexdigest()
