@@ -13,10 +13,12 @@ from typing import NoReturn
 
 from chsel.errors import ChselError
 from replay.console import print_error, print_warning
-from replay.startup import ready
+from replay.startup import package_version, ready
 from replay.verbs import ALIASES, VERBS
 
 TRACEBACK = "--traceback"
+COMPLETES = "_ARGCOMPLETE"
+"""Set in the environment by a shell that asks what can stand next on the line in COMP_LINE."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -54,13 +56,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def program() -> NoReturn:
     """The command `chsel-replay`."""
+    if COMPLETES in os.environ:
+        _complete(os.environ["COMP_LINE"].split())
     sys.exit(main())
+
+
+def _complete(words: Sequence[str]) -> None:
+    """Answer the shell, and exit."""
+    import argcomplete
+
+    argcomplete.autocomplete(_parser(next((word for word in words if word in VERBS), "")))
 
 
 def _parser(verb: str) -> Parser:
     """The parser of all verbs, with the arguments of one."""
     parser = Parser(prog="replay", description=__doc__)
     parser.add_argument(TRACEBACK, action="store_true", help="show where an error came from")
+    version = f"chsel-replay {package_version()}"
+    parser.add_argument("--version", action="version", version=version)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     aliases = {name: [old for old, new in ALIASES.items() if new == name] for name in VERBS}
     for name, summary in VERBS.items():

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import platform
 import subprocess
 from importlib.metadata import entry_points
 from pathlib import Path
 
 from replay.events import SessionStarted
+from replay.startup import package_version
 
 PACKAGES = (
     "chsel-replay",
@@ -34,7 +34,7 @@ def environment() -> dict[str, str]:
     }
     offering = {point.dist.name for point in entry_points(group="chsel.methods") if point.dist}
     packages = [*PACKAGES, *sorted(offering.difference(PACKAGES))]
-    return values | {f"package {name}": _version(name) for name in packages}
+    return values | {f"package {name}": package_version(name) for name in packages}
 
 
 def environment_differences(start: SessionStarted) -> tuple[str, ...]:
@@ -45,13 +45,6 @@ def environment_differences(start: SessionStarted) -> tuple[str, ...]:
         for name, value in start.environment.items()
         if here.get(name) != value
     )
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def _processor() -> str:

@@ -5,6 +5,7 @@ And a check that `chsel` is this project's package: the authors' published one h
 
 from __future__ import annotations
 
+import importlib.metadata
 import signal
 import sys
 import threading
@@ -57,6 +58,14 @@ def chsel_is_ours() -> bool:
     folders = spec.submodule_search_locations if spec else None
     places = [Path(folder) for folder in folders or ()]
     return any(_is_file(places, OURS)) and not any(_is_file(places, THEIRS))
+
+
+def package_version(package: str = "chsel-replay") -> str:
+    """The version of an installed package, "not installed" without one."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _is_file(places: list[Path], name: str) -> Iterator[bool]:

@@ -25,7 +25,7 @@ from chsel.problem.streams import StreamKey
 from replay.console import Console
 from runners.align_view import save_view
 from runners.alignment_fit import Fit, fit_of
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.objects.scans import AssetsConfig
 from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose

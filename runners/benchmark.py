@@ -26,7 +26,7 @@ from runners.benchmarks.plot import draw
 from runners.benchmarks.problems import PROBLEMS
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
 from runners.benchmarks.scope import Scope
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.recording import make_run_folder, write_in_run_folder
 
 

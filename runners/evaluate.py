@@ -21,7 +21,7 @@ from chsel.methods import METHODS
 from chsel.numerics.threads import require_threads
 from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.settings import build_settings
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.evaluation.configurations import SENSORS, faulty_name
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label
 from runners.evaluation.definition import definition_text

@@ -21,7 +21,7 @@ from chsel.errors import ChselError, MeshError, SettingError
 from chsel.problem.settings import build_settings
 from replay.console import Console, TextColumn
 from replay.console import Progress as ProgressBar
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.download import DownloadError, Progress, download
 from runners.objects.loader import ObjectConfig
 from runners.objects.scans import MESH_FILE, AssetsConfig, check_scan, scan_folder

@@ -25,7 +25,7 @@ from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from replay.arguments import chosen_steps
 from replay.console import Console, Progress
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.measure import Measure, MetricsConfig
 from runners.objects.scans import AssetsConfig

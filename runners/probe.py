@@ -27,10 +27,10 @@ from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.recording_info import recording_digest
 from replay.registration import symmetry_for_errors
 from replay.startup import importing
-from runners.cli import command, plain
+from runners.command.interrupt import Interrupt
+from runners.command.program import command, plain
 from runners.compiling import Compiling
 from runners.display import Display, reading_bar
-from runners.interrupt import Interrupt
 from runners.objects.loader import ObjectConfig, ObjectModel, load_object
 from runners.objects.scans import AssetsConfig
 from runners.objects.size_check import check_size

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.evaluation.display import Display
 from runners.evaluation.draws import draw_seed, require_draws
 from runners.evaluation.package_files import PackageFiles

@@ -28,7 +28,7 @@ from chsel.problem.settings import build_settings
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from replay.console import Console, Progress
 from replay.events import Probe
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.compiling import Compiling
 from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.selection import chosen_names, chosen_seeds

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings, settings_mapping
 from replay.console import Console
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.reporting.against_baseline import section_against
 from runners.reporting.completeness import planned_methods
 from runners.reporting.console_table import print_table

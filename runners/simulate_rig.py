@@ -16,7 +16,7 @@ from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from replay.console import Console, Progress, TextColumn
-from runners.cli import command, plain
+from runners.command.program import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
 from runners.simulated_robot.configurations import CabinetConfiguration, find_cabinet_configuration

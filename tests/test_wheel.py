@@ -1,71 +1,137 @@
-"""The project works when it is installed, from any folder."""
+"""The project works when it is installed, from any folder: packages, scripts, completion."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
-import zipfile
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+PROJECT: dict[str, Any] = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+SCRIPTS = tuple(PROJECT["scripts"])
+BASH = shutil.which("bash")
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wheel of the checkout, unpacked as an installer does."""
-    folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
-    files = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.split()
-    for name in files:
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of packages of an installation of the checkout; its scripts are in `bin`."""
+    folder = tmp_path_factory.mktemp("installation")
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    files = subprocess.run(listed, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    for name in files.stdout.split():
         if (REPOSITORY / name).is_file():
-            (source / name).parent.mkdir(parents=True, exist_ok=True)
-            (source / name).write_bytes((REPOSITORY / name).read_bytes())
-    options = ["--no-deps", "--no-build-isolation", "--quiet", "--wheel-dir", str(folder)]
-    subprocess.run([sys.executable, "-m", "pip", "wheel", str(source), *options], check=True)
-    (wheel,) = folder.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder / "site")
+            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(REPOSITORY / name, folder / "source" / name)
+    options = ["--no-deps", "--no-build-isolation", "--quiet", "--target", str(folder / "site")]
+    install = [sys.executable, "-m", "pip", "install", str(folder / "source"), *options]
+    subprocess.run(install, check=True)
     return folder / "site"
 
 
-def test_the_wheel_holds_the_four_packages_their_data_and_no_tests(installed: Path) -> None:
-    packages = {path.name for path in installed.iterdir() if not path.name.endswith("dist-info")}
+def ran(site: Path, folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    """A command of the installation, in a folder."""
+    path = os.pathsep.join([str(site / "bin"), str(Path(sys.executable).parent), os.defpath])
+    environment = {**os.environ, "PYTHONPATH": str(site), "PATH": path}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def test_four_packages_with_their_data_and_no_tests_are_installed(site: Path) -> None:
+    beside = ("bin", "dist-info", "__pycache__")
+    packages = {path.name for path in site.iterdir() if not path.name.endswith(beside)}
     assert packages == {"chsel", "conf", "replay", "runners"}
-    of_checkout = sorted((REPOSITORY / "conf").rglob("*.yaml"))
-    names = {str(file.relative_to(REPOSITORY)) for file in of_checkout}
-    assert names == {str(f.relative_to(installed)) for f in (installed / "conf").rglob("*.yaml")}
+    assert {file.parent.name for file in site.rglob("py.typed")} == packages - {"conf"}
+    for pattern in ("conf/**/*.yaml", "runners/**/*.html", "replay/*.json"):
+        names = {str(file.relative_to(REPOSITORY)) for file in REPOSITORY.glob(pattern)}
+        assert names
+        assert names == {str(file.relative_to(site)) for file in site.glob(pattern)}
 
 
-def test_the_installed_command_runs_in_any_folder(installed: Path, tmp_path: Path) -> None:
+def test_the_installed_command_runs_in_any_folder(site: Path, tmp_path: Path) -> None:
     box = trimesh.creation.box((0.1, 0.06, 0.2))
     box.export(tmp_path / "box.stl")
     np.savez(tmp_path / "points.npz", surface=box.vertices[:6])
     overrides = ["session=points", "session.path=points.npz", "object=mesh", "object.path=box.stl"]
     overrides += ["method.descent.restarts=1", "method.emitter.iterations=5"]
-    environment = {**os.environ, "PYTHONPATH": str(installed)}
-    code = "import runners, sys; print(runners.__file__, file=sys.stderr)"
-    where = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    assert str(installed) in where.stderr
-    done = subprocess.run(
-        [sys.executable, "-m", "runners.probe", *overrides],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+    imported = ran(site, tmp_path, sys.executable, "-c", "import runners; print(runners.__file__)")
+    assert str(site) in imported.stdout
+    done = ran(site, tmp_path, "chsel-probe", *overrides)
     assert done.returncode == 0, done.stderr
     (recording,) = tmp_path.glob("logs/probe/*/recording.mcap")
-    assert recording.stat().st_size > 1000
+    verified = ran(site, tmp_path, "chsel-replay", "verify", str(recording))
+    assert verified.returncode == 0, verified.stdout
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_command_has_a_script_and_each_names_its_version(
+    script: str, site: Path, tmp_path: Path
+) -> None:
+    module = script.removeprefix("chsel-").replace("-", "_")
+    module = "replay" if module == "replay" else f"runners.{module}"
+    for command in ([script], [sys.executable, "-X", "importtime", "-m", module]):
+        done = ran(site, tmp_path, *command, "--version")
+        assert (done.returncode, done.stdout) == (0, f"chsel-replay {PROJECT['version']}\n")
+        assert "torch" not in done.stderr
+        assert "hydra" not in done.stderr
+    mistaken = ran(site, tmp_path, script, "colour=red")
+    assert mistaken.returncode == 2
+    assert mistaken.stderr.startswith("error: ")
+    assert mistaken.stderr.count("\n") == 1
+
+
+def test_every_command_of_hydra_has_a_script() -> None:
+    commands = {file.stem for file in (REPOSITORY / "conf").glob("*.yaml")}
+    assert set(SCRIPTS) == {f"chsel-{name.replace('_', '-')}" for name in commands | {"replay"}}
+
+
+COMPLETED = """
+eval "$(chsel-probe -sc install=bash)"
+complete -o nospace -o default -F hydra_bash_completion chsel-evaluate
+eval "$(register-python-argcomplete chsel-replay)"
+completed() {
+    COMP_LINE="$*" COMP_POINT=${#COMP_LINE} COMP_WORDS=($*) COMP_CWORD=$(($# - 1)) COMPREPLY=()
+    local function=$(complete -p "$1" | sed -E 's/.* -F ([^ ]+) .*/\\1/')
+    $function "$1" "$3" "$2"
+    echo ${COMPREPLY[@]}
+}
+completed chsel-probe object=cl
+completed chsel-probe seed=1 method=medial
+completed chsel-evaluate experiment=sm
+completed chsel-replay ver
+completed chsel-replay verify --j
+"""
+
+
+@pytest.mark.skipif(BASH is None, reason="bash is not installed")
+def test_bash_completes_the_scripts(site: Path, tmp_path: Path) -> None:
+    done = ran(site, tmp_path, "bash", "-c", COMPLETED)
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [
+        "object=clamp",
+        "method=medial_constraint method=medial_constraint_cma_me",
+        "experiment=smoke",
+        "verify",
+        "--jobs",
+    ]
+
+
+def test_the_citation_is_of_this_version_and_the_paper() -> None:
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    for key in ("version", "license"):
+        assert citation[key] == PROJECT[key]
+    (paper,) = citation["references"]
+    assert paper["title"].startswith("CHSEL: Producing Diverse Plausible Pose Estimates")
+    assert [author["family-names"] for author in paper["authors"]] == [
+        "Zhong",
+        "Fazeli",
+        "Berenson",
+    ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 
 from chsel.cost.torch_cost import gpus
 from replay.environment import environment
+from replay.startup import package_version
 
 _PACKAGES = ("numba", "llvmlite", "scipy")
 
@@ -20,12 +20,7 @@ def machine() -> dict[str, Any]:
     """Processor, cores, GPU, Python and versions."""
     values: dict[str, Any] = {**environment(), "cores": os.cpu_count(), "cores_usable": cores()}
     values["gpu"] = torch.cuda.get_device_name() if gpus() else None
-    for name in _PACKAGES:
-        try:
-            values[f"package {name}"] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            values[f"package {name}"] = "not installed"
-    return values
+    return values | {f"package {name}": package_version(name) for name in _PACKAGES}
 
 
 def cores() -> int:

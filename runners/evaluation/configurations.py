@@ -11,7 +11,7 @@ import yaml
 
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
-from runners.choices import CONF
+from runners.command.choices import CONF
 from runners.objects.loader import ObjectConfig
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.faults import CLEAN, LEVELS

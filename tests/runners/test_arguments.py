@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from chsel.errors import SettingError
 from replay.__main__ import main as replay
 from runners import plausible, probe
-from runners.arguments import hydra_arguments, is_setting, quoted
+from runners.command.arguments import hydra_arguments, is_setting, quoted
 from tests.runners.in_process import run
 
 NAMES = (

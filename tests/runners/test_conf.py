@@ -11,7 +11,7 @@ import yaml
 from chsel.plausible.true_pose import TruePoseSettings
 from runners.benchmarks.ours import Steps
 from runners.benchmarks.published import PackageConfig
-from runners.choices import CONF
+from runners.command.choices import CONF
 from runners.evaluation.measure import MetricsConfig
 from runners.recording import RecordingConfig
 from runners.reporting.sections import SequenceConfig

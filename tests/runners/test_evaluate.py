@@ -18,7 +18,7 @@ import pytest
 from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, verify
 from runners import evaluate, plausible, probe
-from runners.choices import CONF
+from runners.command.choices import CONF
 from runners.evaluation.claims import ClaimedError, claimed
 from runners.evaluation.plan import Plan, Trial
 from tests.runners.in_process import Done, run

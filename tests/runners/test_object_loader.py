@@ -14,8 +14,8 @@ from hydra import compose, initialize_config_dir
 
 from chsel.errors import MeshError, SettingError
 from chsel.problem.settings import build_settings
-from runners.choices import CONF
-from runners.cli import plain
+from runners.command.choices import CONF
+from runners.command.program import plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.models import MODELS
 from runners.objects.scans import SCANS, check_scan, scan_file

@@ -16,7 +16,7 @@ from chsel.plausible.plausible_set import plausible_set
 from chsel.problem.poses import apply, axis_angle, compose, inverse, rotation_vector
 from replay.mcap.reader import read_recording
 from runners import plausible, probe
-from runners.arguments import hydra_arguments
+from runners.command.arguments import hydra_arguments
 from tests.runners.in_process import run
 
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))

@@ -18,7 +18,7 @@ from chsel.problem.poses import compose, inverse, roll_pitch_yaw, rotation_angle
 from replay.events import RigDescribed
 from replay.mcap.reader import read_recording
 from runners import evaluate
-from runners.choices import CONF
+from runners.command.choices import CONF
 from runners.evaluation.configurations import configurations_of
 from runners.evaluation.display import Display
 from runners.evaluation.plan import Plan, Trial, Unit

@@ -11,8 +11,8 @@ from hydra import compose, initialize_config_dir
 
 from chsel.problem.settings import build_settings, settings_mapping
 from runners import simulate_rig
-from runners.choices import CONF
-from runners.cli import plain
+from runners.command.choices import CONF
+from runners.command.program import plain
 from runners.objects.models import MODELS
 from runners.sensors.rig import Rig
 from runners.simulate_rig import SimulateRigConfig

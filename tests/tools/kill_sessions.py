@@ -32,10 +32,10 @@ from chsel.problem.settings import build_settings
 from replay.events import Event, Probe, ProblemPosed, SessionEnded
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
-from runners.choices import CONF, store_choices
-from runners.cli import plain
+from runners.command.choices import CONF, store_choices
+from runners.command.interrupt import Interrupt
+from runners.command.program import plain
 from runners.display import Display
-from runners.interrupt import Interrupt
 from runners.probe import ProbeConfig, open_scene, run, session_started
 from runners.recording import make_run_folder
 from tests.replay.conftest import same_bits

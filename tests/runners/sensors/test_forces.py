@@ -15,7 +15,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse, roll_pitch_yaw
 from chsel.problem.settings import build_settings
 from replay.events import Logged, Probe
-from runners.choices import CONF
+from runners.command.choices import CONF
 from runners.sensors.rig import Annotations, BoxRig, ForceRig, HandRig, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from runners.simulated_robot.ros_messages import header, transform

@@ -25,7 +25,7 @@ from chsel.problem.settings import build_settings, settings_mapping
 from replay.events import Logged, Probe, RigDescribed, SensorImage, SessionEnded, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
-from runners.choices import CONF
+from runners.command.choices import CONF
 from runners.display import Display
 from runners.objects.loader import ObjectConfig, load_object
 from runners.recording import RecordingConfig

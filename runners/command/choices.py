@@ -15,12 +15,12 @@ from chsel.errors import SettingError
 from chsel.methods import METHODS, preset_settings
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
-from runners.arguments import hydra_arguments
+from runners.command.arguments import hydra_arguments
 from runners.sensors.rig import Rig
 from runners.sessions.faults import CLEAN, LEVELS
 from runners.sessions.probing import ProbingSettings
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
+CONF = Path(__file__).resolve().parents[2] / "conf"
 NESTED_GROUPS = (
     "session/rig",
     "session/faults",
