@@ -19,7 +19,7 @@ from rich.table import Table
 from chsel.errors import InputWarning
 from chsel.problem.registration_problem import Trust
 from replay.console import Console, Progress, TextColumn
-from runners.sensors.session_report import Report, Tally
+from runners.sensors.session_report import Counts, Report
 from runners.step_warning import FROM_SESSION, StepWarning
 
 MEANINGS = {
@@ -136,7 +136,7 @@ class Display:
 
     def sensed(self, report: Report) -> None:
         """What a robot's sensors told, probe by probe, and what was wrong with it."""
-        if report.tallies:
+        if report.by_probe:
             self._console.print(_sensor_table(report))
         for level, text in report.lines:
             self._line(level, text)
@@ -176,24 +176,24 @@ def _viewer() -> str:
 
 def _sensor_table(report: Report) -> Table:
     """Counts by probe and sensor, of those that told anything, and the totals."""
-    rows: list[tuple[str, str, Tally]] = []
-    total = {"all": report.total()} if len(report.tallies) > 1 else {}
-    for step, tallies in [*report.tallies.items(), *total.items()]:
-        told = [(sensor, tally) for sensor, tally in tallies.items() if tally.images]
+    rows: list[tuple[str, str, Counts]] = []
+    total = {"all": report.total()} if len(report.by_probe) > 1 else {}
+    for step, by_sensor in [*report.by_probe.items(), *total.items()]:
+        told = [(sensor, counts) for sensor, counts in by_sensor.items() if counts.images]
         rows += [("" if k else str(step), *entry) for k, entry in enumerate(told)]
     columns = {
-        "used": [f"{tally.used}/{tally.images}" for _, _, tally in rows],
-        "no pose": [str(tally.lost or "") for _, _, tally in rows],
-        "bad": [str(tally.unusable or "") for _, _, tally in rows],
-        "invalid": [_share(tally.invalid, tally.pixels) for _, _, tally in rows],
-        "edge": [_share(tally.edges, tally.pixels) for _, _, tally in rows],
-        "outline": [str(tally.outline or "") for _, _, tally in rows],
-        "small": [str(tally.small or "") for _, _, tally in rows],
-        "far": [str(tally.far or "") for _, _, tally in rows],
-        "spikes": [str(tally.spikes or "") for _, _, tally in rows],
-        "out of reach": [str(tally.outside or "") for _, _, tally in rows],
-        "points": [str(tally.contacts or "") for _, _, tally in rows],
-        "new voxels": [str(tally.free or "") for _, _, tally in rows],
+        "used": [f"{counts.used}/{counts.images}" for _, _, counts in rows],
+        "no pose": [str(counts.lost or "") for _, _, counts in rows],
+        "bad": [str(counts.unusable or "") for _, _, counts in rows],
+        "invalid": [_share(counts.invalid, counts.pixels) for _, _, counts in rows],
+        "edge": [_share(counts.edges, counts.pixels) for _, _, counts in rows],
+        "outline": [str(counts.outline or "") for _, _, counts in rows],
+        "small": [str(counts.small or "") for _, _, counts in rows],
+        "far": [str(counts.far or "") for _, _, counts in rows],
+        "spikes": [str(counts.spikes or "") for _, _, counts in rows],
+        "out of reach": [str(counts.outside or "") for _, _, counts in rows],
+        "points": [str(counts.contacts or "") for _, _, counts in rows],
+        "new voxels": [str(counts.free or "") for _, _, counts in rows],
     }
     columns = {name: cells for name, cells in columns.items() if any(cells)}
     title = "sensors; left out: invalid, edge in % of pixels, others in pixels or points"

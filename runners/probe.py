@@ -340,7 +340,7 @@ def _summarise(
         "recording_digest": recording_digest(folder / "recording.mcap"),
         "trust": None if trust is None else asdict(trust),  # of the last result
         "warnings": [asdict(warning) for warning in session_run.warnings],
-        "sensors": {name: asdict(tally) for name, tally in sensors},
+        "sensors": {name: asdict(counts) for name, counts in sensors},
         "steps": rows,
         "bytes": _sizes(folder),
         "environment": dict(started.environment),

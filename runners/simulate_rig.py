@@ -20,7 +20,7 @@ from runners.command.program import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
 from runners.simulated_robot.configurations import CabinetConfiguration, find_cabinet_configuration
-from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
 from runners.whole_file import WritingError, whole_file
 
@@ -50,7 +50,7 @@ def main(config: DictConfig) -> None:
     values = plain(config)
     own = {name: values.pop(name) for name in SimulateRigConfig.__dataclass_fields__}
     checked = build_settings(SimulateRigConfig, own, "simulate_rig")
-    settings = build_settings(TwinSettings, values, "simulate_rig")
+    settings = build_settings(RobotSettings, values, "simulate_rig")
     configuration = find_cabinet_configuration(checked.configuration)
     count = probe_count(configuration, settings)
     chosen = _object(checked.object, configuration)

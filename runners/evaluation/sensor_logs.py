@@ -13,7 +13,7 @@ from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
 from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS
-from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.settings import RobotSettings
 
 TRUTH = ".truth.yaml"
 _POSITION_STEP = 0.01  # metres: about as well as a person sets a pose by hand
@@ -45,7 +45,7 @@ def ensure_log(plan: Plan, trial: Trial) -> Path:
     log.parent.mkdir(parents=True, exist_ok=True)
     model = load_object(plan.object_config(trial.configuration), plan.assets)
     configuration = CABINET_CONFIGURATIONS[trial.configuration]
-    made = simulate_log(log, configuration, model.mesh, trial.seed, TwinSettings())
+    made = simulate_log(log, configuration, model.mesh, trial.seed, RobotSettings())
     about = {"object": model.name, "scale": model.scale, "configuration": trial.configuration}
     about |= {"seed": trial.seed}
     write_pose(_truth_path(log), made.world_from_object, about, overwrite=True)

@@ -15,7 +15,7 @@ from chsel.problem.points import Workspace
 from chsel.sensing.free_space import FreeGrid
 from runners.sensors.log.transforms import TransformError, TransformTree
 from runners.sensors.rig import GateRig
-from runners.sensors.session_report import Remarks, Tally
+from runners.sensors.session_report import Counts, LogWarnings
 
 _NONE = np.zeros((0, 3))
 
@@ -29,11 +29,11 @@ class FreeMap:
         self._told = np.zeros(self.grid.shape, dtype=bool)
 
     @contextmanager
-    def by(self, tally: Tally) -> Iterator[FreeGrid]:
-        """The grid to mark in; what becomes free within is counted as the tally's."""
+    def by(self, counts: Counts) -> Iterator[FreeGrid]:
+        """The grid to mark in; what becomes free within is counted as the counts'."""
         before = self.grid.count
         yield self.grid
-        tally.free += self.grid.count - before
+        counts.free += self.grid.count - before
 
     def new(self, contacts: FloatArray = _NONE, normals: FloatArray = _NONE) -> FloatArray:
         """Centres (N, 3) of the voxels that became free since the last call.
@@ -76,7 +76,7 @@ class Cell:
     tree: TransformTree
     gap: float  # seconds over which no pose is interpolated
     free: FreeMap
-    remarks: Remarks
+    warnings: LogWarnings
     gate: GateRig = field(default_factory=GateRig)
     diameter: float | None = None  # of the object, metres; None: not known
 
@@ -90,5 +90,5 @@ class Cell:
         try:
             return self.tree.lookup(self.world, frame, time, gap_s=self.gap)
         except TransformError:
-            self.remarks.warn(f"{sensor}: left out, as the pose of {frame} is not known then")
+            self.warnings.warn(f"{sensor}: left out, as the pose of {frame} is not known then")
             return None

@@ -11,7 +11,7 @@ from chsel.sensing.regions import main_regions, point_regions
 from runners.sensors.cell import Cell
 from runners.sensors.log.messages import CloudMessage
 from runners.sensors.rig import CloudRig
-from runners.sensors.session_report import Tally
+from runners.sensors.session_report import Counts
 
 FARTHEST = 100.0  # m: no robot that probes an object measures rays of this length
 
@@ -32,33 +32,33 @@ class Clouds:
         """Whether its points are contacts."""
         return self._rig.role == "contacts"
 
-    def take(self, time: int, message: CloudMessage, tally: Tally, *, within: bool) -> None:
+    def take(self, time: int, message: CloudMessage, counts: Counts, *, within: bool) -> None:
         """Use the points of one message of the current probe."""
-        tally.images += 1
+        counts.images += 1
         if self.touches and not within:
-            tally.spared += 1
+            counts.spared += 1
             return
         pose = self._cell.world_from(message.frame, time, self._rig.topic)
         if pose is None:
-            tally.lost += 1
+            counts.lost += 1
             return
         points = message.points[np.isfinite(message.points).all(axis=1)]
-        tally.pixels += len(message.points)
-        tally.invalid += len(message.points) - len(points)
-        tally.used += 1
+        counts.pixels += len(message.points)
+        counts.invalid += len(message.points) - len(points)
+        counts.used += 1
         points, origin = apply(pose, points), pose[:3, 3]
         within_reach = self._within_reach(points, origin)
-        tally.outside += int((~within_reach).sum())
+        counts.outside += int((~within_reach).sum())
         if self._place is None and len(points):
             self._place = np.median(points, axis=0)
         if self._rig.role == "rays":
-            with self._cell.free.by(tally) as grid:
+            with self._cell.free.by(counts) as grid:
                 grid.along_rays(origin, origin + self._rig.fraction * (points - origin))
         else:
-            self._new.append(self._unseen(points[within_reach], tally))
+            self._new.append(self._unseen(points[within_reach], counts))
 
-    def check(self, total: Tally) -> str | None:
-        """What is suspicious about the tally of a whole log: that no point was within reach."""
+    def check(self, total: Counts) -> str | None:
+        """What is suspicious about the counts of a whole log: that no point was within reach."""
         if self._place is None or total.outside < total.pixels - total.invalid:
             return None
         place = ", ".join(f"{value:.4g}" for value in self._place)
@@ -80,7 +80,7 @@ class Clouds:
         within: BoolArray = ((points - origin) ** 2).sum(axis=1) <= FARTHEST**2
         return within
 
-    def _unseen(self, points: FloatArray, tally: Tally) -> FloatArray:
+    def _unseen(self, points: FloatArray, counts: Counts) -> FloatArray:
         """The first point of every voxel that had none, of those that are the object's."""
         _, first = np.unique(self._lattice.voxels(points), axis=0, return_index=True)
         points = points[np.sort(first)]
@@ -91,8 +91,8 @@ class Clouds:
             points=points,
             diameter=self._cell.diameter,
         )
-        tally.small += found.small
-        tally.far += found.far
+        counts.small += found.small
+        counts.far += found.far
         points = points[found.kept]
         voxels = [tuple(voxel) for voxel in self._lattice.voxels(points).tolist()]
         new = [voxel not in self._seen for voxel in voxels]

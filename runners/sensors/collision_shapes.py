@@ -23,7 +23,7 @@ _SUFFIXES = (".stl", ".obj", ".ply", ".off")
 class MeshFiles:
     """Reads the mesh files of a URDF, each once.
 
-    urdf: its path, beside which relative paths are looked for. remarks: of meshes that were not
+    urdf: its path, beside which relative paths are looked for. warnings: of meshes that were not
     closed, and are their convex hulls here.
     """
 
@@ -31,7 +31,7 @@ class MeshFiles:
         self._folder = urdf.resolve().parent
         self._read: dict[Path, trimesh.Trimesh] = {}
         self._bytes = 0
-        self.remarks: list[str] = []
+        self.warnings: list[str] = []
 
     def solid(self, name: str | None, scale: Any, where: str) -> trimesh.Trimesh:
         """The closed solid in the file `name`, times `scale`: None, a number, or three (3,).
@@ -110,7 +110,7 @@ class MeshFiles:
                 mesh = mesh.convex_hull
             except Exception:  # of qhull, for flat meshes
                 raise SettingError(f"{where} is flat; accepted: a solid") from None
-            self.remarks.append(f"{where} is open; its convex hull is used")
+            self.warnings.append(f"{where} is open; its convex hull is used")
         if mesh.volume < 0.0:
             mesh.invert()
         return mesh

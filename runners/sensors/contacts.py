@@ -14,7 +14,7 @@ from runners.sensors.cell import Cell
 from runners.sensors.depth_camera import View
 from runners.sensors.pad import Imprint, Pad
 from runners.sensors.rig import Rig
-from runners.sensors.session_report import Tally
+from runners.sensors.session_report import Counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +86,12 @@ class ContactFinder:
         self._rig, self._pads, self._cell, self._seed = rig, pads, cell, seed
 
     def felt(
-        self, step: int, imprints: Mapping[str, Imprint], tallies: Mapping[str, Tally]
+        self, step: int, imprints: Mapping[str, Imprint], by_sensor: Mapping[str, Counts]
     ) -> Contacts:
         """A seeded subset of the contact pixels of all pads, of those within the workspace."""
         if step in self._rig.annotations.exclude:
             if any(imprint.size for imprint in imprints.values()):
-                self._cell.remarks.tell(f"probe {step}: contacts left out, as the rig annotates")
+                self._cell.warnings.note(f"probe {step}: contacts left out, as the rig annotates")
             return Contacts.joined([])
         key = StreamKey(self._seed, step)
         found = []
@@ -100,10 +100,10 @@ class ContactFinder:
             chosen = contact_subset(imprint.size, most, key.stream(Purpose.CONTACT_POINTS, index))
             points, normals = self._pads[name].contacts(imprint, chosen)
             kept = self._cell.free.within(points)
-            self._cell.remarks.warn(
+            self._cell.warnings.warn(
                 f"{name}: a contact left out, as it is out of the workspace", int((~kept).sum())
             )
-            tallies[name].contacts += int(kept.sum())
+            by_sensor[name].contacts += int(kept.sum())
             found.append(Contacts(points[kept], normals[kept]))
         return Contacts.joined(found)
 
@@ -117,19 +117,19 @@ class ContactFinder:
             if extra.foremost and push_end is not None:
                 added.append(push_end.foremost_mean(extra.foremost))
             elif extra.foremost:
-                self._cell.remarks.warn(
+                self._cell.warnings.warn(
                     f"probe {step}: no foremost point is added, as no membrane was seen"
                 )
         points = np.concatenate([np.zeros((0, 3)), *added])
         kept = self._cell.free.within(points)
-        self._cell.remarks.warn(
+        self._cell.warnings.warn(
             f"probe {step}: a contact that the rig adds is left out, as it is out of the workspace",
             int((~kept).sum()),
         )
         contacts = Contacts.without_normals(points[kept])
         if len(contacts.points):
             count = len(contacts.points)
-            self._cell.remarks.tell(f"probe {step}: {count} contacts added, as the rig annotates")
+            self._cell.warnings.note(f"probe {step}: {count} contacts added, as the rig annotates")
         return contacts
 
     def _shares(self, imprints: Mapping[str, Imprint]) -> dict[str, int]:

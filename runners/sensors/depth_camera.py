@@ -14,7 +14,7 @@ from replay.events import SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, CameraRig
-from runners.sensors.session_report import Tally
+from runners.sensors.session_report import Counts
 
 INTEGER_UNIT = 0.001  # m: of 16-bit depth images, as all the world has it
 FINE, COARSE = 0.0001, 0.001  # m: units of recorded images
@@ -35,26 +35,26 @@ class DepthSource:
     def __init__(self, rig: CameraRig | BubbleRig, camera: PinholeCamera, cell: Cell) -> None:
         self.rig, self.camera, self.cell = rig, camera, cell
 
-    def view(self, time: int, message: ImageMessage, tally: Tally) -> View | None:
+    def view(self, time: int, message: ImageMessage, counts: Counts) -> View | None:
         """The image and its pose; None, counted, where it cannot be used."""
         shape = (self.camera.height, self.camera.width)
         if message.values.shape != shape:
             height, width = message.values.shape
-            self.cell.remarks.warn(
+            self.cell.warnings.warn(
                 f"{self.rig.name}: left out, as the image has {width} x {height} pixels and its "
                 f"camera {shape[1]} x {shape[0]}"
             )
-            tally.unusable += 1
+            counts.unusable += 1
             return None
         frame = self.rig.frame or message.frame
         world_from_camera = self.cell.world_from(frame, time, self.rig.name)
         if world_from_camera is None:
-            tally.lost += 1
+            counts.lost += 1
             return None
         depth = metres(message.values, self.rig.unit)
         valid = valid_pixels(depth, nearest=self.rig.range[0], furthest=self.rig.range[1])
-        tally.pixels += valid.size
-        tally.invalid += int(valid.size - valid.sum())
+        counts.pixels += valid.size
+        counts.invalid += int(valid.size - valid.sum())
         return View(depth, valid, world_from_camera)
 
 
@@ -65,9 +65,9 @@ def metres(values: np.ndarray, unit: float | None) -> FloatArray:
     return values.astype(np.float64) * unit
 
 
-def recorded(image: FloatArray, counts: BoolArray) -> tuple[np.ndarray, float]:
+def recorded(image: FloatArray, usable: BoolArray) -> tuple[np.ndarray, float]:
     """An image (H, W) of metres as uint16 with its unit in metres; 0 where it does not count."""
-    kept = np.where(counts, image, 0.0)
+    kept = np.where(usable, image, 0.0)
     unit = FINE if kept.max(initial=0.0) < 65535 * FINE else COARSE
     return np.clip(np.rint(kept / unit), 0, 65535).astype(np.uint16), unit
 
@@ -92,35 +92,35 @@ class DepthCamera:
         self._last_time: int | None = None
         self._last: tuple[View, BoolArray] | None = None
 
-    def take(self, time: int, message: ImageMessage, tally: Tally) -> None:
+    def take(self, time: int, message: ImageMessage, counts: Counts) -> None:
         """Use an image of the current probe, unless it comes too soon after the last one."""
-        tally.images += 1
+        counts.images += 1
         if self._too_soon(time):
-            tally.spared += 1
+            counts.spared += 1
             return
-        view = self._source.view(time, message, tally)
+        view = self._source.view(time, message, counts)
         if view is None:
             return
-        counts = view.valid
+        usable = view.valid
         if self._rig.edge is not None:
             edges = occlusion_edges(
                 view.metres, view.valid, self._rig.edge, reach=self._rig.edge_reach
             )
-            tally.edges += int(edges.sum())
-            counts = view.valid & ~edges
-        if not counts.any():
-            tally.unusable += 1
-            self._cell.remarks.warn(f"{self._rig.name}: an image without a pixel that counts")
+            counts.edges += int(edges.sum())
+            usable = view.valid & ~edges
+        if not usable.any():
+            counts.unusable += 1
+            self._cell.warnings.warn(f"{self._rig.name}: an image without a pixel that counts")
             return
-        self._mark(view, self._ends(view, counts, tally), counts, tally)
-        tally.used += 1
-        self._last_time, self._last = time, (view, counts)
+        self._mark(view, self._ends(view, usable, counts), usable, counts)
+        counts.used += 1
+        self._last_time, self._last = time, (view, usable)
 
     def image(self, step: int) -> SensorImage | None:
         """The last image since the last call, with the pixels whose rays are free."""
         if self._last is None:
             return None
-        (view, counts), self._last = self._last, None
+        (view, usable), self._last = self._last, None
         values, unit = recorded(view.metres, view.valid)
         return SensorImage(
             step,
@@ -128,17 +128,17 @@ class DepthCamera:
             "depth",
             values,
             unit,
-            counts,
+            usable,
             intrinsics_of(self._source.camera),
             view.world_from_camera,
         )
 
-    def _ends(self, view: View, counts: BoolArray, tally: Tally) -> FloatArray:
+    def _ends(self, view: View, usable: BoolArray, counts: Counts) -> FloatArray:
         """Depths (H, W) up to which rays are free: of speckles the least of what is around them."""
         gate = self._cell.gate
-        regions = depth_regions(view.metres, counts, self._source.camera, gate.jump)
+        regions = depth_regions(view.metres, usable, self._source.camera, gate.jump)
         ends, small = speckle_free(view.metres, view.valid, regions, gate.speckle)
-        tally.small += small
+        counts.small += small
         return ends
 
     def _too_soon(self, time: int) -> bool:
@@ -146,10 +146,10 @@ class DepthCamera:
             return False
         return 0 <= time - self._last_time < _EARLY * 1e9 / self._rig.rate
 
-    def _mark(self, view: View, ends: FloatArray, counts: BoolArray, tally: Tally) -> None:
-        with self._cell.free.by(tally) as grid:
+    def _mark(self, view: View, ends: FloatArray, usable: BoolArray, counts: Counts) -> None:
+        with self._cell.free.by(counts) as grid:
             target = grid if self._own is None else self._own
-            arguments = (ends, self._source.camera, view.world_from_camera, counts)
+            arguments = (ends, self._source.camera, view.world_from_camera, usable)
             if self._rig.rays == "scaled_images":
                 target.scaled_images(*arguments)
             else:

@@ -18,7 +18,7 @@ from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.regions import depth_regions, main_regions, speckle_free
 from runners.sensors.depth_frame import DepthFrame
 from runners.sensors.rig import CameraRig, Rig
-from runners.sensors.session_report import Tally
+from runners.sensors.session_report import Counts
 
 LABEL_MARGIN = 2  # pixels: by so much a label's outline may be off the depth image's
 
@@ -31,8 +31,8 @@ class FramePoints:
     workspace: Workspace  # where the object can be
     rays: BoolArray  # (H, W), pixels whose rays are free
     surface: BoolArray  # (H, W), pixels on the object
-    tally: Tally  # of the whole image
-    labelled: Tally | None  # of the pixels of the object's label, if there is one
+    counts: Counts  # of the whole image
+    labelled: Counts | None  # of the pixels of the object's label, if there is one
 
 
 def depth_frame_points(
@@ -57,18 +57,18 @@ def depth_frame_points(
         )
     edges = _edges(frame, camera, valid)
     measured = frame.camera.back_project(frame.depth)
-    tally = Tally(images=1, used=1, pixels=valid.size, invalid=int((~valid).sum()))
-    tally.edges = int(edges.sum())
+    counts = Counts(images=1, used=1, pixels=valid.size, invalid=int((~valid).sum()))
+    counts.edges = int(edges.sum())
     rays = valid & ~edges
     surface, labelled = np.zeros_like(valid), None
     if frame.label is not None:
         surface, labelled = _surface_pixels(frame.label, valid, edges)
         surface = _connected(frame, rig, surface, measured, diameter, labelled)
         rays &= surface | ~frame.label
-        tally.outline, tally.far = labelled.outline, labelled.far
+        counts.outline, counts.far = labelled.outline, labelled.far
     regions = depth_regions(frame.depth, rays, frame.camera, rig.gate.jump)
     ends, small = speckle_free(frame.depth, valid, regions, rig.gate.speckle)
-    tally.small = small + (0 if labelled is None else labelled.small)
+    counts.small = small + (0 if labelled is None else labelled.small)
     on_object = apply(frame.world_from_camera, measured[surface])
     workspace = _workspace(rig, on_object, diameter)
     free = _free_voxels(frame, ends, camera, workspace, free_resolution, rays)
@@ -76,8 +76,8 @@ def depth_frame_points(
         free=_outside_of(on_object, free, free_resolution),
         known=one_per_voxel(on_object, rig.surface_resolution),
     )
-    tally.contacts, tally.free = len(points.known), len(points.free)
-    return FramePoints(points, workspace, rays, surface, tally, labelled)
+    counts.contacts, counts.free = len(points.known), len(points.free)
+    return FramePoints(points, workspace, rays, surface, counts, labelled)
 
 
 def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
@@ -98,7 +98,7 @@ def _edges(frame: DepthFrame, camera: CameraRig, valid: BoolArray) -> BoolArray:
 
 def _surface_pixels(
     label: BoolArray, valid: BoolArray, edges: BoolArray
-) -> tuple[BoolArray, Tally]:
+) -> tuple[BoolArray, Counts]:
     """The object's pixels (H, W) but for those at its outline, where others are mixed in."""
     square = np.ones((3, 3), dtype=bool)
     within = binary_erosion(label, square, iterations=LABEL_MARGIN, border_value=1)
@@ -108,7 +108,7 @@ def _surface_pixels(
             f"none of the {int(label.sum())} pixels of label tells of the surface: outlines "
             "and edges of depth are left out, and pixels out of range"
         )
-    counted = Tally(images=1, used=1, pixels=int(label.sum()))
+    counted = Counts(images=1, used=1, pixels=int(label.sum()))
     counted.invalid = int((label & ~valid).sum())
     counted.edges = int((label & edges).sum())
     counted.outline = int((label & valid & ~edges & ~within).sum())
@@ -121,7 +121,7 @@ def _connected(
     surface: BoolArray,
     measured: FloatArray,
     diameter: float | None,
-    labelled: Tally,
+    labelled: Counts,
 ) -> BoolArray:
     """Surface pixels (H, W) in regions that can be the object's, the others counted by reason."""
     regions = depth_regions(frame.depth, surface, frame.camera, rig.gate.jump)

@@ -14,16 +14,16 @@ from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.transforms import TransformTree
 from runners.sensors.log_checks import LogChecks, named_topics, require_topics, transform_topics
-from runners.sensors.log_scan import FirstPass
+from runners.sensors.log_scan import LogScan
 from runners.sensors.pad import membrane_reference
 from runners.sensors.rig import Rig
-from runners.sensors.session_report import Remarks
+from runners.sensors.session_report import LogWarnings
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
+class FirstPass:
     """What is known of a log before its images are read.
 
     transform_times (T,): nanoseconds, ascending. cameras, references: by the names of sensors, the
@@ -40,86 +40,86 @@ class Survey:
     bulky: tuple[str, ...]
 
 
-def survey_log(
-    log: RawLog, rig: Rig, joint_names: Sequence[str], remarks: Remarks, progress: Progress
-) -> Survey:
+def read_first_pass(
+    log: RawLog, rig: Rig, joint_names: Sequence[str], warnings: LogWarnings, progress: Progress
+) -> FirstPass:
     """Look through a log. joint_names: of the joints that move the hand.
 
     Raises SessionError if topics, camera infos or transforms are missing, or depths are no depths.
     """
     require_topics(log, rig)
-    seen = FirstPass(rig, joint_names)
+    scan = LogScan(rig, joint_names)
     topics = {*named_topics(rig), *transform_topics(log)}
-    seen.read(log, topics, progress)
-    clocks = seen.clocks.correction()
+    scan.read(log, topics, progress)
+    clocks = scan.clocks.correction()
     moving = Movements(rig, joint_names)
-    if seen.moving.differs(clocks):
-        again = {topic for topic in topics if topic in seen.moving.topics}
+    if scan.moving.differs(clocks):
+        again = {topic for topic in topics if topic in scan.moving.topics}
         for received in log.messages(again, progress=progress):
             moving.add(received, clocks.time(received))
     else:
-        moving = seen.moving
-    for text in (*log.remarks, *clocks.remarks):
-        remarks.warn(text)
+        moving = scan.moving
+    for text in (*log.warnings, *clocks.warnings):
+        warnings.warn(text)
     for text, count in moving.tree.faults.items():
-        remarks.warn(text, count)
-    checks = LogChecks(log, rig, seen, moving, clocks, remarks)
+        warnings.warn(text, count)
+    checks = LogChecks(log, rig, scan, moving, clocks, warnings)
     checks.sensors()
-    windows = _windows(log, rig, seen, clocks, checks.times, remarks)
+    windows = _windows(log, rig, scan, clocks, checks.times, warnings)
     cameras = checks.cameras()
-    return Survey(
+    return FirstPass(
         tree=moving.tree,
         transform_times=moving.times(),
         joints=moving.joints,
         clocks=clocks,
         windows=windows,
         cameras=cameras,
-        references=_references(log, rig, seen, cameras, windows, clocks, remarks),
-        bulky=tuple(seen.sightings),
+        references=_references(log, rig, scan, cameras, windows, clocks, warnings),
+        bulky=tuple(scan.message_times),
     )
 
 
 def _windows(
     log: RawLog,
     rig: Rig,
-    seen: FirstPass,
+    scan: LogScan,
     clocks: ClockCorrection,
     times: dict[str, IntArray],
-    remarks: Remarks,
+    warnings: LogWarnings,
 ) -> list[ProbeWindow]:
     """The probes of the log; all of it is one if nothing tells them apart."""
     begin = log.begin + clocks.typical
     first = min([begin, *(int(of[0]) for of in times.values())])
     last = max([log.end + clocks.typical, *(int(of[-1]) for of in times.values())])
     if rig.probes is not None:
-        windows = timed_windows(rig.probes, begin, last, remarks)
+        windows = timed_windows(rig.probes, begin, last, warnings)
         return windows or whole_log(first, last)
     if rig.markers:
         markers = [
             (clocks.time(received), received.content.text)
-            for received in seen.markers
+            for received in scan.markers
             if isinstance(received.content, MarkerMessage)
         ]
-        windows = marked_windows(markers, first, last, remarks)
+        windows = marked_windows(markers, first, last, warnings)
         if windows:
             return windows
-        remarks.warn(f"topic {rig.markers} marks no probe: the whole log is one")
+        warnings.warn(f"topic {rig.markers} marks no probe: the whole log is one")
     return whole_log(first, last)
 
 
 def _references(
     log: RawLog,
     rig: Rig,
-    seen: FirstPass,
+    scan: LogScan,
     cameras: dict[str, PinholeCamera],
     windows: list[ProbeWindow],
     clocks: ClockCorrection,
-    remarks: Remarks,
+    warnings: LogWarnings,
 ) -> dict[str, FloatArray]:
     """Depth images of the untouched membranes, by the names of pads."""
     references = {}
     for pad in rig.bubbles:
-        camera, first = cameras[pad.name], seen.first_images[pad.depth]
+        camera, first = cameras[pad.name], scan.first_images[pad.depth]
         size = (camera.height, camera.width)
         fitting = [
             (clocks.time(received), received.content.values)
@@ -129,7 +129,7 @@ def _references(
         untouched = [values for time, values in fitting if time < windows[0].begin]
         if pad.reference is None and pad.kind == "depth" and not untouched:
             untouched = [values for _, values in fitting]
-            remarks.warn(
+            warnings.warn(
                 f"{pad.name}: no image before the first probe; its reference is made of the first "
                 f"{len(untouched)} of the probe"
             )

@@ -19,7 +19,7 @@ from runners.sensors.hand import HandModel
 from runners.sensors.log.messages import WrenchMessage
 from runners.sensors.log.motion import JointHistory
 from runners.sensors.rig import ForceRig, HandRig
-from runners.sensors.session_report import Tally
+from runners.sensors.session_report import Counts
 
 _MOST_KEPT = 50  # samples of a probe, the strongest
 _MOST_TARED = 4096  # samples
@@ -57,9 +57,9 @@ class Forces:
         self._row: list[_Sample] = []  # not yet long enough for a contact
         self._strongest: list[_Sample] = []
 
-    def take(self, time: int, message: WrenchMessage, tally: Tally, *, within: bool) -> None:
+    def take(self, time: int, message: WrenchMessage, counts: Counts, *, within: bool) -> None:
         """Use a message; `within` a probe's begin and end, forces are of contacts."""
-        tally.images += 1
+        counts.images += 1
         numbers = np.concatenate([message.force, message.torque])
         numbers = numbers if self._rig.acts == "on_hand" else -numbers
         self._has_torque |= bool(message.torque.any())
@@ -67,34 +67,34 @@ class Forces:
             self._set_tare(time)
         self._within = within
         if within and self._tare is not None:
-            tally.used += 1
+            counts.used += 1
             beyond = numbers - self._tare
             newtons = float(np.sqrt((beyond[:3] ** 2).sum()))
-            self._look(_Sample(newtons, time, message.frame, tuple(beyond.tolist())), tally)
+            self._look(_Sample(newtons, time, message.frame, tuple(beyond.tolist())), counts)
             return
-        self._end_row(tally)
+        self._end_row(counts)
         self._idle.append((time, numbers))
-        tally.spared += 1
+        counts.spared += 1
         if within and time - self._idle[0][0] >= self._rig.tare * _NANOSECONDS:
-            self._cell.remarks.warn(
+            self._cell.warnings.warn(
                 f"{self._rig.topic}: nothing came before the first probe: its first "
                 f"{self._rig.tare:g} s are its tare"
             )
             self._set_tare(time)
 
-    def contacts(self, tally: Tally) -> Contacts:
+    def contacts(self, counts: Counts) -> Contacts:
         """The contacts since the last call, the strongest first."""
-        self._end_row(tally)
+        self._end_row(counts)
         samples, self._strongest = sorted(self._strongest, reverse=True), []
         found: dict[tuple[int, ...], tuple[FloatArray, FloatArray]] = {}
         for sample in samples:
-            contact = self._contact(sample, tally)
+            contact = self._contact(sample, counts)
             if contact is not None:
                 voxel = tuple(self._lattice.voxels(contact[0][None])[0].tolist())
                 found.setdefault(voxel, contact)
             if len(found) == self._rig.points:
                 break
-        tally.contacts += len(found)
+        counts.contacts += len(found)
         points, normals = [point for point, _ in found.values()], [n for _, n in found.values()]
         return Contacts(np.reshape(points, (-1, 3)), np.reshape(normals, (-1, 3)))
 
@@ -106,10 +106,10 @@ class Forces:
         if idle:
             self._tare = np.median(idle, axis=0)
 
-    def _look(self, sample: _Sample, tally: Tally) -> None:
+    def _look(self, sample: _Sample, counts: Counts) -> None:
         """Keep a sample if it is of a contact, and strong."""
         if sample.newtons <= self._rig.threshold:
-            self._end_row(tally)
+            self._end_row(counts)
             return
         self._row.append(sample)
         if not self._in_contact and len(self._row) < self._rig.samples:
@@ -121,19 +121,19 @@ class Forces:
                 heapq.heappop(self._strongest)
         self._row.clear()
 
-    def _end_row(self, tally: Tally) -> None:
+    def _end_row(self, counts: Counts) -> None:
         """The force is no longer above the threshold, or its probe is over."""
-        tally.spikes += len(self._row)
+        counts.spikes += len(self._row)
         self._row.clear()
         self._in_contact = False
 
-    def _contact(self, sample: _Sample, tally: Tally) -> tuple[FloatArray, FloatArray] | None:
+    def _contact(self, sample: _Sample, counts: Counts) -> tuple[FloatArray, FloatArray] | None:
         """Where a force acts, and the object's outward normal there (3,), world; None, counted."""
         sensor = self._rig.frame or sample.frame
         world_from_sensor = self._cell.world_from(sensor, sample.time, self._rig.topic)
         world_from_hand = self._cell.world_from(self._hand.frame, sample.time, self._rig.topic)
         if world_from_sensor is None or world_from_hand is None:
-            tally.lost += 1
+            counts.lost += 1
             return None
         triangles = self._triangles(sample.time)
         sensor_from_hand = inverse(world_from_sensor) @ world_from_hand
@@ -145,7 +145,7 @@ class Forces:
             found = contact_ahead(force, triangles)
         point = apply(world_from_sensor, found.point[None])
         if found.miss > self._rig.reach or not self._cell.free.within(point)[0]:
-            tally.outside += 1
+            counts.outside += 1
             return None
         return point[0], -rotated(world_from_sensor[:3, :3], found.normal[None])[0]
 

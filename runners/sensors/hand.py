@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 class HandModel:
     """The solids of a hand, read once, placed as often as joints move.
 
-    joint_names: joints whose values move any of them. remarks: what a user should know of how
+    joint_names: joints whose values move any of them. warnings: what a user should know of how
     they were read. Raises SettingError for a URDF that cannot be used.
     """
 
@@ -28,7 +27,7 @@ class HandModel:
         self._boxes = [_solid(box, f"hand.boxes[{i}]") for i, box in enumerate(rig.boxes)]
         self._linkage = None if rig.urdf is None else Linkage(Path(rig.urdf), rig.root)
         self.joint_names = () if self._linkage is None else self._linkage.joint_names
-        self.remarks = () if self._linkage is None else self._linkage.remarks
+        self.warnings = () if self._linkage is None else self._linkage.warnings
 
     def parts(self, joints: Mapping[str, float] | None = None) -> list[trimesh.Trimesh]:
         """Closed solids in the hand's frame, metres; they may overlap.
@@ -46,21 +45,6 @@ class HandModel:
         parts = self.parts(joints)
         joined: Any = trimesh.util.concatenate(parts) if parts else None
         return joined
-
-    def missing(self, joints: Mapping[str, float] | None) -> list[str]:
-        """The joints that move the hand and have no value, so that 0 is used."""
-        return [name for name in self.joint_names if name not in (joints or {})]
-
-
-def hand_solids(hand: HandRig, joints: Mapping[str, float] | None = None) -> trimesh.Trimesh | None:
-    """The hand's solids at one moment, in its frame; what is worth a remark is a warning."""
-    model = HandModel(hand)
-    remarks = list(model.remarks)
-    if missing := model.missing(joints):
-        remarks.append(f"joints without a value are at 0: {', '.join(missing)}")
-    for remark in remarks:
-        warnings.warn(remark, stacklevel=2)
-    return model.solids(joints)
 
 
 def _solid(box: BoxRig, where: str) -> trimesh.Trimesh:

@@ -17,7 +17,7 @@ from runners.sensors.hand import HandModel
 from runners.sensors.log.motion import JointHistory
 from runners.sensors.log.probe_windows import ProbeWindow
 from runners.sensors.rig import HandRig
-from runners.sensors.session_report import Tally
+from runners.sensors.session_report import Counts
 
 if TYPE_CHECKING:
     import trimesh
@@ -44,24 +44,24 @@ class HandPath:
         self._filled: tuple[dict[str, float], FloatArray] | None = None
         self._filled_parts: dict[int, tuple[FloatArray, FloatArray]] = {}
 
-    def follow(self, window: ProbeWindow, tally: Tally) -> FloatArray:
+    def follow(self, window: ProbeWindow, counts: Counts) -> FloatArray:
         """Sweep the hand along the path of a probe; some of its poses (P, 4, 4), in their order."""
         shown = [np.zeros((0, 4, 4))]
         states = self._joints.during(window.opens, window.closes)
         ends = [time for time, _ in states[1:]] + [window.closes]
         for (begin, joints), end in zip(states, ends, strict=True):
             interior = self._interior(joints)
-            for poses in self._runs(begin, end, tally):
+            for poses in self._runs(begin, end, counts):
                 dense = self._dense(poses, interior)
                 if self._rig.sweep == "path" and len(interior):
-                    with self._cell.free.by(tally) as grid:
+                    with self._cell.free.by(counts) as grid:
                         grid.at(interior, poses=dense)
                 shown.append(dense)
         path = np.concatenate(shown)
         count = min(len(path), MOST_POSES)
         return path[np.linspace(0, len(path) - 1, count).astype(int)]
 
-    def backwards(self, push_end: PushEnd, tally: Tally) -> None:
+    def backwards(self, push_end: PushEnd, counts: Counts) -> None:
         """Sweep the pads' points and what is between them back along the hand's z axis."""
         world_from_hand = push_end.world_from_hand
         points = apply(inverse(world_from_hand), push_end.membranes)
@@ -70,11 +70,11 @@ class HandPath:
         axes.append(high[2] + _FILLING_DEPTH)
         filling = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         points = np.concatenate([points, filling])
-        with self._cell.free.by(tally) as grid:
+        with self._cell.free.by(counts) as grid:
             for offset in _BACKWARDS:
                 grid.at(apply(world_from_hand, points - [0.0, 0.0, offset]))
 
-    def _runs(self, begin: int, end: int, tally: Tally) -> Iterator[FloatArray]:
+    def _runs(self, begin: int, end: int, counts: Counts) -> Iterator[FloatArray]:
         """Poses (P, 4, 4) from a time to before another, cut where they are not known for long."""
         times = self._times[np.searchsorted(self._times, begin) : np.searchsorted(self._times, end)]
         for start in range(0, len(times), _BATCH):
@@ -83,9 +83,9 @@ class HandPath:
             poses, known = self._cell.tree.lookups(
                 self._cell.world, self._rig.frame, stamps, gap_s=self._cell.gap
             )
-            tally.images += len(stamps)
-            tally.used += int(known.sum())
-            tally.lost += int(len(stamps) - known.sum())
+            counts.images += len(stamps)
+            counts.used += int(known.sum())
+            counts.lost += int(len(stamps) - known.sum())
             poses, stamps = poses[known], stamps[known]
             cuts = np.flatnonzero(np.diff(stamps) > self._cell.gap * 1e9) + 1
             yield from (run for run in np.split(poses, cuts) if len(run))

@@ -9,9 +9,9 @@ from runners.sensors.log.clocks import ClockCorrection
 from runners.sensors.log.motion import Movements
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.transforms import TransformError
-from runners.sensors.log_scan import FirstPass, missing_images
+from runners.sensors.log_scan import LogScan, missing_images
 from runners.sensors.rig import Rig
-from runners.sensors.session_report import Remarks
+from runners.sensors.session_report import LogWarnings
 
 _TRANSFORMS = ("TFMessage", "TransformStamped", "FrameTransform", "FrameTransforms")
 
@@ -74,27 +74,30 @@ class LogChecks:
         self,
         log: RawLog,
         rig: Rig,
-        seen: FirstPass,
+        scan: LogScan,
         moving: Movements,
         clocks: ClockCorrection,
-        remarks: Remarks,
+        warnings: LogWarnings,
     ) -> None:
-        self._log, self._rig, self._seen, self._moving = log, rig, seen, moving
-        self._remarks = remarks
-        self.times = {topic: sightings.times(clocks) for topic, sightings in seen.sightings.items()}
+        self._log, self._rig, self._scan, self._moving = log, rig, scan, moving
+        self._warnings = warnings
+        self.times = {
+            topic: message_times.times(clocks)
+            for topic, message_times in scan.message_times.items()
+        }
 
     def sensors(self) -> None:
         """Messages of every sensor, units, and the poses of sensors and hand."""
         for sensor in self._rig.sensors:
             self._require_messages(sensor.depth, sensor.name, "depth images")
             self._require_poses(sensor.name, sensor.depth, sensor.frame)
-            suspicious = self._seen.units[sensor.name].judge()
+            suspicious = self._scan.units[sensor.name].judge()
             if suspicious:
-                self._remarks.warn(suspicious)
+                self._warnings.warn(suspicious)
             lost = missing_images(self.times[sensor.depth])
             if lost:
                 count = len(self.times[sensor.depth])
-                self._remarks.tell(
+                self._warnings.note(
                     f"{sensor.name}: about {lost} of {count + lost} images are missing"
                 )
         for cloud in self._rig.clouds:
@@ -110,13 +113,13 @@ class LogChecks:
         """Intrinsics by the names of sensors."""
         cameras = {}
         for sensor in self._rig.sensors:
-            info = self._seen.infos.get(sensor.info)
+            info = self._scan.infos.get(sensor.info)
             if info is None:
                 raise SessionError(
                     f"log {self._log.path}: no camera info of {sensor.name} on topic "
                     f"{sensor.info}{self._reason(sensor.info)}"
                 )
-            sizes = self._seen.sightings[sensor.depth].sizes
+            sizes = self._scan.message_times[sensor.depth].sizes
             if (info.height, info.width) not in sizes:
                 (height, width), _ = sizes.most_common(1)[0]
                 raise SessionError(
@@ -125,12 +128,12 @@ class LogChecks:
                     "the same"
                 )
             if info.distorted:
-                self._remarks.warn(
+                self._warnings.warn(
                     f"{sensor.name}: its camera info names a distortion, which is not undone"
                 )
-            changes = self._seen.changed_infos.get(sensor.info, 0)
+            changes = self._scan.changed_infos.get(sensor.info, 0)
             if changes:
-                self._remarks.warn(f"{sensor.name}: another camera info than the first", changes)
+                self._warnings.warn(f"{sensor.name}: another camera info than the first", changes)
             cameras[sensor.name] = PinholeCamera(
                 info.width, info.height, info.fx, info.fy, info.cx, info.cy
             )
@@ -151,7 +154,7 @@ class LogChecks:
         return f" (its schema is {self._log.topics[topic].schema})"
 
     def _require_poses(self, name: str, topic: str, frame: str | None) -> None:
-        frame = frame or self._seen.sightings[topic].frame
+        frame = frame or self._scan.message_times[topic].frame
         if not frame:
             raise SessionError(
                 f"log {self._log.path}: messages on {topic} of {name} name no frame; accepted: the "
@@ -164,7 +167,7 @@ class LogChecks:
         if len(times):
             self._require_known("hand", frame, times)
         else:
-            self._remarks.warn("no transform of the log ever changes: the hand has no path")
+            self._warnings.warn("no transform of the log ever changes: the hand has no path")
 
     def _require_known(self, name: str, frame: str, times: IntArray) -> None:
         """Raise SessionError unless a frame's pose is known at one of the times at least."""

@@ -30,7 +30,7 @@ _MOST_SIZES = 100
 _NO_CONTENT = MarkerMessage("")
 
 
-class Sightings:
+class MessageTimes:
     """The messages of one topic.
 
     frame: of the first. sizes: (H, W) of images, with how many had it.
@@ -125,12 +125,12 @@ _MOST_MARKERS = 1_000_000
 _MOST_BYTES = 2**28  # of images that references are made of
 
 
-class FirstPass:
+class LogScan:
     """All that is small, and of what is large when it came.
 
-    infos: by topic, the first; changed_infos: how many others there were. sightings: by the topics
-    of images, clouds and forces. units: a check by the name of a sensor. first_images: by a pad's
-    topic.
+    infos: by topic, the first; changed_infos: how many others there were. message_times: by the
+    topics of images, clouds and forces. units: a check by the name of a sensor. first_images: by a
+    pad's topic.
     """
 
     def __init__(self, rig: Rig, joint_names: Sequence[str]) -> None:
@@ -141,7 +141,7 @@ class FirstPass:
         self.changed_infos: dict[str, int] = {}
         self.markers: list[Received] = []
         sensors = rig.sensors
-        self.sightings = {sensor.depth: Sightings(sensor.depth) for sensor in sensors}
+        self.message_times = {sensor.depth: MessageTimes(sensor.depth) for sensor in sensors}
         self.units = {sensor.name: UnitCheck(sensor) for sensor in sensors}
         self.first_images: dict[str, list[Received]] = {pad.depth: [] for pad in rig.bubbles}
         self._images = {sensor.depth for sensor in sensors}
@@ -149,7 +149,7 @@ class FirstPass:
             *(cloud.topic for cloud in rig.clouds),
             *(part.topic for part in rig.forces),
         ]
-        self.sightings |= {topic: Sightings(topic) for topic in self._others}
+        self.message_times |= {topic: MessageTimes(topic) for topic in self._others}
         self._infos = {sensor.info for sensor in sensors}
         self._held = 0
 
@@ -162,7 +162,7 @@ class FirstPass:
             if isinstance(content, ImageMessage) and topic in self._images:
                 self._see(received, content)
             elif isinstance(content, CloudMessage | WrenchMessage) and topic in self._others:
-                self.sightings[topic].add(received, content)
+                self.message_times[topic].add(received, content)
             elif isinstance(content, CameraInfoMessage) and topic in self._infos:
                 if self.infos.setdefault(topic, content) != content:
                     self.changed_infos[topic] = self.changed_infos.get(topic, 0) + 1
@@ -175,7 +175,7 @@ class FirstPass:
 
     def _see(self, received: Received, content: ImageMessage) -> None:
         topic = received.topic
-        self.sightings[topic].add(received, content)
+        self.message_times[topic].add(received, content)
         for sensor in self.rig.sensors:
             if sensor.depth == topic:
                 self.units[sensor.name].add(content.values)

@@ -20,7 +20,7 @@ from runners.sensors.depth_camera import DepthSource, View, intrinsics_of, metre
 from runners.sensors.log.image_file import read_image
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
-from runners.sensors.session_report import Tally
+from runners.sensors.session_report import Counts
 
 
 def membrane_reference(
@@ -120,37 +120,37 @@ class Pad:
         self._best: Imprint | None = None
 
     def take(
-        self, time: int, message: ImageMessage, tally: Tally, *, within: bool
+        self, time: int, message: ImageMessage, counts: Counts, *, within: bool
     ) -> Imprint | None:
         """Use an image of the current probe; `within` its begin and end, contacts count."""
-        tally.images += 1
-        imprint = self._imprint(time, message, tally)
+        counts.images += 1
+        imprint = self._imprint(time, message, counts)
         if imprint is None:
             return None
         used = within
         if within and imprint.outweighs(self._best):
             self._best = imprint
         if self._inside and self._has_moved(imprint.view.world_from_camera):
-            self._mark(imprint.view, tally)
+            self._mark(imprint.view, counts)
             used = True
-        tally.used += used
-        tally.spared += not used
+        counts.used += used
+        counts.spared += not used
         return imprint
 
-    def strongest(self, tally: Tally) -> Imprint | None:
+    def strongest(self, counts: Counts) -> Imprint | None:
         """The image of the contact since the last call."""
         best, self._best = self._best, None
         if best is None:
             return None
-        tally.touching += best.size
+        counts.touching += best.size
         if self._inside:
-            self._mark(best.view, tally)
+            self._mark(best.view, counts)
         return best
 
     def image(self, step: int, imprint: Imprint) -> SensorImage:
         """The deformation with the pixels in contact."""
-        counts = imprint.view.valid & (imprint.pressed > 0.0)
-        values, unit = recorded(imprint.pressed, counts)
+        usable = imprint.view.valid & (imprint.pressed > 0.0)
+        values, unit = recorded(imprint.pressed, usable)
         return SensorImage(
             step,
             self._rig.name,
@@ -176,8 +176,8 @@ class Pad:
         points = self._camera.back_project(view.metres)[view.valid]
         return apply(view.world_from_camera, points)
 
-    def _imprint(self, time: int, message: ImageMessage, tally: Tally) -> Imprint | None:
-        view = self._source.view(time, message, tally)
+    def _imprint(self, time: int, message: ImageMessage, counts: Counts) -> Imprint | None:
+        view = self._source.view(time, message, counts)
         if view is None:
             return None
         known = self._reference > 0.0
@@ -187,15 +187,15 @@ class Pad:
             depth = self._reference - pressed
             nearest, furthest = self._rig.range
             valid = told & (depth >= nearest) & (depth <= furthest)
-            kept = self._main(depth, valid, tally)
+            kept = self._main(depth, valid, counts)
             pressed[valid & ~kept] = 0.0
             valid, view = kept, View(depth, kept, view.world_from_camera)
         else:
-            valid = self._main(view.metres, view.valid & known, tally)
+            valid = self._main(view.metres, view.valid & known, counts)
             pressed = deformation(self._reference, view.metres, valid=valid)
         if not valid.any():
-            tally.unusable += 1
-            self._cell.remarks.warn(f"{self._rig.name}: an image without a pixel that counts")
+            counts.unusable += 1
+            self._cell.warnings.warn(f"{self._rig.name}: an image without a pixel that counts")
             return None
         pressed = smooth(pressed, self._contact.filter)
         touching = contact_mask(
@@ -204,28 +204,28 @@ class Pad:
             threshold=self._contact.threshold,
             valid=valid,
         )
-        touching = self._main(view.metres, touching, tally, least=self._contact.pixels)
+        touching = self._main(view.metres, touching, counts, least=self._contact.pixels)
         return Imprint(view, pressed, touching)
 
     def _main(
-        self, depth: FloatArray, counts: BoolArray, tally: Tally, *, least: int = 0
+        self, depth: FloatArray, usable: BoolArray, counts: Counts, *, least: int = 0
     ) -> BoolArray:
         """Of pixels (H, W) those in regions without a jump of depth that are not too small.
 
         least: pixels of a region.
         """
         gate = self._cell.gate
-        regions = depth_regions(depth, counts, self._camera, gate.jump)
-        kept = counts & ~small_regions(regions, least)
+        regions = depth_regions(depth, usable, self._camera, gate.jump)
+        kept = usable & ~small_regions(regions, least)
         kept[kept] = main_regions(regions[kept], part=gate.part).kept
-        tally.small += int((counts & ~kept).sum())
+        counts.small += int((usable & ~kept).sum())
         return kept
 
-    def _mark(self, view: View, tally: Tally) -> None:
+    def _mark(self, view: View, counts: Counts) -> None:
         """The pad's inside is free, less half a voxel's diagonal before what it may touch."""
         margin = sqrt(0.75) * self._cell.spacing
         depth = view.metres - margin / self._lengths
-        with self._cell.free.by(tally) as grid:
+        with self._cell.free.by(counts) as grid:
             grid.from_depth(
                 depth,
                 self._camera,

@@ -13,7 +13,7 @@ from runners.sensors.cell import Cell
 from runners.sensors.clouds import Clouds
 from runners.sensors.contacts import ContactFinder, Contacts, PushWatch
 from runners.sensors.depth_camera import DepthCamera
-from runners.sensors.first_pass import Survey
+from runners.sensors.first_pass import FirstPass
 from runners.sensors.forces import Forces
 from runners.sensors.hand import HandModel
 from runners.sensors.hand_path import HandPath
@@ -29,13 +29,13 @@ HAND = "hand"
 Event = RigDescribed | SensorImage | Logged | Probe
 
 
-class LogReading:
+class SecondPass:
     """All that a rig senses, probe by probe."""
 
     def __init__(
         self,
         rig: Rig,
-        survey: Survey,
+        first_pass: FirstPass,
         cell: Cell,
         report: Report,
         hand: HandModel | None,
@@ -44,14 +44,14 @@ class LogReading:
         images: bool,
     ) -> None:
         """seed: of the choice of contact pixels. images: whether they are among the events."""
-        self._rig, self._windows, self._cell, self._report = rig, survey.windows, cell, report
+        self._rig, self._windows, self._cell, self._report = rig, first_pass.windows, cell, report
         self._images = images
         self._sensors = _by_topic(rig)
         self._cameras = {
-            sensor.name: DepthCamera(sensor, survey.cameras[sensor.name], cell)
+            sensor.name: DepthCamera(sensor, first_pass.cameras[sensor.name], cell)
             for sensor in rig.cameras
         }
-        self._pads = {sensor.name: self._pad(sensor, survey) for sensor in rig.bubbles}
+        self._pads = {sensor.name: self._pad(sensor, first_pass) for sensor in rig.bubbles}
         self._clouds = {
             cloud.topic: Clouds(cloud, cell, rig.surface_resolution) for cloud in rig.clouds
         }
@@ -59,12 +59,14 @@ class LogReading:
         self._hand, self._push_end = None, None
         self._forces: dict[str, Forces] = {}
         if rig.hand is not None and hand is not None:
-            parts = rig.hand, hand, survey.joints
+            parts = rig.hand, hand, first_pass.joints
             self._forces = {
                 force.topic: Forces(force, parts, cell, rig.surface_resolution)
                 for force in rig.forces
             }
-            self._hand = HandPath(rig.hand, hand, survey.joints, survey.transform_times, cell)
+            self._hand = HandPath(
+                rig.hand, hand, first_pass.joints, first_pass.transform_times, cell
+            )
             if self._asks_for_push_end():
                 self._push_end = PushWatch(rig.hand.frame, cell)
 
@@ -74,7 +76,7 @@ class LogReading:
         sensors = (*self._cameras, *self._pads, *self._clouds, *self._forces)
         for window in self._windows:
             for name in (*sensors, *[HAND] * bool(self._hand)):
-                self._report.of(window.step, name)  # in this order they are shown
+                self._report.counts(window.step, name)  # in this order they are shown
             while message is not None and message[0] < window.closes:
                 self._take(window, *message)
                 message = next(messages, None)
@@ -86,15 +88,15 @@ class LogReading:
         for topic, cloud in self._clouds.items():
             suspicious = cloud.check(total[topic]) if topic in total else None
             if suspicious:
-                self._cell.remarks.warn(suspicious)
+                self._cell.warnings.warn(suspicious)
 
-    def _pad(self, sensor: BubbleRig, survey: Survey) -> Pad:
+    def _pad(self, sensor: BubbleRig, first_pass: FirstPass) -> Pad:
         """A pad; where the reference's sweep is chosen, that alone tells of free space by it."""
         return Pad(
             sensor,
             self._rig.contact,
-            survey.cameras[sensor.name],
-            survey.references[sensor.name],
+            first_pass.cameras[sensor.name],
+            first_pass.references[sensor.name],
             self._cell,
             inside=not self._sweeps_backwards(),
         )
@@ -102,20 +104,20 @@ class LogReading:
     def _take(self, window: ProbeWindow, time: int, message: Received) -> None:
         """Hand a message to whoever reads its topic."""
         if time < window.opens:
-            self._cell.remarks.warn(f"{message.topic}: left out, as it came long after its probe")
+            self._cell.warnings.warn(f"{message.topic}: left out, as it came long after its probe")
             return
         for sensor in self._sensors.get(message.topic, ()):
-            tally, within = self._report.of(window.step, sensor), window.holds(time)
+            counts, within = self._report.counts(window.step, sensor), window.holds(time)
             content = message.content
             if isinstance(content, CloudMessage) and sensor in self._clouds:
-                self._clouds[sensor].take(time, content, tally, within=within)
+                self._clouds[sensor].take(time, content, counts, within=within)
             elif isinstance(content, WrenchMessage) and sensor in self._forces:
-                self._forces[sensor].take(time, content, tally, within=within)
+                self._forces[sensor].take(time, content, counts, within=within)
             elif isinstance(content, ImageMessage) and sensor in self._cameras:
-                self._cameras[sensor].take(time, content, tally)
+                self._cameras[sensor].take(time, content, counts)
             elif isinstance(content, ImageMessage) and sensor in self._pads:
                 pad = self._pads[sensor]
-                imprint = pad.take(time, content, tally, within=within)
+                imprint = pad.take(time, content, counts, within=within)
                 if imprint is not None and within and self._push_end is not None:
                     self._push_end.take(time, sensor, pad, imprint.view)
 
@@ -123,17 +125,17 @@ class LogReading:
         """What is known at the end of a probe."""
         step, path = window.step, np.zeros((0, 4, 4))
         if self._hand is not None:
-            path = self._hand.follow(window, self._report.of(step, HAND))
+            path = self._hand.follow(window, self._report.counts(step, HAND))
         imprints = {
             name: imprint
             for name, pad in self._pads.items()
-            if (imprint := pad.strongest(self._report.of(step, name))) is not None
+            if (imprint := pad.strongest(self._report.counts(step, name))) is not None
         }
         push_end = self._push_end.next() if self._push_end else None
         if push_end is not None and self._hand is not None and self._sweeps_backwards():
-            self._hand.backwards(push_end, self._report.of(step, HAND))
-        tallies = self._report.tallies[step]
-        felt = self._contacts.felt(step, imprints, tallies)
+            self._hand.backwards(push_end, self._report.counts(step, HAND))
+        by_sensor = self._report.by_probe[step]
+        felt = self._contacts.felt(step, imprints, by_sensor)
         added = self._contacts.annotated(step, push_end)
         scanned = self._scanned(step, contacts=True)
         pushed = self._pushed(step)
@@ -163,14 +165,14 @@ class LogReading:
                 points = cloud.surface()
                 if contacts and step in self._rig.annotations.exclude:
                     points = points[:0]
-                self._report.of(step, topic).contacts += len(points)
+                self._report.counts(step, topic).contacts += len(points)
                 found.append(points)
         return np.concatenate(found)
 
     def _pushed(self, step: int) -> Contacts:
         """Contacts by the forces on the hand."""
         found = [
-            force.contacts(self._report.of(step, name)) for name, force in self._forces.items()
+            force.contacts(self._report.counts(step, name)) for name, force in self._forces.items()
         ]
         return Contacts.joined([] if step in self._rig.annotations.exclude else found)
 
@@ -185,9 +187,11 @@ class LogReading:
 
     def _told(self, step: int, new: KnownPoints, contacts: Contacts) -> Iterator[Logged]:
         """What a probe came to, in a line; and whether its points contradict one another."""
-        tallies = self._report.tallies[step].items()
-        free = ", ".join(f"{name} {tally.free}" for name, tally in tallies if tally.free)
-        surface = ", ".join(f"{name} {tally.contacts}" for name, tally in tallies if tally.contacts)
+        by_sensor = self._report.by_probe[step].items()
+        free = ", ".join(f"{name} {counts.free}" for name, counts in by_sensor if counts.free)
+        surface = ", ".join(
+            f"{name} {counts.contacts}" for name, counts in by_sensor if counts.contacts
+        )
         text = f"probe {step}: {len(new.free)} new free voxels" + f" ({free})" * bool(free)
         text += f", {len(new.known)} surface points" + f" ({surface})" * bool(surface)
         held = self._cell.free.holds(contacts.points)
@@ -197,7 +201,7 @@ class LogReading:
         lattice = self._cell.free.grid.lattice
         behind = lattice.centres(lattice.voxels(contacts.points)) - contacts.points
         inside = held & ((behind * contacts.normals).sum(axis=1) < 0.0)
-        self._cell.remarks.warn(
+        self._cell.warnings.warn(
             "a contact lies in a free voxel whose centre is behind it, in the object",
             int(inside.sum()),
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Tally:
+class Counts:
     """Counts of one sensor in one probe."""
 
     images: int = 0  # that came, or clouds, forces, poses of the hand
@@ -41,7 +41,7 @@ class Tally:
         total = f"{self.pixels} pixels or points" if self.pixels else f"{self.images} messages"
         return f"left out of {total}: {counts}" if counts else ""
 
-    def add(self, other: Tally) -> None:
+    def add(self, other: Counts) -> None:
         """Add the counts of another one."""
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
@@ -51,19 +51,19 @@ class Tally:
 class Report:
     """Tallies of a session by step and by the name of a sensor, and its lines of text."""
 
-    tallies: dict[int, dict[str, Tally]] = field(default_factory=dict)
+    by_probe: dict[int, dict[str, Counts]] = field(default_factory=dict)
     lines: list[tuple[str, str]] = field(default_factory=list)
 
-    def of(self, step: int, sensor: str) -> Tally:
-        """The tally to count in."""
-        return self.tallies.setdefault(step, {}).setdefault(sensor, Tally())
+    def counts(self, step: int, sensor: str) -> Counts:
+        """The counts of a sensor in a probe."""
+        return self.by_probe.setdefault(step, {}).setdefault(sensor, Counts())
 
-    def total(self) -> dict[str, Tally]:
+    def total(self) -> dict[str, Counts]:
         """By sensor, over all probes."""
-        totals: dict[str, Tally] = {}
-        for tallies in self.tallies.values():
-            for name, tally in tallies.items():
-                totals.setdefault(name, Tally()).add(tally)
+        totals: dict[str, Counts] = {}
+        for by_sensor in self.by_probe.values():
+            for name, counts in by_sensor.items():
+                totals.setdefault(name, Counts()).add(counts)
         return totals
 
 
@@ -71,10 +71,10 @@ MOST_KINDS = 100  # a hostile log must not flood the recording
 LONGEST = 400  # characters of a line
 
 
-class Remarks:
+class LogWarnings:
     """Lines of text in the order in which their kinds came up."""
 
-    def __init__(self, before: Remarks | None = None) -> None:
+    def __init__(self, before: LogWarnings | None = None) -> None:
         """before: whose lines come ahead."""
         self._counts: dict[tuple[str, str], int] = dict(before._counts) if before else {}
         self._further: int = before._further if before else 0
@@ -83,7 +83,7 @@ class Remarks:
         """Something is wrong, or was left out; `count` times."""
         self._add("warning", text, count)
 
-    def tell(self, text: str) -> None:
+    def note(self, text: str) -> None:
         """Something worth knowing."""
         self._add("info", text, 1)
 

@@ -100,7 +100,7 @@ class Linkage:
     """The part of a URDF that hangs on one link, and moves with it.
 
     path: of the file. root: the link whose frame is the hand's; None: the link that hangs on no
-    other. joint_names: joints whose values move any solid. remarks: on how the file was taken.
+    other. joint_names: joints whose values move any solid. warnings: on how the file was taken.
     Raises SettingError, which names the file, for one that cannot be used.
     """
 
@@ -118,7 +118,7 @@ class Linkage:
         self._shapes = self._all_shapes([links[name] for name in own], files)
         moving = self._moving()
         self.joint_names = tuple(dict.fromkeys(self._driver(joint)[0] for joint in moving))
-        self.remarks = (*files.remarks, *self._fixed_remarks())
+        self.warnings = (*files.warnings, *self._fixed_remarks())
 
     def solids(self, joints: Mapping[str, float]) -> list[trimesh.Trimesh]:
         """Closed solids in the root's frame; joints: values, radians or metres, 0 if missing."""

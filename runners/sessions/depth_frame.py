@@ -51,17 +51,17 @@ class DepthFrameSession:
     def probes(self) -> Iterator[SessionEvent]:
         """The image, and what follows from it."""
         found, (camera,) = self._points, self._rig.cameras
-        self.report.tallies[0] = {camera.name: found.tally}
+        self.report.by_probe[0] = {camera.name: found.counts}
         yield RigDescribed(-1, self._rig.name, file_digest(self._path))
         if self._images:
             yield self._image(camera.name)
         count = len(found.points.known)
         text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
         yield Logged(0, "info", text)
-        tallies = {camera.name: found.tally, "label": found.labelled}
+        by_sensor = {camera.name: found.counts, "label": found.labelled}
         self.report.lines.clear()
-        for name, tally in tallies.items():
-            if tally is not None and (left_out := tally.left_out()):
+        for name, counts in by_sensor.items():
+            if counts is not None and (left_out := counts.left_out()):
                 self.report.lines.append(("info", f"{name}: {left_out}"))
                 yield Logged(0, "info", f"{name}: {left_out}")
         label = found.labelled

@@ -13,15 +13,15 @@ from replay.events import Logged, RigDescribed
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import Cell, FreeMap
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
-from runners.sensors.first_pass import survey_log
+from runners.sensors.first_pass import read_first_pass
 from runners.sensors.hand import HandModel
 from runners.sensors.log.clocks import in_time_order
 from runners.sensors.log.messages import Received
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.pose_file import beside, read_pose
 from runners.sensors.rig import Rig
-from runners.sensors.second_pass import LogReading
-from runners.sensors.session_report import Remarks, Report
+from runners.sensors.second_pass import SecondPass
+from runners.sensors.session_report import LogWarnings, Report
 from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.free_space import box_shell
 from runners.sessions.session import Progress, Session, SessionEvent, unwatched
@@ -102,56 +102,62 @@ class SensorsSession:
         self.world_from_object: FloatArray | None = None
         self._rig, self._seed, self._images = rig, seed, settings.images
         self._progress, self._diameter = progress, diameter
-        self._opening = Remarks()
+        self._opening = LogWarnings()
         self._hand = HandModel(rig.hand) if rig.hand else None
+        for text in self._hand.warnings if self._hand else ():
+            self._opening.warn(text)
         self._log = RawLog(path, progress=self._shown("looking for topics"))
         self._find_pose(path, settings.pose)
         joints = self._hand.joint_names if self._hand else ()
-        self._survey = survey_log(
+        self._first_pass = read_first_pass(
             self._log, rig, joints, self._opening, self._shown("first pass over the log")
         )
+        missing = [name for name in joints if name not in self._first_pass.joints.first()]
+        if missing:
+            self._opening.warn(f"joints without a value are at 0: {', '.join(missing)}")
         self.source = self._log.digest(self._shown("digest of the log"))
-        self.count = len(self._survey.windows)
+        self.count = len(self._first_pass.windows)
         self.initial_points = KnownPoints(free=self._free_map()[1])
         annotated = {*rig.annotations.exclude, *(add.probe for add in rig.annotations.contacts)}
-        for step in sorted(annotated - {window.step for window in self._survey.windows}):
+        for step in sorted(annotated - {window.step for window in self._first_pass.windows}):
             self._opening.warn(f"the rig annotates probe {step}, which the log does not have")
 
     def probes(self) -> Iterator[SessionEvent]:
         """The probes of the log, in their order; its images are read as they go."""
-        rig, survey, remarks = self._rig, self._survey, Remarks(self._opening)
-        self.report.tallies.clear()
+        rig, first_pass, warnings = self._rig, self._first_pass, LogWarnings(self._opening)
+        self.report.by_probe.clear()
         cell = Cell(
             rig.world,
-            survey.tree,
+            first_pass.tree,
             rig.clock.gap,
             self._free_map()[0],
-            remarks,
+            warnings,
             rig.gate,
             self._diameter,
         )
-        reading = LogReading(
-            rig, survey, cell, self.report, self._hand, seed=self._seed, images=self._images
+        reading = SecondPass(
+            rig, first_pass, cell, self.report, self._hand, seed=self._seed, images=self._images
         )
-        hand = self._hand.solids(survey.joints.first()) if self._hand else None
+        hand = self._hand.solids(first_pass.joints.first()) if self._hand else None
         yield RigDescribed(-1, rig.name, self.source, hand)
         messages: Iterator[Received] = iter(())
-        if survey.bulky:
-            messages = self._log.messages(survey.bulky, progress=self._shown("reading images"))
-        yield from reading.events(in_time_order(messages, survey.clocks.time))
+        if first_pass.bulky:
+            messages = self._log.messages(first_pass.bulky, progress=self._shown("reading images"))
+        yield from reading.events(in_time_order(messages, first_pass.clocks.time))
         reading.check()
         for text, count in self._log.faults.items():
-            remarks.warn(text, count)
-        for name, tally in self.report.total().items():
-            if left_out := tally.left_out():
-                remarks.tell(f"{name}: {left_out}")
-            if tally.edges > _MANY * tally.pixels:
-                remarks.warn(
-                    f"{name}: {100 * tally.edges // tally.pixels} % of its pixels are left out as "
+            warnings.warn(text, count)
+        for name, counts in self.report.total().items():
+            if left_out := counts.left_out():
+                warnings.note(f"{name}: {left_out}")
+            if counts.edges > _MANY * counts.pixels:
+                share = 100 * counts.edges // counts.pixels
+                warnings.warn(
+                    f"{name}: {share} % of its pixels are left out as "
                     "edges; a larger edge (m), or a smaller edge_reach (pixels), keeps more"
                 )
-        self.report.lines = remarks.lines()
-        last = survey.windows[-1].step
+        self.report.lines = warnings.lines()
+        last = first_pass.windows[-1].step
         yield from (Logged(last, level, text) for level, text in self.report.lines)
 
     def close(self) -> None:
@@ -171,7 +177,7 @@ class SensorsSession:
         file = Path(chosen).expanduser() if chosen else beside(path)
         if chosen or file.is_file():
             self.world_from_object = read_pose(file)
-            self._opening.tell(f"the true pose is that of {file.name}")
+            self._opening.note(f"the true pose is that of {file.name}")
 
     def _shown(self, stage: str) -> Callable[[int, int], None]:
         """Progress of a stage in bytes, told in megabytes."""

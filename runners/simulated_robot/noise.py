@@ -8,7 +8,7 @@ from scipy import ndimage
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import normals
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.simulated_robot.settings import TwinBubbles, TwinCamera
+from runners.simulated_robot.settings import BubbleSettings, CameraSettings
 
 EDGE = 0.03  # m: a jump of depth among neighbours that is an occlusion edge
 NEAREST = 0.15  # m: the outer camera measures nothing nearer
@@ -26,7 +26,7 @@ BUBBLE_LOST = 0.001
 
 
 def stereo_depth(
-    depth: FloatArray, pinhole: PinholeCamera, camera: TwinCamera, stream: np.random.Generator
+    depth: FloatArray, pinhole: PinholeCamera, camera: CameraSettings, stream: np.random.Generator
 ) -> np.ndarray:
     """What the outer camera measures of depths (H, W) in metres: uint16 millimetres, 0 for none.
 
@@ -51,7 +51,7 @@ def stereo_depth(
 
 
 def bubble_depth(
-    depth: FloatArray, bubbles: TwinBubbles, stream: np.random.Generator
+    depth: FloatArray, bubbles: BubbleSettings, stream: np.random.Generator
 ) -> np.ndarray:
     """What a bubble's camera measures of depths (H, W) in metres: float32 metres, 0 for none."""
     measured = depth + bubbles.noise * normals(stream, depth.shape)

@@ -30,7 +30,7 @@ class RenderedCamera(PinholeCamera):
 
 
 @dataclass(frozen=True)
-class TwinCamera:
+class CameraSettings:
     """The depth camera outside. Its image is three quarters as high as wide.
 
     width: pixels. view: horizontal, degrees. rate: images a second. noise: standard deviation of
@@ -58,7 +58,7 @@ class TwinCamera:
 
 
 @dataclass(frozen=True)
-class TwinBubbles:
+class BubbleSettings:
     """The depth cameras in the two pads, which just see all of their membranes.
 
     width: pixels, along the longer side. rate: images a second. noise: standard deviation, metres.
@@ -79,7 +79,7 @@ class TwinBubbles:
 
 
 @dataclass(frozen=True)
-class TwinSettings:
+class RobotSettings:
     """How the twin records.
 
     probes: how many of the configuration's grid; null: all. push_step, push_steps: metres, and how
@@ -91,8 +91,8 @@ class TwinSettings:
     """
 
     probes: int | None = None
-    camera: TwinCamera = field(default_factory=TwinCamera)
-    bubbles: TwinBubbles = field(default_factory=TwinBubbles)
+    camera: CameraSettings = field(default_factory=CameraSettings)
+    bubbles: BubbleSettings = field(default_factory=BubbleSettings)
     push_step: float = 0.05
     push_steps: int = 5
     push_speed: float = 0.05

@@ -19,7 +19,7 @@ from runners.simulated_robot.log_writer import LogWriter
 from runners.simulated_robot.pads import Pads
 from runners.simulated_robot.recorder import TICK, Recorder
 from runners.simulated_robot.scene import Scene
-from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.settings import RobotSettings
 from runners.whole_file import whole_file
 
 HOME = (0.48, 0.0, 0.433)  # m: where the wrist is before and after all probes
@@ -62,7 +62,7 @@ def simulate_log(
     configuration: CabinetConfiguration,
     mesh: trimesh.Trimesh,
     seed: int,
-    settings: TwinSettings,
+    settings: RobotSettings,
     told: Told | None = None,
 ) -> SimulatedLog:
     """Probe an object in the cabinet, and write the raw log; an older file of that name is gone.
@@ -90,7 +90,7 @@ def simulate_log(
     return SimulatedLog(world_from_object, tuple(pushes), robot.seconds, log.messages)
 
 
-def probe_count(configuration: CabinetConfiguration, settings: TwinSettings) -> int:
+def probe_count(configuration: CabinetConfiguration, settings: RobotSettings) -> int:
     """How many probes there will be; SettingError for more than the configuration has."""
     most = len(configuration.grid)
     if settings.probes is not None and settings.probes > most:
@@ -102,7 +102,7 @@ class _Robot:
     """Moves the wrist on straight lines, tick by tick."""
 
     def __init__(
-        self, scene: Scene, pads: Pads, recorder: Recorder, settings: TwinSettings
+        self, scene: Scene, pads: Pads, recorder: Recorder, settings: RobotSettings
     ) -> None:
         self._scene = scene
         self._pads = pads

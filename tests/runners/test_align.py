@@ -22,7 +22,7 @@ from runners.evaluation import trial_truth
 from runners.objects.models import MODELS
 from runners.sensors.pose_file import beside, read_pose, read_pose_file
 from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS
-from runners.simulated_robot.settings import TwinBubbles, TwinCamera, TwinSettings
+from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 from tests.runners.in_process import Done, run
 
 YAW = 0.5
@@ -137,7 +137,9 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
     from runners.simulated_robot.simulation import simulate_log
 
     log = tmp_path / "log.mcap"
-    small = TwinSettings(probes=1, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=96))
+    small = RobotSettings(
+        probes=1, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=96)
+    )
     model = MODELS["mustard"]()
     mesh = clean_mesh(model.vertices, model.faces, name="mustard", scale=1.0)
     made = simulate_log(log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh, 0, small)

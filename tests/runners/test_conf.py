@@ -18,7 +18,7 @@ from runners.reporting.sections import SequenceConfig
 from runners.sessions.points import PointsSettings
 from runners.sessions.recorded import RecordedSettings
 from runners.sessions.sensors import SensorsSettings
-from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.settings import RobotSettings
 
 SHOWN = [
     ("align", "search", TruePoseSettings),
@@ -27,7 +27,7 @@ SHOWN = [
     ("plausible", "metrics", MetricsConfig),
     ("evaluate", "metrics", MetricsConfig),
     ("report", "sequence", SequenceConfig),
-    ("simulate_rig", "", TwinSettings),
+    ("simulate_rig", "", RobotSettings),
     ("recording/both", "", RecordingConfig),
     ("session/points", "", PointsSettings),
     ("session/recorded", "", RecordedSettings),

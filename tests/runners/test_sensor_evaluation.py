@@ -183,10 +183,12 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
 ) -> None:
     pytest.importorskip("pybullet")
     from runners.evaluation import sensor_logs
-    from runners.simulated_robot.settings import TwinBubbles, TwinCamera, TwinSettings
+    from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 
-    small = TwinSettings(probes=2, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=96))
-    monkeypatch.setattr(sensor_logs, "TwinSettings", lambda: small)
+    small = RobotSettings(
+        probes=2, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=96)
+    )
+    monkeypatch.setattr(sensor_logs, "RobotSettings", lambda: small)
     plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
     outcome = do_unit(plan, Unit(trial), set())
     assert (outcome.kind, outcome.reason) == ("done", "")

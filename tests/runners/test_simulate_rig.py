@@ -23,7 +23,7 @@ from runners.simulated_robot.configurations import (
     stood_on_shelf,
 )
 from runners.simulated_robot.recorder import WORLD, WRIST
-from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 from tests.runners.in_process import run
 
@@ -112,7 +112,7 @@ def test_the_configuration_file_says_the_defaults_of_the_twin() -> None:
         values = plain(compose("simulate_rig"))
     for name in SimulateRigConfig.__dataclass_fields__:
         del values[name]
-    assert values == settings_mapping(TwinSettings())
+    assert values == settings_mapping(RobotSettings())
 
 
 def test_the_rig_of_the_cabinet_describes_the_twin() -> None:

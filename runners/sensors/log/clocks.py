@@ -43,7 +43,7 @@ class Clocks:
     def correction(self) -> ClockCorrection:
         """What must be added to the stamps of each topic, by all messages so far."""
         if self._rig.stamp == "log" or not self._offsets:
-            return ClockCorrection(by_log=True, remarks=tuple(self._step_remarks()))
+            return ClockCorrection(by_log=True, warnings=tuple(self._step_remarks()))
         medians = {topic: offsets.median() for topic, offsets in self._offsets.items()}
         typical = _typical(list(medians.values()))
         limit, jump = self._rig.offset * _NANOSECONDS, self._rig.jump * _NANOSECONDS
@@ -52,25 +52,25 @@ class Clocks:
             for topic, median in medians.items()
             if abs(typical - median) > limit
         }
-        remarks = [
+        warnings = [
             f"the clock of {topic} is {_seconds(-shift)} other topics': its stamps are shifted"
             for topic, shift in sorted(shifts.items())
         ]
         for topic, offsets in sorted(self._offsets.items()):
             count = offsets.departing(medians[topic], jump)
             if count:
-                remarks.append(
+                warnings.append(
                     f"{count} messages on {topic} have stamps more than {self._rig.jump:g} s off: "
                     "the log's times count for them"
                 )
         if abs(typical) > limit:
-            remarks.append(f"stamps are {_seconds(typical)} the log's clock, all alike")
+            warnings.append(f"stamps are {_seconds(typical)} the log's clock, all alike")
         return ClockCorrection(
             shifts=shifts,
             medians=medians,
             typical=typical if abs(typical) > limit else 0,
             jump=jump,
-            remarks=(*remarks, *self._step_remarks()),
+            warnings=(*warnings, *self._step_remarks()),
         )
 
     def _step_remarks(self) -> list[str]:
@@ -83,7 +83,7 @@ class Clocks:
 
 @dataclass(frozen=True)
 class ClockCorrection:
-    """Times of messages by one clock. remarks: what a user should know of the clocks.
+    """Times of messages by one clock. warnings: what a user should know of the clocks.
 
     shifts: nanoseconds to add, of topics that depart. medians: of the stamps less the log's times,
     by topic. typical: of all topics, 0 if small. jump: nanoseconds a stamp may be off at most.
@@ -95,7 +95,7 @@ class ClockCorrection:
     typical: int = 0
     jump: float = 0.0
     by_log: bool = False
-    remarks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def of(self, topic: str) -> int:
         """Nanoseconds to add to a topic's stamps."""

@@ -1,4 +1,4 @@
-"""Foxglove's messages, as protobuf: what they say."""
+"""Foxglove's messages, as protobuf, decoded."""
 
 from __future__ import annotations
 
@@ -12,51 +12,43 @@ from google.protobuf.message import DecodeError
 from chsel.errors import RecordingError
 from chsel.problem.poses import apply
 from replay.mcap.wire import check_wire
+from runners.sensors.log import message_fields as fields
 from runners.sensors.log.images import pixel_rows, png_pixels
-from runners.sensors.log.message_fields import (
-    Said,
-    frame_name,
-    intrinsics,
-    joints,
-    marker,
-    named_fields,
-    packed_points,
-    positions,
-    require_length,
-    stamp_of,
-)
 from runners.sensors.log.messages import (
+    CameraInfoMessage,
     CloudMessage,
     Content,
+    Decode,
+    Decoded,
     ImageMessage,
+    JointsMessage,
+    MarkerMessage,
     PoseMessage,
     UnusableMessage,
 )
-from runners.sensors.log.messages import TransformMessage as Transform
-from runners.sensors.log.quaternions import rigid
 
 _MOST_TRANSFORMS = 10_000  # in one message
 _MATRIX = 9  # entries of intrinsics
 
 
-def foxglove_decoder(name: str) -> Callable[[bytes], Iterator[Said]] | None:
-    """What a message of this name says; None for one that is not read.
+def foxglove_decoder(name: str) -> Decode | None:
+    """Decodes messages of this name; None for one that is not read.
 
     Its class is the installed package's, never one that a file describes.
     """
-    made, kind = _CONTENTS.get(name), _kind(name)
-    if made is None or kind is None:
+    contents, kind = _CONTENTS.get(name), _kind(name)
+    if contents is None or kind is None:
         return None
 
-    def said(data: bytes) -> Iterator[Said]:
+    def decode(data: bytes) -> Iterator[Decoded]:
         try:
             check_wire(kind.DESCRIPTOR, data)
             message = kind.FromString(data)
         except (DecodeError, RecordingError):
             raise UnusableMessage(f"a message is no valid {name}") from None
-        return made(message)
+        return contents(message)
 
-    return said
+    return decode
 
 
 @cache
@@ -72,108 +64,96 @@ def _kind(name: str) -> Any:
 
 
 def _stamp(message: Any) -> int | None:
-    return stamp_of(message.timestamp.seconds, message.timestamp.nanos)
+    return fields.stamp_of(message.timestamp.seconds, message.timestamp.nanos)
 
 
-def _one(message: Any, content: Content) -> Iterator[Said]:
-    yield _stamp(message), content
-
-
-def _image(message: Any) -> Iterator[Said]:
+def _image(message: Any, frame: str) -> ImageMessage:
     size = (message.width, message.height)
-    values = pixel_rows(message.data, message.encoding, size, message.step)
-    return _one(message, ImageMessage(frame_name(message.frame_id), values))
+    return ImageMessage(frame, pixel_rows(message.data, message.encoding, size, message.step))
 
 
-def _compressed_image(message: Any) -> Iterator[Said]:
-    return _one(message, ImageMessage(frame_name(message.frame_id), png_pixels(message.data)))
+def _compressed_image(message: Any, frame: str) -> ImageMessage:
+    return ImageMessage(frame, png_pixels(message.data))
 
 
-def _calibration(message: Any) -> Iterator[Said]:
-    require_length("entries", len(message.K), "of its intrinsics", _MATRIX)
+def _calibration(message: Any, frame: str) -> CameraInfoMessage:
+    fields.require_length("entries", len(message.K), "of its intrinsics", _MATRIX)
     fx, _, cx, _, fy, cy, *_ = message.K
-    frame, size = frame_name(message.frame_id), (message.width, message.height)
-    return _one(message, intrinsics(frame, size, (fx, fy), (cx, cy), message.D))
+    size = (message.width, message.height)
+    return fields.intrinsics(frame, size, (fx, fy), (cx, cy), message.D)
 
 
-def _transform(message: Any) -> Transform | UnusableMessage:
-    """A transform, or what is wrong with it, as others of its message may be right."""
-    t, q = message.translation, message.rotation
-    try:
-        return Transform(
-            frame_name(message.parent_frame_id, needed=True),
-            frame_name(message.child_frame_id, needed=True),
-            rigid((t.x, t.y, t.z), (q.x, q.y, q.z, q.w)),
-        )
-    except UnusableMessage as error:
-        return error
+def _pose(message: Any, frame: str) -> PoseMessage:
+    return PoseMessage(frame, fields.rigid(message.pose.position, message.pose.orientation))
 
 
-def _one_transform(message: Any) -> Iterator[Said]:
-    yield _stamp(message), _transform(message)
+def _poses(message: Any, frame: str) -> CloudMessage:
+    return CloudMessage(frame, fields.positions(pose.position for pose in message.poses))
 
 
-def _transforms(message: Any) -> Iterator[Said]:
-    if len(message.transforms) > _MOST_TRANSFORMS:
-        raise UnusableMessage(f"it has {len(message.transforms)} transforms")
-    for part in message.transforms:
-        yield _stamp(part), _transform(part)
+def _point(message: Any, frame: str) -> CloudMessage:
+    return CloudMessage(frame, fields.positions([message.point]))
 
 
-def _pose(message: Any) -> Iterator[Said]:
-    return _one(message, PoseMessage(frame_name(message.frame_id), _rigid(message.pose)))
-
-
-def _rigid(pose: Any) -> Any:
-    p, q = pose.position, pose.orientation
-    return rigid((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
-
-
-def _poses(message: Any) -> Iterator[Said]:
-    positioned = [pose.position for pose in message.poses]
-    return _one(message, positions(message.frame_id, positioned))
-
-
-def _point(message: Any) -> Iterator[Said]:
-    return _one(message, positions(message.frame_id, [message.point]))
-
-
-def _cloud(message: Any) -> Iterator[Said]:
-    fields = named_fields((field.name, field.offset, field.type) for field in message.fields)
+def _cloud(message: Any, frame: str) -> CloudMessage:
+    named = fields.named_fields((field.name, field.offset, field.type) for field in message.fields)
     stride, data = message.point_stride, message.data
     if stride < 1 or len(data) % stride:
         raise UnusableMessage(f"a point cloud has {len(data)} bytes, of {stride} a point")
-    points = packed_points(data, fields, stride, size=(len(data) // stride, 1), row=len(data))
+    size = (len(data) // stride, 1)
+    points = fields.packed_points(data, named, stride, size=size, row=len(data))
     if message.HasField("pose"):
-        points = apply(_rigid(message.pose), points)
-    return _one(message, CloudMessage(frame_name(message.frame_id), points))
+        points = apply(fields.rigid(message.pose.position, message.pose.orientation), points)
+    return CloudMessage(frame, points)
 
 
-def _joints(message: Any) -> Iterator[Said]:
+def _joints(message: Any, _: str) -> JointsMessage:
     known = [joint for joint in message.joints if joint.HasField("position")]
-    return _one(message, joints((joint.name, joint.position) for joint in known))
+    return fields.joints((joint.name, joint.position) for joint in known)
 
 
-def _log(message: Any) -> Iterator[Said]:
-    return _one(message, marker(message.message))
+def _log(message: Any, _: str) -> MarkerMessage:
+    return fields.marker(message.message)
 
 
-def _pair(message: Any) -> Iterator[Said]:
+def _transform(message: Any) -> Iterator[Decoded]:
+    parent, child = message.parent_frame_id, message.child_frame_id
+    yield _stamp(message), fields.transform(parent, child, message.translation, message.rotation)
+
+
+def _transforms(message: Any) -> Iterator[Decoded]:
+    if len(message.transforms) > _MOST_TRANSFORMS:
+        raise UnusableMessage(f"it has {len(message.transforms)} transforms")
+    for part in message.transforms:
+        yield from _transform(part)
+
+
+def _pair(message: Any) -> Iterator[Decoded]:
     """A key "begin" with value "3" is the text "begin 3"."""
-    yield None, marker(f"{message.key} {message.value}")
+    yield None, fields.marker(f"{message.key} {message.value}")
 
 
-_CONTENTS: dict[str, Callable[[Any], Iterator[Said]]] = {
-    "foxglove.RawImage": _image,
-    "foxglove.CompressedImage": _compressed_image,
-    "foxglove.CameraCalibration": _calibration,
-    "foxglove.FrameTransform": _one_transform,
+def _stamped(content: Callable[[Any, str], Content]) -> Callable[[Any], Iterator[Decoded]]:
+    """One content of a message with a time stamp, and perhaps a frame."""
+
+    def contents(message: Any) -> Iterator[Decoded]:
+        frame = fields.frame_name(getattr(message, "frame_id", ""))
+        yield _stamp(message), content(message, frame)
+
+    return contents
+
+
+_CONTENTS: dict[str, Callable[[Any], Iterator[Decoded]]] = {
+    "foxglove.RawImage": _stamped(_image),
+    "foxglove.CompressedImage": _stamped(_compressed_image),
+    "foxglove.CameraCalibration": _stamped(_calibration),
+    "foxglove.FrameTransform": _transform,
     "foxglove.FrameTransforms": _transforms,
-    "foxglove.PoseInFrame": _pose,
-    "foxglove.PosesInFrame": _poses,
-    "foxglove.Point3InFrame": _point,
-    "foxglove.PointCloud": _cloud,
-    "foxglove.JointStates": _joints,
-    "foxglove.Log": _log,
+    "foxglove.PoseInFrame": _stamped(_pose),
+    "foxglove.PosesInFrame": _stamped(_poses),
+    "foxglove.Point3InFrame": _stamped(_point),
+    "foxglove.PointCloud": _stamped(_cloud),
+    "foxglove.JointStates": _stamped(_joints),
+    "foxglove.Log": _stamped(_log),
     "foxglove.KeyValuePair": _pair,
 }

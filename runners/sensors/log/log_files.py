@@ -31,8 +31,8 @@ _METADATA_ERRORS = (
 _LONGEST_METADATA = 2**20  # bytes
 
 
-def log_files(path: Path, remarks: list[str]) -> list[Path]:
-    """The MCAP files of a log in their order; what a user should know of it goes into remarks.
+def log_files(path: Path, warnings: list[str]) -> list[Path]:
+    """The MCAP files of a log in their order; what a user should know of it goes into warnings.
 
     Raises SessionError if there are none, or if they are compressed or stored in another way.
     """
@@ -44,13 +44,13 @@ def log_files(path: Path, remarks: list[str]) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise SessionError(f"log {path} is neither a file nor a folder; {ACCEPTED}")
-    named = _named_files(path, remarks)
+    named = _named_files(path, warnings)
     inside = sorted((file for file in path.iterdir() if file.is_file()), key=_natural)
     _require_mcap([*named, *inside])
     found = [file for file in named if file.is_file()]
     for file in named:
         if not file.is_file():
-            remarks.append(f"file {file.name}, which {_METADATA} names, is missing")
+            warnings.append(f"file {file.name}, which {_METADATA} names, is missing")
     if not found:
         found = [file for file in inside if file.suffix == ".mcap"]
     if not found:
@@ -58,7 +58,7 @@ def log_files(path: Path, remarks: list[str]) -> list[Path]:
     return found
 
 
-def _named_files(folder: Path, remarks: list[str]) -> list[Path]:
+def _named_files(folder: Path, warnings: list[str]) -> list[Path]:
     """The files that a bag's metadata name, none if they cannot be read."""
     try:
         with (folder / _METADATA).open("rb") as file:
@@ -67,13 +67,13 @@ def _named_files(folder: Path, remarks: list[str]) -> list[Path]:
         storage, names = about.get("storage_identifier", "mcap"), about["relative_file_paths"]
         compression = about.get("compression_mode") or ""
     except FileNotFoundError:
-        remarks.append(f"{_METADATA} is missing: its .mcap files are read in the order of names")
+        warnings.append(f"{_METADATA} is missing: its .mcap files are read in the order of names")
         return []
     except _METADATA_ERRORS as error:
-        return _without_metadata(remarks, error)
+        return _without_metadata(warnings, error)
     texts = [storage, compression, *names] if isinstance(names, list) else [names]
     if not all(isinstance(text, str) for text in texts):
-        return _without_metadata(remarks, ValueError("relative_file_paths are no names"))
+        return _without_metadata(warnings, ValueError("relative_file_paths are no names"))
     if storage != "mcap":
         raise SessionError(
             f"log {folder} has storage {one_line(storage)!r}; {ACCEPTED}: convert it with "
@@ -89,9 +89,9 @@ def _named_files(folder: Path, remarks: list[str]) -> list[Path]:
     return list(dict.fromkeys(files))
 
 
-def _without_metadata(remarks: list[str], error: Exception) -> list[Path]:
+def _without_metadata(warnings: list[str], error: Exception) -> list[Path]:
     reason = one_line(str(error) or type(error).__name__)[:200]
-    remarks.append(
+    warnings.append(
         f"{_METADATA} cannot be read ({reason}): the .mcap files are read in the order of names"
     )
     return []

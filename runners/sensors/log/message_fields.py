@@ -1,4 +1,4 @@
-"""Fields that messages of all encodings share: names, times, numbers and points, checked."""
+"""From fields that messages of all encodings share to what they contain, checked."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from chsel.numerics.arrays import FloatArray
 from replay.mcap.texts import LONGEST_NAME, one_line
 from runners.sensors.log.messages import (
     CameraInfoMessage,
-    CloudMessage,
-    Content,
     JointsMessage,
     MarkerMessage,
+    TransformMessage,
     UnusableMessage,
 )
 
-Said = tuple[int | None, Content | UnusableMessage]
-"""The sender's time, nanoseconds, where it gave one, and one thing that a message says."""
-
+MOST_POINTS = 2**25
 _NANOSECONDS = 10**9
 _END_OF_TIME = 2**63
 _MOST_PIXELS_A_SIDE = 2**16
+_FURTHEST = 1e9  # metres: no robot works further from the origin of its frame
+_FLOATS = {7: "f4", 8: "f8"}  # in sensor_msgs/PointField and foxglove.PackedElementField alike
+_AXES = ("x", "y", "z")
+
+Field = tuple[int, int]  # offset in bytes, type
 
 
 def stamp_of(seconds: int, nanoseconds: int) -> int | None:
@@ -45,6 +47,44 @@ def frame_name(name: str, *, needed: bool = False) -> str:
     if len(name) > LONGEST_NAME or one_line(name) != name:
         raise UnusableMessage("the name of a frame is no name on one line")
     return name
+
+
+def rigid(position: Any, quaternion: Any) -> FloatArray:
+    """The transform (4, 4) of a position x, y, z, metres, and a quaternion of any length.
+
+    Raises UnusableMessage for a quaternion of length 0 and for numbers that are not finite.
+    """
+    numbers = x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
+    place = position.x, position.y, position.z
+    largest = max(abs(x), abs(y), abs(z), abs(w))
+    if not 0.0 < largest < math.inf or x != x or y != y or z != z or w != w:
+        raise UnusableMessage(f"its quaternion is {_shown(numbers)}")
+    if not all(abs(value) < _FURTHEST for value in place):
+        raise UnusableMessage(f"its position is {_shown(place)}")
+    x, y, z, w = x / largest, y / largest, z / largest, w / largest
+    s = 2.0 / (x * x + y * y + z * z + w * w)
+    return np.array(
+        [
+            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w), place[0]],
+            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w), place[1]],
+            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y), place[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def transform(
+    parent: str, child: str, position: Any, quaternion: Any
+) -> TransformMessage | UnusableMessage:
+    """A transform, or what is wrong with it, as others of its message may be right."""
+    try:
+        return TransformMessage(
+            frame_name(parent, needed=True),
+            frame_name(child, needed=True),
+            rigid(position, quaternion),
+        )
+    except UnusableMessage as error:
+        return error
 
 
 def intrinsics(
@@ -86,17 +126,9 @@ def require_length(what: str, have: int, others: str, want: int) -> None:
         raise UnusableMessage(f"it has {have} {what} for {want} {others}")
 
 
-def positions(frame: str, points: Iterable[Any]) -> CloudMessage:
-    """Points that have x, y and z, in a frame."""
-    values = np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
-    return CloudMessage(frame_name(frame), values)
-
-
-MOST_POINTS = 2**25
-_FLOATS = {7: "f4", 8: "f8"}  # in sensor_msgs/PointField and foxglove.PackedElementField alike
-_AXES = ("x", "y", "z")
-
-Field = tuple[int, int]  # offset in bytes, type
+def positions(points: Iterable[Any]) -> FloatArray:
+    """Points (N, 3) of objects that have x, y and z."""
+    return np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
 
 
 def named_fields(fields: Iterable[tuple[str, int, int]]) -> dict[str, Field]:
@@ -143,3 +175,7 @@ def packed_points(
     lines = np.frombuffer(data, np.uint8).reshape(rows, row)[:, : width * stride]
     points = np.ascontiguousarray(lines).reshape(-1).view(layout)
     return np.stack([points[axis].astype(np.float64) for axis in _AXES], axis=1)
+
+
+def _shown(numbers: Sequence[float]) -> str:
+    return ", ".join(f"{number:.3g}" for number in numbers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from chsel.numerics.arrays import FloatArray
 
 
 class UnusableMessage(ChselError):
-    """A message is malformed, or of a kind that is not read; it is passed by and counted."""
+    """A message is malformed, or of a kind that is not read; it is skipped and counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +100,11 @@ Content = (
     | WrenchMessage
     | MarkerMessage
 )
+Decoded = tuple[int | None, Content | UnusableMessage]
+"""The sender's time, nanoseconds, where there is one, and one content of a message."""
+
+Decode = Callable[[bytes], Iterator[Decoded]]
+"""From the bytes of a message to its contents."""
 
 
 @dataclass(frozen=True, eq=False)

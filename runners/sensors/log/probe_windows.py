@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from chsel.errors import SettingError
 from runners.sensors.rig import ProbeTimes
-from runners.sensors.session_report import Remarks
+from runners.sensors.session_report import LogWarnings
 
 MOST_PROBES = 100_000
 _TEXT = re.compile(r"(begin|end)\s*(\d{1,6})?")
@@ -38,28 +38,28 @@ class ProbeWindow:
 
 
 def marked_windows(
-    markers: Iterable[tuple[int, str]], first: int, last: int, remarks: Remarks
+    markers: Iterable[tuple[int, str]], first: int, last: int, warnings: LogWarnings
 ) -> list[ProbeWindow]:
     """The probes of markers (time, text) in a log from `first` to `last`; there may be none.
 
     Texts are "begin N", "begin", "end N", "end", integers (below 0: end) and true or false.
     Whatever else they say, and begins and ends that do not fit, is remarked.
     """
-    spans = _Spans(remarks)
+    spans = _Spans(warnings)
     for time, text in sorted(markers, key=lambda marker: marker[0]):
         said = _meaning(text)
         if said is None:
-            remarks.warn(f"a marker says {text[:40]!r}; understood: begin N, end")
+            warnings.warn(f"a marker says {text[:40]!r}; understood: begin N, end")
         elif said.begins:
             spans.begin(time, said)
         else:
             spans.end(time, said)
     spans.close(last)
-    return _windows(spans.whole, first, last, remarks)
+    return _windows(spans.whole, first, last, warnings)
 
 
 def timed_windows(
-    probes: Sequence[ProbeTimes], first: int, last: int, remarks: Remarks
+    probes: Sequence[ProbeTimes], first: int, last: int, warnings: LogWarnings
 ) -> list[ProbeWindow]:
     """The probes that a rig names by seconds since the first message.
 
@@ -76,9 +76,9 @@ def timed_windows(
         before = times.end
         begin, end = (first + round(time * _SECOND) for time in (times.begin, times.end))
         if begin > last:
-            remarks.warn(f"probe {index} begins after the end of the log")
+            warnings.warn(f"probe {index} begins after the end of the log")
         spans.append((begin, end, index))
-    return _windows(spans, first, last, remarks)
+    return _windows(spans, first, last, warnings)
 
 
 def whole_log(first: int, last: int) -> list[ProbeWindow]:
@@ -98,10 +98,10 @@ class _Marker:
 class _Spans:
     """Spans (begin, end, index) of probes from markers in their order."""
 
-    def __init__(self, remarks: Remarks) -> None:
+    def __init__(self, warnings: LogWarnings) -> None:
         self.whole: list[_Span] = []
         self._begun: tuple[int, int | None] | None = None
-        self._remarks = remarks
+        self._warnings = warnings
 
     def begin(self, time: int, said: _Marker) -> None:
         """A begin; within the same probe it says nothing new."""
@@ -109,11 +109,11 @@ class _Spans:
             index = self._begun[1]
             if said.index == index and (said.repeated or index is not None):
                 if not said.repeated:
-                    self._remarks.warn(f"probe {index} begins twice without an end; taken as one")
+                    self._warnings.warn(f"probe {index} begins twice without an end; taken as one")
                 return
             if not said.repeated:
                 text = "has a begin and no end; the next begin ends it"
-                self._remarks.warn(f"{_name(index)} {text}")
+                self._warnings.warn(f"{_name(index)} {text}")
             self.whole.append((self._begun[0], time, index))
         self._begun = (time, said.index)
 
@@ -121,11 +121,11 @@ class _Spans:
         """An end of whatever probe has begun."""
         if self._begun is None:
             if not said.repeated:
-                self._remarks.warn(f"{_name(said.index)} has an end and no begin; ignored")
+                self._warnings.warn(f"{_name(said.index)} has an end and no begin; ignored")
             return
         begin, index = self._begun
         if said.index is not None and index is not None and said.index != index:
-            self._remarks.warn(f"the end of probe {said.index} is taken as that of probe {index}")
+            self._warnings.warn(f"the end of probe {said.index} is taken as that of probe {index}")
         self.whole.append((begin, time, index))
         self._begun = None
 
@@ -133,7 +133,7 @@ class _Spans:
         """The log ends."""
         if self._begun is not None:
             begin, index = self._begun
-            self._remarks.warn(f"{_name(index)} has a begin and no end; the log's end ends it")
+            self._warnings.warn(f"{_name(index)} has a begin and no end; the log's end ends it")
             self.whole.append((begin, max(last, begin), index))
 
 
@@ -156,10 +156,10 @@ def _name(index: int | None) -> str:
     return "a probe" if index is None else f"probe {index}"
 
 
-def _windows(spans: list[_Span], first: int, last: int, remarks: Remarks) -> list[ProbeWindow]:
+def _windows(spans: list[_Span], first: int, last: int, warnings: LogWarnings) -> list[ProbeWindow]:
     """Windows of spans (begin, end, index) in order of time; indices that do not rise are new."""
     if len(spans) > MOST_PROBES:
-        remarks.warn(f"the log marks {len(spans)} probes; the first {MOST_PROBES} count")
+        warnings.warn(f"the log marks {len(spans)} probes; the first {MOST_PROBES} count")
         spans = spans[:MOST_PROBES]
     told = [index for _, _, index in spans if index is not None]
     rising = all(a < b for a, b in itertools.pairwise(told))
@@ -167,7 +167,7 @@ def _windows(spans: list[_Span], first: int, last: int, remarks: Remarks) -> lis
     if told and rising and len(told) == len(spans):
         steps = told
     elif told:
-        remarks.warn(
+        warnings.warn(
             f"probes are marked {', '.join(map(str, told[:10]))}; as these do not rise, they are "
             f"counted from 0 to {len(spans) - 1}"
         )

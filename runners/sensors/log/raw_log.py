@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from chsel.errors import SessionError
@@ -13,9 +13,16 @@ from replay.mcap.texts import one_line
 from replay.raw.catalogue import Channel
 from replay.raw.raw_file import RawFile
 from replay.raw.raw_reading import Fault, RawMessage, Wanted
-from runners.sensors.log.decoding import Decode, decoder
+from runners.sensors.log.foxglove import foxglove_decoder
 from runners.sensors.log.log_files import Span, log_files, merged, most_at_once
-from runners.sensors.log.messages import Received, UnusableMessage
+from runners.sensors.log.messages import (
+    Decode,
+    Decoded,
+    Received,
+    TransformMessage,
+    UnusableMessage,
+)
+from runners.sensors.log.ros2 import ros2_decoder
 
 Progress = Callable[[int, int], None]  # bytes so far, and of all
 
@@ -25,6 +32,7 @@ _DIGEST_SIZE = 16  # bytes
 _MOST_FAULTS = 200  # different texts
 _MOST_LISTED = 60
 _END_OF_TIME = 2**63
+_STATIC = "tf_static"
 
 
 @dataclass(frozen=True)
@@ -47,12 +55,12 @@ class RawLog:
 
     def __init__(self, path: str | Path, *, progress: Progress | None = None) -> None:
         self.path = Path(path).expanduser()
-        self._remarks: list[str] = []
+        self._warnings: list[str] = []
         self.faults: Counter[str] = Counter()
         self.topics: dict[str, Topic] = {}
         self.begin = self.end = 0
         try:
-            self.files = tuple(log_files(self.path, self._remarks))
+            self.files = tuple(log_files(self.path, self._warnings))
         except OSError as error:
             reason = error.strerror or error
             raise SessionError(f"log {self.path} cannot be read: {reason}") from None
@@ -62,9 +70,9 @@ class RawLog:
         self._find_topics(progress)
 
     @property
-    def remarks(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """What a user should know of how the log is read; all of it once it has been."""
-        return self._remarks + [
+        return self._warnings + [
             f"{part.path.name}: {remark}" for part in self._parts for remark in part.remarks
         ]
 
@@ -179,7 +187,7 @@ class RawLog:
             self.topics[channel.topic] = Topic(channel.schema, channel.encoding, count)
             return
         if (known.schema, known.encoding) != (channel.schema, channel.encoding):
-            self._remarks.append(
+            self._warnings.append(
                 f"topic {channel.topic} carries {known.schema} and {channel.schema}"
             )
         total = known.count + count
@@ -202,10 +210,30 @@ class RawLog:
 
 
 def _decoder(channel: Channel) -> Decode | UnusableMessage:
+    """Decodes the messages of a channel; or why they are not read."""
     try:
-        return decoder(channel.topic, channel.schema, channel.encoding, channel.definition)
+        decode = {
+            "cdr": lambda: ros2_decoder(channel.schema, channel.definition),
+            "protobuf": lambda: foxglove_decoder(channel.schema),
+        }.get(channel.encoding, lambda: None)()
     except UnusableMessage as error:
         return error
+    if decode is None:
+        encoding = channel.encoding or "unknown bytes"
+        return UnusableMessage(f"messages {channel.schema} as {encoding} are not read")
+    return _held(decode) if channel.topic.endswith(_STATIC) else decode
+
+
+def _held(decode: Decode) -> Decode:
+    """Transforms that hold for all times."""
+
+    def static(data: bytes) -> Iterator[Decoded]:
+        for stamp, content in decode(data):
+            if isinstance(content, TransformMessage):
+                content = replace(content, static=True)
+            yield stamp, content
+
+    return static
 
 
 def _after(before: int, tell: Callable[[int], None]) -> Callable[[int], None]:

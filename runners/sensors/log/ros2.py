@@ -1,4 +1,4 @@
-"""ROS 2 messages, as CDR: what they say."""
+"""ROS 2 messages, as CDR, decoded."""
 
 from __future__ import annotations
 
@@ -11,30 +11,26 @@ import numpy as np
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
+from runners.sensors.log import message_fields as fields
 from runners.sensors.log.images import compressed_pixels, pixel_rows
-from runners.sensors.log.message_fields import (
-    Said,
-    frame_name,
-    intrinsics,
-    joints,
-    marker,
-    named_fields,
-    packed_points,
-    positions,
-    require_length,
-    stamp_of,
-)
 from runners.sensors.log.messages import (
+    CameraInfoMessage,
     CloudMessage,
     Content,
+    Decode,
+    Decoded,
     ImageMessage,
+    JointsMessage,
     PoseMessage,
-    TransformMessage,
     UnusableMessage,
     WrenchMessage,
 )
-from runners.sensors.log.quaternions import rigid
-from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition, short_name
+from runners.sensors.log.ros2_definitions import (
+    DEFINITIONS,
+    full_definition,
+    has_known_fields,
+    short_name,
+)
 
 _ERRORS = (ValueError, struct.error, IndexError, OverflowError, MemoryError)  # of the decoder
 _SMALL = 2**20  # bytes; what has no pixels or points is smaller
@@ -44,17 +40,19 @@ _LARGEST_FORCE = 1e6  # N, Nm
 _TEXT_AT = 8  # bytes before the text of std_msgs/String
 
 
-def ros2_decoder(name: str) -> Callable[[bytes], Iterator[Said]] | None:
-    """What a message of this name says; None for one that is not read."""
-    name = short_name(name)
-    made = _CONTENTS.get(name)
-    if made is None:
+def ros2_decoder(name: str, definition: str | None = None) -> Decode | None:
+    """Decodes messages of this name; None for one that is not read.
+
+    definition: of the schema in the file, where there is one. Raises UnusableMessage if it has
+    other fields than by ROS 2 itself.
+    """
+    short = short_name(name)
+    contents = _CONTENTS.get(short)
+    if contents is None:
         return None
-
-    def said(data: bytes) -> Iterator[Said]:
-        return made(_message(name, data))
-
-    return said
+    if definition and not has_known_fields(short, definition):
+        raise UnusableMessage(f"messages {name} have other fields than those of ROS 2")
+    return lambda data: contents(_message(short, data))
 
 
 def _message(name: str, data: bytes) -> Any:
@@ -78,27 +76,18 @@ def _decoder(name: str, *, until: str | None = None) -> Callable[[bytes], Any]:
 
     until: its first field that is left out, with all that follow.
     """
-    text = full_definition(name)
-    if until is not None:
-        own, line, parts = text.partition("=" * 80)
-        kept = own.splitlines()
-        first = next(i for i, field in enumerate(kept) if field.split()[1] == until)
-        text = "\n".join([*kept[:first], line]) + parts
+    text = full_definition(name, until=until)
     schema = Schema(id=1, data=text.encode(), encoding="ros2msg", name=name)
-    made = DecoderFactory().decoder_for("cdr", schema)
-    assert made is not None
-    return made
+    decoder = DecoderFactory().decoder_for("cdr", schema)
+    assert decoder is not None
+    return decoder
 
 
 def _stamp(header: Any) -> int | None:
-    return stamp_of(header.stamp.sec, header.stamp.nanosec)
+    return fields.stamp_of(header.stamp.sec, header.stamp.nanosec)
 
 
-def _one(message: Any, content: Content) -> Iterator[Said]:
-    yield _stamp(message.header), content
-
-
-def _image(message: Any) -> Iterator[Said]:
+def _image(message: Any, frame: str) -> ImageMessage:
     values = pixel_rows(
         message.data,
         message.encoding,
@@ -106,109 +95,100 @@ def _image(message: Any) -> Iterator[Said]:
         message.step,
         big_endian=message.is_bigendian != 0,
     )
-    return _one(message, ImageMessage(frame_name(message.header.frame_id), values))
+    return ImageMessage(frame, values)
 
 
-def _compressed_image(message: Any) -> Iterator[Said]:
-    values = compressed_pixels(message.data, message.format)
-    return _one(message, ImageMessage(frame_name(message.header.frame_id), values))
+def _compressed_image(message: Any, frame: str) -> ImageMessage:
+    return ImageMessage(frame, compressed_pixels(message.data, message.format))
 
 
-def _camera_info(message: Any) -> Iterator[Said]:
+def _camera_info(message: Any, frame: str) -> CameraInfoMessage:
     """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
     region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
     fx, _, cx, _, fy, cy, *_ = message.k
-    info = intrinsics(
-        frame_name(message.header.frame_id),
+    return fields.intrinsics(
+        frame,
         ((region.width or message.width) // across, (region.height or message.height) // down),
         (fx / across, fy / down),
         ((cx - region.x_offset) / across, (cy - region.y_offset) / down),
         message.d,
     )
-    return _one(message, info)
 
 
-def _transform(message: Any) -> TransformMessage | UnusableMessage:
-    """A transform, or what is wrong with it, as others of its message may be right."""
-    t, q = message.transform.translation, message.transform.rotation
-    try:
-        return TransformMessage(
-            frame_name(message.header.frame_id, needed=True),
-            frame_name(message.child_frame_id, needed=True),
-            rigid((t.x, t.y, t.z), (q.x, q.y, q.z, q.w)),
-        )
-    except UnusableMessage as error:
-        return error
+def _pose(message: Any, frame: str) -> PoseMessage:
+    return PoseMessage(frame, fields.rigid(message.pose.position, message.pose.orientation))
 
 
-def _transform_stamped(message: Any) -> Iterator[Said]:
-    yield _stamp(message.header), _transform(message)
+def _poses(message: Any, frame: str) -> CloudMessage:
+    return CloudMessage(frame, fields.positions(pose.position for pose in message.poses))
 
 
-def _transforms(message: Any) -> Iterator[Said]:
-    for part in message.transforms:
-        yield _stamp(part.header), _transform(part)
+def _point(message: Any, frame: str) -> CloudMessage:
+    return CloudMessage(frame, fields.positions([message.point]))
 
 
-def _pose(message: Any) -> Iterator[Said]:
-    p, q = message.pose.position, message.pose.orientation
-    frame_from_body = rigid((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
-    return _one(message, PoseMessage(frame_name(message.header.frame_id), frame_from_body))
-
-
-def _poses(message: Any) -> Iterator[Said]:
-    positioned = [pose.position for pose in message.poses]
-    return _one(message, positions(message.header.frame_id, positioned))
-
-
-def _point(message: Any) -> Iterator[Said]:
-    return _one(message, positions(message.header.frame_id, [message.point]))
-
-
-def _wrench(message: Any) -> Iterator[Said]:
-    parts = [(part.x, part.y, part.z) for part in (message.wrench.force, message.wrench.torque)]
-    force, torque = np.array(parts, dtype=np.float64)
-    if not (np.abs(parts) <= _LARGEST_FORCE).all():  # NaN is not
-        raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
-    frame = frame_name(message.header.frame_id)
-    return _one(message, WrenchMessage(frame, force, torque))
-
-
-def _cloud(message: Any) -> Iterator[Said]:
-    fields = named_fields((field.name, field.offset, field.datatype) for field in message.fields)
-    points = packed_points(
+def _cloud(message: Any, frame: str) -> CloudMessage:
+    points = fields.packed_points(
         message.data,
-        fields,
+        fields.named_fields((part.name, part.offset, part.datatype) for part in message.fields),
         message.point_step,
         size=(message.width, message.height),
         row=message.row_step,
         big_endian=message.is_bigendian,
     )
-    return _one(message, CloudMessage(frame_name(message.header.frame_id), points))
+    return CloudMessage(frame, points)
 
 
-def _joints(message: Any) -> Iterator[Said]:
-    require_length("positions", len(message.position), "names", len(message.name))
-    return _one(message, joints(zip(message.name, message.position, strict=True)))
+def _wrench(message: Any, frame: str) -> WrenchMessage:
+    force, torque = fields.positions([message.wrench.force, message.wrench.torque])
+    if not (np.abs([force, torque]) <= _LARGEST_FORCE).all():  # NaN is not
+        raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
+    return WrenchMessage(frame, force, torque)
 
 
-def _marker(message: Any) -> Iterator[Said]:
+def _joints(message: Any, _: str) -> JointsMessage:
+    fields.require_length("positions", len(message.position), "names", len(message.name))
+    return fields.joints(zip(message.name, message.position, strict=True))
+
+
+def _transform(message: Any) -> Iterator[Decoded]:
+    parent, child, moved = message.header.frame_id, message.child_frame_id, message.transform
+    content = fields.transform(parent, child, moved.translation, moved.rotation)
+    yield _stamp(message.header), content
+
+
+def _transforms(message: Any) -> Iterator[Decoded]:
+    for part in message.transforms:
+        yield from _transform(part)
+
+
+def _marker(message: Any) -> Iterator[Decoded]:
     value = message.data
-    yield None, marker(str(value).lower() if isinstance(value, bool) else str(value))
+    yield None, fields.marker(str(value).lower() if isinstance(value, bool) else str(value))
 
 
-_CONTENTS: dict[str, Callable[[Any], Iterator[Said]]] = {
-    "sensor_msgs/Image": _image,
-    "sensor_msgs/CompressedImage": _compressed_image,
-    "sensor_msgs/CameraInfo": _camera_info,
-    "sensor_msgs/PointCloud2": _cloud,
-    "sensor_msgs/JointState": _joints,
+def _stamped(content: Callable[[Any, str], Content]) -> Callable[[Any], Iterator[Decoded]]:
+    """One content of a message with a header."""
+
+    def contents(message: Any) -> Iterator[Decoded]:
+        frame = fields.frame_name(message.header.frame_id)
+        yield _stamp(message.header), content(message, frame)
+
+    return contents
+
+
+_CONTENTS: dict[str, Callable[[Any], Iterator[Decoded]]] = {
+    "sensor_msgs/Image": _stamped(_image),
+    "sensor_msgs/CompressedImage": _stamped(_compressed_image),
+    "sensor_msgs/CameraInfo": _stamped(_camera_info),
+    "sensor_msgs/PointCloud2": _stamped(_cloud),
+    "sensor_msgs/JointState": _stamped(_joints),
     "tf2_msgs/TFMessage": _transforms,
-    "geometry_msgs/TransformStamped": _transform_stamped,
-    "geometry_msgs/PoseStamped": _pose,
-    "geometry_msgs/PoseArray": _poses,
-    "geometry_msgs/PointStamped": _point,
-    "geometry_msgs/WrenchStamped": _wrench,
+    "geometry_msgs/TransformStamped": _transform,
+    "geometry_msgs/PoseStamped": _stamped(_pose),
+    "geometry_msgs/PoseArray": _stamped(_poses),
+    "geometry_msgs/PointStamped": _stamped(_point),
+    "geometry_msgs/WrenchStamped": _stamped(_wrench),
     **{
         name: _marker
         for name in DEFINITIONS

@@ -1,4 +1,4 @@
-"""The ROS 2 messages that are read: their fields, which never come from a file."""
+"""The ROS 2 messages that are read and simulated: their fields, which never come from a file."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ _HEADER = "std_msgs/Header header"
 _POSE = "geometry_msgs/Pose pose"
 
 DEFINITIONS = {
+    "builtin_interfaces/Time": "int32 sec; uint32 nanosec",
     "std_msgs/Header": "builtin_interfaces/Time stamp; string frame_id",
     "std_msgs/String": "string data",
     "std_msgs/Bool": "bool data",
@@ -48,6 +49,7 @@ DEFINITIONS = {
 """Fields by the name of the message, of which names in files have "/msg" besides."""
 
 _LONGEST_TEXT = 2**16
+_SEPARATOR = "\n" + "=" * 80 + "\n"
 _SAME = {"byte": "uint8", "char": "uint8"}
 _LIMIT = re.compile(r"<=\d+")
 
@@ -57,21 +59,21 @@ def short_name(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def full_definition(name: str) -> str:
-    """The definition of a message with those of all that it is made of, as ROS 2 writes them."""
-    needed = [name]
-    for found in needed:
-        for kind, _ in _fields(DEFINITIONS[found]):
-            inner = kind.split("[")[0]
-            if inner in DEFINITIONS and inner not in needed:
-                needed.append(inner)
-    parts = [DEFINITIONS[found].replace("; ", "\n") for found in needed]
-    for index, inner in enumerate(needed[1:], 1):
-        parts[index] = f"MSG: {inner}\n{parts[index]}"
-    return f"\n{'=' * 80}\n".join(parts)
+def full_definition(name: str, *, until: str | None = None) -> str:
+    """The definition of a message with those of all that it contains, as ROS 2 writes them.
+
+    until: its first field that is left out, with all that follow.
+    """
+    fields = _fields(DEFINITIONS[name])
+    if until is not None:
+        fields = fields[: [field for _, field in fields].index(until)]
+    parts = ["\n".join(f"{kind} {field}" for kind, field in fields)]
+    for inner in _nested(fields):
+        parts.append(f"MSG: {inner}\n" + DEFINITIONS[inner].replace("; ", "\n"))
+    return _SEPARATOR.join(parts) + "\n"
 
 
-def is_laid_out(name: str, text: str) -> bool:
+def has_known_fields(name: str, text: str) -> bool:
     """Whether a definition in a file has the fields of the one that is read in its place.
 
     Texts of other parts than the message's own are those of ROS 2 itself, and not looked at.
@@ -80,24 +82,33 @@ def is_laid_out(name: str, text: str) -> bool:
         return False
     own = re.split(r"^={3,}\s*$", text, maxsplit=1, flags=re.MULTILINE)[0]
     lines = "; ".join(line.split("#")[0] for line in own.splitlines())
-    return not lines.strip("; ") or _plain(lines) == _plain(DEFINITIONS[name])
+    return not lines.strip("; ") or _normalised(lines) == _normalised(DEFINITIONS[name])
 
 
-def _plain(text: str) -> list[tuple[str, str]]:
-    """Types without packages and limits, names in small letters: what texts agree in."""
-    plain = []
+def _nested(fields: list[tuple[str, str]]) -> list[str]:
+    """The messages that fields are made of, each once, in the order of their use."""
+    found: dict[str, None] = {}
+    for kind, _ in fields:
+        inner = kind.partition("[")[0]
+        if inner in DEFINITIONS:
+            found |= dict.fromkeys([inner, *_nested(_fields(DEFINITIONS[inner]))])
+    return list(found)
+
+
+def _normalised(text: str) -> list[tuple[str, str]]:
+    """Types without packages and limits, names in small letters: what all texts agree in."""
+    fields = []
     for kind, name in _fields(text):
-        kind = _LIMIT.sub("", kind).rsplit("/", 1)[-1]
-        base, bracket, rest = kind.partition("[")
-        plain.append((_SAME.get(base, base) + bracket + rest, name.lower()))
-    return plain
+        base, bracket, size = _LIMIT.sub("", kind).rsplit("/", 1)[-1].partition("[")
+        fields.append((_SAME.get(base, base) + bracket + size, name.lower()))
+    return fields
 
 
 def _fields(text: str) -> list[tuple[str, str]]:
     """Types and names of the fields of a definition without comments; constants are none."""
-    found = []
-    for part in text.split(";"):
-        words = part.split()
-        if len(words) >= 2 and not any("=" in word for word in words[1:3]):
-            found.append((words[0], words[1]))
-    return found
+    parts = [part.split() for part in text.split(";")]
+    return [
+        (words[0], words[1])
+        for words in parts
+        if len(words) >= 2 and not any("=" in word for word in words[1:3])
+    ]

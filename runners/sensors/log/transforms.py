@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +13,6 @@ from chsel.errors import SessionError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import compose, inverse, rotation_matrices, slerp
 from runners.sensors.log.messages import TransformMessage
-from runners.sensors.log.quaternions import unit_quaternion
 
 _NANOSECONDS = 1e9
 _MOST_FRAMES = 1024
@@ -208,6 +209,22 @@ class _Edge:
             self._is_sorted = True
         stamps = np.frombuffer(self._stamps, dtype=np.int64)
         return stamps, np.frombuffer(self._numbers).reshape(-1, _NUMBERS)
+
+
+def unit_quaternion(rows: Sequence[Sequence[float]]) -> tuple[float, float, float, float]:
+    """The quaternion of a rotation, rows of three numbers or more; the stablest of four ways."""
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rows[:3])
+    ways = (1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i)
+    way = ways.index(max(ways))
+    outer = (
+        (ways[0], b + d, c + g, h - f),
+        (b + d, ways[1], f + h, c - g),
+        (c + g, f + h, ways[2], d - b),
+        (h - f, c - g, d - b, ways[3]),
+    )[way]
+    length = math.sqrt(sum(value * value for value in outer))
+    x, y, z, w = outer
+    return x / length, y / length, z / length, w / length
 
 
 def _agree(one: FloatArray, other: FloatArray) -> bool:

@@ -32,7 +32,7 @@ def seconds(nanoseconds: float) -> float:
 
 def test_clocks_that_agree_are_left_alone() -> None:
     correction = gathered({"/a": 0.0, "/b": -0.2, "/c": -0.5}).correction()
-    assert (correction.of("/a"), correction.of("/b"), correction.remarks) == (0, 0, ())
+    assert (correction.of("/a"), correction.of("/b"), correction.warnings) == (0, 0, ())
     assert seconds(correction.time(received("/a", 3.0, 2.75)) - BEGIN) == 2.75
     assert seconds(correction.time(received("/a", 3.0, None)) - BEGIN) == 3.0
     assert seconds(correction.time(received("/unknown", 3.0, None)) - BEGIN) == 3.0
@@ -42,8 +42,8 @@ def test_the_clock_that_departs_is_shifted() -> None:
     correction = gathered({"/a": 0.0, "/camera": 90.0, "/c": -0.1}).correction()
     assert abs(seconds(correction.of("/camera")) + 90.0) < 0.02
     assert correction.of("/c") == 0
-    assert len(correction.remarks) == 1
-    assert "the clock of /camera is 90 s ahead of" in correction.remarks[0]
+    assert len(correction.warnings) == 1
+    assert "the clock of /camera is 90 s ahead of" in correction.warnings[0]
     time = correction.time(received("/camera", 5.0, 95.0))
     assert abs(seconds(time - BEGIN) - 5.0) < 0.02
 
@@ -57,7 +57,7 @@ def test_of_two_clocks_the_one_by_the_log_is_believed() -> None:
 def test_a_robot_of_another_time_is_taken_as_it_is() -> None:
     correction = gathered({"/a": -5000.0, "/b": -5000.1, "/c": -5000.2}).correction()
     assert [correction.of(topic) for topic in ("/a", "/b", "/c")] == [0, 0, 0]
-    assert correction.remarks == ("stamps are 5e+03 s behind the log's clock, all alike",)
+    assert correction.warnings == ("stamps are 5e+03 s behind the log's clock, all alike",)
     assert abs(seconds(correction.time(received("/b", 7.0, None)) - BEGIN) + 4993.1) < 0.02
 
 
@@ -66,7 +66,7 @@ def test_a_stamp_far_off_its_topic_gives_way_to_the_logs_time() -> None:
     clocks.add(received("/a", 11, 5000.0))
     clocks.add(received("/a", 11, -5000.0))
     correction = clocks.correction()
-    assert "2 messages on /a have stamps more than 10 s off" in correction.remarks[0]
+    assert "2 messages on /a have stamps more than 10 s off" in correction.warnings[0]
     assert abs(seconds(correction.time(received("/a", 11, 5000.0)) - BEGIN) - 11.0) < 0.02
 
 
@@ -92,14 +92,14 @@ def test_static_transforms_do_not_count() -> None:
     clocks = gathered({"/a": 0.0})
     content = TransformMessage("a", "b", np.eye(4), static=True)
     clocks.add(Received("/tf_static", BEGIN + 10 * SECOND, BEGIN - 9999 * SECOND, content))
-    assert clocks.correction().remarks == ()
+    assert clocks.correction().warnings == ()
 
 
 def test_steps_of_the_logs_time_are_counted() -> None:
     clocks = Clocks(ClockRig(jump=10.0))
     for time in (0, 1, 100, 2, 3, 4, 50, 5):
         clocks.add(received("/a", time, None))
-    assert clocks.correction().remarks == (
+    assert clocks.correction().warnings == (
         "the log's time steps ahead by more than 10 s, 2 times",
         "the log's time steps back by more than 10 s, 2 times",
     )

@@ -209,10 +209,10 @@ def test_surface_points_are_the_boxes_front_without_its_outline(tmp_path: Path) 
     assert in_camera[:, 1].max() == pytest.approx((36 - 29.5) / 110 * FRONT)
     assert found.labelled is not None
     assert found.labelled.edges == 600 - 14 * 24  # inside of the outline
-    assert found.tally.edges == found.labelled.edges + 26 * 36 - 600  # and outside
-    assert found.tally.invalid == HEIGHT * 5
+    assert found.counts.edges == found.labelled.edges + 26 * 36 - 600  # and outside
+    assert found.counts.invalid == HEIGHT * 5
     assert (
-        int(found.rays.sum()) == HEIGHT * WIDTH - HEIGHT * 5 - found.tally.edges
+        int(found.rays.sum()) == HEIGHT * WIDTH - HEIGHT * 5 - found.counts.edges
     )  # no outline is wider
     points = frame_points(frame, found)
     bounds = [points.min(axis=0) - 0.3, points.max(axis=0) + 0.3]
@@ -272,7 +272,7 @@ def test_few_pixels_of_another_depth_give_no_rays(tmp_path: Path) -> None:
     own = dataclasses.replace(rig(), workspace=bounds)
     frame.depth[0:9, 60:69] = 1.4
     found = depth_frame_points(frame, own, free_resolution=0.02)
-    assert found.tally.small == 6 * 3  # but for the edge around them
+    assert found.counts.small == 6 * 3  # but for the edge around them
     assert found.points.free[:, 2].max() < WALL
     every = dataclasses.replace(own, gate=GateRig(speckle=18))
     assert depth_frame_points(frame, every, free_resolution=0.02).points.free[:, 2].max() > 1.3

@@ -95,14 +95,14 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_contact_is_where_the_line_of_force_enters_the_hand(log: Path) -> None:
     session, probe, told = read(log)
-    tally = session.report.total()["/wrench"]
-    assert len(probe.contacts) == tally.contacts == 2  # 10 mm of way are two voxels of 5 mm
+    counts = session.report.total()["/wrench"]
+    assert len(probe.contacts) == counts.contacts == 2  # 10 mm of way are two voxels of 5 mm
     in_hand = apply(inverse(hand_pose(2.0)), probe.contacts)
     np.testing.assert_allclose(in_hand[:, :2], np.tile(TIP[:2], (2, 1)), atol=1e-5)
     assert ((in_hand[:, 2] > TIP[2] - 0.0055) & (in_hand[:, 2] < TIP[2] + 1e-6)).all()
     np.testing.assert_allclose(probe.contact_normals, [[-1.0, 0.0, 0.0]] * 2, atol=1e-6)
     assert probe.outcome == "contact"
-    assert (tally.images, tally.used, tally.spikes) == (401, 201, 1)  # the spike
+    assert (counts.images, counts.used, counts.spikes) == (401, 201, 1)  # the spike
     assert "/wrench: left out of 401 messages: 1 of forces that do not last" in told
 
 

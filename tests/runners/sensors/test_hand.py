@@ -11,7 +11,7 @@ from chsel.errors import SettingError
 from chsel.problem.poses import roll_pitch_yaw
 from runners.sensors import collision_shapes
 from runners.sensors import urdf as urdf_module
-from runners.sensors.hand import HandModel, hand_solids
+from runners.sensors.hand import HandModel
 from runners.sensors.rig import BoxRig, HandRig
 
 GRIPPER = """<?xml version="1.0"?>
@@ -70,7 +70,7 @@ def test_boxes_stand_where_the_rig_puts_them() -> None:
         BoxRig((0.1, 0.2, 0.3), (1.0, 0.0, 0.0)),
         BoxRig((0.1, 0.2, 0.3), rotation=(np.pi / 2, 0.0, np.pi / 2)),
     )
-    solids = hand_solids(HandRig(frame="hand", boxes=boxes))
+    solids = HandModel(HandRig(frame="hand", boxes=boxes)).solids()
     assert solids is not None
     assert solids.is_watertight
     assert solids.volume == pytest.approx(2 * 0.006)
@@ -87,7 +87,7 @@ def test_angles_turn_about_fixed_axes_in_the_order_of_urdf() -> None:
 
 
 def test_a_rig_without_solids_has_no_mesh() -> None:
-    assert hand_solids(HandRig(frame="hand", pose="/hand_pose")) is None
+    assert HandModel(HandRig(frame="hand", pose="/hand_pose")).solids() is None
 
 
 def test_joints_place_the_links(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_joints_place_the_links(tmp_path: Path) -> None:
     model = HandModel(hand(urdf(tmp_path), "palm"))
     palm, left, right, tip = model.parts(joints)
     assert model.joint_names == ("slide", "bend")
-    assert model.remarks == ()
+    assert model.warnings == ()
     np.testing.assert_allclose(palm.bounds, [[-0.02, -0.1, 0.0], [0.02, 0.1, 0.1]])
     np.testing.assert_allclose(left.bounds.mean(axis=0), [0.0, 0.02, 0.1], atol=1e-12)
     # The mimic goes to 2 x 0.02 + 0.01 along -y; a tip turned by 90 degrees about z points there.
@@ -128,13 +128,11 @@ def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
         HandModel(hand(urdf(tmp_path), "wrist"))
 
 
-def test_joints_without_a_value_are_at_zero_and_remarked(tmp_path: Path) -> None:
+def test_joints_without_a_value_are_at_zero(tmp_path: Path) -> None:
     rig = hand(urdf(tmp_path), "palm")
-    with pytest.warns(UserWarning, match="joints without a value are at 0: bend"):
-        solids = hand_solids(rig, {"slide": 0.0})
+    solids = HandModel(rig).solids({"slide": 0.0})
     assert solids is not None
     assert solids.bounds[1, 1] == pytest.approx(0.1)
-    assert HandModel(rig).missing({"slide": 0.1, "bend": 0.0}) == []
     with pytest.raises(SettingError, match="joint slide is nan; accepted: a finite number"):
         HandModel(rig).parts({"slide": float("nan")})
 
@@ -147,7 +145,7 @@ def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) ->
     for name in ("../meshes/palm.stl", "package://gripper_description/meshes/palm.stl"):
         path = one_link(package / "urdf", f'<mesh filename="{name}" scale="0.001 0.001 -0.002"/>')
         model = HandModel(hand(path))
-        assert model.remarks == ()
+        assert model.warnings == ()
         (palm,) = model.parts()
         np.testing.assert_allclose(palm.extents, [0.01, 0.02, 0.06])
         assert palm.volume == pytest.approx(12e-6)  # mirrored, and still turned outward
@@ -163,14 +161,16 @@ def test_an_open_mesh_becomes_its_hull(tmp_path: Path) -> None:
     (solid,) = model.parts()
     assert solid.is_watertight
     assert solid.volume == pytest.approx(1e-3)
-    assert ["open.stl is open; its convex hull is used" in text for text in model.remarks] == [True]
+    assert ["open.stl is open; its convex hull is used" in text for text in model.warnings] == [
+        True
+    ]
 
 
 def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    assert hand_solids(HandRig(frame="hand", boxes=(BoxRig((0.1, 0.1, 0.1)),))) is not None
+    assert HandModel(HandRig(frame="hand", boxes=(BoxRig((0.1, 0.1, 0.1)),))).solids() is not None
     with pytest.raises(SettingError, match=r"pip install chsel-replay\[urdf\]"):
         HandModel(hand(urdf(tmp_path)))
 

@@ -8,16 +8,16 @@ from runners.sensors.log.clocks import SLACK, in_time_order
 from runners.sensors.log.messages import JointsMessage, MarkerMessage, Received
 from runners.sensors.log.motion import MOST_OF_A_PROBE, JointHistory
 from runners.sensors.log.probe_windows import marked_windows
-from runners.sensors.session_report import MOST_KINDS, Remarks
+from runners.sensors.session_report import MOST_KINDS, LogWarnings
 
 
 def spans(*texts: str) -> tuple[list[tuple[int, int, int, int, int]], list[str]]:
-    """Windows of markers at times 10, 20, ... in a log from 0 to 100, and the remarks."""
-    remarks = Remarks()
+    """Windows of markers at times 10, 20, ... in a log from 0 to 100, and the warnings."""
+    warnings = LogWarnings()
     markers = [(10 * (index + 1), text) for index, text in enumerate(texts)]
-    windows = marked_windows(reversed(markers), 0, 100, remarks)
+    windows = marked_windows(reversed(markers), 0, 100, warnings)
     found = [(w.step, w.opens, w.begin, w.end, w.closes) for w in windows]
-    return found, [text for _, text in remarks.lines()]
+    return found, [text for _, text in warnings.lines()]
 
 
 def test_a_window_reaches_to_the_next_begin_and_the_first_one_to_the_start() -> None:
@@ -58,10 +58,10 @@ def test_no_marker_that_is_understood_is_no_window() -> None:
 
 
 def test_lines_are_few_and_short_whatever_a_log_holds() -> None:
-    remarks = Remarks()
+    warnings = LogWarnings()
     for index in range(1000):
-        remarks.warn(f"{index} " + 1000 * "x")
-    lines = remarks.lines()
+        warnings.warn(f"{index} " + 1000 * "x")
+    lines = warnings.lines()
     assert len(lines) == MOST_KINDS + 1
     assert lines[-1][1] == "further kinds of trouble (900 times)"
     assert max(len(text) for _, text in lines) == 400

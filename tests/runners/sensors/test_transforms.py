@@ -1,15 +1,16 @@
 """The tree of transforms: interpolation, gaps, and trees that are none."""
 
 import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, rotation_angle
+from runners.sensors.log.message_fields import rigid
 from runners.sensors.log.messages import TransformMessage, UnusableMessage
-from runners.sensors.log.quaternions import rigid, unit_quaternion
-from runners.sensors.log.transforms import TransformError, TransformTree
+from runners.sensors.log.transforms import TransformError, TransformTree, unit_quaternion
 
 SECOND = 10**9
 X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -133,13 +134,18 @@ def test_a_sample_takes_64_bytes_and_room_to_grow() -> None:
     assert used < 20_000 * 64 * 1.15
 
 
+def xyz(*values: float) -> SimpleNamespace:
+    """A vector or quaternion as messages have it."""
+    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
+
+
 def test_quaternions_and_rotations_are_each_others_inverse() -> None:
     turns = random_rotations(np.random.default_rng(1), 200)
     halves = [axis_angle(axis, np.pi) for axis in np.eye(3)]  # where the usual formula divides by 0
     for rotation in [*turns, np.eye(3), *halves]:
         transform = compose(rotation, np.array([1.0, 2.0, 3.0]))
         quaternion = unit_quaternion(transform.tolist())
-        again = rigid([1.0, 2.0, 3.0], [1e300 * value for value in quaternion])
+        again = rigid(xyz(1.0, 2.0, 3.0), xyz(*(1e300 * value for value in quaternion)))
         np.testing.assert_allclose(again, transform, atol=1e-14)
 
 
@@ -170,4 +176,4 @@ def test_poses_that_are_none_are_refused(
     position: tuple[float, ...], quaternion: tuple[float, ...]
 ) -> None:
     with pytest.raises(UnusableMessage):
-        rigid(position, quaternion)
+        rigid(xyz(*position), xyz(*quaternion))

@@ -379,8 +379,8 @@ def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
     assert len(second.contacts) == 0
     on_ray = (np.abs(first.new_points.free - origin)[:, 1:] < 1e-9).all(axis=1)
     assert len(first.new_points.free[on_ray]) >= 18
-    tally = session.report.tallies[0]["/skin"]
-    assert (tally.images, tally.used, tally.spared, tally.contacts) == (2, 1, 1, 1)
+    counts = session.report.by_probe[0]["/skin"]
+    assert (counts.images, counts.used, counts.spared, counts.contacts) == (2, 1, 1, 1)
     surface = replace(with_clouds, clouds=(CloudRig("/skin", "surface"),))
     first = probes(open_log(log, surface).probes())[0]
     assert (len(first.contacts), len(first.new_points.known)) == (50, 51)
@@ -453,8 +453,8 @@ def test_a_hole_in_the_transforms_costs_the_images_within(tmp_path: Path) -> Non
     events = list(session.probes())
     first, second = probes(events)
     assert len(first.contacts) == 50
-    assert (second.outcome, session.report.tallies[0]["pad"].lost) == ("free", 0)
-    assert session.report.tallies[1]["pad"].lost == 12
+    assert (second.outcome, session.report.by_probe[0]["pad"].lost) == ("free", 0)
+    assert session.report.by_probe[1]["pad"].lost == 12
     assert "pad: left out, as the pose of pad_frame is not known then (12 times)" in lines(events)
     # Nothing is swept across the hole.
     steps = np.abs(np.diff(second.gripper_path[:, 0, 3]))
@@ -580,11 +580,13 @@ def test_damaged_logs_give_points_or_one_clear_error(log: Path, tmp_path: Path) 
 def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
     from runners.simulated_robot.configurations import find_cabinet_configuration
-    from runners.simulated_robot.settings import TwinBubbles, TwinCamera, TwinSettings
+    from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
     from runners.simulated_robot.simulation import simulate_log
 
     mesh = load_object(ObjectConfig("mustard", 1.0, 0.0003, "mustard"), tmp_path).mesh
-    small = TwinSettings(probes=1, camera=TwinCamera(width=96), bubbles=TwinBubbles(width=64))
+    small = RobotSettings(
+        probes=1, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=64)
+    )
     log = tmp_path / "log.mcap"
     made = simulate_log(log, find_cabinet_configuration("cabinet_mustard"), mesh, 0, small)
     rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
@@ -600,7 +602,7 @@ def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
     assert len(free) > 5000
     assert free.min() > -0.02  # a coarse image with strays at edges
     assert (free < 0.0).mean() < 0.01
-    lost = [tally.lost for tally in session.report.total().values()]
+    lost = [counts.lost for counts in session.report.total().values()]
     assert sum(lost) == 0
 
 

@@ -16,7 +16,7 @@ from runners.simulated_robot.configurations import (
     find_cabinet_configuration,
     stood_on_shelf,
 )
-from runners.simulated_robot.settings import TwinSettings
+from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 
 GRIDS = {
@@ -48,7 +48,7 @@ def test_objects_stand_on_the_shelf_within_the_workspace(name: str) -> None:
 
 @pytest.mark.parametrize("name", GRIDS)
 def test_several_but_not_all_probes_reach_the_object(name: str) -> None:
-    configuration, settings = CABINET_CONFIGURATIONS[name], TwinSettings()
+    configuration, settings = CABINET_CONFIGURATIONS[name], RobotSettings()
     mesh = MODELS[configuration.object]()
     surface = apply(stood_on_shelf(mesh, configuration), mesh.sample(4000, seed=0))
     way = np.linspace(0.0, settings.push_step * settings.push_steps, 51)

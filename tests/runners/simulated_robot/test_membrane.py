@@ -8,10 +8,10 @@ import pytest
 from chsel.numerics.arrays import FloatArray
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.simulated_robot.pads import TAUTNESS, Membrane
-from runners.simulated_robot.settings import TwinBubbles
+from runners.simulated_robot.settings import BubbleSettings
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 
-CAMERA = TwinBubbles().pinhole
+CAMERA = BubbleSettings().pinhole
 APEX = CAP_BASE + CAP[2]
 
 
@@ -56,7 +56,7 @@ def test_no_object_goes_through_the_base(membrane: Membrane) -> None:
 
 @pytest.mark.parametrize("width", [224, 112])
 def test_beside_a_straight_edge_the_dent_falls_as_that_of_a_taut_sheet(width: int) -> None:
-    camera = TwinBubbles(width=width).pinhole
+    camera = BubbleSettings(width=width).pinhole
     wide = Membrane(camera)
     beyond = np.full(wide.rest.shape, 1.0)
     beyond[:, : width // 2] = wide.rest[:, : width // 2] - 0.004

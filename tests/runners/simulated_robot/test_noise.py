@@ -7,9 +7,9 @@ import pytest
 
 from chsel.problem.streams import Purpose, StreamKey
 from runners.simulated_robot.noise import LOST, bubble_depth, stereo_depth
-from runners.simulated_robot.settings import TwinBubbles, TwinCamera
+from runners.simulated_robot.settings import BubbleSettings, CameraSettings
 
-CAMERA = TwinCamera(width=320)
+CAMERA = CameraSettings(width=320)
 PINHOLE = CAMERA.pinhole
 NEAR, FAR = 0.5, 0.9
 LEFT, RIGHT = 120, 200  # columns of a bar before a wall
@@ -89,7 +89,7 @@ def test_depths_out_of_range_are_not_measured() -> None:
 
 
 def test_a_bubble_camera_is_noisy_by_what_it_says() -> None:
-    bubbles = TwinBubbles()
+    bubbles = BubbleSettings()
     measured = bubble_depth(np.full((171, 224), 0.07), bubbles, stream())
     assert measured.dtype == np.float32
     good = measured[measured > 0]

@@ -17,7 +17,7 @@ from runners.objects.models import MODELS
 from runners.simulated_robot import cabinet, wrist
 from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS, REST, stood_on_shelf
 from runners.simulated_robot.scene import NEAR, Scene
-from runners.simulated_robot.settings import RenderedCamera, TwinBubbles, TwinCamera
+from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RenderedCamera
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
 
@@ -57,19 +57,19 @@ def agreement(seen: FloatArray, exact: FloatArray) -> float:
 
 @pytest.mark.parametrize("hand", [False, True])
 def test_the_outer_camera_sees_exact_depths(scene: Scene, hand: bool) -> None:
-    camera, pose = TwinCamera(width=160).pinhole, cabinet.world_from_camera()
+    camera, pose = CameraSettings(width=160).pinhole, cabinet.world_from_camera()
     seen = scene.depth(camera, pose, HAND if hand else None)
     assert agreement(seen, cast(solid(hand), camera, pose)) > 0.998
 
 
 def test_the_hand_hides_what_is_behind_it(scene: Scene) -> None:
-    camera, pose = TwinCamera(width=160).pinhole, cabinet.world_from_camera()
+    camera, pose = CameraSettings(width=160).pinhole, cabinet.world_from_camera()
     nearer = scene.depth(camera, pose, HAND) < scene.depth(camera, pose) - 0.01
     assert 0.02 < nearer.mean() < 0.5
 
 
 def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene: Scene) -> None:
-    camera = TwinBubbles(width=112).pinhole
+    camera = BubbleSettings(width=112).pinhole
     pose = HAND @ wrist.wrist_from_bubble_camera("right")
     seen = scene.depth(camera, pose)
     assert agreement(seen, cast(solid(False), camera, pose)) > 0.998
@@ -77,7 +77,7 @@ def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene: Scene) -
 
 
 def test_the_object_is_seen_but_in_part() -> None:
-    camera, pose = TwinCamera(width=160).pinhole, cabinet.world_from_camera()
+    camera, pose = CameraSettings(width=160).pinhole, cabinet.world_from_camera()
     alone = cast(MESH.copy().apply_transform(POSE), camera, pose) < camera.far
     whole = cast(solid(False), camera, pose)
     visible = alone & (np.abs(whole - cast(solid(False), camera, pose)) < 1e-9)

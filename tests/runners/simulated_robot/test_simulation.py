@@ -23,7 +23,7 @@ from chsel.problem.poses import apply, compose, inverse
 from runners.objects.models import MODELS
 from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS, REST
 from runners.simulated_robot.recorder import START, TICK
-from runners.simulated_robot.settings import TwinBubbles, TwinCamera, TwinSettings
+from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 from runners.simulated_robot.simulation import SimulatedLog, simulate_log
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
@@ -31,10 +31,10 @@ pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only
 CONFIGURATION = CABINET_CONFIGURATIONS["cabinet_mustard"]
 MESH = MODELS["mustard"]()
 SEED = 3
-SMALL = TwinSettings(
+SMALL = RobotSettings(
     probes=2,
-    camera=TwinCamera(width=160, rate=1.0),
-    bubbles=TwinBubbles(rate=5.0),
+    camera=CameraSettings(width=160, rate=1.0),
+    bubbles=BubbleSettings(rate=5.0),
     push_speed=0.1,
     standing=1.0,
 )
@@ -195,7 +195,7 @@ def test_a_camera_may_have_a_clock_of_its_own_and_compress(tmp_path: Path) -> No
 
 def test_images_get_lost_as_often_as_said(tmp_path: Path) -> None:
     path = tmp_path / "lossy.mcap"
-    settings = replace(TINY, standing=4.0, drop=0.5, bubbles=TwinBubbles(width=16, rate=25.0))
+    settings = replace(TINY, standing=4.0, drop=0.5, bubbles=BubbleSettings(width=16, rate=25.0))
     lossy = _read(path, simulate_log(path, CONFIGURATION, MESH, SEED, settings))
     sent = lossy.truth.seconds * 25.0
     for pad in PADS:
