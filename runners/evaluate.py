@@ -27,9 +27,9 @@ from runners.evaluation.contenders import chosen_contenders, drawn, require_labe
 from runners.evaluation.definition import definition_text
 from runners.evaluation.display import Display
 from runners.evaluation.experiment import join_experiment, read_experiment
+from runners.evaluation.external_results import external_file, external_folders, read_external
 from runners.evaluation.gathering import gather
-from runners.evaluation.measure import MetricsConfig
-from runners.evaluation.outside import outside_file, outside_folders, read_outside
+from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
 from runners.evaluation.schedule import Progress, Schedule
 from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
@@ -168,7 +168,7 @@ def _plan(config: EvaluateConfig) -> Plan:
         recordings=config.recordings,
         assets=config.assets.folder,
         contenders={contender.label: contender for contender in chosen},
-        outside=outside_folders(given),
+        outside=external_folders(given),
         logs=Path(str(logs)).expanduser() if logs is not None else None,
         truth=config.truth,
         plausible=config.plausible,
@@ -207,9 +207,9 @@ def _check(plan: Plan, trials: list[Trial]) -> None:
         if not folder.is_dir():
             raise SettingError(f"outside.{label} is {folder}; accepted: a folder")
         for trial in trials:
-            path = outside_file(folder, trial)
+            path = external_file(folder, trial)
             if path is not None:
-                read_outside(plan, trial, path)
+                read_external(plan, trial, path)
 
 
 def _check_sessions(plan: Plan, trials: list[Trial]) -> None:

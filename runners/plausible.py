@@ -27,7 +27,7 @@ from replay.arguments import chosen_steps
 from replay.console import Console, Progress
 from runners.command.program import command, plain
 from runners.evaluation.definition import definition_label, definition_settings
-from runners.evaluation.measure import Measure, MetricsConfig
+from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
 from runners.objects.scans import AssetsConfig
 from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import beside, read_pose
@@ -143,7 +143,7 @@ def _rows(
     rows: list[Row] = []
     failures: list[str] = []
     before: PlausibleSet | None = None
-    measure = Measure(config.metrics, source.mesh, truth)
+    metrics = HypothesisMetrics(config.metrics, source.mesh, truth)
     waiting = Console(stderr=True)
     with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress:
         for step in progress.track(steps, description="plausible sets"):
@@ -160,7 +160,7 @@ def _rows(
                 save_plausible(folder, found)
             before = found
             row = _row(problem, found, time.perf_counter() - begun if again else None)
-            rows.append(row | measure.of(problem, found, source.problems.found(step)))
+            rows.append(row | metrics.compute(problem, found, source.problems.found(step)))
     return rows, failures
 
 

@@ -18,10 +18,10 @@ from chsel.problem.settings import build_settings
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
 from runners.command.program import command, plain
 from runners.evaluation.display import Display
-from runners.evaluation.draws import draw_seed, require_draws
 from runners.evaluation.package_files import PackageFiles
 from runners.evaluation.package_session import PackageSession
 from runners.evaluation.plan import Trial
+from runners.evaluation.repeats import repeat_seed, require_repeats
 from runners.evaluation.schedule import Progress
 from runners.evaluation.selection import chosen_seeds
 from runners.evaluation.trial_session import read_told
@@ -44,7 +44,7 @@ class PublishedConfig:
     draws: int
 
     def __post_init__(self) -> None:
-        require_draws(self.draws)
+        require_repeats(self.draws)
         if not self.dir:
             raise SettingError("dir is missing; pass dir=FOLDER, of an evaluation")
 
@@ -90,7 +90,7 @@ def register(files: Sequence[PackageFiles], package: PublishedPackage, display: 
     for one in open_files:
         progress.running = [one.unit]
         display.progress(progress)
-        run = PackageSession(package, draw_seed(one.trial.seed, one.draw), warm)
+        run = PackageSession(package, repeat_seed(one.trial.seed, one.draw), warm)
         found = {}
         for step, result in run.sets(one.session, one.steps):
             found[step] = result

@@ -12,7 +12,7 @@ from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.problem.settings import build_settings, changed_settings, settings_mapping
 from replay.comparing.contenders import METHODS_HELP
-from runners.evaluation.draws import draw_label, require_draws
+from runners.evaluation.repeats import repeat_label, require_repeats
 
 _LABEL = re.compile(r"(?P<name>\w+)(@(?P<preset>\w+))?(#(?P<mark>[\w+-]+))?")
 _FILE_NAME = re.compile(r"[\w@#+-]{1,80}")
@@ -83,9 +83,9 @@ def drawn(contenders: Sequence[Contender], draws: int) -> tuple[Contender, ...]:
 
     Raises SettingError for a number of draws that there cannot be, and for a label that is taken.
     """
-    require_draws(draws)
+    require_repeats(draws)
     every = tuple(
-        replace(contender, label=draw_label(contender.label, draw), draw=draw)
+        replace(contender, label=repeat_label(contender.label, draw), draw=draw)
         for contender in contenders
         for draw in range(draws)
     )

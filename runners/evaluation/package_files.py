@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from replay.files import file_digest
-from runners.evaluation.draws import draw_label
-from runners.evaluation.outside import DRAW_FOLDER
+from runners.evaluation.external_results import REPEAT_FOLDER
 from runners.evaluation.package_session import PackageSet
-from runners.evaluation.plan import Trial, Unit
+from runners.evaluation.plan import Task, Trial
+from runners.evaluation.repeats import repeat_label
 from runners.whole_file import whole_file
 
 
@@ -34,14 +34,14 @@ class PackageFiles:
     versions: Mapping[str, Any]
 
     @property
-    def unit(self) -> Unit:
+    def unit(self) -> Task:
         """As progress names it."""
-        return Unit(self.trial, draw_label("package", self.draw))
+        return Task(self.trial, repeat_label("package", self.draw))
 
     @property
     def sets(self) -> Path:
         """The hypotheses, as runners.evaluate takes them."""
-        of_draw = self.folder / DRAW_FOLDER.format(self.draw) if self.draw else self.folder
+        of_draw = self.folder / REPEAT_FOLDER.format(self.draw) if self.draw else self.folder
         return of_draw / self.trial.configuration / f"seed_{self.trial.seed}.npz"
 
     @property

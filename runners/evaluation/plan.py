@@ -26,7 +26,7 @@ from runners.evaluation.configurations import (
 )
 from runners.evaluation.contenders import Contender
 from runners.evaluation.definition import definition_label, definition_settings
-from runners.evaluation.measure import MetricsConfig
+from runners.evaluation.metrics import MetricsConfig
 from runners.objects.loader import ObjectConfig
 from runners.sessions import session_settings
 from runners.sessions.faults import CLEAN, LEVELS, level_name
@@ -170,7 +170,7 @@ class Trial:
 
 
 @dataclass(frozen=True, order=True)
-class Unit:
+class Task:
     """What one worker does at a time: the session of a trial, or a label's rows about it.
 
     label: of a contender, or of sets from outside; "" for the session and its plausible sets.

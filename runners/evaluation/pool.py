@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from runners.evaluation.plan import Plan, Unit
+from runners.evaluation.plan import Plan, Task
 from runners.evaluation.work import ONE_THREAD, Outcome, work
 
 Job = Callable[[Connection, Plan], None]
@@ -23,7 +23,7 @@ class Worker:
 
     process: Any
     connection: Connection
-    unit: Unit | None = None
+    unit: Task | None = None
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Pool:
     _workers: list[Worker] = field(default_factory=list)
 
     @property
-    def running(self) -> list[Unit]:
+    def running(self) -> list[Task]:
         """The units that are being done."""
         return [worker.unit for worker in self._workers if worker.unit is not None]
 
@@ -52,7 +52,7 @@ class Pool:
         """Whether another unit can be given."""
         return len(self.running) < self.size
 
-    def give(self, unit: Unit) -> None:
+    def give(self, unit: Task) -> None:
         """Let a worker do a unit."""
         idle = [worker for worker in self._workers if worker.unit is None]
         worker = idle[0] if idle else self._start()
@@ -62,7 +62,7 @@ class Pool:
         except OSError:  # it has died; `ended` tells
             return
 
-    def ended(self, seconds: float) -> Iterator[tuple[Unit, Outcome | Died]]:
+    def ended(self, seconds: float) -> Iterator[tuple[Task, Outcome | Died]]:
         """What has ended, after at most so many seconds of waiting for any."""
         busy = [worker for worker in self._workers if worker.unit is not None]
         ready = wait([worker.connection for worker in busy], seconds)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from chsel.errors import ChselError
-from runners.evaluation.outside import PRESET
-from runners.evaluation.plan import Plan, Trial, Unit
+from runners.evaluation.external_results import PRESET
+from runners.evaluation.plan import Plan, Task, Trial
 from runners.evaluation.pool import Died, Job, Pool
 from runners.evaluation.table import RESULTS, Row, write_part
 from runners.evaluation.trial_session import has_session, read_session
@@ -27,15 +27,15 @@ class Progress:
     total: int
     finished: int = 0
     done: int = 0
-    running: list[Unit] = field(default_factory=list)
-    failed: dict[Unit, str] = field(default_factory=dict)
+    running: list[Task] = field(default_factory=list)
+    failed: dict[Task, str] = field(default_factory=dict)
     seconds_left: float | None = None
 
 
-def units_of(plan: Plan, trials: Sequence[Trial]) -> list[Unit]:
+def units_of(plan: Plan, trials: Sequence[Trial]) -> list[Task]:
     """All units of trials; a session and its methods need no order here."""
     labels = ["", *plan.contenders, *plan.outside]
-    return [Unit(trial, label) for trial in trials for label in labels]
+    return [Task(trial, label) for trial in trials for label in labels]
 
 
 class Schedule:
@@ -53,8 +53,8 @@ class Schedule:
         self._plan, self._workers, self._show = plan, workers, show
         self._pool = Pool(plan, workers, job)
         self._open = {unit for unit in units if not is_finished(plan, unit)}
-        self._not_before: dict[Unit, float] = {}
-        self._attempts: dict[Unit, int] = {}
+        self._not_before: dict[Task, float] = {}
+        self._attempts: dict[Task, int] = {}
         self._speed = _Speed(plan)
         self.progress = Progress(len(units), len(units) - len(self._open))
 
@@ -80,20 +80,20 @@ class Schedule:
         self._tell()
         return self.progress
 
-    def _next(self) -> Unit | None:
+    def _next(self) -> Task | None:
         """The unit to begin; None if none can be begun yet."""
         now = time.monotonic()
         ready = [unit for unit in self._open if self._not_before.get(unit, 0.0) <= now]
         ready = [unit for unit in ready if not unit.label or self._has_session(unit.trial)]
         return min(ready, key=self._order, default=None)
 
-    def _order(self, unit: Unit) -> tuple[int, bool, float, Unit]:
+    def _order(self, unit: Task) -> tuple[int, bool, float, Task]:
         return unit.trial.seed, bool(unit.label), -self._speed.expected(unit), unit
 
     def _has_session(self, trial: Trial) -> bool:
-        return Unit(trial) not in self._open and has_session(self._plan, trial)
+        return Task(trial) not in self._open and has_session(self._plan, trial)
 
-    def _take(self, unit: Unit, outcome: Outcome | Died) -> None:
+    def _take(self, unit: Task, outcome: Outcome | Died) -> None:
         if isinstance(outcome, Died):
             self._attempts[unit] = self._attempts.get(unit, 0) + 1
             if self._attempts[unit] < ATTEMPTS:
@@ -111,7 +111,7 @@ class Schedule:
             self.progress.done += 1
             self._speed.take(unit, outcome.seconds)
 
-    def _fail(self, unit: Unit, reason: str) -> None:
+    def _fail(self, unit: Task, reason: str) -> None:
         """Put the failure into the table; the next call tries again."""
         self.progress.failed[unit] = reason
         if unit.label:
@@ -121,7 +121,7 @@ class Schedule:
             self._open.discard(other)
             self._fail(other, f"session: {reason}")
 
-    def _failure_rows(self, unit: Unit, reason: str) -> list[Row]:
+    def _failure_rows(self, unit: Task, reason: str) -> list[Row]:
         """A row a step, or one without a step if there is no session that tells the steps."""
         plan, trial = self._plan, unit.trial
         preset = PRESET if unit.label in plan.outside else plan.contenders[unit.label].preset
@@ -165,20 +165,20 @@ class _Speed:
         """Whether any unit is done."""
         return bool(self._probes)
 
-    def take(self, unit: Unit, seconds: float) -> None:
+    def take(self, unit: Task, seconds: float) -> None:
         """A unit is done."""
         label = unit.label
         self._seconds[label] = self._seconds.get(label, 0.0) + seconds
         self._probes[label] = self._probes.get(label, 0) + self._probes_of(unit)
 
-    def expected(self, unit: Unit) -> float:
+    def expected(self, unit: Task) -> float:
         """Seconds that a unit will take; of an unknown label, as the mean of all."""
         if unit.label in self._probes:
             return self._probes_of(unit) * self._seconds[unit.label] / self._probes[unit.label]
         probes = sum(self._probes.values())
         return self._probes_of(unit) * (sum(self._seconds.values()) / probes if probes else 1.0)
 
-    def _probes_of(self, unit: Unit) -> int:
+    def _probes_of(self, unit: Task) -> int:
         return self._plan.configurations[unit.trial.configuration].probes or 1
 
 

@@ -4,22 +4,95 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from chsel.errors import EvaluationError, RecordingError
+from chsel.numerics.arrays import FloatArray
 from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
+from replay.environment import environment
+from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.claims import claimed
-from runners.evaluation.plan import Plan, Trial, Unit
-from runners.evaluation.session_recording import TRUTH, record_session
+from runners.evaluation.configurations import SENSORS
+from runners.evaluation.plan import Plan, Task, Trial
+from runners.evaluation.sensor_logs import ensure_log
+from runners.evaluation.true_poses import find_truth, known_at_the_end
+from runners.objects.loader import load_object
+from runners.objects.size_check import check_size
+from runners.sessions import open_session
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 from runners.whole_file import WritingError, whole_file
+
+METHOD = "none"
+"""The method that the recording of a session alone names."""
+TRUTH = "truth"
+"""Key of the configuration under which stands how a true pose was found."""
+
+
+def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
+    """Probe, or read the trial's raw log, and write it all down; of a log with its true pose."""
+    log = ensure_log(plan, trial) if plan.kind == SENSORS else None
+    object_config = plan.object_config(trial.configuration)
+    model = load_object(object_config, plan.assets)
+    settings = plan.session_settings(trial)
+    config: dict[str, Any] = {
+        "object": vars(object_config),
+        "session": plan.session_config(trial),
+        "preset": {"name": plan.preset},
+        "seed": trial.seed,
+        "configuration": trial.configuration,
+    }
+    session = open_session(plan.kind, settings, model, trial.seed)
+    if plan.kind == SENSORS:
+        for warning in check_size(model, session.workspace):
+            warnings.warn(warning, stacklevel=2)
+    try:
+        sdf = model.grid(settings)
+        truth: FloatArray | None = session.world_from_object
+        events: Iterable[Event] = session.probes()
+        if log is not None:
+            # The true pose stands at the beginning, and is found with what is known at the end.
+            events = list(events)
+            problem = known_at_the_end(trial, session, sdf, events)
+            truth, config[TRUTH] = find_truth(plan, problem, model.mesh, log)
+            config["session"]["path"] = f"{trial.configuration}/{log.name}"
+        recorder.record(
+            SessionStarted(
+                runner="evaluate",
+                object=model.name,
+                session=plan.kind,
+                method=METHOD,
+                seed=trial.seed,
+                config=config,
+                mesh=model.mesh,
+                sdf=sdf,
+                workspace=session.workspace,
+                free_resolution=session.free_resolution,
+                initial_points=session.initial_points,
+                world_from_object=truth,
+                environment=environment(),
+            )
+        )
+        step = 0
+        for event in events:
+            recorder.record(event)
+            if isinstance(event, Probe):
+                step = event.step
+                recorder.flush()
+        recorder.record(Logged(step, "info", "session finished"))
+        recorder.record(SessionEnded(step, "finished"))
+    finally:
+        session.close()
+        recorder.close()
+
 
 _ONE = OnlineSettings(hypotheses=1)
 
@@ -44,7 +117,7 @@ def make_session(plan: Plan, trial: Trial) -> None:
     """
     folder, clean = trial.folder(plan), trial.without_faults(plan)
     if clean != trial and plan.plausible:
-        with claimed(plan.folder, Unit(clean).claim):
+        with claimed(plan.folder, Task(clean).claim):
             if not has_session(plan, clean):
                 make_session(plan, clean)
     begun = time.perf_counter()

@@ -1,13 +1,98 @@
-"""What the trials of an evaluation tell about the true poses that were sought for them."""
+"""True poses T* of trials from sensor logs: sought near a guess, and read from results."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import trimesh
+
+from chsel.errors import SessionError
+from chsel.numerics.arrays import FloatArray
+from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
+from chsel.plausible.true_pose import TruePose, find_true_pose
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+from replay.events import Event, Probe
+from runners.alignment_fit import fit_of
+from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.sensor_logs import guessed_pose, twin_truth
+from runners.sessions.session import Session
+
+
+def known_at_the_end(
+    trial: Trial, session: Session, sdf: SdfGrid, events: Sequence[Event]
+) -> RegistrationProblem:
+    """All that a session tells, as a problem of its last step.
+
+    Raises SessionError if it has no contact.
+    """
+    probes = [event for event in events if isinstance(event, Probe)]
+    points = reduce(
+        KnownPoints.merged, [probe.new_points for probe in probes], session.initial_points
+    )
+    if len(points.known) == 0:
+        raise SessionError(f"none of {len(probes)} probes has a contact; accepted: at least one")
+    return RegistrationProblem(
+        sdf,
+        points,
+        np.eye(4)[None],
+        session.workspace,
+        session.free_resolution,
+        StreamKey(trial.seed, probes[-1].step),
+    )
+
+
+def find_truth(
+    plan: Plan, problem: RegistrationProblem, mesh: trimesh.Trimesh, log: Path
+) -> tuple[FloatArray, dict[str, Any]]:
+    """T* as world_from_object (4, 4), and what is to be told about it, plain values.
+
+    Of the problem of a trial's last step: the pose of least evaluation cost near the guess that
+    belongs to the log. mesh: of the object, m. Distances are in metres and radians, modulo the
+    object's symmetries, at its centre.
+    """
+    guess, truth = guessed_pose(log), twin_truth(log)
+    found = find_true_pose(problem, guess, plan.truth)
+    return found.world_from_object, _told(plan, problem, object_symmetry(mesh), found, guess, truth)
+
+
+def _told(
+    plan: Plan,
+    problem: RegistrationProblem,
+    symmetry: ObjectSymmetry,
+    found: TruePose,
+    guess: FloatArray,
+    truth: FloatArray | None,
+) -> dict[str, Any]:
+    fit = fit_of(problem, found.world_from_object, found.cost, plan.truth.cost)
+    told: dict[str, Any] = {
+        "cost": found.cost,
+        "mean_distance": fit.mean_distance,
+        "violations": fit.violations,
+        "guess": guess.tolist(),
+        "guess_cost": found.guess_cost,
+        "from_guess": _between(found.world_from_object, guess, symmetry),
+    }
+    if truth is not None:
+        told["simulated"] = truth.tolist()
+        told["from_simulated"] = _between(found.world_from_object, truth, symmetry)
+    return told
+
+
+def _between(one: FloatArray, other: FloatArray, symmetry: ObjectSymmetry) -> dict[str, float]:
+    position, rotation = pose_errors(inverse(one)[None], other, symmetry)
+    return {"position": float(position[0]), "rotation": float(rotation[0])}
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from multiprocessing.connection import Connection
 import torch
 
 from runners.evaluation.claims import ClaimedError, claimed
-from runners.evaluation.outside import outside_digest, outside_file, rank_outside
-from runners.evaluation.plan import Plan, Unit
-from runners.evaluation.registering import register_trial
+from runners.evaluation.external_results import external_digest, external_file, rank_external
+from runners.evaluation.plan import Plan, Task
+from runners.evaluation.run_method import register_trial
 from runners.evaluation.table import about_part, is_part
 from runners.evaluation.trial_session import has_session, make_session
 from runners.session_run import one_line
@@ -37,7 +37,7 @@ class Outcome:
     reason: str = ""
 
 
-def is_finished(plan: Plan, unit: Unit) -> bool:
+def is_finished(plan: Plan, unit: Task) -> bool:
     """Whether there is nothing left to do. Sets from outside may have changed since.
 
     A file that is damaged, as by a power cut, is made again.
@@ -48,12 +48,12 @@ def is_finished(plan: Plan, unit: Unit) -> bool:
     if not is_part(finished):
         return False
     if unit.label in plan.outside:
-        path = outside_file(plan.outside[unit.label], unit.trial)
-        return about_part(finished) == outside_digest(path)
+        path = external_file(plan.outside[unit.label], unit.trial)
+        return about_part(finished) == external_digest(path)
     return True
 
 
-def do_unit(plan: Plan, unit: Unit, warm: set[str]) -> Outcome:
+def do_unit(plan: Plan, unit: Task, warm: set[str]) -> Outcome:
     """Do a unit, unless it is finished or claimed."""
     begun = time.perf_counter()
     try:
@@ -87,16 +87,16 @@ def work(connection: Connection, plan: Plan) -> None:
         connection.send(do_unit(plan, unit, warm))
 
 
-def _do(plan: Plan, unit: Unit, warm: set[str]) -> None:
+def _do(plan: Plan, unit: Task, warm: set[str]) -> None:
     if not unit.label:
         make_session(plan, unit.trial)
     elif unit.label in plan.outside:
-        rank_outside(plan, unit.trial, unit.label)
+        rank_external(plan, unit.trial, unit.label)
     else:
         register_trial(plan, unit.trial, plan.contenders[unit.label], warm)
 
 
-def _clear(plan: Plan, unit: Unit) -> None:
+def _clear(plan: Plan, unit: Task) -> None:
     """Remove what was half written by a process that is no more."""
     folder = unit.trial.folder(plan)
     for path in folder.glob(f".{unit.label or 'session'}.*"):

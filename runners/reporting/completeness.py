@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from runners.evaluation.draws import draw_of
+from runners.evaluation.repeats import repeat_of
 from runners.reporting.evaluation_folder import Evaluation, Trial, asked_labels, named
 from runners.reporting.method_style import MethodStyle
 from runners.reporting.section import Cell, Table
@@ -30,7 +30,7 @@ def planned_trials(evaluation: Evaluation) -> list[Trial]:
 def planned_methods(evaluation: Evaluation) -> list[str]:
     """Labels that were asked for, then those that are there besides."""
     asked = asked_labels(evaluation.experiment)
-    without_draws = [draw_of(label, asked)[0] for label in asked]
+    without_draws = [repeat_of(label, asked)[0] for label in asked]
     return list(dict.fromkeys([*without_draws, *evaluation.methods]))
 
 

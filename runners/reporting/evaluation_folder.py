@@ -16,7 +16,7 @@ import pyarrow.parquet
 
 from chsel.errors import ChselError
 from runners.evaluation.definition import definition_label, definition_text
-from runners.evaluation.draws import draw_of
+from runners.evaluation.repeats import repeat_of
 
 EXPERIMENT = "experiment.json"
 RESULTS = "results.parquet"
@@ -99,7 +99,7 @@ def open_evaluation(folder: Path) -> Evaluation:
     iterations, _ = _table(folder, ITERATIONS, "trials/*/seed_*/*.iterations.parquet")
     labels = {str(row["method"]) for row in rows} | set(asked_labels(experiment))
     for row in [*rows, *iterations]:
-        row["method"], row["draw"] = draw_of(row["method"], labels)
+        row["method"], row["draw"] = repeat_of(row["method"], labels)
     order = ("object", "configuration", "seed", "method", "step")
     rows.sort(key=lambda row: [_sortable(row[name]) for name in (*order, "draw")])
     moments = (*order[1:], "iteration", "draw")

@@ -148,7 +148,7 @@ def _draw_contacts(axes: Axes, probes: Sequence[Probe], step: int, frame: Frame)
 
 
 def _direction(path: FloatArray, contact: FloatArray) -> FloatArray:
-    """Unit vector (3,) of the gripper's last way (P, 4, 4) to a contact, zero where unknown."""
+    """Task vector (3,) of the gripper's last way (P, 4, 4) to a contact, zero where unknown."""
     places = path[:, :3, 3]
     if len(places) == 0:
         return np.zeros(3)

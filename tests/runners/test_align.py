@@ -18,7 +18,7 @@ from chsel.problem.poses import apply, axis_angle, compose, inverse, roll_pitch_
 from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from runners import align, plausible, probe
-from runners.evaluation import trial_truth
+from runners.evaluation import true_poses
 from runners.objects.models import MODELS
 from runners.sensors.pose_file import beside, read_pose, read_pose_file
 from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS
@@ -195,7 +195,7 @@ def test_distances_between_poses_are_modulo_symmetries_at_the_centre() -> None:
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     half_turn[:3, 3] = [1.0, 0.002, 0.0]  # about the box's own axis, and 2 mm aside
     symmetry = object_symmetry(mesh)
-    for between in (align._between, lambda *poses: trial_truth._between(*poses).values()):
+    for between in (align._between, lambda *poses: true_poses._between(*poses).values()):
         position, rotation = between(POSE @ half_turn, POSE, symmetry)
         assert position == pytest.approx(0.002, abs=1e-9)
         assert rotation == pytest.approx(0.0, abs=1e-6)

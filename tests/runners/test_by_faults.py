@@ -11,7 +11,7 @@ from runners import evaluate, report
 from runners.evaluation.configurations import configurations_of, with_faults
 from runners.evaluation.experiment import join_experiment
 from runners.evaluation.gathering import gather
-from runners.evaluation.plan import Trial, Unit
+from runners.evaluation.plan import Task, Trial
 from runners.evaluation.selection import chosen_names
 from runners.evaluation.table import RESULTS, read_part, write_part
 from runners.evaluation.work import do_unit
@@ -55,7 +55,7 @@ def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(
 ) -> None:
     plan = plan_in(tmp_path / "out", steps="5", plausible=False)
     join_experiment(plan, "test", [FAULTY.configuration], [0])
-    for unit in (Unit(FAULTY), Unit(FAULTY, "icp")):
+    for unit in (Task(FAULTY), Task(FAULTY, "icp")):
         assert do_unit(plan, unit, set()).kind == "done"
     (found,) = gather(plan.folder).to_pylist()
     assert (found["status"], found["members"], found["diversity"]) == ("ok", None, None)

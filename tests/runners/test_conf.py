@@ -12,7 +12,7 @@ from chsel.plausible.true_pose import TruePoseSettings
 from runners.benchmarks.ours import Steps
 from runners.benchmarks.published import PackageConfig
 from runners.command.choices import CONF
-from runners.evaluation.measure import MetricsConfig
+from runners.evaluation.metrics import MetricsConfig
 from runners.recording import RecordingConfig
 from runners.reporting.sections import SequenceConfig
 from runners.sessions.points import PointsSettings

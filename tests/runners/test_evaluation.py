@@ -26,15 +26,15 @@ from chsel.problem.settings import settings_mapping
 from replay.events import Measured
 from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, NO_RESULT, verify
-from runners.evaluation import registering, work
+from runners.evaluation import run_method, work
 from runners.evaluation.claims import claimed
 from runners.evaluation.configurations import configurations_of
 from runners.evaluation.contenders import Contender, chosen_contenders
 from runners.evaluation.experiment import join_experiment
+from runners.evaluation.external_results import ExternalSetError, read_external
 from runners.evaluation.gathering import gather
-from runners.evaluation.measure import MetricsConfig
-from runners.evaluation.outside import OutsideError, read_outside
-from runners.evaluation.plan import OWN, Plan, Trial, Unit
+from runners.evaluation.metrics import MetricsConfig
+from runners.evaluation.plan import OWN, Plan, Task, Trial
 from runners.evaluation.schedule import Schedule
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
 from runners.evaluation.trial_session import open_recorded, problems
@@ -73,7 +73,7 @@ def plan_in(folder: Path, methods: Any = ("icp",), **changes: Any) -> Plan:
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A trial's folder with its session and plausible sets."""
     plan = plan_in(tmp_path_factory.mktemp("session"))
-    assert do_unit(plan, Unit(TRIAL), set()).kind == "done"
+    assert do_unit(plan, Task(TRIAL), set()).kind == "done"
     return TRIAL.folder(plan)
 
 
@@ -179,7 +179,7 @@ def test_a_worker_that_dies_once_costs_nothing_and_twice_its_unit_alone(
     failed = [row for row in results(plan) if row["method"] == "always"]
     assert [row["step"] for row in failed] == [4, 5]
     assert {row["diversity"] for row in failed} == {None}
-    assert do_unit(plan, Unit(TRIAL, "always"), set()).kind == "done"
+    assert do_unit(plan, Task(TRIAL, "always"), set()).kind == "done"
     assert {row["status"] for row in results(plan)} == {"ok"}
     assert not list(TRIAL.folder(plan).glob("*failed*"))
 
@@ -196,7 +196,7 @@ def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(
 ) -> None:
     plan = make_plan()
     monkeypatch.setattr(Contender, "method", lambda self: _FailsAtFour())
-    assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "done"
+    assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "done"
     first, second = results(plan)
     assert first["status"] == "failed: nothing to see"
     assert first["members"] > 0
@@ -219,8 +219,8 @@ def test_a_session_that_fails_fails_its_methods_and_no_others(tmp_path: Path) ->
 def test_a_unit_that_another_run_has_claimed_is_left_to_it(make_plan: MakePlan) -> None:
     plan = make_plan()
     with claimed(plan.folder, "mustard.0.icp"):
-        assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "elsewhere"
-    assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "done"
+        assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "elsewhere"
+    assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "done"
 
 
 def test_what_cannot_be_written_stops_everything_and_leaves_no_file(
@@ -232,7 +232,7 @@ def test_what_cannot_be_written_stops_everything_and_leaves_no_file(
 
     plan = make_plan()
     monkeypatch.setattr(pa.parquet, "write_table", full)
-    outcome = do_unit(plan, Unit(TRIAL, "icp"), set())
+    outcome = do_unit(plan, Task(TRIAL, "icp"), set())
     assert outcome.kind == "stop"
     assert "icp.parquet cannot be written (No space left on device)" in outcome.reason
     assert not [path for path in TRIAL.folder(plan).iterdir() if "parquet" in path.name]
@@ -262,8 +262,8 @@ def test_what_cannot_be_recorded_is_a_failure_of_its_unit_alone(
         raise RecordingError("not finite")
 
     plan = make_plan()
-    monkeypatch.setattr(registering.McapRecorder, "record", refused)
-    outcome = do_unit(plan, Unit(TRIAL, "icp"), set())
+    monkeypatch.setattr(run_method.McapRecorder, "record", refused)
+    outcome = do_unit(plan, Task(TRIAL, "icp"), set())
     assert (outcome.kind, outcome.reason) == ("failed", "not finite")
 
 
@@ -273,7 +273,7 @@ def test_what_a_dead_process_left_half_written_is_removed(make_plan: MakePlan) -
     left, other = folder / ".icp.mcap.01234567", folder / ".svgd.mcap.01234567"
     for path in (left, other):
         path.write_text("half")
-    assert do_unit(plan, Unit(TRIAL, "icp"), set()).kind == "done"
+    assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "done"
     assert not left.exists()
     assert other.exists()
 
@@ -349,7 +349,7 @@ def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Pat
     listed = {"step_5": shifted.tolist(), "cost_5": list(range(len(shifted)))[::-1]}
     (folders["text"] / "mustard" / "seed_0.json").write_text(json.dumps(listed))
     for label in ("icp", *folders):
-        assert do_unit(plan, Unit(TRIAL, label), set()).kind == "done"
+        assert do_unit(plan, Task(TRIAL, label), set()).kind == "done"
     by = {(row["method"], row["step"]): row for row in results(plan)}
     for step in (4, 5):
         own = by["perfect", step]
@@ -365,7 +365,7 @@ def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Pat
     assert by["text", 5]["best_cost"] == 0.0
     assert by["text", 5]["diversity"] > 1e4
     assert by["text", 5]["exact_members"] == 0.0
-    unit = Unit(TRIAL, "text")
+    unit = Task(TRIAL, "text")
     assert work.is_finished(plan, unit)
     listed["step_4"] = sets["step_4"].tolist()
     (folders["text"] / "mustard" / "seed_0.json").write_text(json.dumps(listed))
@@ -404,14 +404,14 @@ def test_a_set_from_outside_that_is_wrong_is_told(
 ) -> None:
     path = tmp_path / "seed_0.npz"
     np.savez(path, **values)
-    with pytest.raises(OutsideError, match=message):
-        read_outside(plan_in(tmp_path), TRIAL, path)
+    with pytest.raises(ExternalSetError, match=message):
+        read_external(plan_in(tmp_path), TRIAL, path)
 
 
 def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None:
     plan = make_plan(["chsel", "chsel_cma_me"], starts="gradient_descent", every=5)
     for label in plan.contenders:
-        assert do_unit(plan, Unit(TRIAL, label), set()).kind == "done"
+        assert do_unit(plan, Task(TRIAL, label), set()).kind == "done"
     rows = results(plan)
     starts = {(row["step"], row["problem_digest"]) for row in rows}
     assert len(starts) == 2  # one a step, whatever the method
@@ -443,7 +443,7 @@ def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without
         return np.array([problem.key.step == 5])
 
     monkeypatch.setattr(Icp, "holds", holds, raising=False)
-    for unit in (Unit(faulty), Unit(faulty, "icp"), Unit(TRIAL, "icp")):
+    for unit in (Task(faulty), Task(faulty, "icp"), Task(TRIAL, "icp")):
         assert do_unit(plan, unit, set()).kind == "done"
     assert not (faulty.folder(plan) / "plausible").exists()
     clean, noisy = results(plan)

@@ -17,7 +17,7 @@ from replay.mcap.reader import read_recording
 from runners import evaluate, published
 from runners.benchmarks.published import BenchmarkError, RefusedError
 from runners.benchmarks.published_worker import Worker
-from runners.evaluation.draws import draw_seed
+from runners.evaluation.repeats import repeat_seed
 from tests.runners.in_process import Done, run
 from tests.runners.test_evaluate import SMALL, table
 
@@ -138,7 +138,7 @@ def test_draws_differ_in_their_numbers_alone_and_rank_under_labels_of_their_own(
         read_recording(folder / f"trials/mustard/seed_0/{name}.mcap").problem(4).key.seed
         for name in ("icp", "icp+1")
     }
-    assert seeds == {0, draw_seed(0, 1)}
+    assert seeds == {0, repeat_seed(0, 1)}
     assert "icp+1" in done.stdout
 
 

@@ -21,7 +21,7 @@ from runners import evaluate
 from runners.command.choices import CONF
 from runners.evaluation.configurations import configurations_of
 from runners.evaluation.display import Display
-from runners.evaluation.plan import Plan, Trial, Unit
+from runners.evaluation.plan import Plan, Task, Trial
 from runners.evaluation.selection import chosen_configurations
 from runners.evaluation.sensor_logs import (
     TRUTH,
@@ -190,7 +190,7 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
     )
     monkeypatch.setattr(sensor_logs, "RobotSettings", lambda: small)
     plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
-    outcome = do_unit(plan, Unit(trial), set())
+    outcome = do_unit(plan, Task(trial), set())
     assert (outcome.kind, outcome.reason) == ("done", "")
     log = trial.log(plan)
     assert {file.name for file in log.parent.iterdir()} == {"seed_0.mcap", f"seed_0{TRUTH}"}
@@ -210,7 +210,7 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
     session = open_recorded(plan, trial)
     assert session.start == (1, 0)
     elsewhere = replace(plan, folder=tmp_path / "again", logs=log.parents[1])
-    assert do_unit(elsewhere, Unit(trial), set()).kind == "done"
+    assert do_unit(elsewhere, Task(trial), set()).kind == "done"
     first, second = (trial.folder(one) / "session.mcap" for one in (plan, elsewhere))
     assert first.read_bytes() == second.read_bytes()
     log.with_name(f"seed_0{TRUTH}").unlink()

@@ -14,9 +14,10 @@ from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
-from chsel.problem.streams import StreamKey
-from runners.evaluation.iterations import hypotheses_of
-from runners.evaluation.measure import Measure
+from chsel.problem.search_space import search_space
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.qd.selection import ranked, select_elites
+from runners.evaluation.metrics import HypothesisMetrics
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.table import Row
 from runners.evaluation.trial_session import (
@@ -30,7 +31,7 @@ from runners.session_run import one_line
 from runners.sessions.recorded import RecordedSession
 
 
-class Judge:
+class ResultRows:
     """Makes rows of the table of what was found at the steps of a trial."""
 
     def __init__(
@@ -42,9 +43,9 @@ class Judge:
         preset: str,
         method: Method | None = None,
     ) -> None:
-        """method: that made what is judged; one with `holds` tells whether its set has the truth.
+        """method: that made the hypotheses; one with `holds` tells whether its set has the truth.
 
-        A session with faults is judged by the plausible sets of the same probes without any.
+        A session with faults is measured by the plausible sets of the same probes without any.
         """
         assert session.world_from_object is not None
         self._plan, self._trial, self._session = plan, trial, session
@@ -59,7 +60,7 @@ class Judge:
         self._told = read_session(plan, self._clean) if plan.plausible else None
         self._settings = plausible_settings_of(plan, session)
         mesh, truth = session.recorded.mesh, session.world_from_object
-        self._measure, self._truth = Measure(plan.metrics, mesh, truth), truth
+        self._metrics, self._truth = HypothesisMetrics(plan.metrics, mesh, truth), truth
         self._symmetry = object_symmetry(mesh)
 
     def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
@@ -121,7 +122,7 @@ class Judge:
         cost = EvaluationCost(self._of_session(problem), self._settings.cost)
         below = cost.evaluate(found.object_from_world, limit=limit) < limit
         exact = {"exact_members": float(below.mean())} if len(below) else {}
-        return row | self._measure.of(self._of_session(problem), members, found) | exact
+        return row | self._metrics.compute(self._of_session(problem), members, found) | exact
 
     def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
         """The problem without faults, with the same random numbers for all draws."""
@@ -138,7 +139,7 @@ class Judge:
         }
         if len(found.cost) == 0:
             return row
-        nearest, distance = self._measure.nearest(self._of_session(problem), found)
+        nearest, distance = self._metrics.nearest(self._of_session(problem), found)
         chosen = found.object_from_world[[0, nearest]]
         position, rotation = pose_errors(chosen, self._truth, self._symmetry)
         if self._holds is not None:
@@ -164,7 +165,7 @@ class Judge:
         """The rows of a step's search, of a method with these settings."""
         for snapshot in snapshots:
             found = hypotheses_of(snapshot, problem, settings)
-            metrics = self._measure.of(self._of_session(problem), members, found, ranked=False)
+            metrics = self._metrics.compute(self._of_session(problem), members, found, ranked=False)
             metrics.pop("distinct", None)
             yield {
                 "configuration": self._trial.configuration,
@@ -179,3 +180,17 @@ class Judge:
                 "qd_score": snapshot.qd_score,
                 **metrics,
             }
+
+
+def hypotheses_of(
+    snapshot: ArchiveSnapshot, problem: RegistrationProblem, settings: Any
+) -> Hypotheses:
+    """The cells with the |E_0| lowest costs, chosen as the method with these settings does.
+
+    settings: with `output` and `plane`, as every method that keeps an archive has them.
+    """
+    space = search_space(settings.plane, problem.sdf)
+    stream = problem.key.stream(Purpose.RESAMPLE, snapshot.refinement)
+    costs, poses = -snapshot.objectives, space.poses(snapshot.solutions)
+    chosen = select_elites(costs, poses, problem, space, settings.output, stream)
+    return ranked(poses[chosen].matrices, costs[chosen], snapshot.cells[chosen], poses.matrices)

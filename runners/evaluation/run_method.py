@@ -20,9 +20,9 @@ from replay.files import file_digest
 from replay.mcap.writer import McapRecorder
 from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender
-from runners.evaluation.draws import draw_seed
-from runners.evaluation.judge import Judge
 from runners.evaluation.plan import OWN, Plan, Trial
+from runners.evaluation.repeats import repeat_seed
+from runners.evaluation.result_rows import ResultRows
 from runners.evaluation.table import ITERATIONS, RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded
 from runners.recording import RecordingConfig
@@ -53,7 +53,7 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
             session,
             session.online(
                 (leader or method).online,
-                draw_seed(trial.seed, contender.draw),
+                repeat_seed(trial.seed, contender.draw),
                 only=chosen if leader is None else None,
             ),
             method,
@@ -81,20 +81,20 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
             return leader.register(problem)
 
         steps = run.steps(register, Exception) if leader is None else run.steps(register_and_lead)
-        judge = Judge(plan, trial, session, contender.label, contender.preset, method)
+        result_rows = ResultRows(plan, trial, session, contender.label, contender.preset, method)
         for step, _ in steps:
             problem = step.problem
             if problem is None or step.step not in chosen:
                 continue
             found = None if run.registered is None else run.registered.hypotheses
-            members, missing = judge.members(problem)
-            row = judge.row(problem, found, members, run.failure or missing)
+            members, missing = result_rows.members(problem)
+            row = result_rows.row(problem, found, members, run.failure or missing)
             if run.registered is not None:
                 row["seconds"] = run.registered.total_seconds
             rows.append(row)
             if found is not None and members is not None and plan.every is not None:
                 taken = by_step.snapshots
-                iterations += judge.iterations(problem, taken, method.settings, members)
+                iterations += result_rows.iterations(problem, taken, method.settings, members)
         recorder.record(Logged(run.step, "info", "session finished"))
         recorder.record(SessionEnded(run.step, "finished"))
         recorder.close()

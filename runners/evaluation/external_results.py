@@ -18,27 +18,27 @@ from chsel.problem.poses import Poses, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.qd.selection import repeated
 from replay.files import file_digest
-from runners.evaluation.draws import MOST_DRAWS, draw_label
-from runners.evaluation.judge import Judge
 from runners.evaluation.plan import Plan, Trial
+from runners.evaluation.repeats import MOST_REPEATS, repeat_label
+from runners.evaluation.result_rows import ResultRows
 from runners.evaluation.table import RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded, problems
 
 PRESET = "outside"
 """What the table has for a preset."""
-DRAW_FOLDER = "draw_{}"
+REPEAT_FOLDER = "draw_{}"
 """Where further sets of the same sessions are, in the folder of the first ones."""
 SUFFIXES = (".npz", ".json")
 _TOLERANCE = 1e-5  # of the entries of R^T R - 1: transforms may have been written as text
 _KEY = re.compile(r"(step|cost|seconds)_(\d{1,10})")
 
 
-class OutsideError(ChselError):
+class ExternalSetError(ChselError):
     """A file of hypothesis sets from elsewhere cannot be used."""
 
 
 @dataclass(frozen=True, eq=False)
-class OutsideSet:
+class ExternalSet:
     """The hypotheses of one step.
 
     world_from_object (B, 4, 4): poses of the object's mesh frame in the world, best first. cost
@@ -58,19 +58,19 @@ class OutsideSet:
         return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, poses)
 
 
-def outside_folders(given: Mapping[str, Path]) -> dict[str, Path]:
+def external_folders(given: Mapping[str, Path]) -> dict[str, Path]:
     """Folders by label: those given, and under a label of its own every draw in them."""
     found = dict(given)
     for label, folder in given.items():
-        for draw in range(1, MOST_DRAWS):
-            of_draw = folder / DRAW_FOLDER.format(draw)
+        for draw in range(1, MOST_REPEATS):
+            of_draw = folder / REPEAT_FOLDER.format(draw)
             if not of_draw.is_dir():
                 break
-            found.setdefault(draw_label(label, draw), of_draw)
+            found.setdefault(repeat_label(label, draw), of_draw)
     return found
 
 
-def outside_file(folder: Path, trial: Trial) -> Path | None:
+def external_file(folder: Path, trial: Trial) -> Path | None:
     """FOLDER/CONFIGURATION/seed_S.npz, or .json; None if there is neither."""
     for suffix in SUFFIXES:
         path = folder / trial.configuration / f"seed_{trial.seed}{suffix}"
@@ -79,52 +79,52 @@ def outside_file(folder: Path, trial: Trial) -> Path | None:
     return None
 
 
-def outside_digest(path: Path | None) -> str:
+def external_digest(path: Path | None) -> str:
     """Digest of a file; "none" without one."""
     return "none" if path is None else file_digest(path)
 
 
-def read_outside(plan: Plan, trial: Trial, path: Path) -> dict[int, OutsideSet]:
+def read_external(plan: Plan, trial: Trial, path: Path) -> dict[int, ExternalSet]:
     """The sets of a trial by step.
 
     npz: arrays `step_K` (B, 4, 4), world_from_object of step K; where known `cost_K` (B,) and
-    `seconds_K`. json: an object with the same names, and lists. Raises OutsideError for anything
-    else: other names, steps that do not exist, shapes, numbers, rotations.
+    `seconds_K`. json: an object with the same names, and lists. Raises ExternalSetError for
+    anything else: other names, steps that do not exist, shapes, numbers, rotations.
     """
     values = _values(path)
     steps = plan.probes_of(trial.configuration)
     for key in values:
         match = _KEY.fullmatch(key)
         if match is None:
-            raise OutsideError(f"{path} has {key!r}; accepted: step_K, cost_K and seconds_K")
+            raise ExternalSetError(f"{path} has {key!r}; accepted: step_K, cost_K and seconds_K")
         if int(match[2]) not in steps:
-            raise OutsideError(
+            raise ExternalSetError(
                 f"{path} has {key}; accepted: steps 0 to {steps[-1]} of {trial.configuration}"
             )
         if f"step_{int(match[2])}" not in values:
-            raise OutsideError(f"{path} has {key}; accepted: only with step_{int(match[2])}")
+            raise ExternalSetError(f"{path} has {key}; accepted: only with step_{int(match[2])}")
     names = [key for key in values if key.startswith("step_")]
     return {int(name[5:]): _set_of(path, int(name[5:]), values) for name in names}
 
 
-def rank_outside(plan: Plan, trial: Trial, label: str) -> None:
+def rank_external(plan: Plan, trial: Trial, label: str) -> None:
     """Write the part of the table about the sets of a folder, of one trial."""
-    path = outside_file(plan.outside[label], trial)
-    about = outside_digest(path)
-    sets = {} if path is None else read_outside(plan, trial, path)
+    path = external_file(plan.outside[label], trial)
+    about = external_digest(path)
+    sets = {} if path is None else read_external(plan, trial, path)
     reason = f"{path} has no set of this step"
     if path is None:
         reason = f"there is no {_wanted(plan, trial, label)}"
     session = open_recorded(plan, trial)
-    judge = Judge(plan, trial, session, label, PRESET)
+    result_rows = ResultRows(plan, trial, session, label, PRESET)
     rows: list[Row] = []
     for problem in problems(plan, trial, session):
-        members, missing = judge.members(problem)
+        members, missing = result_rows.members(problem)
         given = sets.get(problem.key.step)
         if given is None:
-            row = judge.row(problem, None, members, reason)
+            row = result_rows.row(problem, None, members, reason)
         else:
-            row = judge.row(problem, given.hypotheses(), members, missing)
+            row = result_rows.row(problem, given.hypotheses(), members, missing)
             row["seconds"] = given.seconds
             if given.cost is None:
                 row |= {"best_cost": None, "mean_cost": None}
@@ -141,33 +141,33 @@ def _wanted(plan: Plan, trial: Trial, label: str) -> Path:
 def _values(path: Path) -> Mapping[str, Any]:
     try:
         if path.suffix == ".npz":
-            return read_npz(path, error=OutsideError)
+            return read_npz(path, error=ExternalSetError)
         values = json.loads(path.read_text())
-    except (OSError, ValueError, OutsideError) as error:
+    except (OSError, ValueError, ExternalSetError) as error:
         reason = " ".join(str(error).split())
-        raise OutsideError(f"{path} cannot be read ({reason})") from None
+        raise ExternalSetError(f"{path} cannot be read ({reason})") from None
     if not isinstance(values, Mapping):
-        raise OutsideError(f"{path} is no object; accepted: step_K, cost_K and seconds_K")
+        raise ExternalSetError(f"{path} is no object; accepted: step_K, cost_K and seconds_K")
     return values
 
 
-def _set_of(path: Path, step: int, values: Mapping[str, Any]) -> OutsideSet:
+def _set_of(path: Path, step: int, values: Mapping[str, Any]) -> ExternalSet:
     name = f"{path}: step_{step}"
-    poses = frozen(name, values[f"step_{step}"], (None, 4, 4), error=OutsideError)
+    poses = frozen(name, values[f"step_{step}"], (None, 4, 4), error=ExternalSetError)
     if len(poses) == 0:
-        raise OutsideError(f"{name} is empty; accepted: at least one transform")
+        raise ExternalSetError(f"{name} is empty; accepted: at least one transform")
     _check_rigid(name, poses)
     cost = values.get(f"cost_{step}")
     if cost is not None:
-        cost = frozen(f"{path}: cost_{step}", cost, (len(poses),), error=OutsideError)
+        cost = frozen(f"{path}: cost_{step}", cost, (len(poses),), error=ExternalSetError)
     seconds = values.get(f"seconds_{step}")
     if seconds is not None:
-        seconds = float(frozen(f"{path}: seconds_{step}", seconds, (), error=OutsideError))
-    return OutsideSet(poses, cost, seconds)
+        seconds = float(frozen(f"{path}: seconds_{step}", seconds, (), error=ExternalSetError))
+    return ExternalSet(poses, cost, seconds)
 
 
 def _check_rigid(name: str, poses: FloatArray) -> None:
-    """Raise OutsideError unless all (B, 4, 4) are rigid to what text files keep of a number."""
+    """Raise ExternalSetError unless all (B, 4, 4) are rigid to what text files keep of a number."""
     rotation = poses[:, :3, :3]
     off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
     off = np.maximum(off, np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1))
@@ -176,7 +176,7 @@ def _check_rigid(name: str, poses: FloatArray) -> None:
     if wrong.any():
         row = int(np.argmax(wrong))
         what = "mirrors" if mirrored[row] and off[row] <= _TOLERANCE else "is not rigid"
-        raise OutsideError(
+        raise ExternalSetError(
             f"{name}[{row}] {what}; accepted: [R t; 0 0 0 1] with R^T R = 1 to {_TOLERANCE:g} and "
             "det R = 1"
         )

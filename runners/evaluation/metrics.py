@@ -34,7 +34,7 @@ class MetricsConfig:
         return DistanceSettings(self.points, self.method, self.bidirectional)
 
 
-class Measure:
+class HypothesisMetrics:
     """The metrics of hypotheses; the same points on the surface for all steps of a session."""
 
     def __init__(
@@ -44,7 +44,7 @@ class Measure:
         self._config, self._mesh, self._truth = config, mesh, world_from_object
         self._distance: SurfaceDistance | None = None
 
-    def of(
+    def compute(
         self,
         problem: RegistrationProblem,
         members: PlausibleSet,

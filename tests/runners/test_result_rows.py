@@ -13,10 +13,10 @@ from chsel.plausible.plausible_set import PlausibleSet
 from chsel.problem.poses import compose, inverse, product, rotation_vector
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
-from runners.evaluation.draws import MOST_DRAWS, draw_seed
-from runners.evaluation.judge import Judge
-from runners.evaluation.measure import Measure, MetricsConfig
-from runners.evaluation.plan import Unit
+from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
+from runners.evaluation.plan import Task
+from runners.evaluation.repeats import MOST_REPEATS, repeat_seed
+from runners.evaluation.result_rows import ResultRows
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.evaluation.work import do_unit
 from runners.sessions.recorded import RecordedSession
@@ -27,9 +27,9 @@ EPSILON = 0.0003  # metres, that of the mustard bottle
 
 @dataclass(frozen=True)
 class Scene:
-    """A judge of one trial, and what it judges: the problem of a step, and its plausible set."""
+    """The rows of a trial, with the problem of one step and its plausible set."""
 
-    judge: Judge
+    rows: ResultRows
     session: RecordedSession
     truth: FloatArray  # world_from_object (4, 4)
     problem: RegistrationProblem
@@ -40,16 +40,16 @@ class Scene:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     plan = plan_in(tmp_path_factory.mktemp("session"))
-    assert do_unit(plan, Unit(TRIAL), set()).kind == "done"
+    assert do_unit(plan, Task(TRIAL), set()).kind == "done"
     session = open_recorded(plan, TRIAL)
     truth = session.world_from_object
     assert truth is not None
-    judge = Judge(plan, TRIAL, session, "made_up", "default")
+    rows = ResultRows(plan, TRIAL, session, "made_up", "default")
     problem = list(problems(plan, TRIAL, session))[-1]
-    members, _ = judge.members(problem)
+    members, _ = rows.members(problem)
     assert members is not None
     cost = EvaluationCost(problem, plan.plausible_settings(EPSILON).cost)
-    return Scene(judge, session, truth, problem, members, cost)
+    return Scene(rows, session, truth, problem, members, cost)
 
 
 def hypotheses(world_from_object: FloatArray) -> Hypotheses:
@@ -70,11 +70,11 @@ def test_errors_are_those_of_the_best_hypothesis(scene: Scene) -> None:
     shifts = np.array([[0.012, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.0, 0.1]])
     turns = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.3, 0.0, 0.0]])
     shifted = hypotheses(moved(scene.truth, shifts, turns))
-    row = scene.judge.row(scene.problem, shifted, scene.members, "")
+    row = scene.rows.row(scene.problem, shifted, scene.members, "")
     assert row["position_error"] == pytest.approx(0.012)
     assert row["rotation_error"] == pytest.approx(0.0, abs=1e-6)
     turned = hypotheses(moved(scene.truth, shifts[::-1], turns[::-1]))
-    row = scene.judge.row(scene.problem, turned, scene.members, "")
+    row = scene.rows.row(scene.problem, turned, scene.members, "")
     assert row["rotation_error"] == pytest.approx(0.3)
     assert (row["best_cost"], row["mean_cost"]) == (0.0, 1.0)
     assert (row["hypotheses"], row["distinct"]) == (3, 3)
@@ -82,7 +82,7 @@ def test_errors_are_those_of_the_best_hypothesis(scene: Scene) -> None:
 
 def test_points_are_counted_by_their_class(scene: Scene) -> None:
     points = scene.problem.points
-    row = scene.judge.row(scene.problem, None, scene.members, "no reason")
+    row = scene.rows.row(scene.problem, None, scene.members, "no reason")
     assert row["status"] == "failed: no reason"
     assert row["free_points"] == len(points.free) > 1000
     assert row["contacts"] == len(points.contacts) == len(points.known) > 0
@@ -101,9 +101,9 @@ def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene: Scen
     far = poses[above > 5.0 * EPSILON][:4]
     assert (len(inside), len(near), len(far)) == (3, 5, 4)
     found = hypotheses(np.concatenate([inside, near, far]))
-    row = scene.judge.row(scene.problem, found, scene.members, "")
+    row = scene.rows.row(scene.problem, found, scene.members, "")
     assert row["exact_members"] == pytest.approx(3.0 / 12.0)
-    assert scene.judge.row(scene.problem, found, None, "none")["status"] == "none"
+    assert scene.rows.row(scene.problem, found, None, "none")["status"] == "none"
 
 
 def test_all_steps_of_a_session_are_measured_by_the_same_points_on_the_surface(
@@ -113,23 +113,25 @@ def test_all_steps_of_a_session_are_measured_by_the_same_points_on_the_surface(
     found = hypotheses(moved(scene.truth, stream.normal(0.0, 0.02, (5, 3)), np.zeros((5, 3))))
     mesh = scene.session.recorded.mesh
 
-    def measured(measure: Measure, seed: int, step: int) -> dict[str, float]:
-        return measure.of(replace(scene.problem, key=StreamKey(seed, step)), scene.members, found)
+    def measured(metrics: HypothesisMetrics, seed: int, step: int) -> dict[str, float]:
+        return metrics.compute(
+            replace(scene.problem, key=StreamKey(seed, step)), scene.members, found
+        )
 
-    def measure() -> Measure:
-        return Measure(MetricsConfig(points=50), mesh, scene.truth)
+    def fresh() -> HypothesisMetrics:
+        return HypothesisMetrics(MetricsConfig(points=50), mesh, scene.truth)
 
-    one = measure()
+    one = fresh()
     first = measured(one, 0, 4)
     assert measured(one, 0, 5) == first
-    assert measured(measure(), 0, 5) == first  # of a run that went on at this step
-    assert measured(measure(), 1, 4)["diversity"] != first["diversity"]
+    assert measured(fresh(), 0, 5) == first  # of a run that went on at this step
+    assert measured(fresh(), 1, 4)["diversity"] != first["diversity"]
 
 
 def test_seeds_of_draws_are_no_seeds_of_other_sessions() -> None:
     seeds = range(50)
-    assert [draw_seed(seed, 0) for seed in seeds] == list(seeds)
-    drawn = {draw_seed(seed, draw) for seed in seeds for draw in range(20)}
+    assert [repeat_seed(seed, 0) for seed in seeds] == list(seeds)
+    drawn = {repeat_seed(seed, draw) for seed in seeds for draw in range(20)}
     assert len(drawn) == 50 * 20
-    others = {draw_seed(seed, draw) for seed in seeds for draw in (1, 2, MOST_DRAWS - 1)}
+    others = {repeat_seed(seed, draw) for seed in seeds for draw in (1, 2, MOST_REPEATS - 1)}
     assert min(others) > 2**31  # nobody counts sessions up to there
