@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import trimesh
 
-from chsel.methods.cvo.cvo_kernels import flow_at
+from chsel.methods.cvo.cvo_kernels import Product, flow_at
+from chsel.methods.cvo.gaussian_blur import Kernel
+from chsel.methods.cvo.rkhs_fields import free_field, surface_field
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.pose_tuples import pose_at
 from chsel.problem.points import KnownPoints
@@ -17,6 +20,24 @@ from chsel.problem.sdf_grid import SdfGrid
 SIGMA, S_SIGMA, S_ELL = 0.1, 0.8, 0.1
 FREE, SURFACE = np.array([0.9, 0.1]), np.array([0.1, 0.9])
 C = D = 7.0
+KERNEL = Kernel(0.1, 0.0064)
+MESH = trimesh.creation.box([0.12, 0.08, 0.06])
+SDF = SdfGrid.from_mesh(MESH, 0.01, padding=0.03)
+
+
+def scene(count: int = 60) -> KnownPoints:
+    """Free points and 20 contacts around the box."""
+    stream = np.random.default_rng(1)
+    free = stream.uniform(-0.25, 0.25, (count, 3))
+    return KnownPoints(free=free, known=stream.uniform(-0.06, 0.06, (20, 3)))
+
+
+def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Product:
+    """The inner product by fields, with a surface band of a voxel."""
+    band = sdf.resolution
+    free, surface = free_field(sdf, kernel, band), surface_field(sdf, kernel, band)
+    nothing = free.term(np.zeros((0, 3)), 1.0)
+    return Product(free.term(points.free, 1.0), nothing, surface.term(points.contacts, 1.0))
 
 
 def labels(free: int, surface: int) -> FloatArray:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import trimesh
 
-from chsel.errors import SettingError
 from chsel.methods.anchored.anchor_sampling import (
     AnchorSettings,
     anchored_poses,
@@ -14,18 +12,14 @@ from chsel.methods.anchored.anchor_sampling import (
 )
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.streams import StreamKey
+from tests.chsel.methods.scene import BOX, BOX_GRID, WORKSPACE, contacts_on
 
-MESH = trimesh.creation.box((0.2, 0.12, 0.08))
-GRID = SdfGrid.from_mesh(MESH, 0.01)
-TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
-WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
-CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(MESH, 12, seed=1)[0]))
+CONTACTS = contacts_on(BOX, 12)
 PAIRS, SINGLES = AnchorSettings(1.0, 0.0), AnchorSettings(0.0, 1.0)
 UNIFORM = AnchorSettings(0.0, 0.0)
 
@@ -39,8 +33,10 @@ def drawn(
     index: int = 0,
 ) -> FloatArray:
     """The best poses (K, 12); all of them where most is as many."""
-    problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
-    space, known = search_space(plane, GRID), most_informative_first(points)
+    problem = RegistrationProblem(
+        BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
+    )
+    space, known = search_space(plane, BOX_GRID), most_informative_first(points)
     return anchored_poses(
         problem, known, space, settings, samples=samples, most=most, index=index
     ).numbers
@@ -50,7 +46,7 @@ def distances(poses: FloatArray, points: FloatArray) -> FloatArray:
     """Signed distances (B, M) at world points."""
     rotations = poses[:, :9].reshape(-1, 3, 3)
     moved = np.einsum("nij,mj->nmi", rotations, points) + poses[:, None, 9:]
-    s = GRID.query(moved.reshape(-1, 3), lookup="trilinear")[0].numpy()
+    s = BOX_GRID.query(moved.reshape(-1, 3), lookup="trilinear")[0].numpy()
     return s.reshape(len(poses), len(points))
 
 
@@ -80,8 +76,10 @@ def test_a_point_of_known_distance_is_met_at_that_distance(value: float) -> None
 
 def test_rotations_are_rigid_and_objects_within_bounds() -> None:
     points = KnownPoints(known=CONTACTS)
-    problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
-    lower, upper = origin_bounds(problem.workspace, search_space(None, GRID), 0.15)
+    problem = RegistrationProblem(
+        BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
+    )
+    lower, upper = origin_bounds(problem.workspace, search_space(None, BOX_GRID), 0.15)
     np.testing.assert_allclose(lower, np.array(WORKSPACE.lower) - 0.15)
     poses = drawn(points, AnchorSettings())
     rotations = poses[:, :9].reshape(-1, 3, 3)
@@ -134,16 +132,3 @@ def test_known_points_come_far_apart_first_and_none_is_lost() -> None:
     first = ordered.known[:8]
     gaps = np.sqrt(((first[:, None] - first[None]) ** 2).sum(axis=2)) + 9.0 * np.eye(8)
     assert gaps.min() > 2.0
-
-
-@pytest.mark.parametrize(
-    ("shares", "message"),
-    [
-        ({"pairs": 0.8, "contacts": 0.3}, "pairs and contacts are 0.8 and 0.3; accepted: shares"),
-        ({"pairs": -0.1}, "pairs is -0.1; accepted"),
-        ({"margin": float("nan")}, "margin is nan; accepted"),
-    ],
-)
-def test_shares_out_of_bounds_are_refused(shares: dict[str, float], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        AnchorSettings(**shares)

@@ -7,16 +7,15 @@ import pytest
 import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.errors import SettingError
 from chsel.methods import build_method, preset_settings
 from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.chsel import Chsel
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, axis_angle, compose, inverse
-from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.streams import StreamKey
 from chsel.problem.surface import has_surface
+from tests.chsel.methods.scene import Watcher
 
 BOX = trimesh.creation.box((0.2, 0.1, 0.05))
 GRID = SdfGrid.from_mesh(BOX, resolution=0.01)
@@ -39,18 +38,6 @@ def starts_of(
 ) -> FloatArray:
     space = search_space(plane, problem.sdf)
     return anchored_starts(problem, space, STARTS, index).matrices
-
-
-class Descents(NullObserver):
-    """Keeps the vectors of the first trace of every descent."""
-
-    def __init__(self) -> None:
-        self.first: list[FloatArray] = []
-
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        """Keep them."""
-        if (stage, iteration) == ("descent", 0):
-            self.first.append(vectors)
 
 
 def test_starts_are_nearer_to_the_contacts_than_e_0() -> None:
@@ -98,24 +85,10 @@ def test_default_finds_what_e_0_is_too_far_from(name: str) -> None:
     settings = preset_settings(name)
     assert settings.starts is not None
     quick = replace(settings, emitter=replace(settings.emitter, iterations=5))
-    observer, problem = Descents(), posed()
+    observer, problem = Watcher(), posed()
     found = Chsel(replace(quick, starts=STARTS)).register(problem, observer)
-    assert [len(first) for first in observer.first] == [5 + 8]
+    firsts = [trace for trace in observer.traces if trace[:2] == ("descent", 0)]
+    assert [len(first.vectors) for first in firsts] == [5 + 8]
     assert len(found.cost) == len(FAR)
     alone = Chsel(replace(quick, starts=None)).register(problem)
     assert found.cost[0] < 0.5 * alone.cost[0]
-
-
-@pytest.mark.parametrize("preset", ["paper", "reference"])
-def test_starts_are_off_in_the_other_presets(preset: str) -> None:
-    settings = preset_settings("chsel", preset)
-    assert (settings.starts, settings.output.margin) == (None, None)
-    assert settings.output.choice == "lowest"
-
-
-@pytest.mark.parametrize(
-    ("setting", "value"), [("samples", 0), ("kept", 0), ("samples", 10**9), ("kept", 10**6)]
-)
-def test_refused_numbers(setting: str, value: int) -> None:
-    with pytest.raises(SettingError, match=f"{setting} is {value}; accepted"):
-        AnchoredStarts(**{setting: value})  # type: ignore[arg-type]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import trimesh
 
 from chsel.methods.anchored.anchor_sampling import most_informative_first
 from chsel.methods.anchored.energy import Energy, NoiseLevel
@@ -12,21 +11,17 @@ from chsel.methods.anchored.fit_kernels import Loss, surrounding_for
 from chsel.methods.anchored.walk_kernels import Chains, energies_below
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, random_rotations
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.streams import StreamKey
+from tests.chsel.methods.scene import BOX, BOX_GRID, TRUTH, WORKSPACE, contacts_on
 
-MESH = trimesh.creation.box((0.2, 0.12, 0.08))
-GRID = SdfGrid.from_mesh(MESH, 0.01)
-TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
-WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
 RANDOM = np.random.default_rng(8)
-CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(MESH, 30, seed=1)[0]))
+CONTACTS = contacts_on(BOX, 30)
 LATTICE = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.04)] * 3, indexing="ij"), -1).reshape(-1, 3)
-FREE = LATTICE[GRID.query(apply(inverse(TRUTH), LATTICE))[0].numpy() > 0.005]
+FREE = LATTICE[BOX_GRID.query(apply(inverse(TRUTH), LATTICE))[0].numpy() > 0.005]
 POINTS = KnownPoints(
     free=np.concatenate([FREE, [[5.0, 0.0, -3.0]]]),
     occupied=apply(TRUTH, 0.03 * RANDOM.standard_normal((5, 3))),
@@ -43,8 +38,10 @@ def energy_of(
     points: KnownPoints, tolerance: float = 0.0, plane: PlaneSettings | None = None
 ) -> tuple[Energy, tuple[FloatArray, FloatArray]]:
     """The energy for points, and the bounds of its walks."""
-    problem = RegistrationProblem(GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
-    space = search_space(plane, GRID)
+    problem = RegistrationProblem(
+        BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
+    )
+    space = search_space(plane, BOX_GRID)
     bounds = origin_bounds(problem.workspace, space, MARGIN)
     level = NoiseLevel(SIGMA, tolerance, CAP)
     return Energy(problem, most_informative_first(points), space, bounds, level), bounds
@@ -70,7 +67,7 @@ def plainly(points: KnownPoints, poses: Poses, tau: float) -> FloatArray:
     energies = []
     for transform in poses.matrices:
         known, free, occupied = (
-            GRID.query(apply(transform, part), lookup="trilinear")[0].numpy()
+            BOX_GRID.query(apply(transform, part), lookup="trilinear")[0].numpy()
             for part in (points.known, points.free, points.occupied)
         )
         mean = losses(known - points.sdf, SIGMA, CAP).mean() if len(known) else 0.0
@@ -83,7 +80,7 @@ def fit_losses(points: KnownPoints, poses: Poses, loss: Loss) -> FloatArray:
     """What a fit lowers, without free points."""
     sums = []
     for transform in poses.matrices:
-        known = GRID.query(apply(transform, points.known), lookup="trilinear")[0].numpy()
+        known = BOX_GRID.query(apply(transform, points.known), lookup="trilinear")[0].numpy()
         sums.append(losses(known - points.sdf, loss.knee, loss.cap).sum())
     return np.array(sums)
 
@@ -206,7 +203,7 @@ def test_neither_fits_nor_walks_depend_on_threads() -> None:
 def test_on_a_plane_fits_and_walks_stay_on_it() -> None:
     plane = PlaneSettings(plane_height=0.3)
     energy, _ = energy_of(TOUCHED, plane=plane)
-    space = search_space(plane, GRID)
+    space = search_space(plane, BOX_GRID)
     near = around(6, 0.01, 0.1)
     poses = space.poses(space.encode(near))
     chains = walked(energy, energy.fitted(poses, 10, FINE), 0.0, 60)

@@ -11,12 +11,12 @@ from torch import Tensor
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
-from chsel.errors import SettingError
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
+from tests.chsel.methods.scene import Watcher
 from tests.chsel.problem.torch_spaces import decode
 
 SIDES = np.array([0.12, 0.08, 0.06])
@@ -37,22 +37,6 @@ def scene(seed: int = 0) -> KnownPoints:
 def contacts() -> Objective:
     """One contact, so that many poses cost nothing."""
     return Objective(CompiledCost(BOX, KnownPoints(known=[[0.02, 0.0, 0.01]])), SE3Space())
-
-
-class Blocks(NullObserver):
-    def __init__(self) -> None:
-        self.iterations: list[int] = []
-        self.traced: list[tuple[FloatArray, FloatArray]] = []
-        self.total = 0
-
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        self.iterations.append(iteration)
-        self.traced.append((vectors, cost))
-
-    def progress(self, stage: str, done: int, total: int) -> None:
-        assert stage == "descent"
-        assert done == self.iterations[-1]
-        self.total = total
 
 
 def descended_by_torch(
@@ -115,25 +99,25 @@ def rotations_near_identity(count: int) -> FloatArray:
 
 
 def test_descent_reports_every_block_as_it_stands() -> None:
-    objective, blocks = contacts(), Blocks()
+    objective, blocks = contacts(), Watcher()
     settings = DescentSettings(restarts=4, iterations=5, rate=0.001, stop_below=None)
     poses, costs = descend(objective, Poses.of(starts(3)), settings, blocks)
     assert blocks.iterations == [0, 5, 10, 15, 20]
-    assert blocks.total == 20
-    np.testing.assert_array_equal(blocks.traced[0][0], SE3Space().encode(Poses.of(starts(3))))
-    for vectors, cost in blocks.traced:
+    assert blocks.progressed == [("descent", done, 20) for done in (5, 10, 15, 20)]
+    np.testing.assert_array_equal(blocks.traces[0].vectors, SE3Space().encode(Poses.of(starts(3))))
+    for _, _, vectors, cost in blocks.traces:
         np.testing.assert_array_equal(cost, objective.costs(vectors))
         rows = vectors[:, :6].reshape(-1, 2, 3)
         products = rows @ rows.transpose(0, 2, 1)
         np.testing.assert_allclose(products, np.tile(np.eye(2), (3, 1, 1)), atol=1e-14)
-    np.testing.assert_allclose(SE3Space().encode(poses), blocks.traced[-1][0], atol=1e-15)
-    np.testing.assert_array_equal(costs, blocks.traced[-1][1])
+    np.testing.assert_allclose(SE3Space().encode(poses), blocks.traces[-1].vectors, atol=1e-15)
+    np.testing.assert_array_equal(costs, blocks.traces[-1].cost)
 
 
 def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to() -> None:
     free = KnownPoints(free=[[1.0, 1.0, 1.0]])  # costs nothing anywhere near
     objective = Objective(CompiledCost(BOX, free), SE3Space())
-    stopping, going = Blocks(), Blocks()
+    stopping, going = Watcher(), Watcher()
     descend(objective, Poses.of(starts(3)), DescentSettings(), stopping)
     descend(objective, Poses.of(starts(3)), DescentSettings(stop_below=None), going)
     assert stopping.iterations == [0, 50]
@@ -142,11 +126,11 @@ def test_descent_ends_when_a_block_gains_nothing_unless_told_not_to() -> None:
 
 def test_descent_goes_on_while_the_mean_gain_of_a_block_is_above_the_bound() -> None:
     objective = contacts()
-    blocks = Blocks()
+    blocks = Watcher()
     settings = DescentSettings(restarts=12, iterations=10, rate=0.001, stop_below=0.05)
     initial = starts(4)
     descend(objective, Poses.of(initial), settings, blocks)
-    costs = [cost for _, cost in blocks.traced]
+    costs = [trace.cost for trace in blocks.traces]
     gains = [
         np.where(a > 0.0, (a - b) / np.maximum(a, 1e-300), 0.0).mean() for a, b in pairwise(costs)
     ]
@@ -171,8 +155,3 @@ def test_each_start_descends_as_if_it_were_alone() -> None:
     together = objective.descended(vectors, 4.0, 0.01, 20)
     alone = objective.descended(vectors[2:3], 4.0, 0.01, 20)
     np.testing.assert_array_equal(together[2:3], alone)
-
-
-def test_settings_that_are_no_numbers_are_refused() -> None:
-    with pytest.raises(SettingError, match="stop_below is nan"):
-        DescentSettings(stop_below=float("nan"))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import torch
 
-from chsel.errors import SettingError
 from chsel.methods.medial_constraint.medial_balls import Balls
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, apply, compose, random_rotations
 from chsel.problem.registration_problem import RegistrationProblem
@@ -124,16 +121,6 @@ def test_costs_do_not_depend_on_threads_or_on_the_batch() -> None:
     cost = MedialCost(problem(contacts()), balls=some_balls())
     many = poses(700)
     together = cost.evaluate(Poses.of(many))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with threads(2):
         np.testing.assert_array_equal(cost.evaluate(Poses.of(many)), together)
-    finally:
-        torch.set_num_threads(threads)
     np.testing.assert_array_equal(cost.evaluate(Poses.of(many[41:42])), together[41:42])
-
-
-@pytest.mark.parametrize("name", ["inflation", "ball_scale", "known_scale"])
-def test_negative_settings_are_refused(name: str) -> None:
-    with pytest.raises(SettingError, match=f"{name} is -1"):
-        replace(MedialCostSettings(), **{name: -1.0})

@@ -18,24 +18,9 @@ from chsel.methods.cvo.rkhs_fields import (
 )
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses
-from tests.chsel.methods.dense_cvo import DenseClouds, flows, nearby
+from tests.chsel.methods.dense_cvo import KERNEL, SDF, DenseClouds, flows, nearby, product_of, scene
 
-SDF = SdfGrid.from_mesh(trimesh.creation.box([0.12, 0.08, 0.06]), 0.01, padding=0.03)
-KERNEL = Kernel(0.1, 0.0064)
 CUT = Kernel.above(0.1, 0.0064, 6e-4)
-
-
-def scene(count: int = 60) -> KnownPoints:
-    stream = np.random.default_rng(1)
-    free = stream.uniform(-0.25, 0.25, (count, 3))
-    return KnownPoints(free=free, known=stream.uniform(-0.06, 0.06, (20, 3)))
-
-
-def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Product:
-    band = sdf.resolution
-    free, surface = free_field(sdf, kernel, band), surface_field(sdf, kernel, band)
-    nothing = free.term(np.zeros((0, 3)), 1.0)
-    return Product(free.term(points.free, 1.0), nothing, surface.term(points.contacts, 1.0))
 
 
 def values(product: Product, transforms: FloatArray) -> FloatArray:

@@ -1,37 +1,33 @@
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numba
 import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 
-from chsel import KnownPoints, RegistrationProblem, RelaxedCost, SdfGrid, Workspace
-from chsel.errors import ChselError, SettingError
-from chsel.methods import preset_settings
+from chsel import KnownPoints, RegistrationProblem, RelaxedCost
+from chsel.errors import SettingError
 from chsel.methods import svgd as kernels
 from chsel.methods.svgd import Particles, Svgd, SvgdSettings, direct, particles_at
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, product
-from chsel.problem.registration_problem import NullObserver
-from chsel.problem.search_space import PlaneSettings, SE3Space
-from chsel.problem.settings import PRESETS
+from chsel.problem.poses import Poses, apply, inverse
+from chsel.problem.search_space import SE3Space
 from chsel.problem.streams import StreamKey
+from tests.chsel.methods.scene import (
+    BOX,
+    BOX_GRID,
+    TRUTH,
+    WORKSPACE,
+    Watcher,
+    around_truth,
+    contacts_on,
+)
 from tests.chsel.problem.torch_spaces import decode
 
-SIDES = np.array([0.2, 0.12, 0.08])
-MESH = trimesh.creation.box(SIDES)
-GRID = SdfGrid.from_mesh(MESH, 0.01)
-TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
-WORKSPACE = Workspace((0.0, -0.1, 0.1), (0.4, 0.3, 0.5))
-CONTACTS = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(MESH, 15, seed=1)[0]))
+CONTACTS = contacts_on(BOX, 15)
 ADAM = {"lr": 0.005, "betas": (0.9, 0.999), "eps": 1e-8}
 
 
@@ -67,19 +63,10 @@ def directions_by_torch(
     return (kernel.detach() @ scores - pull) / count
 
 
-def starts(count: int = 8, angle: float = 0.3, shift: float = 0.03) -> FloatArray:
-    """E_0 around the truth."""
-    random = np.random.default_rng(3)
-    axis = random.standard_normal((count, 3))
-    axis /= np.sqrt((axis**2).sum(axis=1, keepdims=True))
-    turn = product(axis_angle(axis, angle), TRUTH[:3, :3])
-    return inverse(compose(turn, TRUTH[:3, 3] + shift * random.standard_normal((count, 3))))
-
-
 def free_points() -> FloatArray:
     lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.05)] * 3, indexing="ij"), -1)
     free = lattice.reshape(-1, 3)
-    distance, _ = GRID.query(apply(inverse(TRUTH), free))
+    distance, _ = BOX_GRID.query(apply(inverse(TRUTH), free))
     return free[distance.numpy() > 0.01]
 
 
@@ -87,24 +74,8 @@ def posed(
     points: KnownPoints | None = None, initial_set: FloatArray | None = None
 ) -> RegistrationProblem:
     points = points or KnownPoints(free=free_points(), known=CONTACTS)
-    initial_set = starts() if initial_set is None else initial_set
-    return RegistrationProblem(GRID, points, initial_set, WORKSPACE, 0.05, StreamKey(5, 2))
-
-
-class Traces(NullObserver):
-    """Keeps where the particles were, and spoils what it is shown."""
-
-    def __init__(self) -> None:
-        self.traced: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self.progressed: list[tuple[int, int]] = []
-
-    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
-        assert stage == "svgd"
-        self.traced[iteration] = vectors.copy(), cost.copy()
-        vectors[:], cost[:] = np.nan, np.nan
-
-    def progress(self, stage: str, iteration: int, total: int) -> None:
-        self.progressed.append((iteration, total))
+    initial_set = around_truth() if initial_set is None else initial_set
+    return RegistrationProblem(BOX_GRID, points, initial_set, WORKSPACE, 0.05, StreamKey(5, 2))
 
 
 @pytest.mark.parametrize("median", [False, True])
@@ -164,23 +135,23 @@ def test_particles_in_one_place_share_their_scores() -> None:
 
 @pytest.mark.parametrize("kernel", ["reference", "median"])
 def test_particles_move_as_torch_would_move_them(kernel: str) -> None:
-    problem = posed(initial_set=starts(6, 0.02, 0.002))
+    problem = posed(initial_set=around_truth(6, 0.02, 0.002))
     settings = SvgdSettings(kernel=kernel, scale=0.05, iterations=60)
-    kept = Traces()
+    kept = Watcher()
     Svgd(settings).register(problem, kept)
     cost, space = RelaxedCost.of(problem, settings.cost), SE3Space()
     vectors = torch.from_numpy(Poses.of(problem.initial_set).vectors.copy()).requires_grad_()
     adam = torch.optim.Adam([vectors], **ADAM)  # type: ignore[arg-type]
     for iteration in range(60):
-        if iteration == 50:
-            np.testing.assert_allclose(kept.traced[50][0], vectors.detach(), atol=1e-8)
+        if iteration == kept.iterations[1] == 50:
+            np.testing.assert_allclose(kept.traces[1].vectors, vectors.detach(), atol=1e-8)
         (gradient,) = torch.autograd.grad(cost(*decode(space, vectors)).sum(), vectors)
         phi = directions_by_torch(
             vectors, -settings.sharpness * gradient, settings.scale, median=kernel == "median"
         )
         vectors.grad = -phi
         adam.step()
-    np.testing.assert_allclose(kept.traced[60][0], vectors.detach(), atol=1e-8)
+    np.testing.assert_allclose(kept.traces[2].vectors, vectors.detach(), atol=1e-8)
 
 
 def test_the_object_is_found_where_it_was_touched_all_over() -> None:
@@ -197,7 +168,7 @@ def test_the_object_is_found_where_it_was_touched_all_over() -> None:
 
 
 def test_a_kernel_of_wide_reach_keeps_particles_apart() -> None:
-    problem = posed(initial_set=starts(8, 0.01, 0.001))
+    problem = posed(initial_set=around_truth(8, 0.01, 0.001))
     spreads = [
         Svgd(SvgdSettings(scale=scale))
         .register(problem)
@@ -210,16 +181,14 @@ def test_a_kernel_of_wide_reach_keeps_particles_apart() -> None:
 
 
 def test_an_observer_sees_every_fifty_iterations_and_changes_nothing() -> None:
-    problem, kept = posed(), Traces()
+    problem, kept = posed(), Watcher()
     method = Svgd(SvgdSettings(iterations=120))
     assert method.register(problem, kept).digest == method.register(problem).digest
-    assert list(kept.traced) == [0, 50, 100, 120]
-    assert kept.progressed == [(50, 120), (100, 120), (120, 120)]
-    np.testing.assert_array_equal(kept.traced[0][0], Poses.of(problem.initial_set).vectors)
-    means = [float(cost.mean()) for _, cost in kept.traced.values()]
+    assert [trace[:2] for trace in kept.traces] == [("svgd", n) for n in (0, 50, 100, 120)]
+    assert kept.progressed == [("svgd", done, 120) for done in (50, 100, 120)]
+    np.testing.assert_array_equal(kept.traces[0].vectors, Poses.of(problem.initial_set).vectors)
+    means = [float(trace.cost.mean()) for trace in kept.traces]
     assert means[-1] < 0.5 * means[0]
-    with threads(2):
-        assert method.register(posed()).digest == method.register(problem).digest
 
 
 def test_a_particle_need_not_remember_what_is_around_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,67 +198,6 @@ def test_a_particle_need_not_remember_what_is_around_it(monkeypatch: pytest.Monk
     assert Svgd().register(problem).digest == first
 
 
-@pytest.mark.parametrize("kernel", ["reference", "median"])
-@pytest.mark.parametrize(
-    "points",
-    [
-        KnownPoints(known=CONTACTS[:1]),
-        KnownPoints(free=CONTACTS),
-        KnownPoints(occupied=TRUTH[None, :3, 3]),
-        KnownPoints(known=CONTACTS + 1e8),
-    ],
-    ids=["one contact", "free alone", "occupied alone", "far off"],
-)
-@pytest.mark.parametrize("count", [1, 8])
-def test_odd_problems_have_results(points: KnownPoints, kernel: str, count: int) -> None:
-    settings = SvgdSettings(kernel=kernel, iterations=20)
-    found = Svgd(settings).register(posed(points, starts(count)))
-    assert np.isfinite(found.cost).all()
-    assert np.isfinite(found.object_from_world).all()
-    same = np.tile(starts(1), (3, 1, 1))
-    assert np.isfinite(Svgd(settings).register(posed(points, same)).cost).all()
-
-
-def test_points_beyond_all_numbers_are_one_clear_error() -> None:
-    points = KnownPoints(known=np.full((3, 3), 1e300))
-    with pytest.raises(ChselError, match="no hypothesis has a finite cost"):
-        Svgd(SvgdSettings(iterations=3)).register(posed(points))
-
-
 def test_more_particles_than_pairs_can_be_held_of_are_one_clear_error() -> None:
     with pytest.raises(SettingError, match="number of poses in E_0 is 10001; accepted: at most"):
         Svgd().register(posed(initial_set=np.tile(np.eye(4), (10_001, 1, 1))))
-
-
-def test_on_a_plane_every_hypothesis_stands_on_it() -> None:
-    settings = SvgdSettings(plane=PlaneSettings(plane_height=0.3), iterations=50)
-    found = Svgd(settings).register(posed())
-    world = inverse(found.object_from_world)
-    np.testing.assert_allclose(world[:, 2, 3] - SIDES[2] / 2.0, 0.3, atol=1e-3)
-    np.testing.assert_allclose(world[:, 2, 2], 1.0, atol=1e-12)
-
-
-def test_presets_have_the_values_that_were_published() -> None:
-    for preset in PRESETS:
-        settings = preset_settings("svgd", preset)
-        values: Any = (settings.sharpness, settings.kernel, settings.scale)
-        assert values == (5.0, "reference", 0.01)
-        assert (settings.iterations, settings.rate) == (300, 0.005)
-    assert preset_settings("svgd", "reference").cost.free_term == "interior"
-    assert preset_settings("svgd", "paper").online.rotation_law == "axis_gauss"
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("sharpness", 0.0),
-        ("kernel", "rbf"),
-        ("scale", -1.0),
-        ("rate", float("nan")),
-        ("iterations", -1),
-        ("iterations", 10**7),
-    ],
-)
-def test_settings_out_of_bounds_are_refused(name: str, value: object) -> None:
-    with pytest.raises(SettingError, match=f"{name} is .*accepted"):
-        replace(SvgdSettings(), **{name: value})

@@ -1,0 +1,143 @@
+"""What tests of methods share: bodies, what is known of them, and an observer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+
+from chsel.methods.method import Method
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.online_registration import pose_problem
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose, inverse, product
+from chsel.problem.registration_problem import (
+    ArchiveSnapshot,
+    Hypotheses,
+    NullObserver,
+    RegistrationProblem,
+)
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+
+TRUTH = compose(axis_angle(np.array([0.0, 0.6, 0.8]), np.array(0.7)), np.array([0.2, 0.1, 0.3]))
+STANDING = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(2.0)), np.array([0.2, 0.1, 0.3]))
+WORKSPACE = Workspace((-0.1, -0.2, 0.0), (0.5, 0.4, 0.6))
+SIDE = 0.025  # of free voxels, metres
+
+
+def l_shape() -> trimesh.Trimesh:
+    """A body without symmetry."""
+    arms = ([0.2, 0.06, 0.05], [0.06, 0.14, 0.05], [0.06, 0.06, 0.1])
+    parts = [trimesh.creation.box(bounds=np.array([[0.0, 0.0, 0.0], arm])) for arm in arms]
+    return trimesh.boolean.union(parts, engine="manifold")
+
+
+MESH = l_shape()
+GRID = SdfGrid.from_mesh(MESH, 0.01)
+BOX_SIDES = np.array([0.2, 0.12, 0.08])
+BOX = trimesh.creation.box(BOX_SIDES)
+BOX_GRID = SdfGrid.from_mesh(BOX, 0.01)
+
+
+def contacts_on(mesh: trimesh.Trimesh, count: int) -> FloatArray:
+    """Points (count, 3) all over a body at TRUTH."""
+    return apply(TRUTH, np.asarray(trimesh.sample.sample_surface(mesh, count, seed=1)[0]))
+
+
+def known_points(world_from_object: FloatArray, contacts: int) -> KnownPoints:
+    """Contacts with the L, and the free voxels of the workspace that miss it."""
+    surface = trimesh.sample.sample_surface(MESH, contacts, seed=1)[0]
+    lower, upper = WORKSPACE.bounds
+    counts = np.rint((upper - lower) / SIDE).astype(int)
+    free = lower + SIDE * (0.5 + np.indices(counts).reshape(3, -1).T)
+    sdf, _ = GRID.query(apply(inverse(world_from_object), free))
+    return KnownPoints(free=free[sdf.numpy() > SIDE], known=apply(world_from_object, surface))
+
+
+POINTS = known_points(TRUTH, 40)
+_FREE, _KNOWN = POINTS.free, POINTS.known
+_INSIDE = apply(TRUTH, np.array([[0.03, 0.03, 0.03], [0.15, 0.03, 0.025]]))
+ODD = {
+    "one contact": KnownPoints(known=_KNOWN[:1]),
+    "two contacts": KnownPoints(known=_KNOWN[:2]),
+    "three contacts": KnownPoints(known=_KNOWN[:3]),
+    "one place": KnownPoints(known=np.repeat(_KNOWN[:1], 20, axis=0)),
+    "a line": KnownPoints(known=np.linspace([0.1, 0.1, 0.1], [0.3, 0.3, 0.3], 5)),
+    "hundreds": known_points(TRUTH, 400),
+    "free": KnownPoints(free=_FREE),
+    "one voxel": KnownPoints(free=_FREE[:1]),
+    "one voxel and contacts": KnownPoints(free=_FREE[:1], known=_KNOWN[:4]),
+    "occupied": KnownPoints(occupied=_INSIDE),
+    "occupied and contacts": KnownPoints(occupied=_INSIDE, known=_KNOWN[:3]),
+    "depths": KnownPoints(known=_KNOWN[:4], known_sdf=[0.05, -0.01, 0.0, 0.3]),
+    "contradictory": KnownPoints(free=_KNOWN, known=_KNOWN),
+    "far": KnownPoints(free=_FREE + 1e6, known=_KNOWN + 1e6),
+    "a stray contact": KnownPoints(known=np.concatenate([_KNOWN, [[1e9, 1e9, 1e9]]])),
+    "vast": KnownPoints(free=[[1e200, 0.0, 0.0]], known=[[1e150, 0.0, 0.0]]),
+    "all over": KnownPoints(free=np.linspace([0.0, 0.0, 0.0], [1e200, -1e200, 1e200], 2500)),
+}
+"""Points that tell little, or are hardly those of an object."""
+
+
+def posed(
+    method: Method,
+    points: KnownPoints = POINTS,
+    previous: Hypotheses | None = None,
+    sdf: SdfGrid = GRID,
+    **changes: Any,
+) -> RegistrationProblem:
+    """The problem that a method is given, with other fields as said."""
+    key = StreamKey(3, 1)
+    problem = pose_problem(sdf, points, WORKSPACE, SIDE, key, method.online, previous)
+    return replace(problem, **changes)
+
+
+def around_truth(count: int = 8, angle: float = 0.3, shift: float = 0.03) -> FloatArray:
+    """E_0 (count, 4, 4), turned by an angle and shifted at random."""
+    random = np.random.default_rng(3)
+    axis = random.standard_normal((count, 3))
+    axis /= np.sqrt((axis**2).sum(axis=1, keepdims=True))
+    turn = product(axis_angle(axis, angle), TRUTH[:3, :3])
+    return inverse(compose(turn, TRUTH[:3, 3] + shift * random.standard_normal((count, 3))))
+
+
+class Trace(NamedTuple):
+    """What an observer is shown of a search."""
+
+    stage: str
+    iteration: int
+    vectors: FloatArray  # (B, d)
+    cost: FloatArray  # (B,)
+
+
+@dataclass
+class Watcher(NullObserver):
+    """Keeps all that it is shown, and spoils the arrays."""
+
+    snapshot_interval: int = 0
+
+    def __post_init__(self) -> None:
+        self.traces: list[Trace] = []
+        self.progressed: list[tuple[str, int, int]] = []  # stage, iteration, total
+        self.archives: list[ArchiveSnapshot] = []
+
+    @property
+    def iterations(self) -> list[int]:
+        """Those that were traced."""
+        return [trace.iteration for trace in self.traces]
+
+    def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
+        """Keep copies."""
+        self.traces.append(Trace(stage, iteration, vectors.copy(), cost.copy()))
+        vectors[:], cost[:] = np.nan, np.nan
+
+    def progress(self, stage: str, iteration: int, total: int) -> None:
+        """Keep the numbers."""
+        self.progressed.append((stage, iteration, total))
+
+    def snapshot(self, archive: ArchiveSnapshot) -> None:
+        """Keep it."""
+        self.archives.append(archive)

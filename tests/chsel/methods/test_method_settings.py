@@ -1,0 +1,215 @@
+"""Settings of all methods: presets, single changes, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from chsel.cost.cost_settings import CostSettings
+from chsel.errors import SettingError
+from chsel.methods import METHODS, OURS, build_method, preset_settings
+from chsel.methods.anchored.anchor_sampling import AnchoredStarts, AnchorSettings
+from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
+from chsel.methods.cvo.cvo import CvoSettings
+from chsel.methods.gradient_descent import DescentSettings
+from chsel.methods.icp import Icp, IcpSettings
+from chsel.methods.medial_constraint.cma_es import CmaEsSettings
+from chsel.methods.medial_constraint.medial_cost import MedialCostSettings
+from chsel.methods.svgd import SvgdSettings
+from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.settings import PRESETS, settings_mapping
+from chsel.qd.selection import OutputSettings
+
+NAN, INF = float("nan"), float("inf")
+REFUSED: dict[type[Any], list[tuple[dict[str, Any], str]]] = {
+    AnchoredSettings: [
+        ({"size": "huge"}, "^size is .*accepted: "),
+        ({"noise": 0.0}, "^noise is "),
+        ({"penetration_tolerance": -0.001}, "^penetration_tolerance is "),
+        ({"limit_noise": INF}, "^limit_noise is "),
+        ({"limit_ratio": -1.0}, "^limit_ratio is "),
+        ({"limit_slack": NAN}, "^limit_slack is "),
+        ({"outer_share": 1.1}, "^outer_share is "),
+        ({"outer_noise": -1.0}, "^outer_noise is "),
+    ],
+    Effort: [
+        ({"samples": 0}, "^samples is "),
+        ({"samples": 10**12}, "^samples is "),
+        ({"kept": -1}, "^kept is "),
+        ({"refined": 0}, "^refined is "),
+        ({"descents": 0}, "^descents is "),
+        ({"chains": 0}, "^chains is "),
+        ({"moves": -1}, "^moves is "),
+        ({"polished": -3}, "^polished is "),
+        ({"polish_moves": -1}, "^polish_moves is "),
+        ({"enough": 0.0}, "^enough is "),
+        ({"evaluations": NAN}, "^evaluations is "),
+    ],
+    AnchorSettings: [
+        ({"pairs": 0.8, "contacts": 0.3}, "^pairs and contacts are 0.8 and 0.3; accepted: shares"),
+        ({"pairs": -0.1}, "^pairs is -0.1; "),
+        ({"margin": NAN}, "^margin is nan; "),
+    ],
+    AnchoredStarts: [
+        ({"samples": 0}, "^samples is 0; "),
+        ({"samples": 10**9}, "^samples is 1000000000; "),
+        ({"kept": 0}, "^kept is 0; "),
+        ({"kept": 10**6}, "^kept is 1000000; "),
+    ],
+    CmaEsSettings: [
+        ({"starts": "many"}, "^starts is 'many'; accepted: per_start, single"),
+        ({"population": 0}, "^population is 0"),
+        ({"generations": 20_001}, "^generations is 20001; accepted: at most 20_000"),
+        ({"sigma0": 0.0}, r"^sigma0 is 0\.0"),
+        ({"tolfun": -1.0}, r"^tolfun is -1\.0"),
+    ],
+    CostSettings: [
+        ({"penetration_tolerance": 0.01}, "^penetration_tolerance is 0.01"),
+        ({"free_scale": -1.0}, "^free_scale is -1.0"),
+        ({"free_term": "inside"}, "accepted: direct, interior"),
+        ({"lookup": "cubic"}, "accepted: nearest, trilinear"),
+        ({"free_term": "interior", "gradient": "exact"}, "piecewise constant.*accepted"),
+    ],
+    CvoSettings: [
+        ({"ell": 0.0}, "^ell is 0.0"),
+        ({"ell": 1e-9}, "accepted: 1e-06 to 1000"),
+        ({"c": NAN}, "^c is nan"),
+        ({"max_iterations": 0}, "^max_iterations is 0"),
+        ({"max_iterations": 10_000_000}, "accepted: at most 1_000_000"),
+        ({"sp_thres": 0.0065}, "accepted: .*below sigma"),
+        ({"min_step": 0.9}, "accepted: .*min_step at most max_step"),
+        ({"max_step": 2.0}, "accepted: .*max_step at most 1"),
+        ({"ell_decay": 1.0}, "accepted: .*below 1"),
+        ({"ell_decay": 0.99, "ell_min": 1e-3}, "more than 20 ascents.*accepted"),
+        ({"origin": "moon"}, "accepted: world, workspace"),
+        ({"surface_band": -1.0}, "^surface_band is -1.0"),
+        ({"stop_below": -1.0}, "^stop_below is -1.0"),
+    ],
+    DescentSettings: [({"stop_below": NAN}, "^stop_below is nan")],
+    IcpSettings: [
+        ({"surface_points": 0}, "^surface_points is 0"),
+        ({"surface_points": 10**9}, "^surface_points is "),
+        ({"redraw": "never"}, "^redraw is 'never'"),
+        ({"iterations": -1}, "^iterations is -1"),
+        ({"iterations": 10**7}, "^iterations is "),
+        ({"stop_below": 1.0}, "^stop_below is 1.0"),
+        ({"stop_below": NAN}, "^stop_below is nan"),
+    ],
+    MedialCostSettings: [
+        ({"inflation": -1.0}, "^inflation is -1"),
+        ({"ball_scale": -1.0}, "^ball_scale is -1"),
+        ({"known_scale": -1.0}, "^known_scale is -1"),
+    ],
+    OnlineSettings: [({"rotation_law": "uniform"}, "accepted: axis_gauss, rotvec_gauss")],
+    OutputSettings: [
+        ({"choice": "best"}, "^choice is 'best'; "),
+        ({"margin": -0.1}, "^margin is -0.1; "),
+        ({"margin": NAN}, "^margin is nan; "),
+    ],
+    SvgdSettings: [
+        ({"sharpness": 0.0}, "^sharpness is 0.0"),
+        ({"kernel": "rbf"}, "^kernel is 'rbf'"),
+        ({"scale": -1.0}, "^scale is -1.0"),
+        ({"rate": NAN}, "^rate is nan"),
+        ({"iterations": -1}, "^iterations is -1"),
+        ({"iterations": 10**7}, "^iterations is "),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "changes", "message"),
+    [(settings, *row) for settings, rows in REFUSED.items() for row in rows],
+)
+def test_values_out_of_bounds_are_refused(
+    settings: type[Any], changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SettingError, match=message) as caught:
+        settings(**changes)
+    assert "accepted: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["anchored", "chsel", "medial_constraint_cma_me"])
+def test_a_measure_that_does_not_fit_the_space_is_refused(name: str) -> None:
+    settings = preset_settings(name)
+    archive = replace(settings.archive, measure="plane_angle")
+    with pytest.raises(SettingError, match="plane_angle exists only with plane"):
+        replace(settings, archive=archive)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_class_defaults_are_the_default_preset(name: str) -> None:
+    settings = preset_settings(name)
+    variant = {"chsel_cma_me": {"search": "cma_me"}, "cvo_no_free_space": {"free_space": False}}
+    assert settings == replace(type(settings)(), **variant.get(name, {}))
+    assert build_method(name).settings == build_method(name, {}).settings == settings
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_one_setting_changes_and_nothing_else(name: str) -> None:
+    """Also one of a group, whose other settings have another default in the group's own class."""
+    before = settings_mapping(preset_settings(name))
+    paths = list(_paths(before))
+    assert len(paths) > 5
+    for path in paths:
+        *groups, last = path
+        value = before
+        for group in path:
+            value = value[group]
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            continue
+        changes: dict[str, Any] = {last: value + 1 if isinstance(value, int) else 0.9 * value}
+        expected = deepcopy(before)
+        inner = expected
+        for group in groups:
+            inner = inner[group]
+        inner[last] = changes[last]
+        for group in reversed(groups):
+            changes = {group: changes}
+        assert settings_mapping(build_method(name, changes).settings) == expected, path
+
+
+def test_a_preset_names_what_differs_alone() -> None:
+    for name in OURS:
+        if name == "medial_constraint_cma_me":  # of CHSEL's presets; its defaults are its own
+            continue
+        default = settings_mapping(preset_settings(name))
+        for preset, changes in getattr(type(preset_settings(name)), "presets", {}).items():
+            assert preset in PRESETS[1:]
+            for path in _paths(changes):
+                here: Any = changes
+                ours: Any = default
+                for group in path:
+                    here, ours = here[group], ours[group]
+                assert here != ours, f"{name}, {preset}: {path}"
+
+
+def _paths(settings: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The paths of all settings that are no groups."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            yield from ((name, *path) for path in _paths(value))
+        elif not isinstance(value, Mapping):
+            yield (name,)
+
+
+def test_an_installed_class_may_give_the_settings_of_each_preset(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Theirs(Icp):
+        @staticmethod
+        def preset(name: str) -> IcpSettings:
+            return IcpSettings(iterations=PRESETS.index(name) + 7)
+
+    monkeypatch.setattr("chsel.methods.registry.METHODS", (*METHODS, "theirs"))
+    monkeypatch.setattr(
+        "chsel.methods.registry.installed_method", lambda _: (Theirs, IcpSettings())
+    )
+    assert [preset_settings("theirs", name).iterations for name in PRESETS] == [7, 8, 9]
+    changed = build_method("theirs", {"redraw": "registration"}).settings
+    assert changed == IcpSettings(iterations=7, redraw="registration")
