@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
 from chsel import KnownPoints, SdfGrid, Workspace
-from chsel.errors import SettingError
 from chsel.problem.online_registration import (
     OnlineSettings,
     first_initial_set,
@@ -15,6 +16,7 @@ from chsel.problem.online_registration import (
 from chsel.problem.poses import axis_angle, compose, inverse, rotation_angle
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.streams import StreamKey
+from tests.chsel.samples import hypotheses_at
 
 WORKSPACE = Workspace((-0.1, -0.3, 0.0), (0.5, 0.3, 0.6))
 KEY = StreamKey(5, 2)
@@ -24,9 +26,7 @@ MANY = 100_000
 def result(count: int = 3) -> Hypotheses:
     rotation = axis_angle(np.tile([0.0, 0.6, 0.8], (count, 1)), np.linspace(0.1, 2.0, count))
     poses = compose(rotation, np.linspace(0.0, 0.3, 3 * count).reshape(count, 3))
-    cost = np.arange(count, dtype=float)
-    elites = np.concatenate([poses, inverse(poses)])
-    return Hypotheses(poses, cost, cost < 0, np.full(count, -1), elites)
+    return replace(hypotheses_at(poses), elites=np.concatenate([poses, inverse(poses)]))
 
 
 def test_first_of_the_updated_set_is_the_best_pose_to_the_bit() -> None:
@@ -116,8 +116,3 @@ def test_every_step_draws_the_same_numbers_whatever_ran_before() -> None:
     other = first_initial_set(WORKSPACE, KnownPoints(), StreamKey(2, 4), settings)
     assert first.tobytes() == again.tobytes()
     assert (first != other).any(axis=(1, 2)).all()
-
-
-def test_a_law_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(SettingError, match="accepted: axis_gauss, rotvec_gauss"):
-        OnlineSettings(rotation_law="uniform")

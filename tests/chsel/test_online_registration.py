@@ -9,6 +9,7 @@ from chsel.errors import ChselError, PoseError
 from chsel.problem.online_registration import OnlineSettings, Start, pose_problem
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
+from tests.chsel.samples import hypotheses_at
 
 GRID = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.06, 0.04)), 0.02)
 WORKSPACE = Workspace((-0.1, -0.3, 0.0), (0.5, 0.3, 0.6))
@@ -18,9 +19,7 @@ PROBES = [KnownPoints(known=[[0.1 * step, 0.0, 0.1]]) for step in range(4)]
 
 def starts_as_found(problem: RegistrationProblem) -> Hypotheses:
     """E_0 at ascending costs, the last pose first."""
-    poses, count = problem.initial_set[::-1], len(problem.initial_set)
-    none = np.full(count, -1)
-    return Hypotheses(poses, np.arange(float(count)), np.zeros(count, bool), none, poses)
+    return hypotheses_at(problem.initial_set[::-1])
 
 
 class FailsAt:
@@ -116,8 +115,7 @@ def test_without_a_method_problems_follow_from_what_is_remembered() -> None:
 
 
 def test_a_result_without_poses_cannot_be_followed() -> None:
-    empty = np.zeros((0, 4, 4))
-    nothing = Hypotheses(empty, np.zeros(0), np.zeros(0, bool), np.zeros(0, int), empty)
+    nothing = hypotheses_at(np.zeros((0, 4, 4)))
     online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS, points=PROBES[0], previous=nothing)
     with pytest.raises(PoseError, match="has no hypotheses; accepted: at least one"):
         online.pose(1)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,28 +25,20 @@ from chsel.numerics.threads import threads
 from chsel.problem.poses import Poses, compose, random_rotations
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 from tests.chsel.problem.torch_spaces import decode
+from tests.chsel.samples import ball_grid, random_poses
 
 pytestmark = pytest.mark.filterwarnings("ignore:free_term interior uses")
 BOX_SIDES = (0.12, 0.08, 0.06)
 
 
-def sphere(radius: float, resolution: float, half: int) -> SdfGrid:
-    """The exact signed distance of a sphere, whose values need all of 64 bits."""
-    nodes = np.moveaxis(np.indices((2 * half + 1,) * 3), 0, -1) * resolution - half * resolution
-    distance = np.sqrt((nodes**2).sum(axis=-1))
-    safe = np.where(distance > 0.0, distance, 1.0)[..., None]
-    gradient = np.where(distance[..., None] > 0.0, nodes / safe, [1.0, 0.0, 0.0])
-    return SdfGrid(np.full(3, -half * resolution), resolution, distance - radius, gradient)
-
-
 @cache
 def grid_of(name: str) -> SdfGrid:
     if name == "sphere":
-        return sphere(0.05, 0.01, 9)
+        return ball_grid(0.05, 0.01, 9)
     if name == "box":
         return SdfGrid.from_mesh(trimesh.creation.box(BOX_SIDES), 0.006, padding=0.03)
     if name == "dyadic":  # a grid whose nodes and borders are exact numbers
-        return sphere(0.07, 2.0**-6, 8)
+        return ball_grid(0.07, 2.0**-6, 8)
     legs = [trimesh.creation.box(sides) for sides in ((0.16, 0.07, 0.06), (0.07, 0.14, 0.06))]
     legs[0].apply_translation([0.05, -0.04, 0.0])
     resolution = 0.004 if name == "fine l_shape" else 0.012
@@ -107,12 +100,11 @@ def cases(draw: st.DrawFn, free_terms: tuple[str, ...] = ("direct", "interior"))
     occupied = stream.uniform(-0.15, 0.15, (draw(st.integers(0, 6)), 3))
     points = KnownPoints(free, occupied, known, stream.uniform(-0.03, 0.03, len(known)))
     count, reach = draw(st.integers(1, 9)), draw(st.sampled_from([0.03, 0.1, 0.4]))
-    translations = stream.uniform(-reach, reach, (count, 3))
     space: SearchSpace = SE3Space()
     if draw(st.integers(0, 3)) == 0:
         axis = tuple(stream.standard_normal(3).tolist())
         space = SE2Space(PlaneSettings(axis=axis, offset=0.01), grid_of(shape))
-    vectors = space.encode(Poses.of(compose(random_rotations(stream, count), translations)))
+    vectors = space.encode(Poses.of(random_poses(stream, count, reach)))
     if space.dimension == 9:  # raw vectors are not orthonormal
         vectors[:, :6] += stream.uniform(-0.2, 0.2, (count, 6))
     return Case(shape, points, changes, resolution, vectors, space)
@@ -279,7 +271,7 @@ def test_200_000_free_points_cost_to_the_bit_what_their_sum_one_by_one_is(
 ) -> None:
     sdf, free, stream = grid_of("l_shape"), make(), np.random.default_rng(4)
     changes = CostSettings(lookup=lookup)
-    transforms = compose(random_rotations(stream, 5), stream.uniform(-0.2, 0.2, (5, 3)))
+    transforms = random_poses(stream, 5, 0.2)
     transforms[0] = np.eye(4)
     poses = Poses.of(transforms)
     culled, direct = (
@@ -402,8 +394,7 @@ def test_a_culling_that_does_not_fit_is_refused(free_term: str, spacing: float, 
 )
 def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term: str) -> None:
     stream = np.random.default_rng(7)
-    transforms = compose(random_rotations(stream, 4), stream.uniform(-0.02, 0.02, (4, 3)))
-    vectors = SE3Space().encode(Poses.of(transforms))
+    vectors = SE3Space().encode(Poses.of(random_poses(stream, 4, 0.02)))
     changes = CostSettings(free_term=free_term)
     case = Case("box", edge_points(name), changes, 0.01, vectors, SE3Space())
     assert_equals_torch(case)
@@ -538,8 +529,9 @@ def test_tolerance_zero_charges_every_free_point_inside_of_the_object() -> None:
 def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_nothing() -> None:
     changes = CostSettings(penetration_tolerance=-0.2)
     free = np.random.default_rng(12).uniform(-0.05, 0.05, (100, 3))
-    with pytest.warns(UserWarning, match="cannot be violated"):
-        cost = CompiledCost(grid_of("box"), KnownPoints(free), changes)
+    for made in (RelaxedCost, CompiledCost):
+        with pytest.warns(UserWarning, match="cannot be violated"):
+            cost: Any = made(grid_of("box"), KnownPoints(free), changes)
     assert cost.evaluate(np.eye(4)[None])[0] == 0.0
     objective = Objective(cost, SE3Space())
     vectors = SE3Space().encode(Poses.of(np.eye(4)[None]))
@@ -549,10 +541,12 @@ def test_tolerance_deeper_than_the_object_is_a_warning_and_costs_free_points_not
         CompiledCost(grid_of("box"), KnownPoints(known=free), changes)
 
 
-def test_an_interior_term_without_interior_points_says_what_to_do() -> None:
+@pytest.mark.filterwarnings("ignore:.*cannot be violated")
+@pytest.mark.parametrize("cost", [CompiledCost, RelaxedCost])
+def test_an_interior_term_without_interior_points_says_what_to_do(cost: Any) -> None:
     changes = CostSettings(free_term="interior", penetration_tolerance=-0.2)
     with pytest.raises(SettingError, match="penetration_tolerance nearer to 0"):
-        CompiledCost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0]]), changes)
+        cost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0]]), changes)
 
 
 @pytest.mark.parametrize("far", [1e9, 1e19, 1e300])

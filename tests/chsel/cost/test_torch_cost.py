@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
-from chsel.errors import SettingError
-from chsel.problem.poses import Poses, compose, random_rotations
+from chsel.problem.poses import Poses
 from chsel.problem.search_space import SE3Space
 from tests.chsel.problem.torch_spaces import decode
+from tests.chsel.samples import ball_grid, random_poses
 
 RADIUS = 0.1
 EYE = torch.eye(3, dtype=torch.float64)[None]
@@ -25,12 +25,7 @@ ORIGIN = torch.zeros((1, 3), dtype=torch.float64)
 @pytest.fixture(scope="module")
 def sphere() -> SdfGrid:
     """Exact signed distance of a sphere at nodes that hold the points of the closed forms."""
-    axis = np.arange(-25, 26) * 0.01
-    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    distance = np.sqrt((nodes**2).sum(axis=-1))
-    safe = np.where(distance > 0.0, distance, 1.0)[..., None]
-    gradient = np.where(distance[..., None] > 0.0, nodes / safe, [1.0, 0.0, 0.0])
-    return SdfGrid(np.full(3, -0.25), 0.01, distance - RADIUS, gradient)
+    return ball_grid(RADIUS, 0.01, 25)
 
 
 def value_and_translation_gradient(
@@ -116,9 +111,7 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
     cost = RelaxedCost(sphere, points, changes, free_resolution=0.02)
     compiled = CompiledCost(sphere, points, changes, free_resolution=0.02)
     space = SE3Space()
-    vector = space.encode(
-        Poses.of(compose(random_rotations(stream, 1), stream.uniform(-0.02, 0.02, (1, 3))))
-    )
+    vector = space.encode(Poses.of(random_poses(stream, 1, 0.02)))
     vector[:, :6] *= 1.3  # raw vectors are not orthonormal
     _, gradient = Objective(compiled, space).costs_and_gradients(vector)
     expected = np.zeros(9)
@@ -174,7 +167,7 @@ def test_interior_term_counts_interior_points_in_free_voxels(sphere: SdfGrid) ->
     free = np.stack(np.meshgrid(axis[axis > 0], axis, axis, indexing="ij"), -1).reshape(-1, 3)
     settings_ = CostSettings(penetration_tolerance=-0.01, free_term="interior", lookup="nearest")
     cost = RelaxedCost(sphere, KnownPoints(free=free), settings_, free_resolution=0.01)
-    nodes = np.stack(np.meshgrid(*[np.arange(-25, 26) * 0.01] * 3, indexing="ij"), -1)
+    nodes = np.moveaxis(np.indices((51, 51, 51)), 0, -1) * 0.01 - 25 * 0.01
     s = np.sqrt((nodes**2).sum(-1)) - RADIUS
     deep = (s < -0.01) & (nodes[..., 0] > 0.005)
     assert cost.evaluate(np.eye(4)[None])[0] == pytest.approx(20 * -s[deep].sum(), rel=1e-9)
@@ -199,7 +192,7 @@ def test_volume_normalise_weighs_interior_points_by_their_voxel_share(sphere: Sd
 def test_free_term_leaves_no_violated_point_out(seed: int, count: int, poses: int) -> None:
     stream = np.random.default_rng(seed)
     grid = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.06, 0.04)), 0.01)
-    transforms = compose(random_rotations(stream, poses), stream.uniform(-0.05, 0.05, (poses, 3)))
+    transforms = random_poses(stream, poses, 0.05)
     free = stream.uniform(-0.15, 0.15, (count, 3))
     free[: count // 2] = np.round(free[: count // 2], 2)  # onto nodes and voxel borders
     for lookup in ("nearest", "trilinear"):
@@ -216,7 +209,7 @@ def test_free_term_leaves_no_violated_point_out(seed: int, count: int, poses: in
 
 def test_a_pose_costs_the_same_alone_and_in_any_batch(sphere: SdfGrid) -> None:
     stream = np.random.default_rng(1)
-    transforms = compose(random_rotations(stream, 9), stream.uniform(-0.1, 0.1, (9, 3)))
+    transforms = random_poses(stream, 9, 0.1)
     points = KnownPoints(
         stream.uniform(-0.2, 0.2, (500, 3)), known=stream.uniform(-0.2, 0.2, (9, 3))
     )
@@ -224,32 +217,3 @@ def test_a_pose_costs_the_same_alone_and_in_any_batch(sphere: SdfGrid) -> None:
     alone = [cost.evaluate(one[None])[0] for one in transforms]
     np.testing.assert_array_equal(cost.evaluate(transforms), alone)
     assert cost.evaluate(transforms[:0]).shape == (0,)
-
-
-def test_no_interior_point_is_an_error_that_says_what_to_do(sphere: SdfGrid) -> None:
-    changes = CostSettings(free_term="interior", penetration_tolerance=-0.2)
-    with (
-        pytest.warns(UserWarning, match="cannot be violated"),
-        pytest.raises(SettingError, match="penetration_tolerance nearer to 0"),
-    ):
-        RelaxedCost(sphere, KnownPoints(free=[[0, 0, 0]]), changes)
-
-
-def test_tolerance_deeper_than_the_object_is_a_warning(sphere: SdfGrid) -> None:
-    with pytest.warns(UserWarning, match="cannot be violated"):
-        RelaxedCost(sphere, KnownPoints(free=[[0, 0, 0]]), CostSettings(penetration_tolerance=-0.2))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"penetration_tolerance": 0.01}, "penetration_tolerance is 0.01"),
-        ({"free_scale": -1.0}, "free_scale is -1.0"),
-        ({"free_term": "inside"}, "accepted: direct, interior"),
-        ({"lookup": "cubic"}, "accepted: nearest, trilinear"),
-        ({"free_term": "interior", "gradient": "exact"}, "piecewise constant"),
-    ],
-)
-def test_settings_out_of_range_are_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        CostSettings(**changes)  # type: ignore[arg-type]

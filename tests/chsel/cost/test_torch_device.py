@@ -17,9 +17,10 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.torch_cost import gpus
 from chsel.errors import EngineError, SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import Poses, compose, random_rotations
+from chsel.problem.poses import Poses
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space
 from tests.chsel.problem.torch_spaces import decode
+from tests.chsel.samples import random_poses
 
 needs_gpu = pytest.mark.skipif(gpus() == 0, reason="torch finds no GPU here")
 SETTINGS = [
@@ -47,8 +48,7 @@ def points() -> KnownPoints:
 
 
 def poses(count: int, reach: float = 0.2) -> FloatArray:
-    stream = np.random.default_rng(1)
-    return compose(random_rotations(stream, count), stream.uniform(-reach, reach, (count, 3)))
+    return random_poses(np.random.default_rng(1), count, reach)
 
 
 def costs_and_gradients(cost: RelaxedCost, space: Any, vectors: FloatArray) -> list[FloatArray]:

@@ -13,19 +13,19 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import Poses, compose, random_rotations
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 from tests.chsel.methods.scene import Watcher
 from tests.chsel.problem.torch_spaces import decode
+from tests.chsel.samples import random_poses
 
 SIDES = np.array([0.12, 0.08, 0.06])
 BOX = SdfGrid.from_mesh(trimesh.creation.box(SIDES), 0.01)
 
 
 def starts(count: int, seed: int = 0, reach: float = 0.02) -> FloatArray:
-    stream = np.random.default_rng(seed)
-    return compose(random_rotations(stream, count), stream.uniform(-reach, reach, (count, 3)))
+    return random_poses(np.random.default_rng(seed), count, reach)
 
 
 def scene(seed: int = 0) -> KnownPoints:

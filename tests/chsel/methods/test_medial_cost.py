@@ -10,24 +10,17 @@ from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSe
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import Poses, apply, compose, random_rotations
+from chsel.problem.poses import Poses, apply, compose
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
+from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
 from chsel.problem.streams import StreamKey
+from tests.chsel.samples import ball_grid, random_poses
 
 RADIUS = 0.1
 IDENTITY = Poses.of(np.eye(4)[None])
 
 
-def sphere() -> SdfGrid:
-    """A sphere around the origin, which is a node."""
-    nodes = 0.01 * np.indices((31, 31, 31)).transpose(1, 2, 3, 0) - 0.15
-    length = np.sqrt((nodes**2).sum(axis=-1))
-    outwards = nodes / np.maximum(length, 1e-9)[..., None]
-    return SdfGrid(np.full(3, -0.15), 0.01, length - RADIUS, outwards)
-
-
-GRID = sphere()
+GRID = ball_grid(RADIUS, 0.01, 15)
 
 
 def problem(points: KnownPoints) -> RegistrationProblem:
@@ -46,8 +39,7 @@ def some_balls(count: int = 40) -> Balls:
 
 
 def poses(count: int = 50) -> FloatArray:
-    random = np.random.default_rng(3)
-    return compose(random_rotations(random, count), random.uniform(-0.1, 0.1, (count, 3)))
+    return random_poses(np.random.default_rng(3), count, 0.1)
 
 
 def test_a_ball_of_1_m_around_the_centre_of_a_sphere_of_10_cm_costs_1_21() -> None:

@@ -205,12 +205,15 @@ def test_snapshots_of_the_archive_come_at_start_interval_and_end_and_only_improv
 
 
 @pytest.mark.parametrize("name", WITH_ARCHIVE)
-def test_elites_of_the_last_result_enter_the_archive(name: str) -> None:
-    method = quick(name)
-    first = method.register(posed(method, FEW))
-    problem = posed(method, FEW, first)
-    assert len(problem.low_cost_set) == len(first.elites)
-    assert method.register(problem).cost[0] <= first.cost[0] * (1.0 + 1e-9)
+def test_poses_of_the_low_cost_set_enter_the_archive(name: str) -> None:
+    method, truth = quick(name), inverse(TRUTH)[None]
+    without, problem = posed(method, FEW), posed(method, FEW, low_cost_set=truth)
+    cost = judged(method, problem, truth)
+    assert cost is not None
+    assert method.register(without).cost[0] > 2.0 * cost[0]
+    assert method.register(problem).cost[0] <= cost[0] * (1.0 + 1e-9)
+    first = method.register(without)
+    assert len(posed(method, FEW, first).low_cost_set) == len(first.elites)
 
 
 def test_more_passes_do_not_worsen_the_best_cost() -> None:

@@ -11,6 +11,7 @@ import pytest
 import chsel
 from chsel.errors import EngineError
 from chsel.numerics.threads import require_ieee_arithmetic
+from tests.chsel.samples import ball_grid
 
 # fesetround's argument, from the C library's <fenv.h>
 MODES = {
@@ -35,7 +36,8 @@ def test_a_thread_that_rounds_otherwise_is_refused(mode: str) -> None:
 
 
 @pytest.mark.skipif(not MODES or platform.system() != "Linux", reason="fesetround's values differ")
-def test_no_registration_runs_with_another_rounding(ball: chsel.SdfGrid) -> None:
+def test_no_registration_runs_with_another_rounding() -> None:
+    ball = ball_grid(0.025, 0.01, 4)
     points = {"surface": np.array([[0.025, 0.0, 0.0]]), "free": np.array([[0.1, 0.0, 0.0]])}
     settings = {"descent": {"restarts": 1, "iterations": 1}, "emitter": {"iterations": 1}}
     chsel.register(ball, **points, settings=settings)
@@ -46,11 +48,3 @@ def test_no_registration_runs_with_another_rounding(ball: chsel.SdfGrid) -> None
             chsel.register(ball, **points, settings=settings)
     finally:
         library.fesetround(NEAREST)
-
-
-@pytest.fixture
-def ball() -> chsel.SdfGrid:
-    nodes = np.indices((9, 9, 9)) * 0.01 - 0.04
-    radius = np.sqrt((nodes**2).sum(axis=0))
-    gradients = np.moveaxis(nodes / np.maximum(radius, 1e-9), 0, -1)
-    return chsel.SdfGrid(np.full(3, -0.04), 0.01, radius - 0.025, gradients)

@@ -12,6 +12,7 @@ from chsel.problem.poses import apply, compose, random_rotations
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
+from tests.chsel.samples import ball_grid
 
 WORKSPACE = Workspace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 RESOLUTION = 0.02
@@ -19,11 +20,7 @@ RESOLUTION = 0.02
 
 def ball(radius: float = 0.1, resolution: float = RESOLUTION) -> SdfGrid:
     """A ball around the origin."""
-    count = 2 * int(np.ceil((radius + 0.05) / resolution)) + 1
-    nodes = (np.indices((count,) * 3) - count // 2) * resolution
-    length = np.sqrt((nodes**2).sum(axis=0))
-    gradients = np.moveaxis(nodes / np.maximum(length, 1e-9), 0, -1)
-    return SdfGrid(np.full(3, -(count // 2) * resolution), resolution, length - radius, gradients)
+    return ball_grid(radius, resolution, int(np.ceil((radius + 0.05) / resolution)))
 
 
 def box(half: FloatArray, resolution: float = RESOLUTION) -> SdfGrid:

@@ -15,6 +15,7 @@ from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from runners.objects.models import MODELS
+from tests.chsel.samples import hypotheses_at
 
 TRUTH = compose(rotation_vector(np.array([0.7, -0.4, 1.1])), np.array([0.3, -0.2, 0.9]))
 CENTRE = np.array([0.4, -0.2, 0.6])  # far from the origin of the mesh
@@ -96,9 +97,7 @@ def problem_of(mesh: trimesh.Trimesh, poses: FloatArray) -> RegistrationProblem:
 def test_numbers_of_a_result_are_modulo_symmetries_with_or_without_a_mesh() -> None:
     motions = [about_centre(Z, np.pi, np.array([0.0, 0.02, 0.0])), about_centre(X, 0.5)]
     poses = np.concatenate([hypothesis(motion) for motion in motions])
-    found = Hypotheses(
-        poses, np.zeros(2), np.zeros(2, dtype=bool), np.full(2, -1), np.zeros((0, 4, 4))
-    )
+    found = hypotheses_at(poses)
     problem = problem_of(BOX, poses)
     numbers = result_numbers(found, problem, TRUTH, SYMMETRY)
     assert numbers["best_position_error"] == pytest.approx(0.02, abs=1e-9)
@@ -116,14 +115,7 @@ QUARTER = axis_angle(Z, np.pi / 2)
 
 
 def hypotheses(world_from_object: np.ndarray, duplicate: list[bool]) -> Hypotheses:
-    count = len(duplicate)
-    return Hypotheses(
-        object_from_world=inverse(world_from_object),
-        cost=np.zeros(count),
-        duplicate=np.array(duplicate, dtype=bool),
-        cell=np.full(count, -1),
-        elites=np.zeros((0, 4, 4)),
-    )
+    return hypotheses_at(inverse(world_from_object), duplicate)
 
 
 def test_turning_about_the_centre_spreads_rotations_alone() -> None:

@@ -11,6 +11,7 @@ from chsel import SdfGrid
 from chsel.errors import MeshError, SdfError, SettingError
 from chsel.problem.mesh import load_mesh
 from chsel.problem.sdf_grid import _parts, mesh_sdf
+from tests.chsel.samples import box_distance
 
 SIZE = np.array([0.2, 0.12, 0.08])
 
@@ -26,9 +27,7 @@ def grid(box: trimesh.Trimesh) -> SdfGrid:
 
 
 def box_sdf(points: np.ndarray) -> np.ndarray:
-    q = np.abs(points) - SIZE / 2
-    outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(axis=1))
-    return outside + np.minimum(q.max(axis=1), 0.0)
+    return box_distance(points, SIZE)
 
 
 def test_distance_to_a_box_has_its_closed_form(box: trimesh.Trimesh) -> None:

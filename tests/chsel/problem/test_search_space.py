@@ -16,19 +16,19 @@ from chsel.problem.poses import (
     axis_angle,
     compose,
     inverse,
-    random_rotations,
     rotation_vector,
 )
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
 from chsel.qd.measures import MEASURES, Measure, measure_named
 from tests.chsel.problem.torch_spaces import decode
+from tests.chsel.samples import random_poses
 
 BOX = SdfGrid.from_mesh(trimesh.creation.box((0.2, 0.1, 0.06)), 0.01)
 STREAM = np.random.default_rng(0)
 
 
 def random_transforms(count: int) -> np.ndarray:
-    return compose(random_rotations(STREAM, count), STREAM.uniform(-0.3, 0.3, (count, 3)))
+    return random_poses(STREAM, count, 0.3)
 
 
 def test_nine_numbers_and_transforms_are_inverse_to_each_other() -> None:

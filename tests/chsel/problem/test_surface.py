@@ -10,6 +10,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
+from tests.chsel.samples import ball_grid
 
 RADIUS, RESOLUTION = 0.05, 0.01
 SIDES = np.array([0.163, 0.107, 0.089])
@@ -20,15 +21,6 @@ def stream(seed: int = 0) -> np.random.Generator:
     return StreamKey(seed, 0).stream(Purpose.ICP_SURFACE)
 
 
-def sphere() -> SdfGrid:
-    """A sphere by its formula."""
-    origin = np.full(3, -0.1)
-    nodes = origin + np.indices((21, 21, 21)).transpose(1, 2, 3, 0) * RESOLUTION
-    length = np.sqrt((nodes**2).sum(axis=-1))
-    unit = nodes / np.maximum(length, 1e-12)[..., None]
-    return SdfGrid(origin, RESOLUTION, length - RADIUS, unit)
-
-
 def chi_square(counts: FloatArray, shares: FloatArray) -> float:
     """How unlike counts are to shares: mean 1 per degree of freedom, here in deviations off it."""
     expected = counts.sum() * shares / shares.sum()
@@ -37,7 +29,7 @@ def chi_square(counts: FloatArray, shares: FloatArray) -> float:
 
 
 def test_points_are_on_a_sphere_and_uniform_there() -> None:
-    points = surface_points(sphere(), COUNT, stream())
+    points = surface_points(ball_grid(RADIUS, RESOLUTION, 10), COUNT, stream())
     distance = np.sqrt((points**2).sum(axis=1)) - RADIUS
     assert np.abs(distance).max() < 0.02 * RESOLUTION
     # Bands of equal height have equal areas.
@@ -70,10 +62,10 @@ def test_points_are_on_a_box_and_uniform_there() -> None:
 
 
 def test_points_depend_on_the_stream_alone() -> None:
-    grid = sphere()
+    grid, again = ball_grid(RADIUS, RESOLUTION, 10), ball_grid(RADIUS, RESOLUTION, 10)
     first = surface_points(grid, 50, stream())
     np.testing.assert_array_equal(surface_points(grid, 50, stream()), first)
-    np.testing.assert_array_equal(surface_points(sphere(), 50, stream()), first)
+    np.testing.assert_array_equal(surface_points(again, 50, stream()), first)
     assert np.abs(surface_points(grid, 50, stream(1)) - first).max() > 0.01
 
 

@@ -24,6 +24,7 @@ from chsel.problem.trust import (
     has_pose,
     trust_in,
 )
+from tests.chsel.samples import hypotheses_at
 
 SIDES = np.array([0.1, 0.06, 0.16])
 BOX = trimesh.creation.box(SIDES)
@@ -41,11 +42,7 @@ def problem(points: chsel.KnownPoints, sdf: chsel.SdfGrid = BALL) -> Registratio
 
 
 def hypotheses(*world_from_object: FloatArray) -> Hypotheses:
-    poses = inverse(np.array(world_from_object))
-    count = len(poses)
-    return Hypotheses(
-        poses, np.arange(float(count)), np.zeros(count, bool), np.full(count, -1), poses[:0]
-    )
+    return hypotheses_at(inverse(np.array(world_from_object)))
 
 
 def moved(x: float = 0.0, y: float = 0.0, z: float = 0.0, about_z: float = 0.0) -> FloatArray:
@@ -203,12 +200,8 @@ def test_poses_that_are_not_finite_or_repeated_are_left_out() -> None:
     found = ball()
     poses = found.object_from_world.copy()
     poses[1, 0, 3], poses[2, 1, 1] = np.inf, np.nan
-    broken = Hypotheses(poses, found.cost, found.duplicate, found.cell, found.elites)
-    one = [part[:1] for part in (poses, found.cost, found.duplicate, found.cell)]
-    assert trust_in(posed, broken) == trust_in(posed, Hypotheses(*one, poses[:0]))
-    first = Hypotheses(poses[[1, 0]], found.cost[:2], found.duplicate[:2], found.cell[:2], poses)
-    none = Hypotheses(poses[:0], found.cost[:0], found.duplicate[:0], found.cell[:0], poses[:0])
-    for bad in (first, none):
+    assert trust_in(posed, hypotheses_at(poses)) == trust_in(posed, hypotheses_at(poses[:1]))
+    for bad in (hypotheses_at(poses[[1, 0]]), hypotheses_at(poses[:0])):
         assert not has_pose(bad)
         with pytest.raises(PoseError, match="accepted: at least one pose"):
             trust_in(posed, bad)

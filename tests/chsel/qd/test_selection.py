@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
-from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses, compose, inverse
 from chsel.problem.search_space import search_space
@@ -22,22 +21,15 @@ from chsel.qd.selection import (
     select_elites,
     sized_archive,
 )
+from tests.chsel.samples import ball_grid
 
 COSTS = np.array([3.0, 0.1, 9.0, 0.2, 0.4, 0.6])
-
-
-def ball(radius: float = 0.05) -> SdfGrid:
-    """A ball by its formula, with nodes 2 cm apart."""
-    origin = np.full(3, -0.1)
-    nodes = origin + np.indices((11, 11, 11)).transpose(1, 2, 3, 0) * 0.02
-    length = np.sqrt((nodes**2).sum(axis=-1))
-    return SdfGrid(origin, 0.02, length - radius, nodes / np.maximum(length, 1e-12)[..., None])
 
 
 def problem_of(count: int, sdf: SdfGrid | None = None) -> RegistrationProblem:
     """One of so many hypotheses and 10 known points, in a workspace of a metre."""
     return RegistrationProblem(
-        ball() if sdf is None else sdf,
+        ball_grid(0.05, 0.02, 5) if sdf is None else sdf,
         KnownPoints(known=np.full((10, 3), 0.5)),
         np.tile(np.eye(4), (count, 1, 1)),
         Workspace((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
@@ -168,7 +160,7 @@ def test_lowest_are_chosen_where_too_few_are_below_the_limit() -> None:
 
 
 def test_lowest_are_chosen_of_an_object_without_a_surface() -> None:
-    thin = ball(radius=-0.01)
+    thin = ball_grid(-0.01, 0.02, 5)
     assert selected(RISING, GROUPS, 3, sdf=thin, choice="representative", **NEAR) == [0, 1, 2]
 
 
@@ -178,11 +170,3 @@ def test_poses_beside_the_workspace_are_not_chosen_unless_all_are() -> None:
     assert selected(COSTS, x, 3, margin=0.15) == [1, 3, 4]
     assert selected(COSTS, x, 3, margin=0.05) == [1, 1, 4]
     assert selected(COSTS, x + 10.0, 3, margin=0.15) == [1, 3, 4]
-
-
-@pytest.mark.parametrize(
-    ("setting", "value"), [("choice", "best"), ("margin", -0.1), ("margin", float("nan"))]
-)
-def test_refused_output_settings(setting: str, value: object) -> None:
-    with pytest.raises(SettingError, match=f"{setting} is {value!r}; accepted"):
-        OutputSettings(**{setting: value})  # type: ignore[arg-type]

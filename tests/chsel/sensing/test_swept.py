@@ -9,9 +9,10 @@ import trimesh
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
-from chsel.problem.poses import apply, axis_angle, compose, inverse, random_rotations
+from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.swept import between, interior_lattice
+from tests.chsel.samples import box_distance, random_poses
 
 SIZE = np.array([0.10, 0.04, 0.06])
 SPACING = 0.01
@@ -28,9 +29,7 @@ def distance_to_box(points: FloatArray, poses: FloatArray) -> FloatArray:
     """Signed distance (N,) to the union of the box at poses (P, 4, 4), from outside exact."""
     best = np.full(len(points), np.inf)
     for box_from_world in inverse(poses):
-        beyond = np.abs(apply(box_from_world, points)) - 0.5 * SIZE
-        outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
-        best = np.minimum(best, outside + np.minimum(beyond.max(axis=1), 0.0))
+        best = np.minimum(best, box_distance(apply(box_from_world, points), SIZE))
     return best
 
 
@@ -62,7 +61,7 @@ def test_a_spacing_that_makes_too_many_nodes_is_refused() -> None:
 
 def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way() -> None:
     stream = np.random.default_rng(0)
-    poses = compose(random_rotations(stream, 6), stream.uniform(-0.2, 0.2, (6, 3)))
+    poses = random_poses(stream, 6, 0.2)
     way = between(poses, step=0.005, radius=0.1)
     np.testing.assert_array_equal(way[[0, -1]], poses[[0, -1]])
     points = stream.normal(size=(50, 3))
