@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 from omegaconf import DictConfig
@@ -34,9 +35,8 @@ from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.selection import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.probe import PresetName
-from runners.reporting.console_table import print_table
-from runners.reporting.section import Cell, Table, number
-from runners.reporting.statistics import grouped, spread
+from runners.reporting.statistics import spreads
+from runners.reporting.tables import Cell, Table, number, print_table, range_text
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sensors.rig import Rig
 from runners.sessions import open_session
@@ -199,17 +199,19 @@ class RealCase:
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Medians [quartiles] over seeds of every case and method."""
+    table, by = pd.DataFrame(rows), ["points", "case", "method"]
+    medians = {column: spreads(table, by, column) for column, *_ in _MEDIANS}
     lines = []
-    for (case, method), own in grouped(rows, lambda row: (row["case"], row["method"])).items():
-        by_points = grouped(own, lambda row: row["points"])
-        right = [row["right"] for row in by_points[_ALL] if row["right"] is not None]
-        counts = (by_points[_ALL][0]["touches"], by_points[_ALL][0]["free_points"])
+    for (case, method), own in table.groupby(by[1:], sort=False):
+        every = own[own["points"] == _ALL]
+        right = every["right"].dropna()
+        counts = (every["touches"].iloc[0], every["free_points"].iloc[0])
         cells = [Cell(str(text)) for text in (case, method, *counts)]
-        cells.append(Cell(f"{sum(right)} of {len(right)}" if right else "-"))
+        cells.append(Cell(f"{sum(right)} of {len(right)}" if len(right) else "-"))
         for column, points, _, scale in _MEDIANS:
-            found = spread(by_points.get(points, ()), column)
-            low, median, high = (number(scale * value) for value in found.quartiles)
-            cells.append(Cell(median, between=f"[{low}, {high}]" if found.count else ""))
+            found = medians[column].reindex([(points, case, method)]).iloc[0]
+            quartiles = range_text(scale * found["lower"], scale * found["upper"])
+            cells.append(Cell(number(scale * found["median"]), between=quartiles))
         lines.append(tuple(cells))
     header = ("case", "method", "touches", "free", "right", *(text for _, _, text, _ in _MEDIANS))
     note = (

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
-from chsel.errors import SettingError
+from chsel.errors import SettingError, require_choice
 from chsel.problem.settings import build_settings, settings_mapping
 from replay.console import Console
 from runners.command.program import command, plain
-from runners.reporting.against_baseline import section_against
-from runners.reporting.completeness import planned_methods
-from runners.reporting.console_table import print_table
+from runners.reporting.against_baseline import against_baseline
 from runners.reporting.evaluation_folder import open_evaluation
-from runners.reporting.method_style import method_styles
-from runners.reporting.page import Page, as_html, as_markdown, page_of
-from runners.reporting.sections import SequenceConfig, sections_of
+from runners.reporting.figures import FORMATS, drawing, set_title, write_picture
+from runners.reporting.page import as_html, as_markdown, page_of
+from runners.reporting.section import Section, SequenceConfig, Subject
+from runners.reporting.sections import sections_of
+from runners.reporting.tables import print_table
 from runners.whole_file import whole_file
 
 HTML, MARKDOWN = "report.html", "report.md"
@@ -32,32 +33,30 @@ class ReportConfig:
     sequence: SequenceConfig
     dir: str | None
     baseline: str | None
+    format: str
     out: str | None
 
     def __post_init__(self) -> None:
+        require_choice("format", self.format, FORMATS)
         if not self.dir:
             raise SettingError("dir is missing; pass the folder of an evaluation")
 
 
 @command("report")
 def main(config: DictConfig) -> None:
-    """Draw all figures, and write the page, the Markdown and the pictures."""
+    """Draw all figures, and write the page, the Markdown, the pictures and their data."""
     checked = build_settings(ReportConfig, plain(config), "report")
     folder = Path(checked.dir or "").expanduser()
     out = Path(checked.out).expanduser() if checked.out else folder / "report"
-    evaluation = open_evaluation(folder)
+    subject = Subject(open_evaluation(folder), checked.sequence, checked.baseline)
     console, waiting = Console(), Console(stderr=True)
-    if checked.baseline is not None:
-        styles = method_styles(planned_methods(evaluation))
-        for table in section_against(evaluation, styles, checked.baseline).tables:
+    if (compared := against_baseline(subject)) is not None:
+        for table in compared.tables:
             print_table(console, table)
             console.print()
-    if waiting.is_terminal:
-        with waiting.status("drawing"):
-            sections = sections_of(evaluation, checked.sequence, checked.baseline)
-    else:
-        sections = sections_of(evaluation, checked.sequence, checked.baseline)
-    _write(out, page_of(evaluation, sections, _command(checked)))
+    with drawing(), waiting.status("drawing") if waiting.is_terminal else nullcontext():
+        sections = sections_of(subject)
+        _write(out, subject, sections, checked)
     for section in sections:
         if section.missing:
             line = f"no picture of {section.title}: {section.missing}"
@@ -66,13 +65,15 @@ def main(config: DictConfig) -> None:
         console.print(str(out / name), soft_wrap=True)
 
 
-def _write(out: Path, page: Page) -> None:
+def _write(out: Path, subject: Subject, sections: list[Section], config: ReportConfig) -> None:
     """The files, each in the place of that of an earlier report."""
-    for section in page.sections:
-        if section.picture is not None:
-            with whole_file(out / section.picture.name) as beside:
-                beside.write_bytes(section.picture.png)
-    for name, text in ((MARKDOWN, as_markdown(page)), (HTML, as_html(page))):
+    contents = {}
+    for section in sections:
+        if (picture := section.picture) is not None:
+            set_title(picture.figure, f"{section.title}, {subject.evaluation.name}")
+            contents[picture.name] = write_picture(picture, out, config.format)
+    page = page_of(subject.evaluation, sections, _command(config), config.format)
+    for name, text in ((MARKDOWN, as_markdown(page)), (HTML, as_html(page, contents))):
         with whole_file(out / name) as beside:
             beside.write_text(text, encoding="utf-8")
 
@@ -82,9 +83,9 @@ def _command(config: ReportConfig) -> str:
     usual = settings_mapping(SequenceConfig())
     chosen = settings_mapping(config.sequence)
     changed = {name: value for name, value in chosen.items() if value != usual[name]}
-    settings = [f"sequence.{name}={_value(value)}" for name, value in changed.items()]
-    if config.baseline is not None:
-        settings.insert(0, f"baseline={config.baseline}")
+    settings = [] if config.baseline is None else [f"baseline={config.baseline}"]
+    settings += [] if config.format == FORMATS[0] else [f"format={config.format}"]
+    settings += [f"sequence.{name}={_value(value)}" for name, value in changed.items()]
     return shlex.join(["python", "-m", "runners.report", str(config.dir), *settings])
 
 

@@ -18,9 +18,9 @@ from replay.console import Console, Progress, TextColumn
 from runners.evaluation import schedule
 from runners.evaluation.true_poses import FoundPose
 from runners.reporting.by_faults import tables_by_faults
-from runners.reporting.console_table import print_table
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_style import method_styles
+from runners.reporting.tables import print_table
 
 _SPARSE = 60.0  # s between lines where there is no terminal
 _MOST_SHOWN = 3  # units at work, failures

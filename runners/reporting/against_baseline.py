@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
-from runners.reporting.evaluation_folder import Evaluation, ReportError, Row
-from runners.reporting.method_style import MethodStyle
-from runners.reporting.section import Cell, Section, Table, number
-from runners.reporting.statistics import Spread, grouped, spread, trial_of
-from runners.reporting.tables import DIVERSITY
+from runners.reporting.evaluation_folder import TRIAL, Evaluation, ReportError
+from runners.reporting.section import Section, Styles, Subject
+from runners.reporting.statistics import DIVERSITY
+from runners.reporting.tables import Cell, Table, number, range_text, table_of
 
 LEAST_PD = 1.0  # mm^2: a PD below counts as this in geometric means, which a 0 would make 0
+MISSED = 0.003  # m: a best energy above this is not of the right pose
 _WORSE = 1.0 + 1e-9  # a ratio above; the rounding of a geometric mean makes no PD worse
-MISSED = 0.003  # m: a best energy above this is none of the right pose's
 _ENERGY = ("anchored",)  # methods whose cost is an energy in metres
-Styles = Mapping[str, MethodStyle]
+_PLACE = [*TRIAL, "step"]
 
 
-def section_against(evaluation: Evaluation, styles: Styles, baseline: str) -> Section:
+def against_baseline(subject: Subject) -> Section | None:
     """Tables of all methods beside the baseline. Raises ReportError if that has no PD."""
-    base = baseline_pd(evaluation.rows, baseline)
-    if not base:
-        raise ReportError(
-            f"baseline {baseline} has no PD; accepted: {', '.join(evaluation.methods)}"
-        )
+    evaluation, baseline = subject.evaluation, subject.baseline
+    if baseline is None:
+        return None
+    rows = with_ratios(evaluation.rows, baseline)
     text = (
         "Over all registrations: every step of every trial, and every draw, that is the same "
         f"session registered with other random numbers. A ratio is PD by that of {baseline} at the "
@@ -34,125 +34,113 @@ def section_against(evaluation: Evaluation, styles: Styles, baseline: str) -> Se
         f"is a ratio above 1. PD below {LEAST_PD:g} mm² counts as {LEAST_PD:g} mm² in geometric "
         "means and ratios. What has failed has no PD and is left out, n says of how many numbers."
     )
+    if rows["ratio"].isna().all():
+        raise ReportError(
+            f"baseline {baseline} has no PD; accepted: {', '.join(evaluation.methods)}"
+        )
     tables = (
-        _summary(evaluation, styles, baseline, base),
-        _ratios(evaluation, styles, base, "object"),
-        _ratios(evaluation, styles, base, "step"),
+        _summary(evaluation, subject.styles, baseline, rows),
+        *(_ratios(rows, subject.styles, by) for by in ("object", "step")),
     )
     return Section("against-baseline", f"All methods beside {baseline}", text, tables=tables)
 
 
-def baseline_pd(rows: Iterable[Row], baseline: str) -> dict[Hashable, float]:
-    """PD of the baseline by trial and step: the geometric mean over its draws."""
-    own = [row for row in rows if row["method"] == baseline and row[DIVERSITY] is not None]
-    return {place: geometric_mean(pd_of(some)) for place, some in grouped(own, _place).items()}
+def with_ratios(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
+    """The rows with `floored`, PD of at least LEAST_PD, and `ratio`, that by the baseline's.
+
+    The baseline's PD at a trial and step is the geometric mean over its draws.
+    """
+    rows = rows.assign(floored=rows[DIVERSITY].clip(lower=LEAST_PD))
+    of_baseline = rows[rows["method"] == baseline].groupby(_PLACE)["floored"].agg(geometric_mean)
+    rows = rows.join(of_baseline.rename("of_baseline"), on=_PLACE)
+    return rows.assign(ratio=rows["floored"] / rows["of_baseline"])
 
 
-def pd_ratios(rows: Iterable[Row], base: Mapping[Hashable, float]) -> list[float]:
-    """PD by that of the baseline, of rows where both have one."""
-    both = [row for row in rows if row[DIVERSITY] is not None and _place(row) in base]
-    return [pd / base[_place(row)] for row, pd in zip(both, pd_of(both), strict=True)]
+def geometric_mean(values: pd.Series) -> float:
+    """Of positive numbers, without those that are NaN; NaN of nothing."""
+    return math.exp(np.log(values).mean())
 
 
-def pd_of(rows: Iterable[Row]) -> list[float]:
-    """PD in mm^2 of the rows that have one, at least LEAST_PD."""
-    return [max(value, LEAST_PD) for value in spread(rows, DIVERSITY).values]
+@dataclass(frozen=True)
+class _Compared:
+    """A method beside the baseline."""
+
+    title: str
+    rows: pd.DataFrame  # of the method, with ratios
+    is_baseline: bool
+    has_energy: bool  # its cost is an energy in metres
 
 
-def geometric_mean(values: Sequence[float]) -> float:
-    """Of positive numbers; NaN of nothing."""
-    return math.exp(float(np.mean(np.log(values)))) if len(values) else math.nan
+def _worse(of: _Compared) -> str:
+    ratios = of.rows["ratio"].dropna()
+    return "-" if of.is_baseline else _percent((ratios > _WORSE).mean())
 
 
-def _summary(
-    evaluation: Evaluation, styles: Styles, baseline: str, base: Mapping[Hashable, float]
-) -> Table:
-    by_method = grouped(evaluation.rows, lambda row: row["method"])
-    lines = []
-    for method, style in styles.items():
-        rows = by_method.get(method, [])
-        pd, seconds = spread(rows, DIVERSITY), spread(rows, "seconds")
-        ratios = pd_ratios(rows, base)
-        worse = "-" if method == baseline else _share(ratio > _WORSE for ratio in ratios)
-        exact, distinct = spread(rows, "exact_members"), spread(rows, "distinct")
-        least = f"[{min(distinct.values):.0f}]" if distinct.count else ""
-        lines.append(
-            (
-                Cell(style.title),
-                Cell(str(pd.count), note=f"{pd.left_out} left out" if pd.left_out else ""),
-                _quartiles(pd),
-                Cell(number(geometric_mean(pd_of(rows)))),
-                Cell(number(geometric_mean(ratios))),
-                Cell(worse),
-                Cell(_percent(exact.mean)),
-                Cell(number(distinct.mean), between=least),
-                Cell(_misses(evaluation, method, rows)),
-                Cell(number(seconds.median)),
-                Cell(number(seconds.mean)),
-            )
-        )
-    header = (
-        "method",
-        "n",
-        "PD in mm², median [quartiles]",
-        "geometric mean",
-        f"ratio to {baseline}",
-        "worse",
-        "members",
-        "distinct [least]",
-        "misses",
-        "s, median",
-        "s, mean",
+def _misses(of: _Compared) -> str:
+    energies = of.rows["best_cost"].dropna()
+    return _percent((energies > MISSED).mean()) if of.has_energy else "-"
+
+
+def _count(of: _Compared) -> Cell:
+    left_out = of.rows[DIVERSITY].isna().sum()
+    return Cell(str(of.rows[DIVERSITY].count()), note=f"{left_out} left out" if left_out else "")
+
+
+def _median(of: _Compared) -> Cell:
+    lower, median, upper = of.rows[DIVERSITY].quantile([0.25, 0.5, 0.75])
+    return Cell(number(median), between=range_text(lower, upper))
+
+
+def _distinct(of: _Compared) -> Cell:
+    distinct = of.rows["distinct"].dropna()
+    return Cell(
+        number(distinct.mean()), between="" if distinct.empty else f"[{distinct.min():.0f}]"
     )
-    note = (
-        "Ratio: the geometric mean of all. Members: the mean share of hypotheses that are members "
-        f"of the plausible set by its definition, {evaluation.definition_text}. Distinct: poses, "
-        f"the mean. Misses: registrations whose best energy is above {1000.0 * MISSED:g} mm, where "
-        "the cost is an energy."
-    )
-    title = f"PD and its ratios over all registrations, by {evaluation.definition}"
-    return Table(title, header, tuple(lines), note=note)
-
-
-def _ratios(
-    evaluation: Evaluation, styles: Styles, base: Mapping[Hashable, float], column: str
-) -> Table:
-    """Geometric means of the ratios, by what a column holds."""
-    rows = [row for row in evaluation.rows if row[column] is not None]
-    lines = []
-    for value in sorted({row[column] for row in rows}):
-        cells = [Cell(str(value))]
-        for method in styles:
-            own = [row for row in rows if (row[column], row["method"]) == (value, method)]
-            cells.append(Cell(number(geometric_mean(pd_ratios(own, base)))))
-        lines.append(tuple(cells))
-    title = f"Ratios of PD by {column}, geometric means"
-    return Table(title, (column, *(style.title for style in styles.values())), tuple(lines))
-
-
-def _misses(evaluation: Evaluation, method: str, rows: Sequence[Row]) -> str:
-    asked = evaluation.experiment.get("methods")
-    about = asked.get(method) if isinstance(asked, Mapping) else None
-    if not isinstance(about, Mapping) or about.get("name") not in _ENERGY:
-        return "-"
-    return _share(value > MISSED for value in spread(rows, "best_cost").values)
-
-
-def _quartiles(found: Spread) -> Cell:
-    if not found.count:
-        return Cell("-")
-    lower, median, upper = found.quartiles
-    return Cell(number(median), between=f"[{number(lower)}, {number(upper)}]")
-
-
-def _share(flags: Iterable[bool]) -> str:
-    listed = list(flags)
-    return _percent(sum(listed) / len(listed)) if listed else "-"
 
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.1f} %" if math.isfinite(share) else "-"
 
 
-def _place(row: Row) -> Hashable:
-    return (*trial_of(row), row["step"])
+def _summary(evaluation: Evaluation, styles: Styles, baseline: str, rows: pd.DataFrame) -> Table:
+    columns: Mapping[str, Callable[[_Compared], Cell | str | float]] = {
+        "method": lambda of: of.title,
+        "n": _count,
+        "PD in mm², median [quartiles]": _median,
+        "geometric mean": lambda of: geometric_mean(of.rows["floored"]),
+        f"ratio to {baseline}": lambda of: geometric_mean(of.rows["ratio"]),
+        "worse": _worse,
+        "members": lambda of: _percent(of.rows["exact_members"].mean()),
+        "distinct [least]": _distinct,
+        "misses": _misses,
+        "s, median": lambda of: of.rows["seconds"].median(),
+        "s, mean": lambda of: of.rows["seconds"].mean(),
+    }
+    note = (
+        "Ratio: the geometric mean of all. Members: the mean share of hypotheses that are members "
+        f"of the plausible set by its definition, {evaluation.definition_text}. Distinct: poses, "
+        f"on average. Misses: registrations whose best energy is above {1000.0 * MISSED:g} mm, "
+        "where the cost is an energy."
+    )
+    asked = evaluation.experiment.get("methods")
+    asked = asked if isinstance(asked, Mapping) else {}
+    compared = []
+    for method, style in styles.items():
+        about = asked.get(method)
+        energy = isinstance(about, Mapping) and about.get("name") in _ENERGY
+        own = rows[rows["method"] == method]
+        compared.append(_Compared(style.title, own, method == baseline, energy))
+    title = f"PD and its ratios over all registrations, by {evaluation.definition}"
+    return table_of(title, columns, compared, note=note)
+
+
+def _ratios(rows: pd.DataFrame, styles: Styles, by: str) -> Table:
+    """Geometric means of the ratios, by what a column holds."""
+    found = rows.groupby([by, "method"])["ratio"].agg(geometric_mean).unstack()
+    found = found.reindex(columns=list(styles))
+    lines = [
+        (Cell(str(value)), *(Cell(number(ratio)) for ratio in ratios))
+        for value, ratios in zip(found.index, found.to_numpy(), strict=True)
+    ]
+    header = (by, *(style.title for style in styles.values()))
+    return Table(f"Ratios of PD by {by}, geometric means", header, tuple(lines))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -22,8 +23,10 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings
 from replay.mcap.reader import read_recording
 from replay.settings_migration import completed
-from runners.reporting.panels import drawn, new_figure
-from runners.reporting.section import NotDrawn, Picture
+from runners.reporting.figures import NotDrawn, Picture, new_figure
+from runners.reporting.section import Section, Subject, drawn
+from runners.reporting.shown_trial import shown_trial
+from runners.reporting.silhouette import VIEWS, Frame, point_table
 
 _ALONG = 22  # samples along the longer side of the picture
 _MARGIN = 0.04  # metres around the object
@@ -34,7 +37,28 @@ _KINDS = {
 }
 
 
-def picture_of_gradients(path: Path, name: str) -> Picture:
+def cost_gradients(subject: Subject) -> Section:
+    """Of the recording of the shown trial, by CHSEL if that is recorded."""
+    text = (
+        "Where the negative gradient of the relaxed cost pushes a point, on the X-Z "
+        "cross-section of the object (in its own frame) that holds most of it: free points in "
+        "red, occupied points in purple, known surface points in black; grey dots are not pushed. "
+        "The line is the zero level of the SDF, the broken one the penetration tolerance. Longer "
+        "arrows are stronger pushes, to a scale of its own in each panel; free points as in the "
+        "sum over free points (Eq. 8)."
+    )
+
+    def draw() -> Picture:
+        evaluation, (trial, _) = subject.evaluation, shown_trial(subject)
+        for method in ("chsel", *evaluation.methods):
+            if path := evaluation.recording(trial, method):
+                return picture_of_gradients(path)
+        raise NotDrawn(f"there is no recording of {trial[0]}, seed {trial[1]}")
+
+    return Section("gradients", "Gradients of the cost", text, *drawn(draw))
+
+
+def picture_of_gradients(path: Path) -> Picture:
     """The picture from a recording's SDF and cost settings; NotDrawn where it has no cost."""
     try:
         start = read_recording(path).start
@@ -47,7 +71,8 @@ def picture_of_gradients(path: Path, name: str) -> Picture:
         "are pushed outwards, occupied points outside of it inwards, and known points to the "
         "surface from both sides."
     )
-    return Picture(name, alt, drawn(lambda: _figure(start.sdf, settings)))
+    figure, data = _figure(start.sdf, settings)
+    return Picture("gradients", alt, figure, data)
 
 
 def recorded_cost(config: Mapping[str, object], method: str) -> CostSettings:
@@ -85,7 +110,7 @@ def section_plane(sdf: SdfGrid) -> int:
     return int(np.argmax((sdf.values < 0.0).sum(axis=(0, 2))))
 
 
-def _figure(sdf: SdfGrid, settings: CostSettings) -> Figure:
+def _figure(sdf: SdfGrid, settings: CostSettings) -> tuple[Figure, pd.DataFrame]:
     j = section_plane(sdf)
     nodes = [sdf.origin[axis] + sdf.resolution * np.arange(sdf.shape[axis]) for axis in range(3)]
     inside = np.argwhere(sdf.values[:, j, :] < 0.0)
@@ -97,13 +122,16 @@ def _figure(sdf: SdfGrid, settings: CostSettings) -> Figure:
         *(np.arange(lower[i] + 0.5 * spacing, upper[i], spacing) for i in range(2)), indexing="ij"
     )
     points = np.stack([x.ravel(), np.full(x.size, nodes[1][j]), z.ravel()], axis=1)
-    width, height = upper - lower
-    figure = new_figure(float(np.clip(0.9 + 3.3 * height / width, 3.0, 8.0)))
+    frame = Frame(VIEWS["xz"], lower, upper)
+    figure = new_figure(float(np.clip(0.9 + 3.3 * frame.aspect, 3.0, 8.0)))
     figure.set_layout_engine("compressed")  # leaves room for titles above panels of fixed aspect
+    data = []
     for place, (kind, (title, color)) in enumerate(_KINDS.items()):
         axes = figure.add_subplot(1, 3, place + 1)
-        gradients = point_gradients(sdf, settings, points, kind)
-        _draw_arrows(axes, points, -gradients, spacing, color)
+        push = -point_gradients(sdf, settings, points, kind)
+        _draw_arrows(axes, points, push, spacing, color)
+        columns = {"push_x": push[:, 0], "push_z": push[:, 2]}
+        data.append(point_table(points, points=kind).assign(**columns))
         section = sdf.values[:, j, :].T
         axes.contour(nodes[0], nodes[2], section, [0.0], colors="#1f6f8b", linewidths=2.0)
         if kind != "known":
@@ -112,14 +140,8 @@ def _figure(sdf: SdfGrid, settings: CostSettings) -> Figure:
             if section.min() < level < section.max():
                 axes.contour(nodes[0], nodes[2], section, [level], **style)
         axes.set_title(title)
-        axes.set_xlabel("x in m")
-        if place == 0:
-            axes.set_ylabel("z in m")
-        axes.set_xlim(lower[0], upper[0])
-        axes.set_ylim(lower[1], upper[1])
-        axes.set_aspect("equal")
-        axes.grid(visible=False)
-    return figure
+        frame.set_on(axes, left=place == 0)
+    return figure, pd.concat(data)
 
 
 def _draw_arrows(

@@ -1,4 +1,4 @@
-"""What an evaluation has left in its folder: its settings, its tables, its recordings."""
+"""The files of an evaluation: its settings, its tables as pandas data frames, its recordings."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pyarrow
+import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet
 
 from chsel.errors import ChselError
+from runners.evaluation import table
 from runners.evaluation.definition import definition_label, definition_text
 from runners.evaluation.repeats import repeat_of
 
@@ -22,38 +24,41 @@ EXPERIMENT = "experiment.json"
 RESULTS = "results.parquet"
 ITERATIONS = "iterations.parquet"
 _ACCEPTED = "accepted: a folder that runners.evaluate has written"
+_SCHEMAS = {RESULTS: table.RESULTS, ITERATIONS: table.ITERATIONS}
 _NEEDED = {
     RESULTS: ("object", "configuration", "seed", "method", "step", "status", "diversity"),
     ITERATIONS: ("configuration", "seed", "method", "step", "iteration", "diversity"),
 }
-_KEYS = ("object", "configuration", "seed", "method", "status")
+_KEYS = ("object", "configuration", "seed", "method", "status")  # no row is without
 _UNNAMED = "an unnamed definition"
-Row = Mapping[str, Any]
+TRIAL = ["configuration", "seed"]
+"""The columns that tell trials apart."""
 Trial = tuple[str, int]
 """Name of the configuration, and seed."""
 
 
 class ReportError(ChselError):
-    """A folder is no evaluation, or a report on it cannot be made."""
+    """A folder is not an evaluation, or a report on it cannot be made."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """An evaluation, as far as it has come.
-
-    experiment: how it was asked for, plain values. rows: a mapping of every registration, None
-    where there is no finite number; sorted by object, configuration, seed, method, step, draw.
-    Draws of a method are told apart by their `draw` alone, 0 for the first. iterations: the same
-    of moments within registrations. gathered: whether the rows come from finished parts, as there
-    is no table of all yet. definition: label of that of the plausible sets behind all PD.
-    """
+    """An evaluation, as far as it has come."""
 
     folder: Path
-    experiment: Mapping[str, Any]
-    rows: Sequence[Row]
-    iterations: Sequence[Row]
-    gathered: bool = False
-    definition: str = ""
+    experiment: Mapping[str, Any]  # the settings of the evaluation, plain values
+    # A row per registration with the columns of runners.evaluation.table.RESULTS and `draw`, by
+    # which the draws of a method are told apart, 0 for the first. Sorted by object, configuration,
+    # seed, method, step and draw; NaN where there is no finite number.
+    rows: pd.DataFrame
+    iterations: pd.DataFrame  # the same for moments within registrations
+    gathered: bool = False  # the rows are those of finished parts, as there is no table of all yet
+    definition: str = ""  # label of the definition of the plausible sets behind all PD
+
+    @property
+    def name(self) -> str:
+        """The name that the evaluation was given, else that of its folder."""
+        return str(self.experiment.get("name", self.folder.name))
 
     @property
     def definition_text(self) -> str:
@@ -66,21 +71,37 @@ class Evaluation:
 
     @cached_property
     def objects(self) -> list[str]:
-        """Those with a row."""
-        return sorted({row["object"] for row in self.rows})
+        """Objects with a row."""
+        return sorted(self.rows["object"].unique())
 
     @cached_property
     def methods(self) -> list[str]:
-        """Those with a row."""
-        return sorted({row["method"] for row in self.rows})
+        """Methods with a row."""
+        return sorted(self.rows["method"].unique())
 
     @cached_property
-    def object_of(self) -> dict[str, str]:
-        """Objects by configuration."""
-        return {row["configuration"]: row["object"] for row in self.rows}
+    def last_half(self) -> pd.DataFrame:
+        """The rows of the latter half of the steps of every trial."""
+        return last_half(self.rows)
+
+    @cached_property
+    def planned_trials(self) -> list[Trial]:
+        """Trials that were asked for; without that information, those with a row."""
+        configurations = _names(self.experiment.get("configurations"))
+        seeds = self.experiment.get("seeds")
+        if not configurations or not isinstance(seeds, list):
+            return sorted(trials_of(self.rows))
+        return [(name, seed) for name in configurations for seed in seeds]
+
+    @cached_property
+    def planned_methods(self) -> list[str]:
+        """Labels of methods that were asked for, then the others that have a row."""
+        asked = _asked_labels(self.experiment)
+        without_draws = [repeat_of(label, asked)[0] for label in asked]
+        return list(dict.fromkeys([*without_draws, *self.methods]))
 
     def trial_folder(self, trial: Trial) -> Path:
-        """Where the recordings of a trial are."""
+        """The folder of the recordings of a trial."""
         configuration, seed = trial
         return self.folder / "trials" / configuration / f"seed_{seed}"
 
@@ -90,6 +111,23 @@ class Evaluation:
         return path if path.is_file() else None
 
 
+def trials_of(rows: pd.DataFrame) -> set[Trial]:
+    """The trials that have rows."""
+    return set(rows[TRIAL].itertuples(index=False, name=None))
+
+
+def last_half(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the latter half of every trial's steps, the middle one of an odd number too.
+
+    The steps of a trial are those of all methods, so that the half is the same for each.
+    """
+    with_step = rows[rows["step"].notna()]
+    first = with_step.groupby(TRIAL)["step"].transform(
+        lambda steps: sorted(steps.unique())[steps.nunique() // 2]
+    )
+    return with_step[with_step["step"] >= first]
+
+
 def open_evaluation(folder: Path) -> Evaluation:
     """Read the tables of a folder. Raises ReportError unless it is one of an evaluation."""
     if not folder.is_dir():
@@ -97,32 +135,38 @@ def open_evaluation(folder: Path) -> Evaluation:
     experiment = _experiment(folder / EXPERIMENT)
     rows, gathered = _table(folder, RESULTS, "trials/*/seed_*/*.parquet")
     iterations, _ = _table(folder, ITERATIONS, "trials/*/seed_*/*.iterations.parquet")
-    labels = {str(row["method"]) for row in rows} | set(asked_labels(experiment))
-    for row in [*rows, *iterations]:
-        row["method"], row["draw"] = repeat_of(row["method"], labels)
-    order = ("object", "configuration", "seed", "method", "step")
-    rows.sort(key=lambda row: [_sortable(row[name]) for name in (*order, "draw")])
-    moments = (*order[1:], "iteration", "draw")
-    iterations.sort(key=lambda row: [_sortable(row[name]) for name in moments])
-    definition = _definition(folder, experiment, [*rows, *iterations])
+    labels = {*rows["method"], *_asked_labels(experiment)}
+    order = ["object", *TRIAL, "method", "step", "draw"]
+    rows = _in_order(rows, labels, order)
+    iterations = _in_order(iterations, labels, [*order[1:-1], "iteration", "draw"])
+    definition = _definition(folder, experiment, pd.concat([rows, iterations])["definition"])
     return Evaluation(folder, experiment, rows, iterations, gathered, definition)
 
 
-def _definition(folder: Path, experiment: Mapping[str, Any], rows: Sequence[Row]) -> str:
+def _in_order(rows: pd.DataFrame, labels: set[str], order: list[str]) -> pd.DataFrame:
+    """The rows with the label of their method and their draw apart, sorted; no value is first."""
+    draws = {label: repeat_of(label, labels) for label in rows["method"].unique()}
+    draw = rows["method"].map(lambda label: draws[label][1]).astype(int)
+    method = rows["method"].map(lambda label: draws[label][0]).astype(rows["method"].dtype)
+    rows = rows.assign(method=method, draw=draw)
+    return rows.sort_values(order, kind="stable", na_position="first", ignore_index=True)
+
+
+def _definition(folder: Path, experiment: Mapping[str, Any], column: pd.Series) -> str:
     """The label of the one definition of plausible sets by which all rows were measured.
 
     Rows from before there was a column of it have that of experiment.json. Raises ReportError if
     there are several: medians over numbers by different definitions mean nothing.
     """
     asked = experiment.get("definition")
-    ours = _label(asked) if isinstance(asked, Mapping) else _UNNAMED
-    labels = sorted({str(row.get("definition") or ours) for row in rows})
+    usual = _label(asked) if isinstance(asked, Mapping) else _UNNAMED
+    labels = sorted({str(label) if label else usual for label in column.fillna("")})
     if len(labels) > 1:
         raise ReportError(
             f"{folder} has numbers by {len(labels)} definitions of plausible sets, "
             f"{', '.join(labels)}; accepted: one, so evaluate each into an out=DIR of its own"
         )
-    return labels[0] if labels else ours
+    return labels[0] if labels else usual
 
 
 def _label(definition: Mapping[str, Any]) -> str:
@@ -132,12 +176,12 @@ def _label(definition: Mapping[str, Any]) -> str:
         return str(definition.get("name") or _UNNAMED)
 
 
-def asked_labels(experiment: Mapping[str, Any]) -> list[str]:
+def _asked_labels(experiment: Mapping[str, Any]) -> list[str]:
     """Labels of methods and of sets from outside that were asked for, those of draws too."""
-    return [name for kind in ("methods", "outside") for name in named(experiment.get(kind))]
+    return [name for kind in ("methods", "outside") for name in _names(experiment.get(kind))]
 
 
-def named(value: Any) -> list[str]:
+def _names(value: Any) -> list[str]:
     """Names in a list, of which some may be mappings with a label or a name, or in a mapping."""
     if isinstance(value, str):
         return [value]
@@ -159,21 +203,21 @@ def _experiment(path: Path) -> Mapping[str, Any]:
     except (ValueError, OSError) as error:
         raise ReportError(f"{path} cannot be read ({error}); {_ACCEPTED}") from None
     if not isinstance(experiment, Mapping):
-        raise ReportError(f"{path} is no mapping of settings; {_ACCEPTED}")
+        raise ReportError(f"{path} is not a mapping of settings; {_ACCEPTED}")
     return experiment
 
 
-def _table(folder: Path, name: str, parts: str) -> tuple[list[dict[str, Any]], bool]:
+def _table(folder: Path, name: str, parts: str) -> tuple[pd.DataFrame, bool]:
     """The rows of a table; without one, those of its parts, and whether that was so."""
     if (folder / name).exists():
-        return _rows(folder / name, _NEEDED[name]), False
-    found = [
+        return _rows([folder / name], name), False
+    paths = [
         path
         for path in sorted(folder.glob(parts))
-        if name == ITERATIONS or not path.name.endswith(".iterations.parquet")
+        if (name == ITERATIONS or not path.name.endswith(".iterations.parquet"))
+        and not _done_again(path)
     ]
-    found = [path for path in found if not _done_again(path)]
-    return [row for path in found for row in _rows(path, _NEEDED[name])], bool(found)
+    return _rows(paths, name), bool(paths)
 
 
 def _done_again(path: Path) -> bool:
@@ -182,28 +226,22 @@ def _done_again(path: Path) -> bool:
     return name != path.name and path.with_name(f"{name}.parquet").exists()
 
 
-def _sortable(value: Any) -> tuple[bool, Any]:
-    """What has no value comes first."""
-    return (False, 0) if value is None else (True, value)
-
-
-def _rows(path: Path, needed: Sequence[str]) -> list[dict[str, Any]]:
-    try:
-        table = pyarrow.parquet.read_table(path, partitioning=None)
-    except (pyarrow.ArrowException, OSError) as error:
-        text = " ".join(str(error).split())
-        raise ReportError(f"{path} cannot be read as a table ({text}); {_ACCEPTED}") from None
-    missing = [name for name in needed if name not in table.column_names]
-    if missing:
-        raise ReportError(f"{path} lacks the column {', '.join(missing)}; {_ACCEPTED}")
-    rows = [{key: _finite(value) for key, value in row.items()} for row in table.to_pylist()]
-    for row in rows:
-        for key in (key for key in _KEYS if key in needed):
-            if row[key] is None:
-                raise ReportError(f"{path} has a row without {key}; {_ACCEPTED}")
-    return rows
-
-
-def _finite(value: Any) -> Any:
-    """What is not a number has no value."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _rows(paths: Sequence[Path], name: str) -> pd.DataFrame:
+    """The rows of some files, with the columns of today: files of before have NaN in later ones."""
+    schema = _SCHEMAS[name]
+    tables = [schema.empty_table()]
+    for path in paths:
+        try:
+            found = pa.parquet.read_table(path, partitioning=None).replace_schema_metadata()
+            if missing := [column for column in _NEEDED[name] if column not in found.column_names]:
+                raise ReportError(f"{path} lacks the column {', '.join(missing)}; {_ACCEPTED}")
+            both = pa.concat_tables([tables[0], found], promote_options="permissive")
+            tables.append(both.select(schema.names).cast(schema))
+        except (pa.ArrowException, OSError) as error:
+            text = " ".join(str(error).split())
+            raise ReportError(f"{path} cannot be read as a table ({text}); {_ACCEPTED}") from None
+        for column in (column for column in _KEYS if column in _NEEDED[name]):
+            if found[column].null_count:
+                raise ReportError(f"{path} has a row without {column}; {_ACCEPTED}")
+    rows = pa.concat_tables(tables).to_pandas().replace([math.inf, -math.inf], math.nan)
+    return rows.astype({"step": "Int64"})

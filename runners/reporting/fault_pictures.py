@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import trimesh
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError, SettingError, require_choice
@@ -31,9 +31,16 @@ from replay.console import Console, print_error
 from replay.events import Probe
 from runners.evaluation.configurations import object_values
 from runners.objects.loader import ObjectConfig, load_object
-from runners.reporting.panels import drawn, new_figure
-from runners.reporting.silhouette import VIEWS, Frame, Silhouettes
-from runners.reporting.small_picture import small_png
+from runners.reporting.figures import FORMATS, Picture, drawing, new_figure, write_picture
+from runners.reporting.silhouette import (
+    CONTACT,
+    TRUE_POSE,
+    Frame,
+    Silhouettes,
+    corners_in,
+    point_table,
+    pose_table,
+)
 from runners.sessions import open_session
 from runners.sessions.configurations import find_configuration
 from runners.sessions.faults import LEVELS, probed_mesh
@@ -46,11 +53,10 @@ _MARGIN = 0.05  # metres around what is in view
 _IN_VIEW = (0.05, 0.95)  # quantiles of the hypotheses' corners
 _FAR = 0.01  # metres off the object: contacts that are marked
 _TICKS, _MOST = (-30, -10, -3, -1, 0, 1, 3, 10, 30), 60  # millimetres; logarithmic beyond 1
-_POSES, _TRUE = "#0072b2", "#000000"
-_EDGE: Any = {"markeredgecolor": "#222222", "linestyle": "none", "zorder": 6.0}
-_CONTACT: Any = {"color": "#e69f00", "marker": "o", "markersize": 6.0, **_EDGE}
-_OUTLYING: Any = {"color": "#d55e00", "marker": "X", "markersize": 9.0, **_EDGE}
-_FREE: Any = {"color": "#cc79a7", "marker": "s", "markersize": 7.0, **_EDGE}
+_POSES = "#0072b2"
+_CONTACT: Any = {**CONTACT, "zorder": 6.0}
+_OUTLYING: Any = {**_CONTACT, "color": "#d55e00", "marker": "X", "markersize": 9.0}
+_FREE: Any = {**_CONTACT, "color": "#cc79a7", "marker": "s", "markersize": 7.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +73,11 @@ class FaultyCase:
     wrong: FloatArray  # (F, 3), metres, world: free points inside of the probed object
     trust: Trust
     held: bool  # whether the true pose lies in the set, see Anchored.holds
+
+    @property
+    def outlying(self) -> BoolArray:
+        """Which contacts (C,) are far off the object."""
+        return np.asarray(np.abs(self.off[0]) > _FAR)
 
     @property
     def truth_in_set(self) -> str:
@@ -121,54 +132,49 @@ def faulty_case(
     )
 
 
-def picture_of(case: FaultyCase) -> bytes:
-    """A PNG file: the hypotheses from two sides, and how far contacts are off the surface."""
-    return small_png(drawn(lambda: _figure(case)))
-
-
-def _figure(case: FaultyCase) -> Figure:
+def picture_of(case: FaultyCase, name: str) -> Picture:
+    """The hypotheses from two sides, and how far contacts are off the surface."""
     figure, trust = new_figure(4.5), case.trust
     panels = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.3))
     for panel, view in zip(panels, ("xz", "yz"), strict=False):
-        _draw_outlines(panel, case, VIEWS[view])
+        _draw_outlines(panel, case, view)
     _draw_distances(panels[2], case)
     found = f"estimated noise {1e3 * trust.noise:.1f} mm, outliers {100.0 * trust.outliers:.0f} %"
     figure.suptitle(f"{case.title}\n{found}; {trust.verdict}; {case.truth_in_set}")
     looks: dict[str, dict[str, Any]] = {
         f"{len(case.hypotheses)} hypotheses": {"color": _POSES},
-        "true outline": {"color": _TRUE, "linestyle": "--"},
+        "true outline": {"color": TRUE_POSE, "linestyle": "--"},
         "contact": _CONTACT,
     }
-    if _outlying(case).any():
+    if case.outlying.any():
         looks[f"contact over {1e3 * _FAR:.0f} mm off the object"] = _OUTLYING
     if len(case.wrong):
         looks["free voxel inside the object"] = _FREE
     handles = [Line2D([], [], label=label, **look) for label, look in looks.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-    return figure
+    true, best = 1e3 * case.off
+    data = [
+        pose_table(case.hypotheses, kind="hypothesis"),
+        pose_table(case.truth[None], kind="true pose"),
+        point_table(case.contacts, kind="contact", off_true_pose_mm=true, off_best_mm=best),
+        point_table(case.wrong, kind="free voxel inside the object"),
+    ]
+    return Picture(name, case.title, figure, pd.concat(data))
 
 
-def _outlying(case: FaultyCase) -> BoolArray:
-    return np.asarray(np.abs(case.off[0]) > _FAR)
-
-
-def _draw_outlines(panel: Axes, case: FaultyCase, axes: tuple[int, int]) -> None:
-    chosen, far = list(axes), _outlying(case)
-    corners = np.asarray(case.mesh.bounding_box.vertices)
-    places = np.concatenate([apply(pose, corners) for pose in case.hypotheses])
-    near = [np.quantile(places, _IN_VIEW, axis=0), case.contacts, apply(case.truth, corners)]
-    shown = np.concatenate(near)[:, chosen]
-    frame = Frame(axes, shown.min(axis=0) - _MARGIN, shown.max(axis=0) + _MARGIN)
+def _draw_outlines(panel: Axes, case: FaultyCase, view: str) -> None:
+    far, places = case.outlying, corners_in(case.mesh, case.hypotheses)
+    true = corners_in(case.mesh, [case.truth])
+    shown = [np.quantile(places, _IN_VIEW, axis=0), case.contacts, true]
+    frame = Frame.around(view, shown, _MARGIN)
     registered, probed = (Silhouettes(mesh, frame) for mesh in (case.mesh, case.probed))
     for pose in case.hypotheses:
         registered.draw(panel, pose, _POSES, width=0.8, alpha=0.4)
-    probed.draw(panel, case.truth, _TRUE, width=2.0, style="dashed")
+    probed.draw(panel, case.truth, TRUE_POSE, width=2.0, style="dashed")
     parts = (case.wrong, _FREE), (case.contacts[~far], _CONTACT), (case.contacts[far], _OUTLYING)
     for points, look in parts:
-        panel.plot(*points[:, chosen].T, **look)
-    panel.set(xlim=(frame.lower[0], frame.upper[0]), ylim=(frame.lower[1], frame.upper[1]))
-    panel.set(xlabel=f"{'xyz'[axes[0]]} in m", ylabel=f"{'xyz'[axes[1]]} in m", aspect="equal")
-    panel.grid(visible=False)
+        panel.plot(*frame.flat(points).T, **look)
+    frame.set_on(panel)
 
 
 def _draw_distances(panel: Axes, case: FaultyCase) -> None:
@@ -177,7 +183,7 @@ def _draw_distances(panel: Axes, case: FaultyCase) -> None:
     for side in (-FOREIGN, FOREIGN):
         panel.axvline(side * sigma, color="#888888", linestyle=":")
     true, best = 1e3 * case.off
-    panel.plot(true, rows, "o", color="none", markeredgecolor=_TRUE, markersize=10.0)
+    panel.plot(true, rows, "o", color="none", markeredgecolor=TRUE_POSE, markersize=10.0)
     panel.plot(best, rows, "o", color=_POSES, markersize=6.0)
     panel.set_xscale("symlog", linthresh=1.0)
     panel.set(xlim=(-_MOST, _MOST), yticks=rows, ylabel="contact")
@@ -188,20 +194,22 @@ def _draw_distances(panel: Axes, case: FaultyCase) -> None:
 
 
 def main() -> int:
-    """Write FOLDER/LEVEL.png for each level."""
+    """Write FOLDER/LEVEL.png and LEVEL.csv for each level."""
     parser = argparse.ArgumentParser(prog="runners.reporting.fault_pictures", description=__doc__)
     parser.add_argument("folder", type=Path, help="made if it does not exist")
     parser.add_argument("--levels", nargs="+", default=KINDS, help=f"of {', '.join(LEVELS)}")
     parser.add_argument("--configuration", default="mustard")
     parser.add_argument("--probe", type=int, default=10, help="the last one that counts, from 0")
     parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--format", choices=FORMATS, default=FORMATS[0])
     given = parser.parse_args()
     try:
         given.folder.mkdir(parents=True, exist_ok=True)
         where = given.configuration, given.probe, given.seed
         for level in given.levels:
             case = faulty_case(level, *where, AnchoredSettings())
-            (given.folder / f"{level}.png").write_bytes(picture_of(case))
+            with drawing():
+                write_picture(picture_of(case, level), given.folder, given.format, small=True)
             Console().print(f"{level}: {case.trust}; {case.truth_in_set}", soft_wrap=True)
     except (ChselError, OSError) as error:
         print_error(str(error))

@@ -2,96 +2,93 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import pandas as pd
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from runners.reporting.figures import (
+    NotDrawn,
+    Picture,
+    draw_quartiles,
+    legend_of_methods,
+    panels,
+    positive_scale,
+)
+from runners.reporting.section import Section, Styles, Subject, drawn
+from runners.reporting.statistics import DIVERSITY, spreads
+from runners.reporting.tables import Table, method_table
 
-from runners.reporting.evaluation_folder import Evaluation, Row
-from runners.reporting.method_style import MethodStyle
-from runners.reporting.panels import drawn, legend_of_methods, panels, positive_scale
-from runners.reporting.section import NotDrawn, Picture, Table
-from runners.reporting.statistics import grouped, spread
-from runners.reporting.tables import method_table
-
-_COLUMNS = {"diversity": "PD in mm²", "mean_cost": "mean relaxed cost of the best cells"}
-_OWN_COST = "medial_constraint"  # of what these search, the cost is another one
-Styles = Mapping[str, MethodStyle]
+_COLUMNS = {  # label of the axis, title of the table
+    DIVERSITY: ("PD in mm²", "PD in mm² by iteration"),
+    "mean_cost": ("mean relaxed cost of the best cells", "Mean cost by iteration"),
+}
+_NO_RELAXED_COST = "medial_constraint"  # methods that begin so search by another cost, in m^2
 
 
-def picture_over_iterations(evaluation: Evaluation, styles: Styles, name: str) -> Picture:
-    """Medians and quartiles over trials and steps; NotDrawn where nothing was measured."""
-    rows = evaluation.iterations
-    if not evaluation.iterations:
+def over_iterations(subject: Subject) -> Section:
+    """Medians and quartiles over trials and steps."""
+    moments = subject.evaluation.iterations
+    styles = subject.styles_of(moments["method"].unique())
+    picture, missing = drawn(lambda: picture_over_iterations(moments, styles))
+    text = (
+        "What a method would give if its search ended after so many iterations: PD of the "
+        "hypotheses, and the mean cost of the best cells, from which these are taken. Medians and "
+        "25th to 75th percentiles over trials and steps; all searches of a trial and step start "
+        "alike."
+    )
+    if configurations := sorted(moments["configuration"].unique()):
+        text += f" Of {', '.join(configurations)}."
+    title = "Plausible diversity and cost over QD iterations"
+    tables = tables_over_iterations(moments, styles)
+    return Section("over-iterations", title, text, picture, missing, tables)
+
+
+def tables_over_iterations(moments: pd.DataFrame, styles: Styles) -> tuple[Table, ...]:
+    """Of both numbers."""
+    tables = []
+    for column, (_, title) in _COLUMNS.items():
+        rows = _comparable(moments, column)
+        if rows[column].notna().any():
+            shown = {m: style for m, style in styles.items() if (rows["method"] == m).any()}
+            tables.append(method_table(title, rows, "iteration", shown, column=column))
+    return tuple(tables)
+
+
+def _comparable(moments: pd.DataFrame, column: str) -> pd.DataFrame:
+    """Without the costs that are of another kind."""
+    if column != "mean_cost":
+        return moments
+    return moments[~moments["method"].str.startswith(_NO_RELAXED_COST)]
+
+
+def picture_over_iterations(moments: pd.DataFrame, styles: Styles) -> Picture:
+    """A panel for both numbers; NotDrawn where nothing was measured."""
+    if moments.empty:
         raise NotDrawn(
             "no moments within registrations were measured; `python -m runners.evaluate "
             "experiment=paper_qd` measures them"
         )
-    if not any(row.get(column) is not None for row in rows for column in _COLUMNS):
+    if moments[list(_COLUMNS)].isna().all(axis=None):
         raise NotDrawn("no moment within a registration has a number")
-    shown = {m: style for m, style in styles.items() if any(row["method"] == m for row in rows)}
-    alt = (
-        "Plausible diversity and mean cost of the best cells over iterations of "
-        f"{' and '.join(style.title for style in shown.values())}: medians with quartile bands."
-    )
-    return Picture(name, alt, drawn(lambda: _figure(rows, shown)))
-
-
-def tables_over_iterations(evaluation: Evaluation, styles: Styles) -> tuple[Table, ...]:
-    """Of both numbers."""
-    titles = {"diversity": "PD in mm² by iteration", "mean_cost": "Mean cost by iteration"}
-    tables = []
-    for column, title in titles.items():
-        rows = _comparable(evaluation.iterations, column)
-        shown = {m: style for m, style in styles.items() if any(row["method"] == m for row in rows)}
-        if any(row.get(column) is not None for row in rows):
-            tables.append(
-                method_table(
-                    title, "iteration", rows, lambda row: row["iteration"], shown, column=column
-                )
-            )
-    return tuple(tables)
-
-
-def _comparable(rows: Sequence[Row], column: str) -> Sequence[Row]:
-    """Without the costs that are of another kind."""
-    if column != "mean_cost":
-        return rows
-    return [row for row in rows if not row["method"].startswith(_OWN_COST)]
-
-
-def _figure(rows: Sequence[Row], styles: Styles) -> Figure:
     figure, axes = panels(2, columns=2, row_height=3.8)
-    for panel, (column, label) in zip(axes, _COLUMNS.items(), strict=True):
-        _draw(panel, _comparable(rows, column), styles, column)
+    data = []
+    for panel, (column, (label, _)) in zip(axes, _COLUMNS.items(), strict=True):
+        rows = _comparable(moments, column)
+        found = spreads(rows, ["method", "iteration"], column).query("count > 0")
+        for place, (method, style) in enumerate(styles.items()):
+            if method in found.index:
+                of_method = found.loc[method]
+                every = max(1, len(of_method) // 12)
+                markers = (place % every, every)
+                draw_quartiles(panel, of_method, style, alpha=0.18, markevery=markers)
+        positive_scale(panel, pd.concat([found["lower"], found["upper"]]))
+        last = rows["iteration"].max() if len(rows) else 1
+        panel.set_xlim(0.0, last or 1)
         panel.set_ylabel(label)
         panel.set_xlabel("QD iterations")
+        found = found[["count", "lower", "median", "upper"]].reset_index()
+        data.append(found.assign(number=column))
     legend_of_methods(figure, list(styles.values()))
-    return figure
-
-
-def _draw(axes: Axes, rows: Sequence[Row], styles: Styles, column: str) -> None:
-    values: list[float] = []
-    by_method = grouped(rows, lambda row: row["method"])
-    for place, (method, style) in enumerate(styles.items()):
-        by_iteration = grouped(by_method.get(method, ()), lambda row: row["iteration"])
-        spreads = {at: spread(some, column) for at, some in sorted(by_iteration.items())}
-        spreads = {at: found for at, found in spreads.items() if found.count}
-        if not spreads:
-            continue
-        quartiles = [found.quartiles for found in spreads.values()]
-        lower, median, upper = (list(part) for part in zip(*quartiles, strict=True))
-        values += [*lower, *upper]
-        at = list(spreads)
-        every = max(1, len(at) // 12)
-        axes.fill_between(at, lower, upper, color=style.color, alpha=0.18, linewidth=0)
-        axes.plot(
-            at,
-            median,
-            color=style.color,
-            linestyle=style.line,
-            marker=style.marker,
-            markevery=(place % every, every),
-        )
-    positive_scale(axes, values)
-    axes.set_xlim(0.0, max((row["iteration"] for row in rows), default=1) or 1)
+    alt = (
+        "Plausible diversity and mean cost of the best cells over iterations of "
+        f"{' and '.join(style.title for style in styles.values())}: medians with quartile bands."
+    )
+    return Picture("over_iterations", alt, figure, pd.concat(data))

@@ -10,8 +10,10 @@ from typing import Any
 
 import jinja2
 
-from runners.reporting.evaluation_folder import Evaluation
-from runners.reporting.section import Cell, Section, Table
+from runners.reporting.evaluation_folder import Evaluation, trials_of
+from runners.reporting.figures import Picture, file_content
+from runners.reporting.section import Section
+from runners.reporting.tables import Cell, Table
 
 _LONG = 20  # rows, of tables that can be folded
 _NOT_SHOWN = ("environment", "other_environments", "commands", "methods", "format")
@@ -19,43 +21,48 @@ _NOT_SHOWN = ("environment", "other_environments", "commands", "methods", "forma
 
 @dataclass(frozen=True)
 class Page:
-    """title, lead: what it is about. commands: that made it. made: settings and versions."""
+    """A report in full."""
 
     title: str
-    lead: tuple[str, ...]
+    lead: tuple[str, ...]  # what it is about
     sections: tuple[Section, ...]
-    commands: tuple[str, ...]
-    made: tuple[Table, ...]
+    commands: tuple[str, ...]  # that made the evaluation and the report
+    made: tuple[Table, ...]  # settings and versions
+    kind: str  # of the files of its pictures, one of FORMATS
 
 
-def page_of(evaluation: Evaluation, sections: Sequence[Section], command: str) -> Page:
-    """A page of sections. command: that makes the report itself."""
-    experiment = evaluation.experiment
-    trials = {(row["configuration"], row["seed"]) for row in evaluation.rows}
+def page_of(evaluation: Evaluation, sections: Sequence[Section], command: str, kind: str) -> Page:
+    """A page of sections. command: that makes the report itself. kind: of the pictures' files."""
+    experiment, rows = evaluation.experiment, evaluation.rows
     lead = [
-        f"{len(evaluation.methods)} methods on {len(trials)} trials of {len(evaluation.objects)} "
-        f"objects: {len(evaluation.rows)} registrations. PD is plausible diversity in mm², lower "
-        "is better; the best median of a row is bold, in brackets are its quartiles, and n is how "
-        "many numbers are behind it.",
+        f"{len(evaluation.methods)} methods on {len(trials_of(rows))} trials of "
+        f"{len(evaluation.objects)} objects: {len(rows)} registrations. PD is plausible diversity "
+        "in mm², lower is better; the best median of a row is bold, in brackets are its quartiles, "
+        "and n is how many numbers are behind it.",
         f"Plausible sets are by the definition {evaluation.definition_text}.",
     ]
     if evaluation.gathered:
         lead.append("There is no table of the whole evaluation yet: this is what is finished.")
-    if not evaluation.rows:
+    if rows.empty:
         lead = ["Nothing is finished yet: there is no registration to report on."]
     commands = experiment.get("commands")
     made = [str(line) for line in commands] if isinstance(commands, list) else []
     return Page(
-        f"Evaluation {experiment.get('name', evaluation.folder.name)}",
+        f"Evaluation {evaluation.name}",
         tuple(lead),
         tuple(sections),
         (*made, command),
         tuple(table for table in _made(experiment) if table.rows),
+        kind,
     )
 
 
-def as_html(page: Page) -> str:
-    """The page, to be read without anything else."""
+def as_html(page: Page, contents: Mapping[str, bytes]) -> str:
+    """The page with its pictures in it, to be read without anything else.
+
+    contents: of the pictures' files by name. Pictures of PDF files, which pages cannot show, are
+    drawn as PNG.
+    """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("runners.reporting", "."),
         autoescape=True,
@@ -64,24 +71,27 @@ def as_html(page: Page) -> str:
         keep_trailing_newline=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
-    return environment.get_template("page.html").render(
-        title=page.title,
-        lead=page.lead,
-        sections=page.sections,
-        commands=page.commands,
-        made=page.made,
-    )
+
+    def address(picture: Picture) -> str:
+        pdf = page.kind == "pdf"
+        content = file_content(picture.figure) if pdf else contents[picture.name]
+        media_type = "svg+xml" if page.kind == "svg" else "png"
+        return f"data:image/{media_type};base64,{base64.b64encode(content).decode()}"
+
+    environment.filters["address"] = address
+    return environment.get_template("page.html").render(vars(page))
 
 
 def as_markdown(page: Page) -> str:
-    """The page, with links to the pictures beside it."""
+    """The page, with links to the files of its pictures and of their data."""
     parts = [f"# {_text(page.title)}", *map(_text, page.lead)]
     for section in page.sections:
         parts += [f"## {_text(section.title)}"]
         parts += [_text(section.text)] if section.text else []
         if section.picture is not None:
-            parts.append(f"![{_text(section.picture.alt)}]({section.picture.name})")
+            name, alt = section.picture.name, _text(section.picture.alt)
+            parts.append(f"{'' if page.kind == 'pdf' else '!'}[{alt}]({name}.{page.kind})")
+            parts.append(f"[The numbers drawn]({name}.csv)")
         elif section.missing:
             parts.append(f"No picture: {_text(section.missing)}.")
         parts += [part for table in section.tables for part in _markdown_table(table)]

@@ -4,58 +4,84 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import apply, inverse
+from chsel.problem.poses import inverse
 from replay.events import Probe
 from replay.mcap.reader import Recording, read_recording
-from runners.reporting.method_style import MethodStyle
-from runners.reporting.panels import WIDTH, drawn, new_figure
-from runners.reporting.section import NotDrawn, Picture
-from runners.reporting.silhouette import VIEWS, Frame, Silhouettes
+from runners.reporting.figures import WIDTH, NotDrawn, Picture, new_figure
+from runners.reporting.section import Section, Styles, Subject, drawn
+from runners.reporting.shown_trial import shown_trial
+from runners.reporting.silhouette import (
+    CONTACT,
+    TRUE_POSE,
+    Frame,
+    Silhouettes,
+    corners_in,
+    point_table,
+    pose_table,
+)
 
 STEPS = 4
-CONTACT = "#e69f00"
+_METHODS = ("chsel", "medial_constraint", "icp")
+_VIEWS = {
+    "xz": "from the side, with the probing direction x to the right",
+    "xy": "from above, with the probing direction x to the right",
+    "yz": "along the probing direction x",
+}
+_CONTACT = CONTACT | {"markersize": 5.0, "linestyle": "-"}
 _MARGIN = 0.06  # metres around the true pose and the contacts
+_IN_VIEW = (0.05, 0.95)  # quantiles of the hypotheses' corners
 _APPROACH = 0.05  # metres of the gripper's way that are drawn before a contact
 _MOVED = 0.005  # metres, less is shaking
-Styles = Mapping[str, MethodStyle]
+
+
+def probing_sequence(subject: Subject) -> Section:
+    """Of the shown trial."""
+    title, evaluation, sequence = "A probing sequence", subject.evaluation, subject.sequence
+    try:
+        trial, why = shown_trial(subject)
+    except NotDrawn as reason:
+        return Section("sequence", title, "", missing=str(reason))
+    asked = sequence.methods or _METHODS
+    paths = {m: evaluation.recording(trial, m) for m in asked}
+    if sequence.methods is None and not any(paths.values()):
+        paths = {m: evaluation.recording(trial, m) for m in subject.styles}
+    found = {method: path for method, path in paths.items() if path is not None}
+    text = (
+        f"Hypotheses as outlines of the mesh, seen {_VIEWS[sequence.view]}; the true pose is "
+        "the broken line, contacts so far are orange, with the gripper's way to them. The trial is "
+        f"{trial[0]}, seed {trial[1]}"
+    )
+    text += f", {why}." if why else "."
+    if len(found) < len(paths):
+        text += f" Not recorded: {', '.join(m for m in paths if m not in found)}."
+
+    def draw() -> Picture:
+        if not found:
+            raise NotDrawn(f"there is no recording of {', '.join(asked)} in this trial")
+        return picture_of_sequence(found, subject.styles, steps=sequence.steps, view=sequence.view)
+
+    return Section("sequence", title, text, *drawn(draw))
 
 
 def picture_of_sequence(
-    recordings: Mapping[str, Path],
-    styles: Styles,
-    name: str,
-    *,
-    steps: Sequence[int] | None,
-    view: str,
+    paths: Mapping[str, Path], styles: Styles, *, steps: Sequence[int] | None, view: str
 ) -> Picture:
     """The picture of the recordings of one trial by method; NotDrawn where none has a result.
 
     steps: None for the first and last that all methods have, and those evenly between.
     """
-    opened: dict[str, Recording] = {}
-    for method, path in recordings.items():
-        try:
-            opened[method] = read_recording(path)
-        except ChselError as error:
-            raise NotDrawn(str(error)) from None
-    shown = shown_steps(list(opened.values()), steps)
-    truth = next(iter(opened.values())).start
-    alt = (
-        f"Outlines of {truth.object} in the poses that {', '.join(styles[m].title for m in opened)}"
-        f" hold for likely at steps {', '.join(map(str, shown))}, around the true pose."
-    )
     try:
-        return Picture(name, alt, drawn(lambda: _figure(opened, styles, shown, view)))
-    except ChselError as error:  # of a recording that is damaged further on
+        recordings = {method: read_recording(path) for method, path in paths.items()}
+        return _picture(recordings, styles, shown_steps(list(recordings.values()), steps), view)
+    except ChselError as error:
         raise NotDrawn(str(error)) from None
 
 
@@ -80,71 +106,67 @@ def shown_steps(recordings: Sequence[Recording], steps: Sequence[int] | None) ->
     return list(steps)
 
 
-def _figure(
+def _picture(
     recordings: Mapping[str, Recording], styles: Styles, steps: Sequence[int], view: str
-) -> Figure:
-    start = next(iter(recordings.values())).start
-    frame = _frame(recordings, steps, view)
-    silhouettes = Silhouettes(start.mesh, frame)
-    width, height = frame.upper - frame.lower
-    panel_width = (WIDTH - 1.2) / max(len(steps), 3) - 0.5
-    panel_height = float(np.clip(panel_width * height / width, 1.5, 6.0))
-    figure = new_figure(1.1 + len(recordings) * (panel_height + 0.3))
-    for row, (method, recording) in enumerate(recordings.items()):
-        for column, step in enumerate(steps):
-            place = row * len(steps) + column + 1
-            axes = figure.add_subplot(len(recordings), len(steps), place)
-            poses = inverse(recording.hypotheses(step).object_from_world)
-            for pose in poses[::-1]:  # the best on top
-                silhouettes.draw(axes, pose, styles[method].color, width=0.9, alpha=0.45)
-            if start.world_from_object is not None:
-                silhouettes.draw(
-                    axes, start.world_from_object, "#000000", width=1.8, style="dashed"
-                )
-            _draw_contacts(axes, recording.probes, step, frame)
-            _set_frame(axes, frame)
-            if row == 0:
-                axes.set_title(f"step {step}")
-            if column == 0:
-                axes.set_ylabel(f"{styles[method].title}\n{'xyz'[frame.axes[1]]} in m")
-            if row == len(recordings) - 1:
-                axes.set_xlabel(f"{'xyz'[frame.axes[0]]} in m")
-    _legend(figure, start.world_from_object is not None)
-    return figure
-
-
-def _frame(recordings: Mapping[str, Recording], steps: Sequence[int], view: str) -> Frame:
-    """What holds the true pose, the contacts, and nine of ten of the hypotheses' points."""
+) -> Picture:
     first = next(iter(recordings.values()))
-    axes = VIEWS[view]
-    corners = np.asarray(first.start.mesh.bounding_box.vertices, dtype=np.float64)
-    parts = [probe.contacts for probe in first.probes if probe.step <= max(steps)]
-    if first.start.world_from_object is not None:
-        parts.append(apply(first.start.world_from_object, corners))
-    places = [
-        apply(pose, corners)
-        for recording in recordings.values()
+    truth = [] if first.start.world_from_object is None else [first.start.world_from_object]
+    poses = {
+        (method, step): inverse(recording.hypotheses(step).object_from_world)
+        for method, recording in recordings.items()
         for step in steps
-        for pose in inverse(recording.hypotheses(step).object_from_world)
-    ]
-    guessed = np.concatenate(places)
-    parts.append(np.quantile(guessed, (0.05, 0.95), axis=0))
-    flat = np.concatenate(parts)[:, list(axes)]
-    return Frame(axes, flat.min(axis=0) - _MARGIN, flat.max(axis=0) + _MARGIN)
+    }
+    guessed = corners_in(first.start.mesh, np.concatenate(list(poses.values())))
+    contacts = [probe.contacts for probe in first.probes if probe.step <= max(steps)]
+    in_view = [*contacts, np.quantile(guessed, _IN_VIEW, axis=0)]
+    in_view += [corners_in(first.start.mesh, truth)] if truth else []
+    frame = Frame.around(view, in_view, _MARGIN)
+    silhouettes = Silhouettes(first.start.mesh, frame)
+    panel_width = (WIDTH - 1.2) / max(len(steps), 3) - 0.5
+    panel_height = float(np.clip(panel_width * frame.aspect, 1.5, 6.0))
+    figure = new_figure(1.1 + len(recordings) * (panel_height + 0.3))
+    panels = figure.subplots(len(recordings), len(steps), squeeze=False)
+    data = [pose_table(np.array(truth).reshape(-1, 4, 4), kind="true pose")]
+    for (row, column), panel in np.ndenumerate(panels):
+        method, step = list(recordings)[row], steps[column]
+        for pose in poses[method, step][::-1]:  # the best on top
+            silhouettes.draw(panel, pose, styles[method].color, width=0.9, alpha=0.45)
+        for pose in truth:
+            silhouettes.draw(panel, pose, TRUE_POSE, width=1.8, style="dashed")
+        probes = [probe for probe in recordings[method].probes if probe.step <= step]
+        _draw_contacts(panel, probes, frame)
+        frame.set_on(panel, left=column == 0, bottom=row == len(recordings) - 1)
+        panel.tick_params(labelsize=9)
+        if row == 0:
+            panel.set_title(f"step {step}")
+        if column == 0:
+            panel.set_ylabel(f"{styles[method].title}\n{panel.get_ylabel()}")
+        about = {"kind": "hypothesis", "method": method, "step": step}
+        data.append(pose_table(poses[method, step], **about))
+    for probe in first.probes:
+        if probe.step <= max(steps):
+            data.append(point_table(probe.contacts, kind="contact", step=probe.step))
+    handles = [Line2D([], [], color="#888888", linewidth=1.2, label="hypotheses")]
+    if truth:
+        handles.append(Line2D([], [], color=TRUE_POSE, linestyle="--", label="true pose"))
+    handles.append(Line2D([], [], **_CONTACT, label="contact, and the way to it"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    alt = (
+        f"Outlines of {first.start.object} in the poses that "
+        f"{', '.join(styles[method].title for method in recordings)} hold for likely at steps "
+        f"{', '.join(map(str, steps))}, around the true pose."
+    )
+    return Picture("sequence", alt, figure, pd.concat(data))
 
 
-def _draw_contacts(axes: Axes, probes: Sequence[Probe], step: int, frame: Frame) -> None:
-    """Contacts so far, each with the last of the way of the gripper to it."""
-    right, up = frame.axes
+def _draw_contacts(axes: Axes, probes: Sequence[Probe], frame: Frame) -> None:
+    """Contacts, each with the last of the way of the gripper to it."""
     for probe in probes:
-        if probe.step > step:
-            continue
         for contact in probe.contacts:
             before = contact - _APPROACH * _direction(probe.gripper_path, contact)
-            ends = ([before[right], contact[right]], [before[up], contact[up]])
-            axes.plot(*ends, color=CONTACT, linewidth=1.8, zorder=5.0)
-            marker: Any = {"marker": "o", "markersize": 5.0, "markeredgecolor": "#222222"}
-            axes.plot(contact[right], contact[up], color=CONTACT, **marker, zorder=6.0)
+            way = frame.flat(np.stack([before, contact]))
+            axes.plot(*way.T, color=_CONTACT["color"], linewidth=1.8, zorder=5.0)
+            axes.plot(*way[1], **_CONTACT, zorder=6.0)
 
 
 def _direction(path: FloatArray, contact: FloatArray) -> FloatArray:
@@ -157,20 +179,3 @@ def _direction(path: FloatArray, contact: FloatArray) -> FloatArray:
     lengths = np.sqrt((ways**2).sum(axis=1))
     moved = np.flatnonzero(lengths > _MOVED)
     return ways[moved[-1]] / lengths[moved[-1]] if len(moved) else np.zeros(3)
-
-
-def _set_frame(axes: Axes, frame: Frame) -> None:
-    axes.set_xlim(frame.lower[0], frame.upper[0])
-    axes.set_ylim(frame.lower[1], frame.upper[1])
-    axes.set_aspect("equal")
-    axes.grid(visible=False)
-    axes.tick_params(labelsize=9)
-
-
-def _legend(figure: Figure, truth: bool) -> None:
-    handles = [Line2D([], [], color="#888888", linewidth=1.2, label="hypotheses")]
-    if truth:
-        handles.append(Line2D([], [], color="#000000", linestyle="--", label="true pose"))
-    contact = Line2D([], [], color=CONTACT, marker="o", label="contact, and the way to it")
-    contact.set_markeredgecolor("#222222")
-    figure.legend(handles=[*handles, contact], loc="outside lower center", ncols=3)

@@ -1,90 +1,74 @@
-"""What a report is made of: sections of a picture, or why there is none, and tables."""
+"""A section of a report: a picture, or why there is none, and tables."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
-from runners.reporting.statistics import Spread
+from chsel.errors import require_choice
+from runners.reporting.evaluation_folder import Evaluation, ReportError
+from runners.reporting.figures import NotDrawn, Picture
+from runners.reporting.method_style import MethodStyle, method_styles
+from runners.reporting.silhouette import VIEWS
+from runners.reporting.tables import Table
 
-
-@dataclass(frozen=True)
-class Cell:
-    """best: the best of its row, shown bold. between: its quartiles. note: such as a count."""
-
-    text: str
-    best: bool = False
-    between: str = ""
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Table:
-    """header: names of the columns, of which the first `labels` are texts. note: what it tells."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    labels: int = 1
-    note: str = ""
+LAST_HALF = (
+    "Numbers are pooled over trials (a configuration with a seed) and over the steps of the last "
+    "half of every trial."
+)
+Styles = Mapping[str, MethodStyle]
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A PNG file. alt: what it shows, for those who do not see it."""
+class SequenceConfig:
+    """What the pictures of a single trial show."""
 
-    name: str
-    alt: str
-    png: bytes
+    trial: str | None = None  # such as "drill/0"; None: that of the median PD of CHSEL
+    methods: tuple[str, ...] | None = None  # None: those of the paper's picture
+    steps: tuple[int, ...] | None = None  # None: four of those that all methods have
+    view: str = "xz"  # the axes of the world that are drawn
+
+    def __post_init__(self) -> None:
+        require_choice("view", self.view, VIEWS)
+        for name in ("methods", "steps"):
+            if getattr(self, name) == ():
+                raise ReportError(f"{name} is empty; accepted: at least one, or null")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a report is about: an evaluation, and what was asked for."""
+
+    evaluation: Evaluation
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    baseline: str | None = None  # a method to compare all others with
+
+    @cached_property
+    def styles(self) -> Styles:
+        """All methods in the order in which figures and tables have them, with their looks."""
+        return method_styles(self.evaluation.planned_methods)
+
+    def styles_of(self, methods: Sequence[str]) -> Styles:
+        """The same of some methods."""
+        return {method: style for method, style in self.styles.items() if method in methods}
 
 
 @dataclass(frozen=True)
 class Section:
-    """name: of its anchor. text: what is shown and how it comes about. missing: why no picture."""
+    """A section of the page."""
 
-    name: str
+    name: str  # of its anchor
     title: str
-    text: str
+    text: str  # what is shown and how it comes about
     picture: Picture | None = None
-    missing: str = ""
-    tables: tuple[Table, ...] = field(default=())
+    missing: str = ""  # why there is no picture
+    tables: tuple[Table, ...] = ()
 
 
-class NotDrawn(Exception):
-    """Why there is no picture."""
-
-
-def number(value: float) -> str:
-    """Three digits that count, from a thousand on all before the point; "-" for none."""
-    if not math.isfinite(value):
-        return "-"
-    if value != 0.0 and abs(value) < 1e-3:
-        return f"{value:.2e}"
-    if abs(value) >= 1000.0:
-        return f"{value:.0f}"
-    text = f"{value:.3g}"
-    return "1000" if "e" in text else text
-
-
-def spread_cells(
-    spreads: Sequence[Spread], best: Callable[[Sequence[float]], float] | None
-) -> list[Cell]:
-    """Median [quartiles] of each; notes where numbers are fewer than elsewhere in the row.
-
-    best: which median is bold, where there are several.
-    """
-    most = max((spread.count for spread in spreads), default=0)
-    medians = [spread.median for spread in spreads if spread.count]
-    bold = best(medians) if best is not None and len(medians) > 1 else None
-    return [_spread_cell(spread, bold, most) for spread in spreads]
-
-
-def _spread_cell(spread: Spread, bold: float | None, most: int) -> Cell:
-    if not spread.count:
-        return Cell("-", note=f"{spread.left_out} left out" if spread.left_out else "")
-    lower, median, upper = spread.quartiles
-    notes = [f"n {spread.count}"] if spread.count < most else []
-    notes += [f"{spread.left_out} left out"] if spread.left_out else []
-    between = f"[{number(lower)}, {number(upper)}]"
-    return Cell(number(median), median == bold, between, ", ".join(notes))
+def drawn(draw: Callable[[], Picture]) -> tuple[Picture | None, str]:
+    """A picture, or why there is none: two fields of a Section."""
+    try:
+        return draw(), ""
+    except NotDrawn as reason:
+        return None, str(reason)

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import re
 
-from runners.reporting.evaluation_folder import Evaluation, ReportError, Trial
-from runners.reporting.section import NotDrawn
-from runners.reporting.statistics import grouped, last_half, spread, trial_of
-from runners.reporting.tables import DIVERSITY
+from runners.reporting.evaluation_folder import TRIAL, Evaluation, ReportError, Trial, trials_of
+from runners.reporting.figures import NotDrawn
+from runners.reporting.section import Subject
+from runners.reporting.statistics import DIVERSITY
 
 _PREFERRED = "drill"  # the object of the paper's pictures
 _METHOD = "chsel"
+
+
+def shown_trial(subject: Subject) -> tuple[Trial, str]:
+    """The trial, and why this one unless it was asked for. Raises NotDrawn without a recording."""
+    if subject.sequence.trial is None:
+        return usual_trial(subject.evaluation)
+    return named_trial(subject.sequence.trial), ""
 
 
 def named_trial(text: str) -> Trial:
@@ -27,24 +34,23 @@ def usual_trial(evaluation: Evaluation) -> tuple[Trial, str]:
     Of an even number the lower one of the middle two; without any PD, the first recorded trial.
     Raises NotDrawn if there is no recording.
     """
+    rows = evaluation.rows
+    names = rows[[*TRIAL, "method"]].drop_duplicates().itertuples(index=False, name=None)
     recorded = sorted(
-        {
-            trial_of(row)
-            for row in evaluation.rows
-            if evaluation.recording(trial_of(row), row["method"]) is not None
-        }
+        {(name, seed) for name, seed, method in names if evaluation.recording((name, seed), method)}
     )
     if not recorded:
         raise NotDrawn("there are no recordings; `recordings=true` of runners.evaluate keeps them")
-    best = [trial for trial in recorded if evaluation.object_of[trial[0]] == _PREFERRED] or recorded
-    rows = [row for row in last_half(evaluation.rows) if row["method"] == _METHOD]
-    medians = {trial: spread(some, DIVERSITY) for trial, some in grouped(rows, trial_of).items()}
+    of_preferred = trials_of(rows[rows["object"] == _PREFERRED])
+    best = [trial for trial in recorded if trial in of_preferred] or recorded
+    half = evaluation.last_half
+    medians = half[half["method"] == _METHOD].groupby(TRIAL)[DIVERSITY].median().dropna()
     ranked = sorted(
-        (medians[trial].median, trial)
+        (medians[trial], trial)
         for trial in best
-        if trial in medians and medians[trial].count and evaluation.recording(trial, _METHOD)
+        if trial in medians.index and evaluation.recording(trial, _METHOD)
     )
     if not ranked:
         return best[0], "the first one that is recorded"
-    of_object = f" among those of {evaluation.object_of[best[0][0]]}" if best != recorded else ""
-    return ranked[(len(ranked) - 1) // 2][1], f"that of the median PD of CHSEL{of_object}"
+    among = f" among those of {_PREFERRED}" if best != recorded else ""
+    return ranked[(len(ranked) - 1) // 2][1], f"that of the median PD of CHSEL{among}"

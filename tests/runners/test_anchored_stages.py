@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
 from chsel.methods.anchored.anchored import Anchored
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.problem.poses import apply, inverse
 from replay.mcap.reader import read_recording
-from runners.reporting import panels
 from runners.reporting.anchored_stages import main, picture_of_stages, stages_of
+from runners.reporting.figures import write_picture
 from tests.runners.drawn_figures import outlines_of
 from tests.runners.made_up_evaluations import REPLAYS
 
@@ -50,24 +50,15 @@ def test_stages_are_those_of_the_registration_and_come_closer() -> None:
     assert apart.max() < 1e-9  # metres; rotations are orthonormal again
 
 
-def test_the_picture_is_a_small_file_of_poses_in_the_world(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    caught: list[Figure] = []
-    real = panels.png
-
-    def watched(figure: Figure) -> bytes:
-        caught.append(figure)
-        return real(figure)
-
-    monkeypatch.setattr(panels, "png", watched)
+def test_the_picture_is_a_small_file_of_poses_in_the_world(tmp_path: Path) -> None:
     recording = read_recording(REPLAYS / "mustard_chsel.mcap")
     step = recording.steps[0]
-    picture = picture_of_stages(recording, step, SETTINGS, "xz")
-    assert len(picture) < 200_000
-    assert Image.open(io.BytesIO(picture)).width == 1440
+    picture = picture_of_stages(recording, step, SETTINGS, view="xz", name="stages")
+    content = write_picture(picture, tmp_path, "png", small=True)
+    assert len(content) < 200_000
+    assert Image.open(io.BytesIO(content)).width == 1440
     chosen = stages_of(recording.problem(step), SETTINGS)[-1]
-    axes = caught[0].axes[-1]
+    axes = picture.figure.axes[-1]
     outlines = outlines_of(axes)
     poses = [*inverse(chosen.poses), recording.start.world_from_object]
     assert len(outlines) == len(poses) == 31

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from chsel.errors import SettingError
@@ -18,7 +19,7 @@ from runners.evaluation.work import do_unit
 from runners.reporting.by_faults import tables_by_faults
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_style import method_styles
-from runners.reporting.statistics import share_interval
+from runners.reporting.statistics import shares
 from runners.sessions.faults import LEVELS
 from tests.runners.in_process import run
 from tests.runners.made_up_evaluations import row, write_evaluation
@@ -109,10 +110,15 @@ def test_faults_that_cannot_be_evaluated_are_one_line(
 
 
 def test_the_interval_of_a_share_is_wilsons() -> None:
-    low, high = share_interval(9, 10)
-    assert (low, high) == (pytest.approx(0.5958, abs=1e-4), pytest.approx(0.9821, abs=1e-4))
-    assert share_interval(0, 5)[0] == 0.0
-    assert share_interval(5, 5)[1] == 1.0
+    flags = {"most": [True] * 9 + [False, None], "none": [False] * 5, "all": [True] * 5}
+    rows = [{"of": of, "held": held} for of, some in flags.items() for held in some]
+    found = shares(pd.DataFrame(rows), "of", "held")
+    assert found.loc["most", ["lower", "upper"]].tolist() == pytest.approx(
+        [0.5958, 0.9821], abs=1e-4
+    )
+    assert found.loc["most", ["count", "total", "share"]].tolist() == [9, 10, 0.9]
+    assert found.loc["none", "lower"] == 0.0
+    assert found.loc["all", "upper"] == 1.0
 
 
 @pytest.fixture

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
-from runners.reporting import fault_pictures, panels
+from runners.reporting import fault_pictures
 from runners.reporting.fault_pictures import KINDS, faulty_case, picture_of
+from runners.reporting.figures import write_picture
 from runners.sessions.faults import LEVELS
 from tests.runners.drawn_figures import outlines_of
 
@@ -40,30 +40,21 @@ def test_pictures_are_of_levels_that_differ_in_kind() -> None:
     assert all(one != other for n, one in enumerate(ours) for other in ours[:n])
 
 
-def test_a_picture_marks_contacts_off_the_object_and_free_voxels_in_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    caught: list[Figure] = []
-    real = panels.png
-
-    def watched(figure: Figure) -> bytes:
-        caught.append(figure)
-        return real(figure)
-
-    monkeypatch.setattr(panels, "png", watched)
+def test_a_picture_marks_contacts_off_the_object_and_free_voxels_in_it(tmp_path: Path) -> None:
     case = faulty_case("mixed", *WHERE, SETTINGS)
-    picture = Image.open(io.BytesIO(picture_of(case)))
+    drawn = picture_of(case, "mixed")
+    picture = Image.open(io.BytesIO(write_picture(drawn, tmp_path, "png", small=True)))
     assert (picture.format, picture.mode, picture.width) == ("PNG", "P", 1440)
     assert case.off.shape == (2, len(case.contacts))
     far = np.abs(case.off[0]) > 0.01
     assert 0 < far.sum() < len(far)
     assert len(case.wrong) > 0
-    side, front, distances = caught[0].axes
+    side, front, distances = drawn.figure.axes
     for axes, chosen in ((side, [0, 2]), (front, [1, 2])):
-        drawn = {line.get_marker(): line.get_xydata() for line in axes.lines}
-        np.testing.assert_array_equal(drawn["o"], case.contacts[~far][:, chosen])
-        np.testing.assert_array_equal(drawn["X"], case.contacts[far][:, chosen])
-        np.testing.assert_array_equal(drawn["s"], case.wrong[:, chosen])
+        points = {line.get_marker(): line.get_xydata() for line in axes.lines}
+        np.testing.assert_array_equal(points["o"], case.contacts[~far][:, chosen])
+        np.testing.assert_array_equal(points["X"], case.contacts[far][:, chosen])
+        np.testing.assert_array_equal(points["s"], case.wrong[:, chosen])
         assert [style for _, _, style in outlines_of(axes)].count("dashed") == 1
     rings, dots = (np.asarray(line.get_xdata()) for line in distances.lines[-2:])
     np.testing.assert_allclose(1e-3 * rings, case.off[0])
@@ -78,8 +69,8 @@ def test_the_command_writes_a_small_file_for_each_level(
     words = [str(folder), "--levels", "clean", "--probe", "1"]
     monkeypatch.setattr("sys.argv", ["fault_pictures", *words])
     assert fault_pictures.main() == 0
-    (file,) = folder.iterdir()
-    assert file.name == "clean.png"
+    assert sorted(path.name for path in folder.iterdir()) == ["clean.csv", "clean.png"]
+    file = folder / "clean.png"
     assert file.read_bytes().startswith(b"\x89PNG")
     assert file.stat().st_size < 80_000
     assert capsys.readouterr().out.startswith("clean: ")

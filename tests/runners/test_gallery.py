@@ -12,8 +12,8 @@ from PIL import Image
 
 from chsel.errors import RecordingError
 from runners import gallery
-from runners.gallery import PICTURES, REPOSITORY
-from runners.reporting.small_picture import animation, small_png
+from runners.gallery import PICTURES, REPOSITORY, animation
+from runners.reporting.figures import small_png
 
 OF_REPORTS = REPOSITORY / "docs" / "results"
 

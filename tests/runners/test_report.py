@@ -34,6 +34,7 @@ PICTURES = [
     "sequence.png",
     "times.png",
 ]
+DATA = [name.replace(".png", ".csv") for name in PICTURES]
 _VOID = ("meta", "img", "link", "br")
 
 
@@ -95,7 +96,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_report_has_all_pictures_and_stands_alone(whole: Path) -> None:
     found = whole / "report"
     assert sorted(path.name for path in found.iterdir()) == sorted(
-        [*PICTURES, "report.html", "report.md"]
+        [*PICTURES, *DATA, "report.html", "report.md"]
     )
     for name in PICTURES:
         with Image.open(found / name) as image:
@@ -121,7 +122,7 @@ def test_a_report_has_all_pictures_and_stands_alone(whole: Path) -> None:
 
 def test_the_markdown_links_its_pictures_and_has_the_same_numbers(whole: Path) -> None:
     text = (whole / "report" / "report.md").read_text(encoding="utf-8")
-    assert sorted(re.findall(r"\]\(([\w.]+)\)", text)) == PICTURES
+    assert sorted(re.findall(r"\]\(([\w.]+)\)", text)) == sorted([*PICTURES, *DATA])
     table = text.split("**PD in mm² by object**\n\n")[1].split("\n\n")[0]
     lines = [line.strip("| ").split(" | ") for line in table.splitlines()]
     assert [line[:2] for line in lines[2:]] == [["clamp", "4"], ["mustard", "8"]]
@@ -205,9 +206,9 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
     write_table(trial / "icp.failed.parquet", [failed])  # before it went well
     evaluation = open_evaluation(tmp_path)
     assert evaluation.gathered
-    assert [(row["method"], row["diversity"]) for row in evaluation.rows] == [
-        ("icp", 3.0),
-        ("svgd", 4.0),
+    assert evaluation.rows[["method", "diversity"]].to_numpy().tolist() == [
+        ["icp", 3.0],
+        ["svgd", 4.0],
     ]
     assert run(report.main, str(tmp_path)).returncode == 0
     assert "no table of the whole" in (tmp_path / "report" / "report.md").read_text("utf-8")

@@ -82,8 +82,8 @@ def test_they_are_on_the_terminal_and_in_the_command_that_makes_them_again(folde
 def test_draws_are_told_apart_by_their_column_alone(folder: Path) -> None:
     evaluation = open_evaluation(folder)
     assert evaluation.methods == ["own", "package"]
-    places = [(row["method"], row["step"], row["draw"]) for row in evaluation.rows]
-    assert places == [(m, s, d) for m in ("own", "package") for s in (4, 5) for d in (0, 1)]
+    places = evaluation.rows[["method", "step", "draw"]].to_numpy().tolist()
+    assert places == [[m, s, d] for m in ("own", "package") for s in (4, 5) for d in (0, 1)]
     alone = write_evaluation(folder / "other", [row("can", 0, "own+1", 4, diversity=1.0)])
     assert open_evaluation(alone).methods == ["own+1"]  # a label of its own
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,39 +11,24 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.container import BarContainer
 from matplotlib.contour import QuadContourSet
-from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.quiver import Quiver
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from replay.mcap.reader import Recording, read_recording
-from runners.reporting import panels
-from runners.reporting.box_plots import picture_of_boxes
 from runners.reporting.cost_gradients import picture_of_gradients, recorded_cost
+from runners.reporting.diversity import picture_of_boxes, picture_over_probes
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_style import method_styles
 from runners.reporting.over_iterations import picture_over_iterations, tables_over_iterations
-from runners.reporting.over_probes import picture_over_probes
-from runners.reporting.probing_sequence import CONTACT, picture_of_sequence
-from runners.reporting.registration_times import picture_of_times
+from runners.reporting.probing_sequence import picture_of_sequence
+from runners.reporting.registration_times import picture_of_times, times_of
+from runners.reporting.silhouette import CONTACT
 from tests.runners.drawn_figures import bands_of, legend_of, line_of, outlines_of
 from tests.runners.made_up_evaluations import REPLAYS, row, write_evaluation
 
 DRILL, HAMMER = REPLAYS / "drill_chsel.mcap", REPLAYS / "hammer_icp.mcap"
-
-
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Every figure that is drawn during a test, in order. Nothing is rendered to pixels."""
-    caught: list[Figure] = []
-
-    def caught_png(figure: Figure) -> bytes:
-        caught.append(figure)
-        return b"png"
-
-    monkeypatch.setattr(panels, "png", caught_png)
-    return caught
 
 
 def looks(styles: Any) -> dict[str, tuple[object, object, object]]:
@@ -51,7 +37,7 @@ def looks(styles: Any) -> dict[str, tuple[object, object, object]]:
 
 
 def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(
-    tmp_path: Any, figures: list[Figure]
+    tmp_path: Path,
 ) -> None:
     numbers = {"can": {4: (16.0, 1.0, 4.0), 5: (25.0, 9.0)}, "box": {5: (100.0, 400.0)}}
     rows = [
@@ -64,8 +50,8 @@ def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(
     ]
     styles = method_styles(["chsel", "icp"])
     evaluation = open_evaluation(write_evaluation(tmp_path, rows))
-    picture_over_probes(evaluation, styles, "pd.png")
-    (figure,) = figures
+    picture = picture_over_probes(evaluation.rows, styles, "pd")
+    figure = picture.figure
     box, can = figure.axes
     assert [box.get_title(), can.get_title()] == ["box", "can"]
     assert bands_of(can, styles["chsel"]) == {4.0: (2.5, 4.0, 10.0), 5.0: (13.0, 17.0, 21.0)}
@@ -73,11 +59,17 @@ def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(
     assert bands_of(box, styles["chsel"]) == {5.0: (175.0, 250.0, 325.0)}
     assert legend_of(figure) == looks(styles)
     assert line_of(can, styles["icp"]).get_marker() == styles["icp"].marker
+    of_can = picture.data[picture.data["object"] == "can"].drop(columns="object")
+    assert of_can.to_numpy().tolist() == [
+        ["chsel", 4, 3, 2.5, 4.0, 10.0],
+        ["chsel", 5, 2, 13.0, 17.0, 21.0],
+        ["icp", 5, 2, 39.0, 51.0, 63.0],
+    ]
     assert box.get_ylabel() == "PD in mm²"
 
 
 def test_boxes_are_quartiles_with_whiskers_within_one_and_a_half_boxes(
-    figures: list[Figure],
+    tmp_path: Path,
 ) -> None:
     values = {"icp": (1.0, 2.0, 3.0, 4.0, 5.0, 100.0), "chsel": (10.0, 10.0, 11.0, 12.0)}
     rows = [
@@ -86,8 +78,10 @@ def test_boxes_are_quartiles_with_whiskers_within_one_and_a_half_boxes(
         for seed, value in enumerate(some)
     ]
     styles = method_styles(["chsel", "icp"])
-    picture_of_boxes(rows, styles, "boxes.png")
-    (axes,) = figures[0].axes
+    evaluation = open_evaluation(write_evaluation(tmp_path, rows))
+    picture = picture_of_boxes(evaluation.rows, styles, "boxes")
+    (axes,) = picture.figure.axes
+    assert sorted(picture.data["diversity"]) == sorted([*values["icp"], *values["chsel"]])
     assert [tick.get_text() for tick in axes.get_xticklabels()] == ["CHSEL", "ICP"]
     boxes = [patch for patch in axes.patches if isinstance(patch, PathPatch)]
     assert [to_hex(patch.get_facecolor()) for patch in boxes] == [
@@ -106,7 +100,7 @@ def test_boxes_are_quartiles_with_whiskers_within_one_and_a_half_boxes(
     assert outliers == [[], [100.0]]
 
 
-def test_bars_of_time_are_means_with_one_standard_deviation(figures: list[Figure]) -> None:
+def test_bars_of_time_are_means_with_one_standard_deviation(tmp_path: Path) -> None:
     seconds = {"chsel": (0.1, 0.1, 0.1, 0.5), "icp": (0.02, 0.04)}
     rows = [
         row("can", seed, method, 4, seconds=value)
@@ -114,9 +108,10 @@ def test_bars_of_time_are_means_with_one_standard_deviation(figures: list[Figure
         for seed, value in enumerate(values)
     ]
     styles = method_styles(list(seconds))
-    picture = picture_of_times(rows, styles, "times.png")
+    evaluation = open_evaluation(write_evaluation(tmp_path, rows))
+    picture = picture_of_times(times_of(evaluation.rows, styles), styles)
     assert "CHSEL 200 ms, ICP 30 ms" in picture.alt
-    (axes,) = figures[0].axes
+    (axes,) = picture.figure.axes
     assert [tick.get_text() for tick in axes.get_yticklabels()] == ["CHSEL", "ICP"]
     bars = [one.patches[0] for one in axes.containers if isinstance(one, BarContainer)]
     assert [bar.get_width() for bar in bars] == pytest.approx([200.0, 30.0])
@@ -128,6 +123,8 @@ def test_bars_of_time_are_means_with_one_standard_deviation(figures: list[Figure
     deviation = 1e3 * 0.1 * 3.0**0.5  # of 1, 1, 1 and 5: the variance is 3
     # The axis begins at half of the least time.
     np.testing.assert_allclose(ends[:, 0], [max(10.0, 200.0 - deviation), 200.0 + deviation])
+    assert picture.data["mean_ms"].tolist() == pytest.approx([200.0, 30.0])
+    assert picture.data["deviation_ms"].tolist() == pytest.approx([deviation, 10.0])
 
 
 def moments(method: str, cost: float) -> list[dict[str, Any]]:
@@ -150,14 +147,13 @@ def moments(method: str, cost: float) -> list[dict[str, Any]]:
 
 
 def test_numbers_over_iterations_are_medians_and_quartiles_and_costs_of_one_kind(
-    tmp_path: Any, figures: list[Figure]
+    tmp_path: Path,
 ) -> None:
     methods = {"chsel": 1.0, "chsel_cma_me": 2.0, "medial_constraint_cma_me": 1000.0}
     rows = [moment for method, cost in methods.items() for moment in moments(method, cost)]
     evaluation = open_evaluation(write_evaluation(tmp_path, [], rows))
     styles = method_styles(list(methods))
-    picture_over_iterations(evaluation, styles, "over_iterations.png")
-    (figure,) = figures
+    figure = picture_over_iterations(evaluation.iterations, styles).figure
     diversity, cost = figure.axes
     assert diversity.get_ylabel() == "PD in mm²"
     assert cost.get_ylabel() == "mean relaxed cost of the best cells"
@@ -175,7 +171,7 @@ def test_numbers_over_iterations_are_medians_and_quartiles_and_costs_of_one_kind
     # Costs of the Medial Constraint are in m², those of the others are relaxed costs.
     assert len(cost.lines) == len(cost.collections) == 2
     assert legend_of(figure) == looks(styles)
-    of_diversity, of_cost = tables_over_iterations(evaluation, styles)
+    of_diversity, of_cost = tables_over_iterations(evaluation.iterations, styles)
     assert of_diversity.header == ("iteration", "n", *(style.title for style in styles.values()))
     assert of_cost.header == ("iteration", "n", "CHSEL", "CHSEL (CMA-ME)")
     assert [[cell.text for cell in line] for line in of_cost.rows] == [
@@ -196,14 +192,12 @@ def section_at(
     return np.asarray(values), np.asarray(gradients)[:, [0, 2]]
 
 
-def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surface(
-    figures: list[Figure],
-) -> None:
+def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surface() -> None:
     recording = read_recording(DRILL)
     settings = recorded_cost(recording.start.config, "chsel")
     tolerance = settings.penetration_tolerance
-    picture_of_gradients(DRILL, "gradients.png")
-    (figure,) = figures
+    picture = picture_of_gradients(DRILL)
+    figure = picture.figure
     free, occupied, known = (axes for axes in figure.axes)
     # Where each of them is pushed, and along which multiple of the outward normal.
     pushed = {
@@ -230,14 +224,12 @@ def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surf
     ]
 
 
-def test_lines_of_a_section_are_the_surface_and_the_tolerance_of_each_class(
-    figures: list[Figure],
-) -> None:
+def test_lines_of_a_section_are_the_surface_and_the_tolerance_of_each_class() -> None:
     recording = read_recording(DRILL)
     tolerance = recorded_cost(recording.start.config, "chsel").penetration_tolerance
-    picture_of_gradients(DRILL, "gradients.png")
+    figure = picture_of_gradients(DRILL).figure
     levels = {0: [0.0, tolerance], 1: [0.0, -tolerance], 2: [0.0]}
-    for panel, axes in enumerate(figures[0].axes):
+    for panel, axes in enumerate(figure.axes):
         contours = [one for one in axes.collections if isinstance(one, QuadContourSet)]
         assert len(contours) == len(levels[panel])
         for contour, level in zip(contours, levels[panel], strict=True):
@@ -248,16 +240,14 @@ def test_lines_of_a_section_are_the_surface_and_the_tolerance_of_each_class(
         assert axes.get_xlabel() == "x in m"
 
 
-def test_a_probing_sequence_shows_poses_in_the_world_and_the_contacts_so_far(
-    figures: list[Figure],
-) -> None:
+def test_a_probing_sequence_shows_poses_in_the_world_and_the_contacts_so_far() -> None:
     recording = read_recording(HAMMER)
     styles = method_styles(["chsel"])
     touching = {probe.step for probe in recording.probes if len(probe.contacts)}
     last = max(touching & set(recording.steps[1:]))
     shown = [last - 1, last]  # before and after a contact
-    picture_of_sequence({"chsel": HAMMER}, styles, "sequence.png", steps=shown, view="xz")
-    (figure,) = figures
+    picture = picture_of_sequence({"chsel": HAMMER}, styles, steps=shown, view="xz")
+    figure = picture.figure
     assert [axes.get_title() for axes in figure.axes] == [f"step {step}" for step in shown]
     assert figure.axes[0].get_ylabel() == "CHSEL\nz in m"
     for axes, step in zip(figure.axes, shown, strict=True):
@@ -291,7 +281,7 @@ def check_contacts(axes: Axes, recording: Recording, step: int) -> None:
     probes = [probe for probe in recording.probes if probe.step <= step]
     contacts = np.concatenate([probe.contacts for probe in probes])
     assert len(contacts) > 0
-    orange = [line for line in axes.lines if line.get_color() == CONTACT]
+    orange = [line for line in axes.lines if line.get_color() == CONTACT["color"]]
     dots = [line.get_xydata()[0] for line in orange if line.get_marker() == "o"]
     np.testing.assert_array_equal(dots, contacts[:, [0, 2]])
     ways = [line.get_xydata() for line in orange if line.get_marker() != "o"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
@@ -18,13 +19,14 @@ from runners.reporting.cost_gradients import (
     recorded_cost,
     section_plane,
 )
-from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.evaluation_folder import last_half, open_evaluation
+from runners.reporting.figures import NotDrawn
 from runners.reporting.method_style import method_styles
 from runners.reporting.probing_sequence import shown_steps
-from runners.reporting.section import NotDrawn, number, spread_cells
 from runners.reporting.shown_trial import usual_trial
 from runners.reporting.silhouette import Frame, Silhouettes
-from runners.reporting.statistics import Spread, last_half, spread
+from runners.reporting.statistics import spreads
+from runners.reporting.tables import median_cells, number
 from tests.runners.made_up_evaluations import METHODS, REPLAYS, add_recording, row, write_evaluation
 
 
@@ -57,11 +59,11 @@ def test_a_recording_tells_its_cost_or_why_there_is_no_picture(tmp_path: Path) -
     start = read_recording(REPLAYS / "points_exact_descent.mcap").start
     assert recorded_cost(start.config, start.method).gradient == "exact"
     with pytest.raises(NotDrawn, match="icp, has no relaxed cost"):
-        picture_of_gradients(REPLAYS / "clamp_icp.mcap", "gradients.png")
+        picture_of_gradients(REPLAYS / "clamp_icp.mcap")
     damaged = tmp_path / "chsel.mcap"
     damaged.write_bytes(b"no recording")
     with pytest.raises(NotDrawn, match=r"chsel\.mcap"):
-        picture_of_gradients(damaged, "gradients.png")
+        picture_of_gradients(damaged)
 
 
 def test_silhouettes_are_the_projections_of_the_mesh() -> None:
@@ -118,16 +120,31 @@ def test_the_usual_trial_is_the_recorded_one_of_the_median_pd_of_the_drill(tmp_p
 def test_the_last_half_is_that_of_all_methods_of_a_trial() -> None:
     rows = [row("can", 0, "chsel", step) for step in (3, 4, 5, 6)]
     rows += [row("can", 0, "icp", step) for step in (7, 8)] + [row("can", 1, "icp", 3)]
-    kept = [(entry["seed"], entry["method"], entry["step"]) for entry in last_half(rows)]
-    assert kept == [(0, "chsel", 6), (0, "icp", 7), (0, "icp", 8), (1, "icp", 3)]
+    kept = last_half(pd.DataFrame(rows))[["seed", "method", "step"]]
+    assert list(kept.itertuples(index=False, name=None)) == [
+        (0, "chsel", 6),
+        (0, "icp", 7),
+        (0, "icp", 8),
+        (1, "icp", 3),
+    ]
 
 
 def test_quartiles_are_of_the_numbers_that_there_are() -> None:
-    found = spread([{"a": 4.0}, {"a": None}, {"a": 1.0}, {}, {"a": 3.0}, {"a": 2.0}], "a")
-    assert found == Spread((4.0, 1.0, 3.0, 2.0), 2)
-    assert found.quartiles == (1.75, 2.5, 3.25)
-    assert (found.mean, found.deviation) == (2.5, pytest.approx(1.25**0.5))
-    cells = spread_cells([found, Spread((2.5, 2.5), 0), Spread((), 3)], min)
+    numbers = {"a": [4.0, None, 1.0, None, 3.0, 2.0], "b": [2.5, 2.5], "c": [None, None, None]}
+    rows = [{"of": of, "number": value} for of, values in numbers.items() for value in values]
+    found = spreads(pd.DataFrame(rows), "of", "number")
+    assert found.loc["a"].to_dict() == pytest.approx(
+        {
+            "count": 4,
+            "left_out": 2,
+            "lower": 1.75,
+            "median": 2.5,
+            "upper": 3.25,
+            "mean": 2.5,
+            "deviation": 1.25**0.5,
+        }
+    )
+    cells = median_cells(found, "min")
     assert [cell.text for cell in cells] == ["2.5", "2.5", "-"]
     assert [cell.best for cell in cells] == [True, True, False]
     assert [cell.note for cell in cells] == ["2 left out", "n 2", "3 left out"]

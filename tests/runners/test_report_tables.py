@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from runners import report
-from runners.reporting.against_baseline import baseline_pd, section_against
+from runners.reporting.against_baseline import against_baseline
 from runners.reporting.evaluation_folder import open_evaluation
-from runners.reporting.method_style import method_styles
+from runners.reporting.section import Subject
 from tests.runners.in_process import run
 from tests.runners.made_up_evaluations import row, write_evaluation
 from tests.runners.test_report import Page, page_of
@@ -76,8 +76,9 @@ def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path: Path) -> None:
     values = {"package": 8.0, "icp": 8.0, "svgd": 8.1, "cvo": 7.9}
     rows = [row("can", 0, method, 4, diversity=value) for method, value in values.items()]
     evaluation = open_evaluation(write_evaluation(tmp_path, rows))
-    assert list(baseline_pd(evaluation.rows, "package").values()) == [pytest.approx(8.0)]
-    summary = section_against(evaluation, method_styles(list(values)), "package").tables[0]
+    section = against_baseline(Subject(evaluation, baseline="package"))
+    assert section is not None
+    summary = section.tables[0]
     worse = summary.header.index("worse")
     shares = {line[0].text: line[worse].text for line in summary.rows}
     assert shares == {"SVGD": "100.0 %", "ICP": "0.0 %", "CVO": "0.0 %", "package": "-"}
