@@ -18,6 +18,7 @@ from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import quaternions
 from replay.mcap.cumulative_points import LEVELS
+from replay.mcap.schemas import RECORDS, message_class
 from replay.mcap.wire import check_wire
 
 POINT_CLASSES = ("free", "occupied", "known")
@@ -46,6 +47,13 @@ FOXGLOVE: Mapping[str, type[Message]] = {
     **VIEWS,
 }
 """Topics that carry Foxglove's messages. Points and log are the only copy of what they say."""
+
+
+def message_names() -> dict[str, str]:
+    """The full name of the message on every topic of a recording."""
+    kinds = {topic: message_class(name) for topic, name in RECORDS.items()} | {**FOXGLOVE}
+    return {topic: kind.DESCRIPTOR.full_name for topic, kind in kinds.items()}
+
 
 WORLD = "world"
 OBJECT = "object"

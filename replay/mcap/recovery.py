@@ -26,14 +26,14 @@ from replay.mcap.event_checks import RECOVERED
 from replay.mcap.event_order import EventOrder
 from replay.mcap.event_reader import Entry, RecordedProblem
 from replay.mcap.file import StoredMessage
-from replay.mcap.foxglove_messages import FOXGLOVE
+from replay.mcap.foxglove_messages import message_names
 from replay.mcap.gap_reader import WRONG, GapReader
 from replay.mcap.reader import read_recording
+from replay.mcap.records import Damage
 from replay.mcap.salvage import Gap, Salvage
-from replay.mcap.schemas import RECORDS, STEP_TIME, message_class
+from replay.mcap.schemas import STEP_TIME
 from replay.mcap.sensor_messages import ImagePlace
 from replay.mcap.texts import one_line
-from replay.mcap.whole_records import Damage
 from replay.mcap.writer import McapRecorder
 
 _OF_REGISTRATION = (Traced, SnapshotTaken, HypothesesFound)
@@ -150,9 +150,7 @@ class _Recovery:
             yield event
 
     def _salvaged(self) -> Iterator[Event]:
-        names = {topic: message_class(name).DESCRIPTOR.full_name for topic, name in RECORDS.items()}
-        names |= {topic: kind.DESCRIPTOR.full_name for topic, kind in FOXGLOVE.items()}
-        self._file = file = Salvage(self._path, names)
+        self._file = file = Salvage(self._path, message_names())
         reader = GapReader(file.attachments, self._path.stat().st_size)
         unsure: list[tuple[int, int]] = []  # first and last step of those with missing messages
         gap = False

@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from chsel.errors import RecordingError
 from replay.mcap.texts import one_line
 from replay.mcap.wire import check_wire
-from replay.raw.catalogue import Channel
+from replay.raw.channels import Channel
 
 _MOST_TRANSFORMS = 1000  # in one message
 _LONGEST_FRAME = 200  # bytes

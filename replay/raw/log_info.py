@@ -15,7 +15,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
 from replay.mcap.schemas import PROFILE
-from replay.raw.catalogue import Channel
+from replay.raw.channels import Channel
 from replay.raw.frames import frames
 from replay.raw.raw_file import RawFile
 from replay.raw.raw_reading import RawMessage
@@ -209,7 +209,7 @@ class _Gathered:
     def topics(self, file: RawFile, *, counted: bool) -> Iterator[TopicInfo]:
         """What is known of each topic. counted: by the messages read, not by the index."""
         indexed = _indexed(file)
-        for channel in dict.fromkeys([*file.catalogue.channels.values(), *self._seen]):
+        for channel in dict.fromkeys([*file.channels.by_id.values(), *self._seen]):
             seen = self._seen.get(channel, _Seen())
             count, span = seen.count, (seen.first, seen.last)
             if not counted:
@@ -231,7 +231,7 @@ def _indexed(file: RawFile) -> dict[Channel, tuple[int, tuple[int, int]]]:
     """Counts, first and last time of each channel, from an index."""
     found: dict[Channel, tuple[int, tuple[int, int]]] = {}
     spans = file.spans()
-    for number, channel in file.catalogue.channels.items():
+    for number, channel in file.channels.by_id.items():
         count = (file.counts or {}).get(number, 0)
         span = spans.get(number) or file.times or (0, 0)
         before, (first, last) = found.get(channel, (0, span))

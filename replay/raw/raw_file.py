@@ -2,64 +2,41 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
-from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
-from replay.raw.catalogue import Catalogue
-from replay.raw.chunks import UNPACKING_ERRORS, records
-from replay.raw.raw_reading import (
-    MOST_HELD,
-    RECORD_HEAD,
-    ChunkPlace,
-    Fault,
-    RawMessage,
-    RawReading,
-    Wanted,
-    chunk_length,
-    reason,
-)
+from replay.mcap.record_bytes import MALFORMED, reason_of
+from replay.mcap.records import Records, summary
+from replay.raw.channels import Channels
+from replay.raw.raw_reading import LIMITS, ChunkPlace, Fault, RawMessage, RawReading, Wanted
 
 ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, offsets' start, checksum
-_STATISTICS = struct.Struct("<QHIIIIQQI")
-_COUNT, _PLACE = struct.Struct("<HQ"), struct.Struct("<HQ")
-_CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, start, length, size of the offsets
-_CRC_SIZE = 4
-_LARGEST_SUMMARY = 2**28
+MOST_HELD = 2**28  # bytes of messages that wait for their turn
 _COMPARED = 64  # chunks that are looked at before an index is believed
 
 
 class RawFile:
-    """Reads one file; no length in it is believed.
-
-    catalogue: of its channels, complete where there is an index. counts: of messages by id, where
-    the index tells. times: first and last log time, likewise. is_indexed: whether messages come in
-    order of their log time; otherwise they come in the file's. index_fault: what is wrong with its
-    index; "" also where it never had one. Raises SessionError if it is not MCAP.
-    """
+    """Reads one file; no length in it is believed. Raises SessionError if it is not MCAP."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.catalogue = Catalogue()
-        self.counts: dict[int, int] | None = None
-        self.times: tuple[int, int] | None = None
-        self.is_indexed = False
-        self.index_fault = ""
+        self.channels = Channels()  # complete where there is an index
+        self.counts: dict[int, int] | None = None  # of messages by channel, as the index says
+        self.times: tuple[int, int] | None = None  # first and last log time, likewise
+        self.is_indexed = False  # if so, messages come in order of log time, else in the file's
+        self.index_fault = ""  # what is wrong with the index; "" also where there is none
         self.remarks: list[str] = []
         self._chunks: list[ChunkPlace] = []
         try:
             with path.open("rb") as file:
-                self.size = file.seek(0, 2)
-                file.seek(0)
                 if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                     raise SessionError(f"log {path} is no MCAP file; {ACCEPTED}")
+                self.size = file.seek(0, 2)
                 self._read_index(file)
         except OSError as error:
             raise SessionError(f"log {path} cannot be read: {error.strerror or error}") from None
@@ -73,7 +50,7 @@ class RawFile:
         """
         try:
             with self.path.open("rb") as file:
-                reading = RawReading(file, self.catalogue, wanted, fault, self.remarks, progress)
+                reading = RawReading(file, self.channels, wanted, fault, self.remarks, progress)
                 if self.is_indexed:
                     yield from reading.ordered(self._chunks, MOST_HELD // at_once)
                 else:
@@ -82,14 +59,13 @@ class RawFile:
             fault(f"{self.path.name}: it cannot be read on: {error.strerror or error}")
 
     def written(self, fault: Fault) -> Iterator[RawMessage]:
-        """All messages in the order of the file, whether or not an index tells where they are."""
+        """All messages in the order of the file, whether or not an index says where they are."""
+        channels = Channels()
         with self.path.open("rb") as file:
-            catalogue = Catalogue()
-            yield from RawReading(
-                file, catalogue, Wanted(), fault, self.remarks, _unwatched
-            ).as_written()
-            for number, channel in catalogue.channels.items():
-                self.catalogue.channels.setdefault(number, channel)
+            reading = RawReading(file, channels, Wanted(), fault, self.remarks, _unwatched)
+            yield from reading.as_written()
+        for number, channel in channels.by_id.items():
+            self.channels.by_id.setdefault(number, channel)
 
     def samples(self, fault: Fault, most: int) -> Iterator[RawMessage]:
         """The messages of at most so many chunks, in which as many topics as possible are."""
@@ -100,7 +76,7 @@ class RawFile:
                 chosen.append(chunk)
                 seen |= chunk.channels
         with self.path.open("rb") as file:
-            reading = RawReading(file, self.catalogue, Wanted(), fault, self.remarks, _unwatched)
+            reading = RawReading(file, self.channels, Wanted(), fault, self.remarks, _unwatched)
             yield from reading.ordered(chosen, MOST_HELD)
 
     def spans(self) -> dict[int, tuple[int, int]]:
@@ -114,84 +90,65 @@ class RawFile:
 
     def _read_index(self, file: IO[bytes]) -> None:
         """Look at the end of the file; without a whole index there, it is as if there was none."""
+        channels, chunks = Channels(), list[ChunkPlace]()
         try:
-            summary = _summary(file, self.size)
-            if not summary:
-                self.remarks.append("it is read without its index: it has none")
-                return
-            self._take_summary(summary)
-            self._compare_with_chunks(file)
-        except UNPACKING_ERRORS as error:
-            self.index_fault = reason(error)
+            statistics = self._summarized(file, channels, chunks)
+        except MALFORMED as error:
+            self.index_fault = reason_of(error)
             self.remarks.append(f"it is read without its index: {self.index_fault}")
-            self.catalogue, self.counts, self.times = Catalogue(), None, None
-            self._chunks = []
-        else:
-            self.is_indexed = True
+            return
+        if statistics is None:
+            self.remarks.append("it is read without its index: it has none")
+            return
+        self.is_indexed, self.channels, self._chunks = True, channels, chunks
+        self.counts = statistics.channel_message_counts
+        if statistics.message_count:
+            self.times = statistics.message_start_time, statistics.message_end_time
 
-    def _take_summary(self, summary: bytes) -> None:
-        statistics = b""
+    def _summarized(
+        self, file: IO[bytes], channels: Channels, chunks: list[ChunkPlace]
+    ) -> Statistics | None:
+        """What the summary says, None if there is none; any of MALFORMED if it contradicts."""
+        statistics, is_empty = None, True
         alike: dict[frozenset[int], frozenset[int]] = {}
-        for opcode, start, end in records(summary):
-            body = summary[start:end]
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.catalogue.describe(opcode, body)
-            elif opcode == Opcode.STATISTICS:
-                statistics = body
-            elif opcode == Opcode.CHUNK_INDEX:
-                self._chunks.append(self._chunk_place(body, alike))
-        count, _, _, _, _, chunks, first, last, size = _STATISTICS.unpack_from(statistics)
-        counts = statistics[_STATISTICS.size : _STATISTICS.size + size]
-        self.counts = dict(_COUNT.iter_unpack(counts))
-        if chunks != len(self._chunks) or (count and not chunks):
+        for part in summary(file, checked=False):
+            is_empty = False
+            if isinstance(part, Schema | Channel):
+                channels.describe(part)
+            elif isinstance(part, Statistics):
+                statistics = part
+            elif isinstance(part, ChunkIndex):
+                chunks.append(self._chunk_place(part, alike))
+        if is_empty:
+            return None
+        if statistics is None:
+            raise ValueError("its statistics are missing")
+        counts = statistics.channel_message_counts
+        if statistics.chunk_count != len(chunks) or (statistics.message_count and not chunks):
             raise ValueError("its chunks are not all in the index")
-        if len({chunk.offset for chunk in self._chunks}) < chunks or count != sum(
-            self.counts.values()
+        if len({chunk.offset for chunk in chunks}) < len(chunks) or (
+            statistics.message_count != sum(counts.values())
         ):
             raise ValueError("its index contradicts itself")
-        described = self.catalogue.channels
-        if any(number not in described for number, count in self.counts.items() if count):
+        if any(number not in channels.by_id for number, count in counts.items() if count):
             raise ValueError("its index lacks channels")
-        self.times = (first, last) if count else None
-
-    def _compare_with_chunks(self, file: IO[bytes]) -> None:
-        """ValueError if most of some chunks are not where they should be: an index of old."""
-        every = max(len(self._chunks) // _COMPARED, 1)
-        some = self._chunks[::every]
-        missing = sum(chunk_length(file, chunk) is None for chunk in some)
-        if 2 * missing > len(some):
+        some, records = chunks[:: max(len(chunks) // _COMPARED, 1)], Records(file, LIMITS)
+        missing = sum(chunk.head(records) is None for chunk in some)
+        if 2 * missing > len(some):  # an index of old
             raise ValueError("its index is another file's")
+        return statistics
 
-    def _chunk_place(self, body: bytes, alike: dict[frozenset[int], frozenset[int]]) -> ChunkPlace:
-        first, last, offset, length, size = _CHUNK_INDEX.unpack_from(body)
-        if size > len(body) - _CHUNK_INDEX.size or offset + length > self.size:
+    def _chunk_place(
+        self, index: ChunkIndex, alike: dict[frozenset[int], frozenset[int]]
+    ) -> ChunkPlace:
+        """alike: sets of channels that were met, so that many equal ones take little memory."""
+        start, length = index.chunk_start_offset, index.chunk_length
+        if start + length > self.size:
             raise ValueError("a chunk in the index lies outside of the file")
-        places = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + size]
-        channels = frozenset(number for number, _ in _PLACE.iter_unpack(places))
-        return ChunkPlace(first, offset, last, length, alike.setdefault(channels, channels))
+        channels = frozenset(index.message_index_offsets)
+        first, last = index.message_start_time, index.message_end_time
+        return ChunkPlace(first, start, last, length, alike.setdefault(channels, channels))
 
 
 def _unwatched(done: int) -> None:
     """Nobody is shown how far reading is."""
-
-
-def _summary(file: IO[bytes], size: int) -> bytes:
-    """The summary's bytes, its checksum compared; none if the file was written without one."""
-    end = _FOOTER.size + len(MCAP0_MAGIC)
-    file.seek(max(0, size - end))
-    footer = file.read(end)
-    if len(footer) != end or footer[_FOOTER.size :] != MCAP0_MAGIC:
-        raise ValueError("it was never finished, or it is cut")
-    opcode, length, start, _, checksum = _FOOTER.unpack_from(footer)
-    if opcode != Opcode.FOOTER or length != _FOOTER.size - RECORD_HEAD.size:
-        raise ValueError("its end is damaged")
-    if start == 0:
-        return b""
-    if not 0 < size - end - start <= _LARGEST_SUMMARY:
-        raise ValueError("its end is damaged")
-    file.seek(start)
-    summary = file.read(size - end - start)
-    whole = zlib.crc32(footer[: _FOOTER.size - _CRC_SIZE], zlib.crc32(summary))
-    if checksum and whole != checksum:
-        raise ValueError("its checksum is wrong")
-    return summary

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import lz4.frame
 import pytest
 import zstandard
-
 from replay.raw.chunks import UNPACKING_ERRORS, records, unpacked
 
 DATA = bytes(range(256)) * 8

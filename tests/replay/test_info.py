@@ -142,7 +142,7 @@ def test_a_damaged_index_is_named(events, write_steps):
     whole, start = path.read_bytes(), summary_start(path)
     path.write_bytes(whole[: start + 20] + bytes([whole[start + 20] ^ 1]) + whole[start + 21 :])
     info = recording_info(path)
-    assert info.damage == "damaged: the checksum of its summary is wrong"
+    assert info.damage == "damaged: in its summary, its checksum is wrong"
     assert [step["step"] for step in info.steps] == [0, 1, 2]
 
 
@@ -178,10 +178,10 @@ def test_an_index_that_tells_of_other_messages_is_found_out(events, write_steps)
 @pytest.mark.parametrize(
     ("of", "lie", "message"),
     [
-        (ChunkIndex, {"chunk_start_offset": 2**63}, "it should lie from byte"),
-        (ChunkIndex, {"chunk_start_offset": 2**40}, "it should lie from byte"),
-        (ChunkIndex, {"chunk_length": 2**63 - 10**6}, "it should lie from byte"),
-        (ChunkIndex, {"chunk_start_offset": 8}, "there is none at byte 8"),
+        (ChunkIndex, {"chunk_start_offset": 2**63}, "has a damaged chunk"),
+        (ChunkIndex, {"chunk_start_offset": 2**40}, "has a damaged chunk"),
+        (ChunkIndex, {"chunk_length": 2**63 - 10**6}, "has a damaged chunk"),
+        (ChunkIndex, {"chunk_start_offset": 8}, "has a damaged chunk"),
         (ChunkIndex, {"chunk_length": 3}, "has a damaged chunk"),
         (ChunkIndex, {"message_index_offsets": {}}, "has 0 messages on /session"),
         (ChunkIndex, {"message_index_offsets": {999: 0}}, "has a damaged chunk"),

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from replay.__main__ import main
 from replay.raw import log_info as module
-from replay.raw.catalogue import Channel
+from replay.raw.channels import Channel
 from replay.raw.frames import frames
 from replay.raw.log_info import LogInfo, TopicInfo, is_other_programs, log_info
 from tests.runners.sensors.small_logs import (
@@ -116,7 +116,7 @@ def test_unfinished_logs_are_counted_as_far_as_they_go(
     assert 0 < info.count < 9 * 15
     assert main(["info", str(path)]) == 1
     output = " ".join(capsys.readouterr().out.split())
-    assert "damaged or unfinished: log.mcap is cut or damaged" in output
+    assert "damaged or unfinished: log.mcap: it is cut within a record" in output
 
 
 def test_damage_in_the_middle_is_found_by_checking(tmp_path: Path) -> None:

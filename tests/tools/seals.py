@@ -13,14 +13,14 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Message, Schema
 
 from chsel.errors import ChselError
-from replay.mcap.chunk_records import DAMAGE
 from replay.mcap.encoding import decode, encode
+from replay.mcap.record_bytes import MALFORMED
 from replay.mcap.schemas import STEP_TIME
 from replay.mcap.seal import CONTENTS, SEAL, Chain
 from tests.tools.mutations import Record, file_of, joined, packed, split, unpacked
 
 _HEAD = struct.Struct("<HIQQ")  # of a message: channel, sequence, log time, publish time
-_MALFORMED = (*DAMAGE, ChselError, KeyError)
+_MALFORMED = (*MALFORMED, ChselError, KeyError)
 
 
 def reseal_file(path: Path) -> Path:

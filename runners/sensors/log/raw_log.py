@@ -10,7 +10,7 @@ from pathlib import Path
 
 from chsel.errors import SessionError
 from replay.mcap.texts import one_line
-from replay.raw.catalogue import Channel
+from replay.raw.channels import Channel
 from replay.raw.raw_file import RawFile
 from replay.raw.raw_reading import Fault, RawMessage, Wanted
 from runners.sensors.log.foxglove import foxglove_decoder
@@ -165,13 +165,13 @@ class RawLog:
             counts: dict[Channel, int] = {}
             times = list(part.times or ())
             if part.counts is not None:
-                for number, channel in part.catalogue.channels.items():
+                for number, channel in part.channels.by_id.items():
                     counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
             else:
                 for message in part.messages(Wanted(), fault, _after(done, tell)):
                     counts[message.channel] = counts.get(message.channel, 0) + 1
                     times = [min([message.log_time, *times]), max([message.log_time, *times])]
-                for channel in part.catalogue.channels.values():
+                for channel in part.channels.by_id.values():
                     counts.setdefault(channel, 0)
             for channel, count in counts.items():
                 self._add_topic(channel, count)

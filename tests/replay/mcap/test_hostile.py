@@ -168,7 +168,9 @@ def test_a_summary_that_starts_nowhere_is_damage(
     data = bytearray(path.read_bytes())
     data[-28:-20] = b"\xff" * 8
     path.write_bytes(data)
-    with pytest.raises(RecordingError, match="its summary starts beyond its end"):
+    with pytest.raises(
+        RecordingError, match="in its summary, it does not start where the end says"
+    ):
         read_recording(path)
 
 

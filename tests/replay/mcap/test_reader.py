@@ -436,12 +436,12 @@ def test_a_chunk_may_not_claim_more_than_the_file_can_hold(tmp_path):
     zeros = zstandard.ZstdCompressor(level=1).compress(bytes(300 * 2**20))
     assert len(zeros) < 100_000
     crc, size = zlib.crc32(bytes(300 * 2**20)), 300 * 2**20
-    for claimed in (size, 10):
+    for claimed, message in ((size, f"a chunk claims {size} bytes"), (10, "larger than it claims")):
         path.write_bytes(hostile(Chunk("zstd", zeros, 0, 0, crc, claimed)))
-        with pytest.raises(RecordingError, match=f"a chunk claims {claimed} bytes"):
+        with pytest.raises(RecordingError, match=message):
             read_recording(path)
-    path.write_bytes(hostile(Chunk("lz4", b"", 0, 0, 0, 0)))
-    with pytest.raises(RecordingError, match="compressed by 'lz4'; accepted: zstd"):
+    path.write_bytes(hostile(Chunk("br", b"", 0, 0, 0, 0)))
+    with pytest.raises(RecordingError, match="compressed by 'br'; accepted: zstd"):
         read_recording(path)
 
 

@@ -25,9 +25,10 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
+from replay.mcap.file import LIMITS
 from replay.mcap.reader import read_recording
+from replay.mcap.records import ENDS_EARLY, NO_RECORD, Damage, Records
 from replay.mcap.recovery import Recovered, recover, tells_loss
-from replay.mcap.whole_records import WholeRecords
 from replay.mcap.writer import McapRecorder
 from replay.verification import EQUAL, NO_RESULT, verify
 from tests.tools.kill_sessions import PROBES, quick_session
@@ -236,7 +237,6 @@ def test_an_unfinished_recording_gets_an_end_that_says_so(
 
 
 BEHIND = "this is behind the recording's end"
-NO_RECORD = "there is no whole record here"
 
 
 def wrong_summary(data: bytes) -> bytes:
@@ -250,7 +250,7 @@ def wrong_summary(data: bytes) -> bytes:
         (lambda data: data + bytes(PAGE), [BEHIND]),
         (lambda data: data + data, [BEHIND]),
         (lambda data: data[:-30] + data, [NO_RECORD, "another recording begins here"]),
-        (lambda data: data[:-30], [NO_RECORD]),
+        (lambda data: data[:-30], [ENDS_EARLY]),
         (lambda data: b"\0" + data[1:], [NO_RECORD]),
         (lambda data: data[:8] + b"\x77" + data[9:], [NO_RECORD]),
         (wrong_summary, []),
@@ -553,7 +553,8 @@ def test_thousands_of_chunks_within_chunks_are_not_all_tried() -> None:
         file += struct.pack("<QQQII4sQ", 0, 0, left, 1, 4, b"zstd", left)
     file += b"\xff" * (size - len(file))
     counting = Counting(bytes(file))
-    records = WholeRecords(counting, size)
-    assert list(records) == []
-    assert "there is more damage than can be searched" in records.damages[-1].reason
+    *damages, last = Records(counting, LIMITS).whole()
+    assert all(isinstance(damage, Damage) for damage in damages)
+    assert isinstance(last, Damage)
+    assert last.reason == "there is more damage than can be searched"
     assert counting.total < 256 * 2**20 + 101 * size

@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from mcap.reader import make_reader
 from mcap.records import Chunk, DataEnd, Message
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from chsel.errors import RecordingError
 from chsel.problem.points import KnownPoints
@@ -30,7 +30,6 @@ from replay.events import (
     SessionEnded,
     SnapshotTaken,
 )
-from replay.mcap.chunk_records import chunk_records
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
 from replay.mcap.schemas import message_class
@@ -126,7 +125,7 @@ def test_every_chunk_ends_with_a_seal_also_within_a_step(
     topics = {channel.id: channel.topic for channel in summary.channels.values()}
     ends = []
     for chunk in chunks:
-        parts = [part for part in chunk_records(chunk) if isinstance(part, Message)]
+        parts = [part for part in breakup_chunk(chunk) if isinstance(part, Message)]
         ends.append([topics[part.channel_id] for part in parts][-2:])
     assert len(ends) > 10
     assert ends[-1] == ["/seal", "/contents"]

@@ -1,5 +1,6 @@
 """Raw logs: what whole ones say, and what is left of damaged ones."""
 
+import dataclasses
 import hashlib
 import shutil
 import struct
@@ -16,7 +17,7 @@ from mcap.writer import Writer as McapWriter
 from chsel.errors import SessionError
 from replay.files import file_digest
 from replay.raw import raw_file, raw_reading
-from replay.raw.catalogue import Channel
+from replay.raw.channels import Channel
 from replay.raw.raw_reading import RawMessage
 from runners.sensors.log.log_files import merged, most_at_once
 from runners.sensors.log.messages import (
@@ -331,8 +332,8 @@ def test_a_file_of_false_chunks_is_not_searched_for_ever(
         head = struct.pack("<BQQQQII", 6, rest, 0, 0, 10, 0, 4) + b"zstd"
         heads.append(head + struct.pack("<Q", rest - 44))
     (tmp_path / "log.mcap").write_bytes(data + b"\0" + b"".join(heads))
-    monkeypatch.setattr(raw_reading, "_PLAUSIBLE_SIZE", 2**20)
-    monkeypatch.setattr(raw_reading, "_WINDOW", 2**12)
+    few = dataclasses.replace(raw_reading.LIMITS, size=2**20)
+    monkeypatch.setattr(raw_reading, "LIMITS", few)
     log = RawLog(tmp_path / "log.mcap")
     assert 10 < log.faults.total() < count / 2
     assert list(log.messages(log.topics))
