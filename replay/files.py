@@ -1,14 +1,14 @@
-"""Files that survive a power cut and are never overwritten, and the digest that names one."""
+"""Files that are whole once they have their names, and the digest that names one."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from chsel.errors import RecordingError
+from chsel.errors import ChselError, RecordingError
 from chsel.problem.file_checks import refuse_special_file
 
 _DIGEST_SIZE = 16  # bytes
@@ -41,6 +41,10 @@ def disk_error(error: BaseException, path: Path) -> OSError | None:
     return None
 
 
+class WritingError(ChselError):
+    """A file cannot be written, so that going on is of no use."""
+
+
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """A path beside `path` to write to; it becomes `path` if all went well, else it is removed.
@@ -49,17 +53,49 @@ def new_file(path: Path) -> Iterator[Path]:
     or after, and if it cannot be written.
     """
     require_new(path)
-    beside = path.with_name(f".{path.name[:100]}.{os.urandom(4).hex()}")
+    beside = _beside(path)
     try:
-        yield beside
-        sync_file(beside)
-        _rename(beside, path)
-        sync_folder(path.parent)
+        with _placed(beside, path, _rename):
+            yield beside
     except (OSError, RecordingError) as error:
         reason = disk_error(error, beside)
         if reason is None:
             raise
         raise RecordingError(f"{path} cannot be written: {reason.strerror or reason}") from error
+
+
+@contextmanager
+def whole_file(path: Path, accepted: str = "an out=DIR that can be written") -> Iterator[Path]:
+    """A path beside `path` to write to, which replaces `path` once all is on the disk.
+
+    accepted: what to do about it if either cannot be written: the end of the WritingError.
+    """
+    beside = _beside(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _placed(beside, path, Path.replace):
+            yield beside
+    except (OSError, RecordingError) as error:
+        reason = error if isinstance(error, OSError) else error.__context__
+        if not isinstance(reason, OSError):  # what was to be recorded is not valid
+            raise
+        raise WritingError(
+            f"{path} cannot be written ({reason.strerror or reason}); accepted: {accepted}"
+        ) from error
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name[:100]}.{os.urandom(4).hex()}")
+
+
+@contextmanager
+def _placed(beside: Path, path: Path, rename: Callable[[Path, Path], object]) -> Iterator[None]:
+    """Give a file that is written within this context its name, once it is on the disk."""
+    try:
+        yield
+        sync_file(beside)  # else a power cut may leave the name without the content
+        rename(beside, path)
+        sync_folder(path.parent)
     finally:
         with suppress(OSError):
             beside.unlink(missing_ok=True)

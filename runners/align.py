@@ -27,8 +27,8 @@ from runners.align_view import save_view
 from runners.alignment_fit import Fit, fit_of
 from runners.command.program import command, plain
 from runners.objects.scans import AssetsConfig
-from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
+from runners.sessions.problem_source import Source, open_source
 
 Triple = tuple[float, float, float]
 _VIEW = ".pose.rrd"

@@ -27,7 +27,7 @@ from runners.benchmarks.problems import PROBLEMS
 from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
 from runners.benchmarks.scope import Scope
 from runners.command.program import command, plain
-from runners.recording import make_run_folder, write_in_run_folder
+from runners.run.recording import make_run_folder, write_in_run_folder
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,9 @@ from chsel.problem.settings import build_settings
 from replay.console import Console, TextColumn
 from replay.console import Progress as ProgressBar
 from runners.command.program import command, plain
-from runners.download import DownloadError, Progress, download
 from runners.objects.loader import ObjectConfig
+from runners.objects.scan_archive import DownloadError, Progress, download, unpack
 from runners.objects.scans import MESH_FILE, AssetsConfig, check_scan, scan_folder
-from runners.unpack import unpack
 
 
 @command("fetch")

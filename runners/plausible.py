@@ -29,8 +29,8 @@ from runners.command.program import command, plain
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
 from runners.objects.scans import AssetsConfig
-from runners.plausible_source import Source, open_source
 from runners.sensors.pose_file import beside, read_pose
+from runners.sessions.problem_source import Source, open_source
 
 Row = dict[str, Any]
 

@@ -24,31 +24,31 @@ from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from replay.environment import environment
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
+from replay.files import WritingError
 from replay.recording_info import recording_digest
 from replay.registration import symmetry_for_errors
 from replay.startup import importing
 from runners.command.interrupt import Interrupt
 from runners.command.program import command, plain
-from runners.compiling import Compiling
-from runners.display import Display, reading_bar
 from runners.objects.loader import ObjectConfig, ObjectModel, load_object
 from runners.objects.scans import AssetsConfig
 from runners.objects.size_check import check_size
-from runners.recording import (
+from runners.run.compiling import Compiling
+from runners.run.display import Display, reading_bar
+from runners.run.recording import (
     RecordingConfig,
     make_run_folder,
     open_recorder,
     write_in_run_folder,
 )
+from runners.run.session_run import Row, SessionRun
 from runners.sensors.session_report import Report
-from runners.session_run import Row, SessionRun
 from runners.sessions import open_session, session_settings
 from runners.sessions.depth_frame import DepthFrameSession
 from runners.sessions.faults import without_clean_faults
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, unwatched
-from runners.whole_file import WritingError
 
 if TYPE_CHECKING:
     import trimesh

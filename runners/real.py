@@ -29,20 +29,20 @@ from chsel.problem.settings import build_settings
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from replay.console import Console, Progress
 from replay.events import Probe
+from replay.files import whole_file
 from runners.command.program import command, plain
-from runners.compiling import Compiling
 from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.selection import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.probe import PresetName
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import Cell, Table, number, print_table, range_text
+from runners.run.compiling import Compiling
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sensors.rig import Rig
 from runners.sessions import open_session
 from runners.sessions.points import PointsSettings
 from runners.sessions.sensors import SensorsSettings
-from runners.whole_file import whole_file
 
 _RIGHT = (0.005, pi / 36.0)  # m and radians (5 degrees): errors of a hypothesis that is right
 _EPSILON = 0.001  # m, of plausible sets, which are not made here

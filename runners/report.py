@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from chsel.errors import SettingError, require_choice
 from chsel.problem.settings import build_settings, settings_mapping
 from replay.console import Console
+from replay.files import whole_file
 from runners.command.program import command, plain
 from runners.reporting.against_baseline import against_baseline
 from runners.reporting.evaluation_folder import open_evaluation
@@ -21,7 +22,6 @@ from runners.reporting.page import as_html, as_markdown, page_of
 from runners.reporting.section import Section, SequenceConfig, Subject
 from runners.reporting.sections import sections_of
 from runners.reporting.tables import print_table
-from runners.whole_file import whole_file
 
 HTML, MARKDOWN = "report.html", "report.md"
 

@@ -16,13 +16,13 @@ from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from replay.console import Console, Progress, TextColumn
+from replay.files import WritingError, whole_file
 from runners.command.program import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
 from runners.simulated_robot.configurations import CabinetConfiguration, find_cabinet_configuration
 from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
-from runners.whole_file import WritingError, whole_file
 
 EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here
 

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from replay.files import whole_file
 from runners.benchmarks.report import number
-from runners.recording import IN_RUN_FOLDER
-from runners.whole_file import whole_file
+from runners.run.recording import IN_RUN_FOLDER
 
 Values = Mapping[str, Any]
 

@@ -15,7 +15,7 @@ from replay.registration import StepObserver
 from runners.benchmarks.ours import Steps, method
 from runners.benchmarks.problems import PosedProblem, drill
 from runners.benchmarks.timing import in_turn
-from runners.recording import RecordingConfig, open_recorder
+from runners.run.recording import RecordingConfig, open_recorder
 
 _PROBE = 0.1  # seconds: what a probe takes, in which a recorder may end what it has begun
 _FILES = {

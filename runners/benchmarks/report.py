@@ -13,7 +13,7 @@ from rich.table import Table
 
 from replay.console import Console
 from runners.benchmarks.ours import PRESETS
-from runners.recording import write_in_run_folder
+from runners.run.recording import write_in_run_folder
 
 Values = Mapping[str, Any]
 _PAGE_WIDTH = 160  # characters: no table is wider

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from runners.whole_file import WritingError
+from replay.files import WritingError
 
 FOLDER = ".claims"
 

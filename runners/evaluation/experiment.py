@@ -12,10 +12,10 @@ from typing import Any
 from chsel.errors import RecordingError, SettingError
 from chsel.problem.settings import settings_mapping
 from replay.environment import environment
+from replay.files import whole_file
 from runners.evaluation.claims import claimed
 from runners.evaluation.configurations import SENSORS
 from runners.evaluation.plan import Plan
-from runners.whole_file import whole_file
 
 FILE = "experiment.json"
 FORMAT = 1

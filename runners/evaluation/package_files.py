@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from replay.files import file_digest
+from replay.files import file_digest, whole_file
 from runners.evaluation.external_results import REPEAT_FOLDER
 from runners.evaluation.package_session import PackageSet
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.repeats import repeat_label
-from runners.whole_file import whole_file
 
 
 @dataclass(frozen=True)

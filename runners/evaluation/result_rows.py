@@ -27,7 +27,7 @@ from runners.evaluation.trial_session import (
     problems,
     read_session,
 )
-from runners.session_run import one_line
+from runners.run.session_run import one_line
 from runners.sessions.recorded import RecordedSession
 
 

@@ -16,7 +16,7 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
-from replay.files import file_digest
+from replay.files import file_digest, whole_file
 from replay.mcap.writer import McapRecorder
 from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender
@@ -25,10 +25,9 @@ from runners.evaluation.repeats import repeat_seed
 from runners.evaluation.result_rows import ResultRows
 from runners.evaluation.table import ITERATIONS, RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded
-from runners.recording import RecordingConfig
-from runners.session_run import SessionRun
+from runners.run.recording import RecordingConfig
+from runners.run.session_run import SessionRun
 from runners.sessions.recorded import RecordedSession
-from runners.whole_file import whole_file
 
 
 def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str]) -> None:

@@ -11,8 +11,8 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from chsel.errors import RecordingError
+from replay.files import whole_file
 from runners.sessions.faults import CLEAN
-from runners.whole_file import whole_file
 
 Row = Mapping[str, Any]
 

@@ -19,6 +19,7 @@ from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.environment import environment
 from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
+from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
 from runners.evaluation.claims import claimed
 from runners.evaluation.configurations import SENSORS
@@ -29,7 +30,6 @@ from runners.objects.loader import load_object
 from runners.objects.size_check import check_size
 from runners.sessions import open_session
 from runners.sessions.recorded import RecordedSession, RecordedSettings
-from runners.whole_file import WritingError, whole_file
 
 METHOD = "none"
 """The method that the recording of a session alone names."""

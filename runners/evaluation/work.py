@@ -12,14 +12,14 @@ from multiprocessing.connection import Connection
 
 import torch
 
+from replay.files import WritingError
 from runners.evaluation.claims import ClaimedError, claimed
 from runners.evaluation.external_results import external_digest, external_file, rank_external
 from runners.evaluation.plan import Plan, Task
 from runners.evaluation.run_method import register_trial
 from runners.evaluation.table import about_part, is_part
 from runners.evaluation.trial_session import has_session, make_session
-from runners.session_run import one_line
-from runners.whole_file import WritingError
+from runners.run.session_run import one_line
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMBA")
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}

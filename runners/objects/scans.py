@@ -6,12 +6,12 @@ import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from chsel.errors import MeshError, SettingError
 from chsel.problem.mesh import load_mesh
-from runners.download import require_web_address
 
 # By official folder: the choice's name, and the scan's extents in metres.
 SCANS = {
@@ -40,7 +40,7 @@ class AssetsConfig:
     def __post_init__(self) -> None:
         if not self.dir.strip():
             raise SettingError("dir is empty; accepted: a folder")
-        require_web_address("url", self.url)
+        _require_web_address("url", self.url)
 
     @property
     def folder(self) -> Path:
@@ -89,6 +89,17 @@ def check_scan(path: Path, scan: str) -> str:
             f"expected: {_millimetres(expected)}, to 1 % along each axis"
         )
     return f"{len(mesh.vertices)} vertices, {_millimetres(extents)}, watertight"
+
+
+def _require_web_address(name: str, url: str) -> None:
+    """Raise SettingError unless `url` is an http or https address."""
+    try:
+        parts = urlsplit(url)
+        accepted = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # the port or the host is not valid
+        accepted = False
+    if not accepted or re.search(r"[^!-~]", url):
+        raise SettingError(f"{name} is {url!r}; accepted: an http:// or https:// address")
 
 
 def _choice(scan: str) -> str:

@@ -19,8 +19,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
 
+from replay.files import whole_file
 from runners.reporting.method_style import MethodStyle
-from runners.whole_file import whole_file
 
 WIDTH = 12.0  # inches, of every figure
 FORMATS = ("png", "svg", "pdf")

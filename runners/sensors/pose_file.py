@@ -14,8 +14,7 @@ from chsel.errors import PoseError, SessionError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.file_checks import refuse_special_file
 from chsel.problem.poses import nearest_rigid
-from replay.files import new_file
-from runners.whole_file import whole_file
+from replay.files import new_file, whole_file
 
 SUFFIX = ".pose.yaml"
 KEY = "world_from_object"

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
-from runners.physics_engine import connect, silent
 from runners.sessions import hand
 from runners.sessions.configurations import Configuration, find_configuration
 from runners.sessions.faults import probed_mesh
+from runners.sessions.physics_engine import connect, silent
 from runners.sessions.placement import centre_of_mass, laid_down, lowest
 from runners.sessions.probing import START, ProbingSession, ProbingSettings, Touch
 

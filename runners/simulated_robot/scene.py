@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose, inverse
-from runners.physics_engine import connect, silent
 from runners.sensors.rig import BoxRig
+from runners.sessions.physics_engine import connect, silent
 from runners.simulated_robot import cabinet, wrist
 from runners.simulated_robot.settings import RenderedCamera
 

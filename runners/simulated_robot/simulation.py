@@ -13,6 +13,7 @@ import trimesh
 from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey, normals
+from replay.files import whole_file
 from runners.simulated_robot import wrist
 from runners.simulated_robot.configurations import REST, CabinetConfiguration, stood_on_shelf
 from runners.simulated_robot.log_writer import LogWriter
@@ -20,7 +21,6 @@ from runners.simulated_robot.pads import Pads
 from runners.simulated_robot.recorder import TICK, Recorder
 from runners.simulated_robot.scene import Scene
 from runners.simulated_robot.settings import RobotSettings
-from runners.whole_file import whole_file
 
 HOME = (0.48, 0.0, 0.433)  # m: where the wrist is before and after all probes
 REACTION = 1  # ticks that the robot still moves on when its pads have felt something

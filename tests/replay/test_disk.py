@@ -14,12 +14,11 @@ import pytest
 from chsel.errors import RecordingError
 from chsel.problem import online_registration as online
 from replay.__main__ import main
-from replay.files import new_file
+from replay.files import WritingError, new_file, whole_file
 from replay.mcap.writer import McapRecorder
 from replay.rerun.recorder import RerunRecorder
 from runners.benchmarks import report
-from runners.recording import write_in_run_folder
-from runners.whole_file import WritingError, whole_file
+from runners.run.recording import write_in_run_folder
 from tests.runners.in_process import run
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -16,10 +16,10 @@ from chsel.errors import ChselError, MeshError, PointsError, SessionError
 from chsel.problem.file_checks import refuse_special_file
 from chsel.problem.mesh import load_mesh
 from replay.__main__ import main
-from runners.plausible_source import open_source
 from runners.sensors.depth_frame import read_depth_frame
 from runners.sensors.pose_file import read_pose
 from runners.sessions.point_files import read_points
+from runners.sessions.problem_source import open_source
 
 DESCENT = Path(__file__).resolve().parents[1] / "replays" / "cracker_box_gradient_descent.mcap"
 

@@ -18,7 +18,7 @@ from replay.events import Logged
 from replay.mcap.reader import Recording, read_recording
 from replay.recorder import NullRecorder
 from runners.pictures import CheckedPictures
-from runners.recording import RecordingConfig, open_recorder
+from runners.run.recording import RecordingConfig, open_recorder
 from tests.tools.kill_sessions import points_session, reported_probes
 
 PROBES = 6

@@ -18,8 +18,9 @@ from chsel.methods import build_method
 from chsel.methods.method import Method
 from chsel.numerics.compiler import watched
 from chsel.problem.poses import apply, axis_angle, compose
-from runners import compiling, probe
-from runners.compiling import Compiling
+from runners import probe
+from runners.run import compiling
+from runners.run.compiling import Compiling
 from tests.runners.in_process import run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -28,7 +29,7 @@ SESSION = """
 import sys
 from numba.core.dispatcher import Dispatcher
 from runners import probe
-from runners.compiling import Compiling
+from runners.run.compiling import Compiling
 
 def specialised():
     kernels = [module for name, module in sys.modules.items() if name.startswith("chsel.")]

@@ -13,8 +13,8 @@ from runners.benchmarks.ours import Steps
 from runners.benchmarks.published import PackageConfig
 from runners.command.choices import CONF
 from runners.evaluation.metrics import MetricsConfig
-from runners.recording import RecordingConfig
 from runners.reporting.section import SequenceConfig
+from runners.run.recording import RecordingConfig
 from runners.sessions.points import PointsSettings
 from runners.sessions.recorded import RecordedSettings
 from runners.sessions.sensors import SensorsSettings

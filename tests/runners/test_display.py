@@ -10,11 +10,11 @@ import pytest
 import trimesh
 from rich.console import Console
 
-from runners.display import Bar
 from runners.objects.loader import ObjectConfig
 from runners.objects.scans import AssetsConfig
 from runners.probe import PresetName, ProbeConfig, open_scene
-from runners.recording import RecordingConfig
+from runners.run.display import Bar
+from runners.run.recording import RecordingConfig
 
 
 def test_a_bar_stands_there_before_the_work_begins() -> None:

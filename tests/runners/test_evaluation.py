@@ -24,6 +24,7 @@ from chsel.problem.poses import axis_angle
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.settings import settings_mapping
 from replay.events import Measured
+from replay.files import WritingError, whole_file
 from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, NO_RESULT, verify
 from runners.evaluation import run_method, work
@@ -40,7 +41,6 @@ from runners.evaluation.selection import chosen_configurations, chosen_seeds
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.evaluation.work import do_unit
 from runners.sessions.probing import ProbingSettings
-from runners.whole_file import WritingError, whole_file
 
 TRIAL = Trial(0, "mustard")
 FAST = {"chsel": {"descent": {"restarts": 1}, "emitter": {"iterations": 20}}}

@@ -25,7 +25,7 @@ from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import apply, axis_angle, compose
 from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
-from runners.display import MEANINGS
+from runners.run.display import MEANINGS
 
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 QUICK = (

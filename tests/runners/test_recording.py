@@ -17,7 +17,7 @@ from chsel.problem.streams import StreamKey
 from replay.events import Event, SnapshotTaken, Traced
 from replay.recorder import NullRecorder
 from replay.registration import StepObserver
-from runners.recording import RecordingConfig, make_run_folder, open_recorder
+from runners.run.recording import RecordingConfig, make_run_folder, open_recorder
 
 
 def test_run_folders_of_one_second_differ_and_stay_in_the_log_folder(tmp_path: Path) -> None:

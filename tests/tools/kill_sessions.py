@@ -35,9 +35,9 @@ from replay.mcap.recovery import recover, tells_loss
 from runners.command.choices import CONF, store_choices
 from runners.command.interrupt import Interrupt
 from runners.command.program import plain
-from runners.display import Display
 from runners.probe import ProbeConfig, open_scene, run, session_started
-from runners.recording import make_run_folder
+from runners.run.display import Display
+from runners.run.recording import make_run_folder
 from tests.replay.conftest import same_bits
 
 METHODS = ("gradient_descent", "chsel")

@@ -22,8 +22,8 @@ from replay.mcap.recovery import recover
 from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
 from replay.recording_info import recording_info
-from runners.recording import RecordingConfig
-from runners.session_run import SessionRun
+from runners.run.recording import RecordingConfig
+from runners.run.session_run import SessionRun
 from runners.sessions.point_files import PointClass
 
 STEPS, EACH = 150, 7

@@ -14,8 +14,8 @@ from PIL import Image
 from chsel.errors import SettingError
 from replay.events import Logged, Probe
 from replay.mcap.reader import read_recording
-from runners.display import Display
 from runners.probe import main
+from runners.run.display import Display
 from runners.sensors.rig import CloudRig, GateRig, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.runners.in_process import run

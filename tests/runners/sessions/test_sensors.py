@@ -26,9 +26,10 @@ from replay.events import Logged, Probe, RigDescribed, SensorImage, SessionEnded
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from runners.command.choices import CONF
-from runners.display import Display
 from runners.objects.loader import ObjectConfig, load_object
-from runners.recording import RecordingConfig
+from runners.run.display import Display
+from runners.run.recording import RecordingConfig
+from runners.run.session_run import SessionRun
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import (
     Annotations,
@@ -39,7 +40,6 @@ from runners.sensors.rig import (
     ProbeTimes,
     Rig,
 )
-from runners.session_run import SessionRun
 from runners.sessions import session_settings
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.replay.conftest import same_bits

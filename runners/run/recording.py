@@ -11,10 +11,10 @@ from pathlib import Path
 from chsel.errors import RecordingError, require_positive
 from replay.background_recorder import BackgroundRecorder
 from replay.events import Recorder
+from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
 from replay.recorder import TeeRecorder
 from runners.pictures import open_pictures
-from runners.whole_file import WritingError, whole_file
 
 IN_RUN_FOLDER = "a logs=DIR that can be written"
 """What is accepted where a file of a run cannot be written."""

@@ -19,8 +19,8 @@ from rich.table import Table
 from chsel.errors import InputWarning
 from chsel.problem.registration_problem import Trust
 from replay.console import Console, Progress, TextColumn
+from runners.run.session_run import FROM_SESSION, StepWarning
 from runners.sensors.session_report import Counts, Report
-from runners.step_warning import FROM_SESSION, StepWarning
 
 MEANINGS = {
     "determined": "one pose explains the points",

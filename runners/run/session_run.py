@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from chsel.errors import ChselError, InputWarning
@@ -17,11 +18,21 @@ from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, 
 from chsel.problem.trust import check_trust
 from replay.events import Logged, Probe, ProblemPosed, Recorder, Timed
 from replay.registration import Registered, register_recorded
-from runners.recording import RecordingConfig
+from runners.run.recording import RecordingConfig
 from runners.sessions.session import Session
-from runners.step_warning import FROM_SESSION, StepWarning
 
 Row = dict[str, Any]
+FROM_SESSION = "session"
+"""The code of warnings that the session itself gives."""
+
+
+@dataclass(frozen=True)
+class StepWarning:
+    """What a person should know about the input, as the summary has it."""
+
+    step: int  # the probe at which it first holds
+    code: str  # the kind of warning
+    text: str  # one line
 
 
 class SessionRun:
