@@ -15,7 +15,7 @@ from tests.replay.conftest import same_bits
 from tests.tools.fuzz_recordings import Original, main, originals, run_case
 from tests.tools.fuzzing import Tally, peak_memory, quiet
 
-CASES = 500  # of each of six blocks
+CASES = 150  # of each of three blocks; thousands by hand, see fuzz_recordings
 SEED = 20
 
 
@@ -37,7 +37,7 @@ def test_the_originals_are_small_and_equal_to_what_is_registered_today(
         assert [verdict.outcome for verdict in verdicts] == ["equal", "equal"]
 
 
-@pytest.mark.parametrize("block", range(6))
+@pytest.mark.parametrize("block", range(3))
 def test_every_case_ends_in_a_clear_error_or_a_right_answer(
     whole: list[Original], tmp_path: Path, block: int
 ) -> None:

@@ -20,10 +20,10 @@ from tests.tools.kill_sessions import PROBES, points_session, reported_probes
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 SEEDS = (1, 2)  # one for each of two processes
-KILLS = 105  # in each
+KILLS = 30  # in each; thousands by hand, see kill_sessions
 
 
-def test_every_reported_probe_survives_hundreds_of_kills() -> None:
+def test_every_reported_probe_survives_kills_at_random_moments() -> None:
     """In processes of their own: a fork needs one without the threads of other tests."""
     command = [sys.executable, "-m", "tests.tools.kill_sessions", "--count", str(KILLS), "--seed"]
     running = [
