@@ -1,10 +1,13 @@
-"""What happens in a session: the values that recorders write and readers give back."""
+"""What happens in a session: the values that recorders write and readers give back.
+
+`replay.mcap.schemas` says how the message on an event's topic is stored, and what it accepts.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -19,86 +22,80 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class SessionStarted:
-    """Opens every recording.
+    """Opens every recording."""
 
-    config: the resolved configuration, plain values. mesh: of the object, in its frame, metres.
-    world_from_object (4, 4): the true pose, where known. initial_points: known before any probe.
-    environment: versions, platform, processor, state of the checkout; no clock, no paths.
-    source: digest of the recording whose problems these are, "" if the session made its own.
-    """
+    topic: ClassVar[str] = "/session"
+    step: ClassVar[int] = -1  # before all steps
 
     runner: str
     object: str
     session: str
     method: str
     seed: int
-    config: Mapping[str, Any]
-    mesh: trimesh.Trimesh
+    config: Mapping[str, Any]  # the resolved configuration, plain values
+    mesh: trimesh.Trimesh  # of the object, in its frame, metres
     sdf: SdfGrid
     workspace: Workspace
-    free_resolution: float
-    initial_points: KnownPoints
-    world_from_object: FloatArray | None = None
+    free_resolution: float  # side of the voxels of free space, metres
+    initial_points: KnownPoints  # known before any probe
+    world_from_object: FloatArray | None = None  # (4, 4): the true pose, where known
+    # Versions, platform, processor, state of the checkout; no clock, no paths.
     environment: Mapping[str, str] = field(default_factory=dict)
+    # Digest of the recording whose problems these are, "" if the session made its own.
     source: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class RigDescribed:
-    """The sensors of a recorded robot session, and the raw log that they wrote.
+    """The sensors of a recorded robot session, and the raw log that they wrote; at most one."""
 
-    Comes at most once, before all steps: its own is -1. name: of the rig. source: digest of the raw
-    log, which is not part of the recording. hand: its solid parts in its own frame, that of
-    `Probe.gripper_path`, where known.
-    """
+    topic: ClassVar[str] = "/rig"
 
-    step: int
+    step: int  # -1: before all steps
     name: str
-    source: str
+    source: str  # digest of the raw log, which is not part of the recording
+    # The solid parts of the hand in its own frame, that of `Probe.gripper_path`, where known.
     hand: trimesh.Trimesh | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class SensorImage:
-    """An image from which known points of a step come; it precedes the step's probe.
+    """An image from which known points of a step come; it precedes the step's probe."""
 
-    sensor: its name in the rig. kind: "depth" of a camera, or "deformation" of a tactile pad.
-    values (H, W): uint16, in units of `unit` metres, 0 where there is no measurement. mask (H, W):
-    the pixels that count: those whose rays are free, or those in contact. intrinsics (4,): fx, fy,
-    cx, cy, pixels. world_from_camera (4, 4): of the optical centre, x right, y down, z forward.
-    """
+    topic: ClassVar[str] = "/sensor_image"
 
     step: int
-    sensor: str
-    kind: str
-    values: np.ndarray
-    unit: float
-    mask: np.ndarray
-    intrinsics: FloatArray
-    world_from_camera: FloatArray
+    sensor: str  # its name in the rig
+    kind: str  # "depth" of a camera, or "deformation" of a tactile pad
+    values: np.ndarray  # (H, W), uint16, in units of `unit`, 0 where there is no measurement
+    unit: float  # metres
+    mask: np.ndarray  # (H, W): the pixels that count: those of free rays, or those in contact
+    intrinsics: FloatArray  # (4,): fx, fy, cx, cy, pixels
+    world_from_camera: FloatArray  # (4, 4): of the optical centre, x right, y down, z forward
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """One probe and what it told.
+    """One probe and what became known with it."""
 
-    step: index of the probe, from 0. gripper_path (P, 4, 4): world_from_gripper, in order of time,
-    P may be 0. contacts (C, 3): on the object's surface, in the world. contact_normals (C, 3):
-    unit, pointing out of the object, zero where unknown. outcome: "contact", "free" or "points".
-    new_points: all that becomes known with this probe, contacts included.
-    """
+    topic: ClassVar[str] = "/probe"
 
-    step: int
-    outcome: str
-    new_points: KnownPoints
+    step: int  # index of the probe, from 0
+    outcome: str  # "contact", "free" or "points"
+    new_points: KnownPoints  # all that becomes known with this probe, contacts included
+    # world_from_gripper (P, 4, 4) in order of time; P may be 0.
     gripper_path: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    # (C, 3): on the object's surface, in the world.
     contacts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    # (C, 3): unit, pointing out of the object, zero where unknown.
     contact_normals: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class ProblemPosed:
     """A registration starts; with the events before it, this is the whole problem."""
+
+    topic: ClassVar[str] = "/problem"
 
     step: int
     problem: RegistrationProblem
@@ -108,27 +105,37 @@ class ProblemPosed:
 class SnapshotTaken:
     """The archive at one moment of a registration."""
 
+    topic: ClassVar[str] = "/archive"
+
     step: int
     archive: ArchiveSnapshot
 
 
 @dataclass(frozen=True)
 class Traced:
-    """Where a stage of a registration stands at its start or after a block of iterations.
+    """Where a stage of a registration stands at its start or after a block of iterations."""
 
-    digest: of the search vectors and costs. costs: lowest, median and highest, over B.
-    """
+    topic: ClassVar[str] = "/trace"
 
     step: int
     stage: str
     iteration: int
-    digest: str
-    costs: tuple[float, float, float]
+    digest: str  # of the search vectors and costs (B,)
+    lowest_cost: float
+    median_cost: float
+    highest_cost: float
+
+    @property
+    def costs(self) -> tuple[float, float, float]:
+        """Lowest, median and highest cost."""
+        return self.lowest_cost, self.median_cost, self.highest_cost
 
 
 @dataclass(frozen=True, eq=False)
 class HypothesesFound:
     """A registration ends."""
+
+    topic: ClassVar[str] = "/hypotheses"
 
     step: int
     hypotheses: Hypotheses
@@ -142,6 +149,8 @@ class Measured:
     best_position_error, best_rotation_error, distinct_hypotheses, coverage_mm2.
     """
 
+    topic: ClassVar[str] = "/measured"
+
     step: int
     values: Mapping[str, float]
 
@@ -150,28 +159,32 @@ class Measured:
 class Timed:
     """Wall-clock seconds by stage. With it no two recordings are equal to the byte."""
 
+    topic: ClassVar[str] = "/timed"
+
     step: int
     seconds: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class Logged:
-    """A line of text; level is "info" or "warning"."""
+    """A line of text."""
+
+    topic: ClassVar[str] = "/log"
 
     step: int
-    level: str
+    level: str  # "info" or "warning"
     text: str
 
 
 @dataclass(frozen=True)
 class SessionEnded:
-    """Closes a recording.
+    """Closes a recording."""
 
-    outcome: "finished", "interrupted", "failed: REASON", or "recovered: REASON" where a damaged
-    recording did not tell.
-    """
+    topic: ClassVar[str] = "/session_ended"
 
     step: int
+    # "finished", "interrupted", "failed: REASON", or "recovered: REASON" where a damaged recording
+    # has no end.
     outcome: str
 
 

@@ -11,12 +11,13 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay.arguments import chosen_steps
-from replay.events import Measured, Timed
 from replay.export import Exported, require_any
 from replay.export_images import exported_images
 from replay.mcap.contents import Contents
+from replay.mcap.event_messages import step_numbers
 from replay.mcap.foxglove_messages import poses_in_world
 from replay.mcap.reader import Recording
+from replay.mcap.schemas import NUMBERS
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _ENTRIES = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
@@ -111,7 +112,8 @@ def exported_metrics(recording: Recording, steps: str | None) -> Exported:
     """Every recorded number about a step: a row a number, in all three forms.
 
     source: "contents" for counts of what is known and found, and the best cost; "measured" for
-    numbers about the result, in SI units where the name has none; "timed" for seconds.
+    numbers about the result, in SI units where the name has none; "timed" for seconds; the topic
+    of other events with numbers about a step.
     """
     rows = list(_metric_rows(recording))
     require_any(recording, "number about a step", rows)
@@ -199,10 +201,9 @@ def _metric_rows(recording: Recording) -> Iterator[tuple[int, str, str, float]]:
     numbers: list[tuple[int, str, str, float]] = []
     for event in recording.events(images=False):
         contents.take(event)
-        if isinstance(event, Measured):
-            numbers += [(event.step, "measured", *item) for item in event.values.items()]
-        elif isinstance(event, Timed):
-            numbers += [(event.step, "timed", *item) for item in event.seconds.items()]
+        if event.topic in NUMBERS:
+            source = event.topic.strip("/")
+            numbers += [(event.step, source, *item) for item in step_numbers(event).items()]
     for row in contents.rows:
         for name in ("free", "occupied", "known", "contacts"):
             yield row.step, "contents", name, float(getattr(row, name))

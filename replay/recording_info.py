@@ -205,7 +205,7 @@ def _session(path: Path, data: bytes) -> dict[str, Any]:
         "lost": list(values["lost"]),
         "sdf_digest": values["sdf_digest"],
         "mesh_digest": values["mesh_digest"],
-        "environment": {item["name"]: item["value"] for item in values["environment"]},
+        "environment": values["environment"],
         "config": config,
     }
 

@@ -60,7 +60,7 @@ class StepObserver:
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
         """Record where the stage stands."""
         costs = (float(cost.min()), float(np.median(cost)), float(cost.max()))
-        event = Traced(self._step, stage, iteration, digest(vectors, cost), costs)
+        event = Traced(self._step, stage, iteration, digest(vectors, cost), *costs)
         self._recorder.record(event)
 
     def snapshot(self, archive: ArchiveSnapshot) -> None:

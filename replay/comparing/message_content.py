@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,13 @@ from chsel.errors import RecordingError
 from replay.mcap.attachments import MESH, SDF_GRID, mesh_from_ply
 from replay.mcap.encoding import decode
 from replay.mcap.file import StoredMessage
-from replay.mcap.foxglove_messages import FOXGLOVE, cloud_points
+from replay.mcap.foxglove_messages import CLOUDS, FOXGLOVE, cloud_points
 from replay.mcap.schemas import RECORDS, STEP_TIME
-from replay.mcap.sensor_messages import image
+from replay.mcap.sensor_messages import image_from
 
 Content = dict[str, Any]
 """Arrays, numbers, texts and None by path, such as "config.method.cost.free_scale"."""
 
-_CLOUDS = {"/points/free": 3, "/points/occupied": 3, "/points/known": 4}  # columns
 _POSES = ("/gripper_path", "/hypothesis_poses")
 
 
@@ -46,7 +45,7 @@ def message_content(message: StoredMessage) -> Content:
     if message.topic == "/session":
         values["config"] = _parsed_or_text(values["config"])
     elif message.topic == "/sensor_image":
-        seen = image(values)
+        seen = image_from(values)
         values |= {"values": seen.values, "mask": seen.mask}
     return _flat(values)
 
@@ -85,24 +84,10 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
         for name, inner in value.items():
             yield from _leaves(f"{path}.{name}" if path else str(name), inner)
     elif isinstance(value, list | tuple) and value:
-        named = _named(value)
-        if named is not None:
-            yield from _leaves(path, named)
-        else:
-            for index, inner in enumerate(value):
-                yield from _leaves(f"{path}[{index}]", inner)
+        for index, inner in enumerate(value):
+            yield from _leaves(f"{path}[{index}]", inner)
     else:
         yield path, value
-
-
-def _named(items: Sequence[Any]) -> dict[str, Any] | None:
-    """Pairs of name and value as a mapping; None if they are not, or a name comes twice."""
-    if not all(isinstance(item, Mapping) and set(item) == {"name", "value"} for item in items):
-        return None
-    if not all(isinstance(item["name"], str) for item in items):
-        return None
-    named = {item["name"]: item["value"] for item in items}
-    return named if len(named) == len(items) else None
 
 
 def _foxglove_values(message: StoredMessage) -> dict[str, Any]:
@@ -110,14 +95,14 @@ def _foxglove_values(message: StoredMessage) -> dict[str, Any]:
     try:
         parsed: Any = kind.FromString(message.data)
     except DecodeError:
-        raise RecordingError(f"a message is no valid {kind.DESCRIPTOR.full_name}") from None
+        raise RecordingError(f"a message is not a valid {kind.DESCRIPTOR.full_name}") from None
     values: dict[str, Any] = {}
     if not parsed.HasField("timestamp"):
         values["timestamp"] = None
     elif parsed.timestamp.seconds * 10**9 + parsed.timestamp.nanos == message.log_time:
         parsed.ClearField("timestamp")
-    if message.topic in _CLOUDS:
-        values["points"] = cloud_points(message.data, _CLOUDS[message.topic])
+    if message.topic in CLOUDS:
+        values["points"] = cloud_points(message.data, CLOUDS[message.topic])
         for name in ("data", "fields", "point_stride"):
             parsed.ClearField(name)
     elif message.topic in _POSES:

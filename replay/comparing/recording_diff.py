@@ -22,8 +22,8 @@ from replay.comparing.message_content import (
 from replay.mcap.attachments import MESH, SDF_GRID
 from replay.mcap.encoding import decode
 from replay.mcap.file import McapFile, StoredMessage
-from replay.mcap.foxglove_messages import FOXGLOVE, SCENE
-from replay.mcap.schemas import MESSAGES, RECORDS, message_class
+from replay.mcap.foxglove_messages import FOXGLOVE, SCENE, TOPIC_SCHEMAS
+from replay.mcap.schemas import MESSAGES, RECORDS
 from replay.mcap.seal import CONTENTS, SEAL
 
 BOTH, FIRST, SECOND = "both", "first", "second"
@@ -171,10 +171,7 @@ class _Survey:
 
         Seals follow from the messages that they close, and what viewers draw from the rest.
         """
-        schemas = {topic: message_class(name).DESCRIPTOR for topic, name in RECORDS.items()}
-        schemas |= {topic: kind.DESCRIPTOR for topic, kind in FOXGLOVE.items()}
-        names = {topic: kind.full_name for topic, kind in schemas.items()}
-        file = McapFile(self.path, names, check_seals=False)  # to see what was changed
+        file = McapFile(self.path, TOPIC_SCHEMAS, check_seals=False)  # to see what was changed
         numbers: Counter[tuple[str, int, str]] = Counter()
         for message in file.messages():
             derived = message.topic == SEAL or message.topic in SCENE

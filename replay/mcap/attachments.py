@@ -11,6 +11,7 @@ from chsel.errors import RecordingError
 from chsel.problem.sdf_grid import SdfGrid
 from replay.mcap.encoding import decode, encode
 from replay.mcap.schemas import MESH, SDF_GRID
+from replay.mcap.validation import check_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -64,16 +65,6 @@ def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
         raise RecordingError(f"attachment {MESH} has a face that is no triangle")
     check_mesh(vertices, indices)
     return trimesh.Trimesh(vertices.astype(np.float64), indices, process=False)
-
-
-def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Raise RecordingError unless vertices (V, 3) are finite and faces (F, 3) are of them."""
-    if len(faces) == 0:
-        raise RecordingError("the mesh has no faces; accepted: triangles")
-    if not np.isfinite(vertices).all():
-        raise RecordingError("the mesh has a vertex that is not finite; accepted: finite numbers")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise RecordingError("the mesh has a face that is no triangle of its vertices")
 
 
 def sdf_to_bytes(sdf: SdfGrid) -> bytes:

@@ -1,20 +1,85 @@
-"""Values to the bytes of a message and back, checked against the table of messages."""
+"""Values to the bytes of a message and back, as the table of messages says."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import Message
 
 from chsel.errors import RecordingError
-from replay.mcap.schemas import PACKAGE, Kind, field_kinds, message_class
-from replay.mcap.wire import check_wire
+from replay.mcap.schemas import MESSAGES, PACKAGE, TOGETHER
+from replay.mcap.validation import Check
+from replay.mcap.wire import parsed
 
+_ARRAY = re.compile(r"([fib]\d)(~?)\[(.*)\]")
 _NARROW = np.dtype("<f4")
 _LONGEST = 2**40  # of an array's side: what is beyond overflows numpy before it can be checked
+_NAMED = {"Number", "Text"}  # messages that repeat as a mapping from names to values
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One field of the table, taken apart."""
+
+    type: str
+    """A protobuf scalar, or the name of a message."""
+    repeated: bool
+    optional: bool
+    checks: tuple[Check, ...]
+    dtype: np.dtype[Any] | None
+    """Of an array; None for all else."""
+    shape: tuple[str, ...]
+    """Lengths of an array: numbers, or letters."""
+    narrow: bool
+    """Whether an array is stored in 32 bits where that is exact."""
+
+    @property
+    def is_message(self) -> bool:
+        return self.type in MESSAGES
+
+    @property
+    def is_mapping(self) -> bool:
+        return self.repeated and self.type in _NAMED
+
+
+@cache
+def field_kinds(name: str) -> dict[str, Kind]:
+    """The fields of a message, taken apart."""
+    kinds = {}
+    for field, entry in MESSAGES[name].items():
+        text, *checks = (entry,) if isinstance(entry, str) else entry
+        assert isinstance(text, str)
+        bare = text.rstrip("?*")
+        array = _ARRAY.fullmatch(bare)
+        kinds[field] = Kind(
+            type="Array" if array else bare,
+            repeated=text.endswith("*"),
+            optional=text.endswith("?"),
+            checks=tuple(check for check in checks if not isinstance(check, str)),
+            dtype=np.dtype(f"<{array[1]}") if array else None,
+            shape=tuple(array[3].split(",")) if array else (),
+            narrow=bool(array and array[2]),
+        )
+    return kinds
+
+
+def check_message(name: str, values: Mapping[str, Any]) -> None:
+    """Raise RecordingError unless the values of a message are as the table accepts them."""
+    try:
+        _check_fields(name, values)
+    except (RecordingError, ValueError, IndexError, TypeError) as error:
+        text = str(error)
+        if not isinstance(error, RecordingError):  # of arrays that do not fit together
+            text = f"it has a value of another shape or type: {error}"
+        where = f"{name} of step {values['step']}" if "step" in values else name
+        raise RecordingError(f"{where}: {text}") from None
 
 
 def encode(name: str, values: Mapping[str, Any]) -> bytes:
@@ -22,9 +87,10 @@ def encode(name: str, values: Mapping[str, Any]) -> bytes:
 
     Raises RecordingError if a value does not have the type or shape that the table gives.
     """
-    message = message_class(name)()
+    message: Any = message_class(name)()
     _fill(message, name, values)
-    return message.SerializeToString(deterministic=True)
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
 
 
 def decode(name: str, data: bytes) -> dict[str, Any]:
@@ -32,13 +98,42 @@ def decode(name: str, data: bytes) -> dict[str, Any]:
 
     Raises RecordingError if the bytes are no such message or an array is not as the table says.
     """
-    message = message_class(name)()
-    check_wire(message.DESCRIPTOR, data)
-    try:
-        message.ParseFromString(data)
-    except DecodeError:
-        raise RecordingError(f"a message is no valid {PACKAGE}.{name}") from None
-    return _values(message, name)
+    return _values(parsed(message_class(name), data), name)
+
+
+@cache
+def message_class(name: str) -> type[Message]:
+    """The protobuf class of a message of the table."""
+    return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{PACKAGE}.{name}"))
+
+
+def descriptor_set(message: type[Message]) -> bytes:
+    """All that a reader without this code needs to decode a message: a FileDescriptorSet."""
+    files: dict[str, Any] = {}
+
+    def visit(file: Any) -> None:
+        for dependency in file.dependencies:
+            visit(dependency)
+        files.setdefault(file.name, file)
+
+    visit(message.DESCRIPTOR.file)
+    collected = descriptor_pb2.FileDescriptorSet()
+    for file in files.values():
+        file.CopyToProto(collected.file.add())
+    return collected.SerializeToString(deterministic=True)
+
+
+def _check_fields(name: str, values: Mapping[str, Any]) -> None:
+    for field, kind in field_kinds(name).items():
+        value = values[field]
+        if value is None and kind.optional:
+            continue
+        for check in kind.checks:
+            check(field, value)
+        if kind.is_message and kind.dtype is None and not kind.repeated:
+            _check_fields(kind.type, value)
+    if name in TOGETHER:
+        TOGETHER[name](values)
 
 
 def _fill(message: Any, name: str, values: Mapping[str, Any]) -> None:
@@ -55,18 +150,10 @@ def _fill(message: Any, name: str, values: Mapping[str, Any]) -> None:
 
 def _set(message: Any, field: str, kind: Kind, value: Any, lengths: dict[str, int]) -> None:
     if kind.dtype is not None:
-        value = np.asarray(value)
-        _check_array(kind, value.dtype, value.shape, lengths)
-        target = getattr(message, field)
-        stored = value.astype(kind.dtype, copy=False)
-        if kind.narrow and (stored.astype(_NARROW).astype(kind.dtype) == stored).all():
-            stored = stored.astype(_NARROW)
-        target.dtype = stored.dtype.str
-        target.shape.extend(value.shape)
-        target.data = stored.tobytes()
-    elif kind.is_message and kind.repeated:
-        for item in value:
-            _fill(getattr(message, field).add(), kind.type, item)
+        _set_array(getattr(message, field), kind, np.asarray(value), lengths)
+    elif kind.is_mapping:
+        for key, item in value.items():
+            getattr(message, field).add(name=key, value=item)
     elif kind.is_message:
         getattr(message, field).SetInParent()
         _fill(getattr(message, field), kind.type, value)
@@ -74,6 +161,16 @@ def _set(message: Any, field: str, kind: Kind, value: Any, lengths: dict[str, in
         getattr(message, field).extend(value)
     else:
         setattr(message, field, value)
+
+
+def _set_array(target: Any, kind: Kind, value: np.ndarray, lengths: dict[str, int]) -> None:
+    _check_array(kind, value.dtype, value.shape, lengths)
+    stored = value.astype(kind.dtype, copy=False)
+    if kind.narrow and (stored.astype(_NARROW).astype(kind.dtype) == stored).all():
+        stored = stored.astype(_NARROW)
+    target.dtype = stored.dtype.str
+    target.shape.extend(value.shape)
+    target.data = stored.tobytes()
 
 
 def _values(message: Any, name: str) -> dict[str, Any]:
@@ -85,18 +182,20 @@ def _values(message: Any, name: str) -> dict[str, Any]:
 
 
 def _get(message: Any, where: str, field: str, kind: Kind, lengths: dict[str, int]) -> Any:
+    value = getattr(message, field)
+    if kind.is_mapping:
+        mapping = {item.name: item.value for item in value}
+        if len(mapping) != len(value):
+            raise RecordingError(f"{where} has a name twice; accepted: each name once")
+        return mapping
     if kind.repeated:
-        items = getattr(message, field)
-        return (
-            tuple(_values(item, kind.type) for item in items) if kind.is_message else tuple(items)
-        )
+        return tuple(value)
     if not kind.is_message:
-        return getattr(message, field)
+        return value
     if not message.HasField(field):
         if kind.optional:
             return None
         raise RecordingError(f"{where} is missing")
-    value = getattr(message, field)
     return _values(value, kind.type) if kind.dtype is None else _array(where, kind, value, lengths)
 
 
@@ -134,3 +233,33 @@ def _check_array(
     if not fits:
         wanted = ", ".join(str(lengths.get(letter, letter)) for letter in kind.shape)
         raise ValueError(f"it is {dtype} {shape}; accepted: {kind.dtype} ({wanted})")
+
+
+@cache
+def _pool() -> descriptor_pool.DescriptorPool:
+    """All messages of the table, one file each, in a pool of their own."""
+    pool = descriptor_pool.DescriptorPool()
+    for name in MESSAGES:
+        pool.Add(_file(name))
+    return pool
+
+
+def _file(name: str) -> descriptor_pb2.FileDescriptorProto:
+    """The .proto file of one message."""
+    file = descriptor_pb2.FileDescriptorProto(
+        name=_path(name), package=PACKAGE, syntax="proto3", message_type=[{"name": name}]
+    )
+    for number, (field, kind) in enumerate(field_kinds(name).items(), start=1):
+        proto = file.message_type[0].field.add(name=field, number=number)
+        proto.label = proto.LABEL_REPEATED if kind.repeated else proto.LABEL_OPTIONAL
+        if kind.is_message:
+            proto.type, proto.type_name = proto.TYPE_MESSAGE, f".{PACKAGE}.{kind.type}"
+            if _path(kind.type) not in file.dependency:
+                file.dependency.append(_path(kind.type))
+        else:
+            proto.type = proto.Type.Value(f"TYPE_{kind.type.upper()}")
+    return file
+
+
+def _path(name: str) -> str:
+    return f"{PACKAGE}/{name}.proto"

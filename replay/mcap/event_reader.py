@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from google.protobuf.message import DecodeError
 
 from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
@@ -20,45 +19,48 @@ from replay.events import (
     Event,
     HypothesesFound,
     Logged,
-    Measured,
     Probe,
+    ProblemPosed,
     SensorImage,
-    SessionEnded,
     SessionStarted,
     SnapshotTaken,
-    Timed,
-    Traced,
 )
 from replay.lost_attachment import LostAttachment
 from replay.mcap.attachments import MESH, SDF_GRID, mesh_from_ply, sdf_from_bytes
 from replay.mcap.contents import Contents
-from replay.mcap.encoding import decode
-from replay.mcap.event_checks import check_event, check_free_resolution, check_poses
-from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
+from replay.mcap.encoding import check_message, decode, message_class
+from replay.mcap.event_messages import (
+    archive_from,
+    check_digest,
+    event_from,
+    session_from,
+    shared_arguments,
+    workspace_from,
+)
 from replay.mcap.file import StoredMessage
-from replay.mcap.foxglove_messages import VIEWS, cloud_points, log_level_and_text
-from replay.mcap.plain_config import config_from_json
+from replay.mcap.foxglove_messages import CLOUDS, VIEWS, cloud_points, log_level_and_text
 from replay.mcap.schemas import (
+    BEFORE_ALL_STEPS,
     FORMAT_VERSION,
     RECORDS,
     SEALED_SINCE,
     SINCE_VERSION,
     STEP_TIME,
-    message_class,
 )
 from replay.mcap.seal import CONTENTS, SEAL
-from replay.mcap.sensor_messages import ImagePlace, check_image, plausible_pixels, rig
-from replay.mcap.wire import check_wire
+from replay.mcap.sensor_messages import ImagePlace, check_pixels, plausible_pixels, rig_from
+from replay.mcap.validation import EventOrder, check_cells
+from replay.mcap.wire import parsed
 
 if TYPE_CHECKING:
     import trimesh
-
-_CLOUDS = {"/points/free": 3, "/points/occupied": 3, "/points/known": 4}  # columns
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedProblem:
     """A problem without its points and grid, which the events before it give."""
+
+    topic: ClassVar[str] = ProblemPosed.topic
 
     step: int
     initial_set: FloatArray
@@ -80,8 +82,8 @@ class RecordedProblem:
             key=self.key,
             low_cost_set=self.low_cost_set,
         )
-        _check_digest(f"the problem of step {self.step}", problem.digest, self.digest)
-        _check_digest(f"all points of step {self.step}", points.digest, self.points_digest)
+        check_digest(f"the problem of step {self.step}", problem.digest, self.digest)
+        check_digest(f"all points of step {self.step}", points.digest, self.points_digest)
         return problem
 
 
@@ -123,10 +125,10 @@ class EventReader:
         if not self._fits(topic):
             raise RecordingError(f"a message on {topic} is out of place")
         step = message.log_time // STEP_TIME - 1
-        if topic in _CLOUDS:
+        if topic in CLOUDS:
             if step != self._opening.get("step", BEFORE_ALL_STEPS):
                 raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
-            self._clouds[topic] = cloud_points(data, _CLOUDS[topic])
+            self._clouds[topic] = cloud_points(data, CLOUDS[topic])
         elif topic == "/log":
             self._append(Logged(step, *log_level_and_text(data)))
         elif topic == CONTENTS:
@@ -137,6 +139,7 @@ class EventReader:
             values = decode(RECORDS[topic], data)
             if values.get("step", step) != step:
                 raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
+            check_message(RECORDS[topic], values)
             if topic in ("/session", "/probe"):
                 self.within, self._opening = topic, values
             else:
@@ -147,22 +150,18 @@ class EventReader:
         if self.closed:
             return False
         if self.within is not None:
-            return topic == "/known_points" or (topic in _CLOUDS and topic not in self._clouds)
+            return topic == "/known_points" or (topic in CLOUDS and topic not in self._clouds)
         if not self.entries:
             return topic == "/session"
         if SINCE_VERSION.get(topic, 0) > self.version:
             return False
-        return topic not in (*_CLOUDS, "/known_points", "/session")
+        return topic not in (*CLOUDS, "/known_points", "/session")
 
     def _append(self, entry: Entry) -> None:
+        self._order.take(entry.topic, entry.step)
         if isinstance(entry, RecordedProblem):
-            self._order.pose(entry.step)
             self.contents.pose(entry.step)
-        elif isinstance(entry, ImagePlace):
-            self._order.see(entry.step)
-        else:
-            self._order.take(entry)
-            check_event(entry)
+        elif not isinstance(entry, ImagePlace):
             self.contents.take(entry)
         self.entries.append(entry)
 
@@ -179,32 +178,24 @@ class EventReader:
             case "/known_points":
                 return self._close(values)
             case "/rig":
-                return rig(values)
+                return rig_from(values)
             case "/sensor_image":
                 return self._image(values)
             case "/problem":
                 return self._problem(values)
             case "/archive":
-                self._last_snapshot = _snapshot(values)
+                self._last_snapshot = archive_from(values)
                 return SnapshotTaken(values["step"], self._last_snapshot)
-            case "/trace":
-                costs = (values["lowest_cost"], values["median_cost"], values["highest_cost"])
-                named = ("step", "stage", "iteration", "digest")
-                return Traced(**{name: values[name] for name in named}, costs=costs)
             case "/hypotheses":
                 return self._hypotheses(values)
-            case "/measured":
-                return Measured(values["step"], _mapping("measured", values["values"]))
-            case "/timed":
-                return Timed(values["step"], _mapping("timed", values["seconds"]))
             case _:
-                return SessionEnded(**values)
+                return event_from(topic, values)
 
     def _close(self, values: dict[str, Any]) -> SessionStarted | Probe:
         """The event that was open, now that its points are there."""
         clouds = {
             topic: self._clouds.pop(topic, np.zeros((0, columns)))
-            for topic, columns in _CLOUDS.items()
+            for topic, columns in CLOUDS.items()
         }
         free, occupied, known = clouds.values()
         points = KnownPoints(free, occupied, known[:, :3], known[:, 3])
@@ -213,7 +204,7 @@ class EventReader:
             self._counts[name] += count
             if (count, self._counts[name]) != (values[f"new_{name}"], values[name]):
                 raise RecordingError(f"{name} points of step {values['step']} are missing")
-        _check_digest(f"new points of step {values['step']}", points.digest, values["new_digest"])
+        check_digest(f"new points of step {values['step']}", points.digest, values["new_digest"])
         if values["step"] != self._opening.get("step", BEFORE_ALL_STEPS):
             raise RecordingError(f"the points of step {values['step']} follow another probe")
         self._points_digest = values["digest"]
@@ -222,8 +213,8 @@ class EventReader:
             self._sdf_digest = self._opening["sdf_digest"]
             mesh = self._attached(MESH, self._opening["mesh_digest"])
             sdf = self._attached(SDF_GRID, self._sdf_digest)
-            return _session(self._opening, points, mesh, sdf)
-        return Probe(**self._opening, new_points=points)
+            return session_from(self._opening, points, mesh, sdf)
+        return Probe(**shared_arguments(Probe, self._opening), new_points=points)
 
     def _attached(self, name: str, digest: str) -> Any:
         """The mesh or the grid; RecordingError unless it is there as recorded, or known as lost."""
@@ -238,37 +229,30 @@ class EventReader:
 
     def _count_pixels(self, values: dict[str, Any]) -> None:
         """Raise RecordingError if an image is wrong from outside, or one too many to look at."""
-        check_image(values)
+        check_pixels(values)
         self._pixels -= values["height"] * values["width"]
         if self._pixels < 0:
             raise RecordingError("its images have more pixels than a file of its size can hold")
 
     def _problem(self, values: dict[str, Any]) -> RecordedProblem:
         step, low_cost_set = values["step"], values["low_cost_set"]
-        if low_cost_set is None:
-            low_cost_set = self._last_elites
-        else:
-            check_poses(f"the low-cost set of step {step}", low_cost_set)
+        low_cost_set = self._last_elites if low_cost_set is None else low_cost_set
         if low_cost_set is None:
             raise RecordingError(f"the low-cost set of step {step} is missing")
-        if len(values["initial_set"]) == 0:
-            raise RecordingError(f"the initial set of step {step} is empty; accepted: some poses")
-        check_poses(f"the initial set of step {step}", values["initial_set"])
-        check_free_resolution(values["free_resolution"])
         if self.version < SEALED_SINCE:
-            _check_digest(
+            check_digest(
                 f"all points before the problem of step {step}",
                 self._points_digest,
                 values["points_digest"],
             )
-        _check_digest(
+        check_digest(
             f"the SDF grid of the problem of step {step}", self._sdf_digest, values["sdf_digest"]
         )
         return RecordedProblem(
             step=step,
             initial_set=values["initial_set"],
             low_cost_set=low_cost_set,
-            workspace=_workspace(values["workspace"]),
+            workspace=workspace_from(values),
             free_resolution=values["free_resolution"],
             key=StreamKey(values["key_seed"], values["key_step"]),
             points_digest=values["points_digest"],
@@ -276,14 +260,16 @@ class EventReader:
         )
 
     def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
-        archive = self._last_snapshot if values["archive_is_last_snapshot"] else None
+        archive, step = None, values["step"]
         if values["archive"] is not None:
-            archive = _snapshot(values["archive"])
-        elif values["archive_is_last_snapshot"] and archive is None:
-            raise RecordingError(f"the archive of step {values['step']} is missing")
-        named = ("object_from_world", "cost", "duplicate", "cell", "elites")
-        found = Hypotheses(**{name: values[name] for name in named}, archive=archive)
-        _check_digest(f"the hypotheses of step {values['step']}", found.digest, values["digest"])
+            archive = archive_from(values["archive"])
+        elif values["archive_is_last_snapshot"]:
+            if self._last_snapshot is None:
+                raise RecordingError(f"the archive of step {step} is missing")
+            archive = self._last_snapshot
+            check_cells(values["cell"], archive.shape)
+        found = Hypotheses(**shared_arguments(Hypotheses, values | {"archive": archive}))
+        check_digest(f"the hypotheses of step {values['step']}", found.digest, values["digest"])
         self._last_elites = found.elites
         return HypothesesFound(values["step"], found)
 
@@ -294,43 +280,16 @@ def attached(attachments: Mapping[str, bytes], name: str, digest: str) -> trimes
         raise RecordingError(f"it lacks the attachment {name}")
     if name == MESH:
         mesh = mesh_from_ply(attachments[name])
-        _check_digest(f"attachment {name}", mesh_digest(mesh), digest)
+        check_digest(f"attachment {name}", mesh_digest(mesh), digest)
         return mesh
     sdf = sdf_from_bytes(attachments[name])
-    _check_digest(f"attachment {name}", sdf.digest, digest)
+    check_digest(f"attachment {name}", sdf.digest, digest)
     return sdf
-
-
-def _session(values: dict[str, Any], points: KnownPoints, mesh: Any, sdf: Any) -> SessionStarted:
-    config = config_from_json(values["config"])
-    named = ("runner", "object", "session", "method", "seed", "free_resolution", "source")
-    return SessionStarted(
-        **{name: values[name] for name in (*named, "world_from_object")},
-        config=config,
-        mesh=mesh,
-        sdf=sdf,
-        workspace=_workspace(values["workspace"]),
-        initial_points=points,
-        environment=_mapping("the environment", values["environment"]),
-    )
-
-
-def _mapping(what: str, items: tuple[dict[str, Any], ...]) -> dict[str, Any]:
-    """The values of named items; RecordingError if two have one name."""
-    mapping = {item["name"]: item["value"] for item in items}
-    if len(mapping) != len(items):
-        raise RecordingError(f"{what} has a name twice; accepted: each name once")
-    return mapping
 
 
 def _checked_version(data: bytes) -> int:
     """The format of a session; RecordingError for one not known, before reading more of it."""
-    session: Any = message_class("Session")()
-    check_wire(session.DESCRIPTOR, data)
-    try:
-        session.ParseFromString(data)
-    except DecodeError:
-        raise RecordingError("a message is no valid chsel.Session") from None
+    session = parsed(message_class("Session"), data)
     version = int(session.format_version)
     if version > FORMAT_VERSION:
         raise RecordingError(
@@ -339,20 +298,3 @@ def _checked_version(data: bytes) -> int:
     if version < 1:
         raise RecordingError(f"it has format version {version}; accepted: 1 to {FORMAT_VERSION}")
     return version
-
-
-def _snapshot(values: dict[str, Any]) -> ArchiveSnapshot:
-    values = dict(values)
-    step, digest = values.pop("step"), values.pop("digest")
-    snapshot = ArchiveSnapshot(**values)
-    _check_digest(f"an archive of step {step}", snapshot.digest, digest)
-    return snapshot
-
-
-def _workspace(bounds: FloatArray) -> Workspace:
-    return Workspace(*bounds.tolist())
-
-
-def _check_digest(what: str, digest: str, recorded: str) -> None:
-    if digest != recorded:
-        raise RecordingError(f"{what} has digest {digest}, not {recorded} as recorded")

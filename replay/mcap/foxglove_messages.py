@@ -12,14 +12,15 @@ from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import Message
 
 from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import quaternions
 from replay.mcap.cumulative_points import LEVELS
-from replay.mcap.schemas import RECORDS, message_class
-from replay.mcap.wire import check_wire
+from replay.mcap.schemas import PACKAGE, RECORDS
+from replay.mcap.texts import check_text
+from replay.mcap.wire import parsed
 
 POINT_CLASSES = ("free", "occupied", "known")
 SCENE: Mapping[str, type[Message]] = {
@@ -48,12 +49,14 @@ FOXGLOVE: Mapping[str, type[Message]] = {
 }
 """Topics that carry Foxglove's messages. Points and log are the only copy of what they say."""
 
+CLOUDS: Mapping[str, int] = {"/points/free": 3, "/points/occupied": 3, "/points/known": 4}
+"""Columns of the clouds that hold points: x, y, z, and the signed distance."""
 
-def message_names() -> dict[str, str]:
-    """The full name of the message on every topic of a recording."""
-    kinds = {topic: message_class(name) for topic, name in RECORDS.items()} | {**FOXGLOVE}
-    return {topic: kind.DESCRIPTOR.full_name for topic, kind in kinds.items()}
-
+TOPIC_SCHEMAS: Mapping[str, str] = {
+    **{topic: f"{PACKAGE}.{name}" for topic, name in RECORDS.items()},
+    **{topic: kind.DESCRIPTOR.full_name for topic, kind in FOXGLOVE.items()},
+}
+"""The full name of the message on every topic of a recording."""
 
 WORLD = "world"
 OBJECT = "object"
@@ -76,7 +79,7 @@ def point_cloud(points: FloatArray, time: int) -> bytes:
 
 def cloud_points(data: bytes, columns: int) -> FloatArray:
     """The points (N, columns) that `point_cloud` wrote; RecordingError for any other cloud."""
-    message = _parsed(PointCloud, data)
+    message = parsed(PointCloud, data)
     stride = 8 * columns
     if message.point_stride != stride or list(message.fields) != _fields(columns):
         names = ", ".join(_NAMES[:columns])
@@ -110,14 +113,16 @@ def log_line(level: str, text: str, time: int) -> bytes:
     """A line of text of level "info" or "warning"."""
     if level not in _LEVELS:
         raise RecordingError(f"log level is {level!r}; accepted: {', '.join(_LEVELS)}")
+    check_text("a log line", text)
     return _stamped(Log(level=_LEVELS[level], message=text), time)
 
 
 def log_level_and_text(data: bytes) -> tuple[str, str]:
     """What `log_line` wrote."""
-    message = _parsed(Log, data)
+    message = parsed(Log, data)
     for name, level in _LEVELS.items():
         if message.level == level:
+            check_text("a log line", message.message)
             return name, message.message
     raise RecordingError(f"a log line is of level {message.level}; accepted: {', '.join(_LEVELS)}")
 
@@ -138,14 +143,6 @@ def _stamped(message: Any, time: int) -> bytes:
 def set_stamp(stamp: Any, time: int) -> None:
     """Set a protobuf timestamp to nanoseconds."""
     stamp.seconds, stamp.nanos = divmod(time, 10**9)
-
-
-def _parsed(kind: Any, data: bytes) -> Any:
-    check_wire(kind.DESCRIPTOR, data)
-    try:
-        return kind.FromString(data)
-    except DecodeError:
-        raise RecordingError(f"a message is no valid {kind.DESCRIPTOR.full_name}") from None
 
 
 def set_pose(message: Any, position: list[float], quaternion: list[float]) -> None:

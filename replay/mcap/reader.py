@@ -26,9 +26,9 @@ from replay.mcap.damaged import DamagedRecordingError
 from replay.mcap.encoding import decode
 from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
 from replay.mcap.file import McapFile, StoredMessage
-from replay.mcap.foxglove_messages import message_names
+from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
 from replay.mcap.schemas import RECORDS, SEALED_SINCE, STEP_TIME
-from replay.mcap.sensor_messages import ImagePlace, image
+from replay.mcap.sensor_messages import ImagePlace, image_from
 from replay.mcap.texts import one_line
 
 
@@ -154,13 +154,14 @@ class Recording:
 
     def _images(self, steps: Sequence[int] | None = None) -> Iterator[SensorImage]:
         """The images in the file; others are passed by."""
-        topic, partial = "/sensor_image", self.damage is not None
-        names = {topic: message_names()[topic]}
-        file = McapFile(self.path, names, partial=partial, check_seals=False)  # they were
+        topic = "/sensor_image"
+        schemas = {topic: TOPIC_SCHEMAS[topic]}
+        partial = self.damage is not None
+        file = McapFile(self.path, schemas, partial=partial, check_seals=False)  # they were
         for message in file.messages():
             if steps is None or message.log_time // STEP_TIME - 1 in steps:
                 with _blaming(self.path):
-                    found = image(decode(RECORDS[topic], message.data))
+                    found = image_from(decode(RECORDS[topic], message.data))
                 yield found
 
     def _next(self, seen: Iterator[SensorImage], place: ImagePlace) -> SensorImage:
@@ -196,7 +197,7 @@ def read_recording(
     is unfinished or damaged.
     """
     path = Path(path).expanduser()
-    file = McapFile(path, message_names(), partial=partial)
+    file = McapFile(path, TOPIC_SCHEMAS, partial=partial)
     events = EventReader(file.attachments, path.stat().st_size if path.is_file() else 0)
     for message in file.messages():
         if watch is not None:

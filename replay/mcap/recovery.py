@@ -22,11 +22,9 @@ from replay.events import (
 )
 from replay.files import new_file
 from replay.lost_attachment import LostAttachment
-from replay.mcap.event_checks import RECOVERED
-from replay.mcap.event_order import EventOrder
 from replay.mcap.event_reader import Entry, RecordedProblem
 from replay.mcap.file import StoredMessage
-from replay.mcap.foxglove_messages import message_names
+from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
 from replay.mcap.gap_reader import WRONG, GapReader
 from replay.mcap.reader import read_recording
 from replay.mcap.records import Damage
@@ -34,6 +32,7 @@ from replay.mcap.salvage import Gap, Salvage
 from replay.mcap.schemas import STEP_TIME
 from replay.mcap.sensor_messages import ImagePlace
 from replay.mcap.texts import one_line
+from replay.mcap.validation import RECOVERED, EventOrder
 from replay.mcap.writer import McapRecorder
 
 _OF_REGISTRATION = (Traced, SnapshotTaken, HypothesesFound)
@@ -150,7 +149,7 @@ class _Recovery:
             yield event
 
     def _salvaged(self) -> Iterator[Event]:
-        self._file = file = Salvage(self._path, message_names())
+        self._file = file = Salvage(self._path, TOPIC_SCHEMAS)
         reader = GapReader(file.attachments, self._path.stat().st_size)
         unsure: list[tuple[int, int]] = []  # first and last step of those with missing messages
         gap = False
@@ -191,7 +190,7 @@ class _Recovery:
 
     def _kept(self, reader: GapReader, entry: Entry) -> Iterator[Event]:
         """The event, if it still makes sense where it is; else a warning, once a registration."""
-        step = getattr(entry, "step", -1)
+        step = entry.step
         if isinstance(entry, ImagePlace):
             return  # there is none of them here
         if isinstance(entry, SensorImage) and not self._order.has_rig:
@@ -203,7 +202,7 @@ class _Recovery:
             return  # with its problem
         try:
             event = reader.completed(entry) if isinstance(entry, RecordedProblem) else entry
-            self._order.take(event)
+            self._order.take(event.topic, event.step)
         except WRONG as error:
             what, reason = f"{type(entry).__name__} of step {step}", one_line(str(error))
             if isinstance(entry, (RecordedProblem, *_OF_REGISTRATION)):
@@ -248,7 +247,7 @@ class _Recovery:
         """A line in the recording; behind the session's end there can be none."""
         if self.found.ended is None:
             warning = Logged(self._order.step, "warning", f"{RECOVERED}{text}")
-            self._order.take(warning)
+            self._order.take(warning.topic, warning.step)
             yield warning
 
     def _note_attachments(self, start: SessionStarted, reader: GapReader) -> None:

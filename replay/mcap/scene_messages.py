@@ -5,7 +5,8 @@ Foxglove draws the meshes. Rerun passes them by and draws the clouds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,23 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import Hypotheses
-from replay.mcap.foxglove_messages import OBJECT, VIEWS, WORLD, set_pose, set_stamp
-from replay.mcap.simple_mesh import SimpleMesh
+from replay.events import Event, HypothesesFound, Probe, SessionStarted
+from replay.lost_attachment import is_lost
+from replay.mcap.cumulative_points import CumulativePoints
+from replay.mcap.foxglove_messages import (
+    OBJECT,
+    POINT_CLASSES,
+    VIEWS,
+    WORLD,
+    object_in_world,
+    poses_in_world,
+    set_pose,
+    set_stamp,
+)
+from replay.mcap.simple_mesh import SimpleMesh, simple_mesh
 from replay.rerun.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
 from replay.rerun.colors import OBJECT as OBJECT_COLOR
 
@@ -36,6 +50,50 @@ _OBJECT_OPACITY = 0.6
 _BEST_OPACITY, _OTHER_OPACITY = 0.9, 0.25
 _SURFACE_POINTS = 100  # of each hypothesis
 _POINT = np.dtype([("position", "<f4", 3), ("color", "u1", 4)])
+
+
+View = tuple[str, Callable[[int], bytes]]
+"""A topic, and what makes its message of the log time, nanoseconds."""
+
+
+class Views:
+    """Makes the messages for viewers that follow those of an event."""
+
+    def __init__(self) -> None:
+        self._points = {name: CumulativePoints() for name in POINT_CLASSES}
+        self._scene: SceneMessages | None = None
+
+    def after(self, event: Event) -> Iterator[View]:
+        """Messages in their order; each is made when it is written."""
+        match event:
+            case SessionStarted():
+                self._scene = (
+                    None if is_lost(event.mesh) else SceneMessages(simple_mesh(event.mesh))
+                )
+                yield from self._all_points(event.initial_points)
+                if event.world_from_object is not None:
+                    yield "/object_pose", partial(object_in_world, event.world_from_object)
+                    if self._scene is not None:
+                        yield "/object_mesh", self._scene.object_mesh
+                        yield "/object_surface", self._scene.object_surface
+            case Probe():
+                yield from self._all_points(event.new_points)
+                if len(event.gripper_path) > 0:
+                    yield "/gripper_path", partial(poses_in_world, event.gripper_path)
+            case HypothesesFound() if len(event.hypotheses.object_from_world) > 0:
+                found = event.hypotheses
+                yield "/hypothesis_poses", partial(poses_in_world, inverse(found.object_from_world))
+                if self._scene is not None:
+                    yield "/hypothesis_meshes", partial(self._scene.hypothesis_meshes, found)
+                    yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, found)
+
+    def _all_points(self, new: KnownPoints) -> Iterator[View]:
+        """The clouds of all points so far that change with new ones."""
+        for name, cumulative in self._points.items():
+            points = getattr(new, name)
+            for level, cloud in cumulative.add(points).items() if len(points) else ():
+                topic = f"/all_points/{name}/{level}"
+                yield topic, partial(colored_cloud, cloud, POINT_COLORS[name])
 
 
 class SceneMessages:

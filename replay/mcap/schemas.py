@@ -1,16 +1,34 @@
-"""The messages of a recording that are the project's own: one table, made into protobuf here."""
+"""The messages of a recording that are the project's own, and the topics that carry them.
+
+An event of `replay.events` that names its topic is written, read, checked, compared and exported
+as its message here says. A new field or event stands in its class and in this table.
+"""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from google.protobuf.message import Message
+from replay.mcap.validation import (
+    Check,
+    ascending_costs,
+    between,
+    check_archive,
+    check_hand,
+    check_hypotheses,
+    check_trace,
+    finite,
+    intrinsics,
+    not_empty,
+    one_of,
+    plain_texts,
+    rigid,
+    sensor_name,
+    session_end,
+    short_name,
+    short_names,
+    voxel_side,
+)
 
 FORMAT_VERSION = 3
 """That of new recordings. A reader refuses newer ones, so any change of meaning needs a new number.
@@ -30,41 +48,47 @@ STEP_TIME = 10**9
 BEFORE_ALL_STEPS = -1
 """The step of a session's start."""
 
+LARGEST_SIDE = 8192
+"""Pixels of an image, either way."""
+
 MESH, SDF_GRID = "mesh.ply", "sdf_grid"
 """Names of attachments."""
 
+PACKAGE = "chsel"
+
 # A field is a protobuf scalar, a message of this table, or an array with its type and shape. In a
 # shape, a letter is a length that is the same wherever it stands in the message. "?" after a field
-# says that it may be absent, "*" that it repeats. "f8~" is
-# stored in 32 bits where that is exact. Field numbers follow the order: only append.
-MESSAGES: Mapping[str, Mapping[str, str]] = {
+# says that it may be absent, "*" that it repeats; repeated Numbers and Texts are a mapping by their
+# names. "f8~" is stored in 32 bits where that is exact. Functions behind the type say what values
+# are accepted. Field numbers follow the order: only append.
+MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
     # The bytes are little-endian, in C order; the type is named as numpy names it.
     "Array": {"dtype": "string", "shape": "uint64*", "data": "bytes"},
     "Number": {"name": "string", "value": "double"},
     "Text": {"name": "string", "value": "string"},
     "Session": {
         "format_version": "uint32",
-        "runner": "string",
-        "object": "string",
-        "session": "string",
-        "method": "string",
+        "runner": ("string", short_name),
+        "object": ("string", short_name),
+        "session": ("string", short_name),
+        "method": ("string", short_name),
         "seed": "uint64",
         "config": "string",  # JSON
         "workspace": "f8[2,3]",
-        "free_resolution": "double",
-        "world_from_object": "f8[4,4]?",
-        "environment": "Text*",
+        "free_resolution": ("double", voxel_side),
+        "world_from_object": ("f8[4,4]?", rigid),
+        "environment": ("Text*", short_names, plain_texts),
         "mesh_digest": "string",
         "sdf_digest": "string",
-        "source": "string",
+        "source": ("string", short_name),
         "lost": "string*",  # attachments that a damaged file no longer held when it was recovered
     },
     "Probe": {
         "step": "sint32",
-        "outcome": "string",
-        "gripper_path": "f8[P,4,4]",
-        "contacts": "f8[C,3]",
-        "contact_normals": "f8[C,3]",
+        "outcome": ("string", one_of("contact", "free", "points")),
+        "gripper_path": ("f8[P,4,4]", rigid),
+        "contacts": ("f8[C,3]", finite),
+        "contact_normals": ("f8[C,3]", finite),
     },
     # Closes a session's start and every probe, after the point clouds that it counts.
     "KnownPoints": {
@@ -80,10 +104,10 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
     },
     "Problem": {
         "step": "sint32",
-        "initial_set": "f8[B,4,4]",
-        "low_cost_set": "f8[L,4,4]?",  # absent: the elites of the last hypotheses, all of them
+        "initial_set": ("f8[B,4,4]", not_empty, rigid),
+        "low_cost_set": ("f8[L,4,4]?", rigid),  # absent: all elites of the last hypotheses
         "workspace": "f8[2,3]",
-        "free_resolution": "double",
+        "free_resolution": ("double", voxel_side),
         "key_seed": "uint64",
         "key_step": "uint32",
         "points_digest": "string",
@@ -94,21 +118,21 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
         "step": "sint32",
         "iteration": "uint32",
         "refinement": "uint32",
-        "measure_names": "string*",
+        "measure_names": ("string*", short_names),
         "shape": "uint32*",
-        "lower": "f8[k]",
-        "upper": "f8[k]",
+        "lower": ("f8[k]", finite),
+        "upper": ("f8[k]", finite),
         "cells": "i8[C]",
-        "solutions": "f8[C,d]",
-        "objectives": "f8[C]",
-        "measures": "f8[C,k]",
+        "solutions": ("f8[C,d]", finite),
+        "objectives": ("f8[C]", finite),
+        "measures": ("f8[C,k]", finite),
         "digest": "string",
     },
     "Trace": {
         "step": "sint32",
-        "stage": "string",
+        "stage": ("string", short_name),
         "iteration": "uint32",
-        "digest": "string",
+        "digest": ("string", short_name),
         "lowest_cost": "double",
         "median_cost": "double",
         "highest_cost": "double",
@@ -116,7 +140,7 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
     "Hypotheses": {
         "step": "sint32",
         "object_from_world": "f8[B,4,4]",
-        "cost": "f8[B]",
+        "cost": ("f8[B]", ascending_costs),
         "duplicate": "b1[B]",
         "cell": "i8[B]",
         "elites": "f8[L,4,4]",
@@ -124,13 +148,13 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
         "archive_is_last_snapshot": "bool",  # then `archive` is absent
         "digest": "string",
     },
-    "Measured": {"step": "sint32", "values": "Number*"},
-    "Timed": {"step": "sint32", "seconds": "Number*"},
-    "SessionEnded": {"step": "sint32", "outcome": "string"},
+    "Measured": {"step": "sint32", "values": ("Number*", short_names)},
+    "Timed": {"step": "sint32", "seconds": ("Number*", short_names, finite)},
+    "SessionEnded": {"step": "sint32", "outcome": ("string", session_end)},
     "Rig": {
         "step": "sint32",
-        "name": "string",
-        "source": "string",  # digest of the raw log
+        "name": ("string", short_name),
+        "source": ("string", short_name),  # digest of the raw log
         "hand_vertices": "f8[V,3]?",
         "hand_faces": "i4[F,3]?",
     },
@@ -138,15 +162,15 @@ MESSAGES: Mapping[str, Mapping[str, str]] = {
     # other message may grow as much as one can.
     "SensorImage": {
         "step": "sint32",
-        "sensor": "string",
-        "kind": "string",
-        "height": "uint32",
-        "width": "uint32",
+        "sensor": ("string", sensor_name),
+        "kind": ("string", one_of("depth", "deformation")),
+        "height": ("uint32", between(1, LARGEST_SIDE, "pixels")),
+        "width": ("uint32", between(1, LARGEST_SIDE, "pixels")),
         "values": "bytes",  # 16 bits a pixel, little-endian
-        "unit": "double",
+        "unit": ("double", between(1e-9, 1e3, "m")),
         "mask": "bytes",  # a bit a pixel, the first the highest of a byte
-        "intrinsics": "f8[4]",
-        "world_from_camera": "f8[4,4]",
+        "intrinsics": ("f8[4]", intrinsics),  # fx, fy, cx, cy, pixels
+        "world_from_camera": ("f8[4,4]", rigid),
     },
     # The last message: a row for each probe, so that a large file tells at once what is in it.
     "Contents": {
@@ -197,93 +221,16 @@ RECORDS: Mapping[str, str] = {
 }
 """Topics that carry messages of the table."""
 
+NUMBERS = ("/measured", "/timed")
+"""Topics whose numbers are about a step: rows of exported metrics, and curves in Rerun."""
+
+TOGETHER: Mapping[str, Callable[[Mapping[str, Any]], None]] = {
+    "ArchiveSnapshot": check_archive,
+    "Hypotheses": check_hypotheses,
+    "Rig": check_hand,
+    "Trace": check_trace,
+}
+"""What the values of a message must be together; raises RecordingError."""
+
 SINCE_VERSION: Mapping[str, int] = {"/rig": 2, "/sensor_image": 2, "/seal": SEALED_SINCE}
 """Topics that a recording of a lower version does not have."""
-
-PACKAGE = "chsel"
-_ARRAY_KIND = re.compile(r"([fib]\d)(~?)\[(.*)\]")
-
-
-@dataclass(frozen=True)
-class Kind:
-    """One field of the table, taken apart; `dtype` is None for all but arrays."""
-
-    type: str
-    repeated: bool
-    optional: bool
-    dtype: np.dtype[Any] | None
-    shape: tuple[str, ...]
-    narrow: bool
-
-    @property
-    def is_message(self) -> bool:
-        return self.type in MESSAGES
-
-
-def message_class(name: str) -> type[Message]:
-    """The protobuf class of a message of the table."""
-    return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{PACKAGE}.{name}"))
-
-
-def descriptor_set(message: type[Message]) -> bytes:
-    """All that a reader without this code needs to decode a message: a FileDescriptorSet."""
-    files: dict[str, Any] = {}
-
-    def visit(file: Any) -> None:
-        for dependency in file.dependencies:
-            visit(dependency)
-        files.setdefault(file.name, file)
-
-    visit(message.DESCRIPTOR.file)
-    collected = descriptor_pb2.FileDescriptorSet()
-    for file in files.values():
-        file.CopyToProto(collected.file.add())
-    return collected.SerializeToString(deterministic=True)
-
-
-@cache
-def field_kinds(name: str) -> dict[str, Kind]:
-    """The fields of a message, taken apart."""
-    kinds = {}
-    for field, text in MESSAGES[name].items():
-        bare = text.rstrip("?*")
-        array = _ARRAY_KIND.fullmatch(bare)
-        kinds[field] = Kind(
-            type="Array" if array else bare,
-            repeated=text.endswith("*"),
-            optional=text.endswith("?"),
-            dtype=np.dtype(f"<{array[1]}") if array else None,
-            shape=tuple(array[3].split(",")) if array else (),
-            narrow=bool(array and array[2]),
-        )
-    return kinds
-
-
-@cache
-def _pool() -> descriptor_pool.DescriptorPool:
-    """All messages of the table, one file each, in a pool of their own."""
-    pool = descriptor_pool.DescriptorPool()
-    for name in MESSAGES:
-        pool.Add(_file(name))
-    return pool
-
-
-def _file(name: str) -> descriptor_pb2.FileDescriptorProto:
-    """The .proto file of one message."""
-    file = descriptor_pb2.FileDescriptorProto(
-        name=_path(name), package=PACKAGE, syntax="proto3", message_type=[{"name": name}]
-    )
-    for number, (field, kind) in enumerate(field_kinds(name).items(), start=1):
-        proto = file.message_type[0].field.add(name=field, number=number)
-        proto.label = proto.LABEL_REPEATED if kind.repeated else proto.LABEL_OPTIONAL
-        if kind.is_message:
-            proto.type, proto.type_name = proto.TYPE_MESSAGE, f".{PACKAGE}.{kind.type}"
-            if _path(kind.type) not in file.dependency:
-                file.dependency.append(_path(kind.type))
-        else:
-            proto.type = proto.Type.Value(f"TYPE_{kind.type.upper()}")
-    return file
-
-
-def _path(name: str) -> str:
-    return f"{PACKAGE}/{name}.proto"

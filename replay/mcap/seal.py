@@ -96,7 +96,7 @@ class Chain:
             "step": step,
             "session": self.session or _digest(*_texts(parts)),
             "previous": self.last,
-            "parts": [{"name": name, "value": digest} for name, digest in parts.items()],
+            "parts": parts,
         }
         head = Message(0, time, b"", time, sequence)
         values["digest"] = _digest_of(values, head)
@@ -108,9 +108,7 @@ class Chain:
         step = values["step"]
         if self.session and values["session"] != self.session:
             raise ValueError(f"step {step} belongs to another recording: {MIXED}")
-        recorded = {part["name"]: part["value"] for part in values["parts"]}
-        if len(recorded) != len(values["parts"]):
-            raise ValueError(f"the seal of step {step} has a name twice; accepted: each name once")
+        recorded = values["parts"]
         self._compare(recorded, "the session's start" if step < 0 else f"step {step}")
         if values["previous"] != self.last and not self._gap:
             raise ValueError(f"step {step} does not follow the step before it, which was changed")
@@ -164,8 +162,7 @@ class Chain:
 def _digest_of(values: Mapping[str, Any], message: Message) -> str:
     """The digest of a seal, from its other values and from the head of its message."""
     texts = [values["previous"], values["session"], str(values["step"])]
-    parts = {part["name"]: part["value"] for part in values["parts"]}
-    return _digest(_head(message), *(text.encode() for text in texts), *_texts(parts))
+    return _digest(_head(message), *(text.encode() for text in texts), *_texts(values["parts"]))
 
 
 def _texts(parts: Mapping[str, str]) -> list[bytes]:

@@ -11,20 +11,21 @@ import zstandard
 
 from chsel.errors import RecordingError
 from replay.events import RigDescribed, SensorImage
-from replay.mcap.attachments import check_mesh
-from replay.mcap.event_checks import check_image_head
+from replay.mcap.encoding import check_message
+from replay.mcap.event_messages import shared_arguments, shared_values
 
 _LEVEL = 3  # of compression: a higher one takes longer for hardly less
 _VALUE = np.dtype("<u2")
 _BITS = 8
 _PLAUSIBLE_PIXELS = 2**30
 _PIXELS_PER_BYTE = 2**11
-_HEAD = ("step", "sensor", "kind", "unit", "intrinsics", "world_from_camera")
 
 
 @dataclass(frozen=True)
 class ImagePlace:
     """Where an image of a sensor stands among the events: its pixels are read when they matter."""
+
+    topic = SensorImage.topic
 
     step: int
 
@@ -38,69 +39,67 @@ def plausible_pixels(file_size: int) -> int:
 
 
 def rig_values(event: RigDescribed) -> dict[str, Any]:
-    """A rig as the message `Rig` has it, but for its step."""
+    """The message `Rig`."""
     hand = event.hand
-    return {
-        "name": event.name,
-        "source": event.source,
+    return shared_values("Rig", event) | {
         "hand_vertices": None if hand is None else np.asarray(hand.vertices, np.float64),
         "hand_faces": None if hand is None else np.asarray(hand.faces, np.int32),
     }
 
 
-def rig(values: Mapping[str, Any]) -> RigDescribed:
-    """The rig of a message `Rig`. Raises RecordingError if its hand is no mesh."""
+def rig_from(values: Mapping[str, Any]) -> RigDescribed:
+    """The rig of a message `Rig`."""
     import trimesh
 
-    vertices, faces = values["hand_vertices"], values["hand_faces"]
-    if (vertices is None) is not (faces is None):
-        raise RecordingError("the hand lacks its vertices or its faces; accepted: both or none")
     hand = None
-    if vertices is not None:
-        check_mesh(vertices, faces)
-        hand = trimesh.Trimesh(vertices.copy(), faces.astype(np.int64), process=False)
-    return RigDescribed(values["step"], values["name"], values["source"], hand)
+    if values["hand_vertices"] is not None:
+        vertices, faces = values["hand_vertices"].copy(), values["hand_faces"].astype(np.int64)
+        hand = trimesh.Trimesh(vertices, faces, process=False)
+    return RigDescribed(**shared_arguments(RigDescribed, values), hand=hand)
 
 
 def image_values(event: SensorImage) -> dict[str, Any]:
-    """An image as the message `SensorImage` has it, but for its step."""
-    height, width = event.values.shape
-    return {
-        "sensor": event.sensor,
-        "kind": event.kind,
-        "height": height,
-        "width": width,
-        "values": _packed(np.ascontiguousarray(event.values, _VALUE).tobytes()),
-        "unit": event.unit,
-        "mask": _packed(np.packbits(event.mask).tobytes()),
-        "intrinsics": event.intrinsics,
-        "world_from_camera": event.world_from_camera,
+    """The message `SensorImage`; RecordingError if its pixels are of another type or shape."""
+    values, mask = event.values, event.mask
+    if values.dtype != np.uint16 or values.ndim != 2:
+        raise RecordingError(
+            f"an image has values of {values.dtype} {values.shape}; accepted: uint16 (H, W)"
+        )
+    if mask.dtype != np.bool_ or mask.shape != values.shape:
+        raise RecordingError(
+            f"the mask of an image is {mask.dtype} {mask.shape}; accepted: bool {values.shape}"
+        )
+    return shared_values("SensorImage", event) | {
+        "height": values.shape[0],
+        "width": values.shape[1],
+        "values": zstandard.compress(np.ascontiguousarray(values, _VALUE).tobytes(), _LEVEL),
+        "mask": zstandard.compress(np.packbits(mask).tobytes(), _LEVEL),
     }
 
 
-def check_image(values: Mapping[str, Any]) -> None:
-    """Raise RecordingError unless a message `SensorImage` is right, as far as seen from outside."""
-    shape = (values["height"], values["width"])
-    named = ("sensor", "kind", "unit", "intrinsics", "world_from_camera")
-    sensor, kind, unit, intrinsics, pose = (values[name] for name in named)
-    check_image_head(sensor, kind, shape, unit, intrinsics, pose)
+def check_pixels(values: Mapping[str, Any]) -> None:
+    """Raise RecordingError unless an image has as many pixels as it says; none is unpacked."""
     for name, size in _sizes(values).items():
         try:
             claimed = zstandard.frame_content_size(values[name])
         except zstandard.ZstdError:
             claimed = -1
         if claimed != size:
+            shape = (values["height"], values["width"])
             raise RecordingError(
-                f"{name} of an image of {sensor} have {claimed} bytes; accepted: {size} for {shape}"
+                f"{name} of an image of {values['sensor']} have {claimed} bytes; "
+                f"accepted: {size} for {shape}"
             )
 
 
-def image(values: Mapping[str, Any]) -> SensorImage:
+def image_from(values: Mapping[str, Any]) -> SensorImage:
     """The image of a message `SensorImage`; its arrays are read-only.
 
-    Raises RecordingError if its pixels are not as many as it says, or cannot be read.
+    Raises RecordingError if it is not as the table accepts it, or its pixels are not as many as it
+    says, or cannot be read.
     """
-    check_image(values)
+    check_message("SensorImage", values)
+    check_pixels(values)
     shape = (values["height"], values["width"])
     pixels = {}
     for name, size in _sizes(values).items():
@@ -112,16 +111,11 @@ def image(values: Mapping[str, Any]) -> SensorImage:
     bits = np.frombuffer(pixels["mask"], np.uint8)
     mask = np.unpackbits(bits, count=shape[0] * shape[1]).view(np.bool_).reshape(shape)
     mask.setflags(write=False)
-    head = {name: values[name] for name in _HEAD}
-    return SensorImage(**head, values=depths.reshape(shape), mask=mask)
+    parts = {"values": depths.reshape(shape), "mask": mask}
+    return SensorImage(**shared_arguments(SensorImage, values) | parts)
 
 
 def _sizes(values: Mapping[str, Any]) -> dict[str, int]:
     """Bytes of the pixels, unpacked."""
     count = values["height"] * values["width"]
     return {"values": count * _VALUE.itemsize, "mask": -(-count // _BITS)}
-
-
-def _packed(data: bytes) -> bytes:
-    packed: bytes = zstandard.compress(data, _LEVEL)
-    return packed

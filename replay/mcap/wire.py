@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from google.protobuf.message import DecodeError
+
 from chsel.errors import RecordingError
 
 SMALL = 2**20  # bytes of a message that cannot do harm
@@ -15,6 +17,15 @@ MOST_FIELDS = 10_000
 _LONGEST_LIST = 2**12  # bytes of a list of numbers
 _DEEPEST = 8
 _VARINT, _FIXED_64, _LENGTH, _FIXED_32 = 0, 1, 2, 5
+
+
+def parsed(kind: Any, data: bytes) -> Any:
+    """The message of a protobuf class in bytes; RecordingError if they are no such message."""
+    check_wire(kind.DESCRIPTOR, data)
+    try:
+        return kind.FromString(data)
+    except DecodeError:
+        raise RecordingError(f"a message is not a valid {kind.DESCRIPTOR.full_name}") from None
 
 
 def check_wire(descriptor: Any, data: bytes) -> None:
@@ -73,4 +84,4 @@ class _Count:
         raise self._invalid()
 
     def _invalid(self) -> RecordingError:
-        return RecordingError(f"a message is no valid {self._name}")
+        return RecordingError(f"a message is not a valid {self._name}")

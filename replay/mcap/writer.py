@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,61 +15,43 @@ from mcap.writer import CompressionType, Writer
 
 from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import GrowingPoints, KnownPoints
-from chsel.problem.poses import inverse
-from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.events import (
     Event,
     HypothesesFound,
     Logged,
-    Measured,
     Probe,
     ProblemPosed,
     Recorder,
     RigDescribed,
     SensorImage,
-    SessionEnded,
     SessionStarted,
     SnapshotTaken,
-    Timed,
-    Traced,
 )
 from replay.files import sync_folder
-from replay.lost_attachment import LostAttachment, is_lost
+from replay.lost_attachment import is_lost
 from replay.mcap.attachments import MEDIA_TYPES, MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
 from replay.mcap.contents import Contents
-from replay.mcap.cumulative_points import CumulativePoints
-from replay.mcap.encoding import encode
-from replay.mcap.event_checks import check_event
-from replay.mcap.event_order import BEFORE_ALL_STEPS, EventOrder
+from replay.mcap.encoding import check_message, descriptor_set, encode, message_class
+from replay.mcap.event_messages import (
+    archive_values,
+    event_values,
+    problem_values,
+    session_values,
+    shared_values,
+)
 from replay.mcap.foxglove_messages import (
+    CLOUDS,
     FOXGLOVE,
     POINT_CLASSES,
     log_line,
-    object_in_world,
     point_cloud,
-    poses_in_world,
 )
-from replay.mcap.plain_config import config_to_json
-from replay.mcap.scene_messages import (
-    POINT_COLORS,
-    STARTING_EMPTY,
-    SceneMessages,
-    colored_cloud,
-    empty_cloud,
-)
-from replay.mcap.schemas import (
-    FORMAT_VERSION,
-    PROFILE,
-    RECORDS,
-    STEP_TIME,
-    descriptor_set,
-    message_class,
-)
+from replay.mcap.scene_messages import STARTING_EMPTY, Views, empty_cloud
+from replay.mcap.schemas import BEFORE_ALL_STEPS, PROFILE, RECORDS, STEP_TIME
 from replay.mcap.seal import CONTENTS, SEAL, Chain
 from replay.mcap.sensor_messages import image_values, rig_values
-from replay.mcap.simple_mesh import simple_mesh
+from replay.mcap.validation import EventOrder
 
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
 _NEVER = 2**62  # the size at which the library would end a chunk by itself, without a seal
@@ -95,7 +78,7 @@ class McapRecorder(Recorder):
         self._unflushed = 0  # bytes of messages in the chunk in progress
         self._channels: dict[str, int] = {}
         self._points: GrowingPoints | None = None  # all that is known, once a session has started
-        self._cumulative = {name: CumulativePoints() for name in POINT_CLASSES}
+        self._views = Views()
         self._sdf_digest = ""
         self._last_snapshot = b""
         self._last_elites: FloatArray | None = None
@@ -112,12 +95,13 @@ class McapRecorder(Recorder):
         """Write one event."""
         if self._closed:
             raise RecordingError(f"recording {self._path} is closed")
+        if not isinstance(event, Event):
+            raise RecordingError(f"{type(event).__name__} is not an event of a session")
         if isinstance(event, SessionStarted) is not (self._points is None):
             raise RecordingError(f"recording {self._path} needs one SessionStarted, as first event")
         with self._writing():
-            self._order.take(event)
-            check_event(event)
-            if not isinstance(event, SessionStarted) and event.step > self._step:
+            self._order.take(event.topic, event.step)
+            if event.step > self._step:
                 self._seal()
             self._write(event)
         self._contents.take(event)
@@ -176,109 +160,65 @@ class McapRecorder(Recorder):
         return number
 
     def _write(self, event: Event) -> None:
+        """Write the messages of an event, then those for viewers."""
+        step = event.step
         match event:
             case SessionStarted():
                 self._write_session(event)
-            case RigDescribed():
-                self._record("/rig", event.step, rig_values(event))
-                self._end_chunk()  # so that it is read, or lost, apart from what follows
-            case SensorImage():
-                self._record("/sensor_image", event.step, image_values(event))
             case Probe():
-                self._write_probe(event)
+                self._record(event.topic, step, event_values(event))
+                self._write_points(step, event.new_points)
             case ProblemPosed():
                 self._write_problem(event)
             case SnapshotTaken():
-                self._last_snapshot = self._record(
-                    "/archive", event.step, _snapshot_values(event.step, event.archive)
-                )
-            case Traced():
-                self._write_trace(event)
+                values = archive_values(step, event.archive)
+                self._last_snapshot = self._record(event.topic, step, values)
             case HypothesesFound():
                 self._write_hypotheses(event)
-            case Measured():
-                self._record("/measured", event.step, {"values": _numbers(event.values)})
-            case Timed():
-                self._record("/timed", event.step, {"seconds": _numbers(event.seconds)})
+            case SensorImage():
+                self._record(event.topic, step, image_values(event))
+            case RigDescribed():
+                self._record(event.topic, step, rig_values(event))
+                self._end_chunk()  # so that it is read, or lost, apart from what follows
             case Logged():
-                time = self._time(event.step)
-                self._add("/log", time, log_line(event.level, event.text, time))
-            case SessionEnded():
-                self._record("/session_ended", event.step, {"outcome": event.outcome})
+                self._add(event.topic, step, partial(log_line, event.level, event.text))
             case _:
-                raise RecordingError(f"{type(event).__name__} is no event of a session")
+                self._record(event.topic, step, event_values(event))
+        for topic, make in self._views.after(event):
+            self._add(topic, step, make)
+        if isinstance(event, SessionStarted):
+            self._end_chunk()
 
     def _write_session(self, event: SessionStarted) -> None:
+        values = session_values(event)
+        check_message("Session", values)
         if not is_lost(event.mesh):
             self._attach(MESH, mesh_to_ply(event.mesh))
         if not is_lost(event.sdf):
             self._attach(SDF_GRID, sdf_to_bytes(event.sdf))
         self._sdf_digest = event.sdf.digest
-        self._scene = None if is_lost(event.mesh) else SceneMessages(simple_mesh(event.mesh))
-        named = ("runner", "object", "session", "method", "seed", "free_resolution")
-        values = {name: getattr(event, name) for name in (*named, "world_from_object")}
-        values["format_version"] = FORMAT_VERSION
-        values["config"] = config_to_json(event.config)
-        values["workspace"] = event.workspace.bounds
-        values["environment"] = [{"name": k, "value": v} for k, v in event.environment.items()]
-        mesh: Any = event.mesh
-        values["mesh_digest"] = mesh.digest if is_lost(mesh) else mesh_digest(mesh)
-        values["sdf_digest"] = event.sdf.digest
-        values["source"] = event.source
-        lost = [part for part in (event.mesh, event.sdf) if isinstance(part, LostAttachment)]
-        values["lost"] = [part.name for part in lost]
-        self._record("/session", BEFORE_ALL_STEPS, values)
+        self._record(event.topic, event.step, values)
         for topic in STARTING_EMPTY:
-            time = self._time(BEFORE_ALL_STEPS)
-            self._add(topic, time, empty_cloud(time))
+            self._add(topic, event.step, empty_cloud)
         self._points = GrowingPoints(KnownPoints())
-        self._write_points(BEFORE_ALL_STEPS, event.initial_points)
-        if event.world_from_object is not None:
-            time = self._time(BEFORE_ALL_STEPS)
-            self._add("/object_pose", time, object_in_world(event.world_from_object, time))
-            for name in ("object_mesh", "object_surface") if self._scene else ():
-                time = self._time(BEFORE_ALL_STEPS)
-                self._add(f"/{name}", time, getattr(self._scene, name)(time))
-        self._end_chunk()
+        self._write_points(event.step, event.initial_points)
 
     def _attach(self, name: str, data: bytes) -> None:
         self._writer.add_attachment(0, 0, name, MEDIA_TYPES[name], data)
         self._chain.attach(Attachment(0, 0, name, MEDIA_TYPES[name], data))
 
-    def _write_probe(self, event: Probe) -> None:
-        named = ("outcome", "gripper_path", "contacts", "contact_normals")
-        self._record("/probe", event.step, {name: getattr(event, name) for name in named})
-        self._write_points(event.step, event.new_points)
-        if len(event.gripper_path) > 0:
-            time = self._time(event.step)
-            self._add("/gripper_path", time, poses_in_world(event.gripper_path, time))
-
     def _write_points(self, step: int, new: KnownPoints) -> None:
-        """New points, class by class, and then what is known with them."""
+        """New points, class by class, and then how many are known with them."""
         assert self._points is not None
         known = np.column_stack([new.known, new.sdf])
-        clouds = {"/points/free": new.free, "/points/occupied": new.occupied}
-        for topic, points in {**clouds, "/points/known": known}.items():
+        for topic, points in zip(CLOUDS, (new.free, new.occupied, known), strict=True):
             if len(points) > 0:
-                time = self._time(step)
-                self._add(topic, time, point_cloud(points, time))
+                self._add(topic, step, partial(point_cloud, points))
         self._points.add(new)
-        values: dict[str, Any] = {}
-        for name in ("free", "occupied", "known"):
-            values[f"new_{name}"] = len(getattr(new, name))
-            values[name] = getattr(self._points, name)
-        values |= {"new_digest": new.digest, "digest": ""}
+        values = {name: getattr(self._points, name) for name in POINT_CLASSES}
+        values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
+        values |= {"step": step, "new_digest": new.digest, "digest": ""}
         self._record("/known_points", step, values)
-        self._write_all_points(step, new)
-
-    def _write_all_points(self, step: int, new: KnownPoints) -> None:
-        """For viewers: the clouds of all points so far that change with new ones."""
-        for name, cumulative in self._cumulative.items():
-            points = getattr(new, name)
-            for level, cloud in cumulative.add(points).items() if len(points) else ():
-                time = self._time(step)
-                topic = f"/all_points/{name}/{level}"
-                self._add(topic, time, colored_cloud(cloud, POINT_COLORS[name], time))
 
     def _write_problem(self, event: ProblemPosed) -> None:
         problem = event.problem
@@ -290,61 +230,44 @@ class McapRecorder(Recorder):
                 "before it do not give"
             )
         repeats = self._last_elites is not None and _same(problem.low_cost_set, self._last_elites)
-        values = {
-            "initial_set": problem.initial_set,
-            "low_cost_set": None if repeats else problem.low_cost_set,
-            "workspace": problem.workspace.bounds,
-            "free_resolution": problem.free_resolution,
-            "key_seed": problem.key.seed,
-            "key_step": problem.key.step,
-            "points_digest": problem.points.digest,
-            "sdf_digest": problem.sdf.digest,
-            "digest": problem.digest,
-        }
-        self._record("/problem", event.step, values)
-
-    def _write_trace(self, event: Traced) -> None:
-        lowest, median, highest = event.costs
-        values = {name: getattr(event, name) for name in ("stage", "iteration", "digest")}
-        values |= {"lowest_cost": lowest, "median_cost": median, "highest_cost": highest}
-        self._record("/trace", event.step, values)
+        self._record(event.topic, event.step, problem_values(event, repeats_elites=repeats))
 
     def _write_hypotheses(self, event: HypothesesFound) -> None:
         found = event.hypotheses
         archive, repeats = None, False
         if found.archive is not None:
-            archive = _snapshot_values(event.step, found.archive)
+            archive = archive_values(event.step, found.archive)
             repeats = encode("ArchiveSnapshot", archive) == self._last_snapshot
-        named = ("object_from_world", "cost", "duplicate", "cell", "elites", "digest")
-        values = {name: getattr(found, name) for name in named}
-        values["archive"] = None if repeats else archive
-        values["archive_is_last_snapshot"] = repeats
-        self._record("/hypotheses", event.step, values)
+        values = shared_values("Hypotheses", found) | {
+            "step": event.step,
+            "archive": None if repeats else archive,
+            "archive_is_last_snapshot": repeats,
+        }
+        self._record(event.topic, event.step, values, archive=archive)
         self._last_elites = found.elites
-        if len(found.object_from_world) > 0:
-            time, poses = self._time(event.step), inverse(found.object_from_world)
-            self._add("/hypothesis_poses", time, poses_in_world(poses, time))
-            for name in ("hypothesis_meshes", "hypothesis_surfaces") if self._scene else ():
-                time = self._time(event.step)
-                self._add(f"/{name}", time, getattr(self._scene, name)(found, time))
 
-    def _record(self, topic: str, step: int, values: dict[str, Any]) -> bytes:
-        """Write a message of the project's own; its bytes."""
-        values = values if topic == CONTENTS else {"step": step, **values}
+    def _record(self, topic: str, step: int, values: dict[str, Any], **repeated: Any) -> bytes:
+        """Write a message of the project's own; its bytes.
+
+        repeated: values that it leaves out, as they stand in a message before it.
+        """
+        check_message(RECORDS[topic], values | repeated)
         data = encode(RECORDS[topic], values)
-        self._add(topic, self._time(step), data)
+        self._add(topic, step, lambda time: data)
         return data
 
     def _time(self, step: int) -> int:
         """Log time of the next message."""
         return (step - BEFORE_ALL_STEPS) * STEP_TIME + self._count
 
-    def _add(self, topic: str, time: int, data: bytes) -> None:
-        channel = self._channels[topic]
+    def _add(self, topic: str, step: int, make: Callable[[int], bytes]) -> None:
+        """Write a message of a step; make: its bytes, from its log time."""
+        channel, time = self._channels[topic], self._time(step)
+        data = make(time)
         self._writer.add_message(channel, time, data, time, sequence=self._count)
         self._chain.write(topic, Message(channel, time, data, time, self._count))
         self._count += 1
-        self._step = time // STEP_TIME + BEFORE_ALL_STEPS
+        self._step = step
         self._unflushed += len(data)
         if self._unflushed > _CHUNK_SIZE and topic != CONTENTS:
             self._end_chunk()
@@ -352,9 +275,8 @@ class McapRecorder(Recorder):
     def _seal(self) -> None:
         """Close the messages since the last seal, if there are any, with one of their own."""
         if self._chain.is_open and self._count > 0:
-            time = self._time(self._step)
-            values = self._chain.sealed(self._step, self._count, time)
-            self._add(SEAL, time, encode(RECORDS[SEAL], values))
+            values = self._chain.sealed(self._step, self._count, self._time(self._step))
+            self._record(SEAL, self._step, values)
 
     def _end_chunk(self) -> None:
         """End the chunk in progress with a seal, and hand it to the operating system."""
@@ -388,16 +310,6 @@ class McapRecorder(Recorder):
         if hasattr(self, "_file"):
             with suppress(OSError):
                 self._file.close()
-
-
-def _snapshot_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
-    named = ("iteration", "refinement", "measure_names", "shape", "lower", "upper")
-    arrays = ("cells", "solutions", "objectives", "measures", "digest")
-    return {"step": step} | {name: getattr(archive, name) for name in (*named, *arrays)}
-
-
-def _numbers(values: Mapping[str, float]) -> list[dict[str, Any]]:
-    return [{"name": name, "value": value} for name, value in values.items()]
 
 
 def _same(a: FloatArray, b: FloatArray) -> bool:

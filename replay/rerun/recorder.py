@@ -14,6 +14,8 @@ from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay import events
 from replay.events import Recorder
 from replay.files import sync_file, sync_folder
+from replay.mcap.event_messages import step_numbers
+from replay.mcap.schemas import NUMBERS
 from replay.rerun.archive import ArchiveMap, map_frame
 from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
 from replay.rerun.clock import Clock
@@ -129,7 +131,10 @@ class RerunRecorder(Recorder):
 
     @singledispatchmethod
     def _draw(self, event: events.Event) -> None:
-        raise TypeError(f"{type(event).__name__} is not an event")
+        """Events without a branch of their own: numbers about a step are curves."""
+        if event.topic in NUMBERS:
+            for name, value in step_numbers(event).items():
+                self._curves.add_measured(name, value)
 
     @_draw.register
     def _(self, event: events.SessionStarted) -> None:
@@ -196,11 +201,6 @@ class RerunRecorder(Recorder):
         self._log_result(event.hypotheses)
 
     @_draw.register
-    def _(self, event: events.Measured) -> None:
-        for name, value in event.values.items():
-            self._curves.add_measured(name, value)
-
-    @_draw.register
     def _(self, event: events.Timed) -> None:
         for stage, seconds in event.seconds.items():
             self._curves.add_seconds(stage, seconds)
@@ -212,10 +212,6 @@ class RerunRecorder(Recorder):
     def _(self, event: events.Logged) -> None:
         level = _LOG_LEVELS.get(event.level, event.level.upper())
         self._stream.log("log", rr.TextLog(event.text, level=level))
-
-    @_draw.register
-    def _(self, event: events.SessionEnded) -> None:
-        """Nothing to draw: runners also log the outcome as text."""
 
     def _draw_probe(self, probe: events.Probe) -> None:
         self._hand.draw(probe)

@@ -185,7 +185,7 @@ def _registration(
     costs = (0.1, np.pi, 1e9)
     events: list[Any] = [
         ProblemPosed(step, problem),
-        Traced(step, "descent", 100, digest(problem.initial_set), costs),
+        Traced(step, "descent", 100, digest(problem.initial_set), *costs),
     ]
     archives = [_archive(random, 10 * i, elites) for i in range(snapshots)]
     events += [SnapshotTaken(step, archive) for archive in archives]

@@ -20,10 +20,10 @@ from chsel.problem.sdf_grid import SdfGrid
 from replay.__main__ import main
 from replay.comparing.recording_diff import FIRST, SECOND, Ignored, recording_diff
 from replay.events import HypothesesFound, Logged, Measured, SnapshotTaken, Traced
-from replay.mcap.encoding import decode, encode
+from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.reader import read_recording
-from replay.mcap.schemas import RECORDS, message_class
+from replay.mcap.schemas import RECORDS
 
 Messages = list[tuple[str, int, bytes]]
 
@@ -157,7 +157,7 @@ def test_settings_and_environment_differ_by_key(events, write, capsys):
 
 def test_a_message_too_many_shifts_nothing(events, write):
     place = next(i for i, event in enumerate(events) if isinstance(event, Traced))
-    more = [*events[:place], Traced(1, "descent", 50, "1" * 32, (0.0, 1.0, 2.0)), *events[place:]]
+    more = [*events[:place], Traced(1, "descent", 50, "1" * 32, 0.0, 1.0, 2.0), *events[place:]]
     first, second = write(events), write(more)
     assert texts(first, second) == [
         "/trace, step 1, descent iteration 50: only in the second recording"
@@ -284,7 +284,7 @@ def test_recordings_that_contradict_themselves_are_compared_all_the_same(events,
     assert texts(first, broken) == [f"/problem, step 1: key_seed: {2**64 - 1} -> 1"]
     malformed = rewritten(first, edited("/problem", 0, lambda data: b"\xff" + data))
     assert texts(first, malformed)[-2:] == [
-        "/problem, step 1: malformed: absent -> a message is no valid chsel.Problem",
+        "/problem, step 1: malformed: absent -> a message is not a valid chsel.Problem",
         f"/problem, step 1: bytes: absent -> {len(problem_bytes(first)) + 1} bytes",
     ]
     assert texts(malformed, malformed) == []

@@ -68,11 +68,8 @@ def other_text(topic: str, data: bytes) -> bytes:
     return bytes(message.SerializeToString())
 
 
-def smaller_error(values: tuple[dict[str, Any], ...]) -> list[dict[str, Any]]:
-    return [
-        {**item, "value": item["value"] / 2} if "position_error" in item["name"] else item
-        for item in values
-    ]
+def smaller_error(values: dict[str, float]) -> dict[str, float]:
+    return {n: value / 2 if "position_error" in n else value for n, value in values.items()}
 
 
 TAMPERED: dict[str, tuple[str, int, Change]] = {
@@ -85,7 +82,7 @@ TAMPERED: dict[str, tuple[str, int, Change]] = {
     ),
     "the object's name": ("/session", -1, edited(object="another")),
     "the configuration": ("/session", -1, edited(config=lambda text: '{"b": 1,' + text[1:])),
-    "the environment": ("/session", -1, edited(environment=[{"name": "numpy", "value": "9"}])),
+    "the environment": ("/session", -1, edited(environment={"numpy": "9"})),
     "the source": ("/session", -1, edited(source="0" * 32)),
     "the seed": ("/session", -1, edited(seed=lambda seed: seed + 1)),
     "contacts": ("/probe", 1, edited(contacts=lambda points: points + 0.01)),
@@ -242,7 +239,6 @@ def test_one_seal_made_again_does_not_fit_the_next(
         ("/seal", {"digest": "0" * 32}, "the seal of step 1 was changed after it was written"),
         ("/seal", {"previous": ""}, "step 1 does not follow the step before it"),
         ("/seal", {"session": "0" * 32}, "step 1 belongs to another recording"),
-        ("/seal", {"parts": lambda parts: [*parts, parts[0]]}, "the seal of step 1 has a name tw"),
         ("/contents", {"session": "0" * 32}, "its contents belong to another recording"),
         ("/contents", {"digest": ""}, "its contents have another digest than its last step"),
         ("/contents", {"free": lambda free: free + 1}, "its contents, as read, have another free"),
@@ -327,8 +323,8 @@ def test_numbers_may_differ_as_libraries_round_and_no_more(tmp_path: Path) -> No
     whole = write_recording(tmp_path / "whole.mcap", registered_session("gradient_descent"))
     for factor, outcome in ((1 + 1e-13, EQUAL), (1 + 1e-7, DIFFERS)):
 
-        def nudged(values: tuple[dict[str, Any], ...], by: float = factor) -> list[dict[str, Any]]:
-            return [{**item, "value": item["value"] * by} for item in values]
+        def nudged(values: dict[str, float], by: float = factor) -> dict[str, float]:
+            return {name: value * by for name, value in values.items()}
 
         path = tmp_path / f"{outcome}.mcap"
         with_change(path, whole, "/measured", 0, edited(values=nudged))

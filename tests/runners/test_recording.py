@@ -84,6 +84,6 @@ def test_without_files_nothing_runs_in_the_background(tmp_path: Path) -> None:
     before = threading.active_count()
     recorder = open_recorder(tmp_path, RecordingConfig(mcap=False, rerun=False))
     assert threading.active_count() == before
-    recorder.record(Traced(0, "descent", 0, "0", (0.0, 0.0, 0.0)))
+    recorder.record(Traced(0, "descent", 0, "0", 0.0, 0.0, 0.0))
     recorder.close()
     assert list(tmp_path.iterdir()) == []

@@ -20,8 +20,9 @@ from mcap.writer import MCAP0_MAGIC
 from chsel.errors import ChselError
 from chsel.problem.points import KnownPoints
 from replay.events import Event, Probe, ProblemPosed, SessionStarted
+from replay.mcap.encoding import message_class
 from replay.mcap.foxglove_messages import FOXGLOVE
-from replay.mcap.schemas import RECORDS, message_class
+from replay.mcap.schemas import RECORDS
 from tests.tools.small_recordings import write_recording
 
 Random = np.random.Generator
@@ -177,9 +178,10 @@ def meaning(events: Sequence[Event], path: Path, random: Random) -> bytes | None
         changed = _consistent(_other_events(list(events), random))
         if careless:
             with (
-                mock.patch("replay.mcap.writer.check_event"),
-                mock.patch("replay.mcap.event_order.EventOrder.take"),
+                mock.patch("replay.mcap.writer.check_message"),
+                mock.patch("replay.mcap.validation.EventOrder.take"),
                 mock.patch("replay.mcap.plain_config._check_plain"),
+                mock.patch("replay.mcap.foxglove_messages.check_text"),
             ):
                 return write_recording(path, changed)
         return write_recording(path, changed)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from chsel.errors import RecordingError
-from replay.mcap.encoding import decode, encode
-from replay.mcap.schemas import MESSAGES, field_kinds, message_class
+from replay.mcap.encoding import decode, encode, field_kinds, message_class
+from replay.mcap.schemas import MESSAGES
 
 ARCHIVE = {
     "step": -1,
@@ -134,7 +134,7 @@ def test_truth_values_other_than_0_and_1_are_refused():
 
 
 def test_bytes_that_are_no_message_are_refused():
-    with pytest.raises(RecordingError, match=r"a message is no valid chsel\.Probe"):
+    with pytest.raises(RecordingError, match=r"a message is not a valid chsel\.Probe"):
         decode("Probe", b"\xff\xff\xff")
 
 

@@ -22,9 +22,9 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from chsel.errors import RecordingError
 from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SnapshotTaken
-from replay.mcap.encoding import decode, encode
+from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.reader import read_recording
-from replay.mcap.schemas import FORMAT_VERSION, RECORDS, message_class
+from replay.mcap.schemas import FORMAT_VERSION, RECORDS
 from tests.tools.seals import reseal_file
 
 Change = Callable[[str, bytes], bytes | None]

@@ -190,8 +190,8 @@ def test_readers_do_not_look_at_what_viewers_get(events, write, assert_same, mon
     assert recording_diff(path, write(events)).is_equal
 
 
-def _with_nonsense_for_viewers(self: Any, topic: str, time: int, data: bytes) -> None:
-    _ADD(self, topic, time, b"\xff" if topic in SCENE else data)
+def _with_nonsense_for_viewers(self: Any, topic: str, step: int, make: Any) -> None:
+    _ADD(self, topic, step, (lambda time: b"\xff") if topic in SCENE else make)
 
 
 class TestLayout:

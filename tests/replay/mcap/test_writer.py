@@ -30,9 +30,9 @@ from replay.events import (
     SessionEnded,
     SnapshotTaken,
 )
+from replay.mcap.encoding import message_class
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
-from replay.mcap.schemas import message_class
 from replay.mcap.writer import McapRecorder
 
 Sealed = message_class("Seal")
@@ -299,7 +299,7 @@ def test_arrays_of_another_type_or_shape_are_refused(tmp_path, events):
         [
             (narrow, r"Hypotheses\.cell .* int32 \(5,\); .*int64 \(5\)"),
             (longer, r"Hypotheses\.duplicate .*bool \(6,\); .*bool \(5\)"),
-            (short, "HypothesesFound has a value of another shape or type"),
+            (short, "Hypotheses of step 1: it has a value of another shape or type"),
         ]
     ):
         recorder = McapRecorder(tmp_path / f"{number}.mcap")

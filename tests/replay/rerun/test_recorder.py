@@ -134,15 +134,15 @@ def registration(
         SDF, INITIAL, np.eye(4)[None], WORKSPACE, 0.025, StreamKey(3, step)
     )
     yield ProblemPosed(step, problem)
-    yield Traced(step, "gradient_descent", 0, "0", (2.0, 3.0, 900.0))
-    yield Traced(step, "gradient_descent", 50, "0", (1.0, 2.0, 90.0 + step))
+    yield Traced(step, "gradient_descent", 0, "0", 2.0, 3.0, 900.0)
+    yield Traced(step, "gradient_descent", 50, "0", 1.0, 2.0, 90.0 + step)
     last = None
     for iteration in (0, 5):
         if shape is None:
             break
         last = snapshot(iteration, shape)
         yield SnapshotTaken(step, last)
-        yield Traced(step, "quality_diversity", iteration, "0", (0.5, 1.0, 2.0))
+        yield Traced(step, "quality_diversity", iteration, "0", 0.5, 1.0, 2.0)
     yield HypothesesFound(step, hypotheses(count, last))
     errors = {
         "best_position_error": 0.01 * (step + 1),
@@ -639,7 +639,7 @@ def test_a_thread_in_the_background_draws_the_same(
 def test_long_searches_are_drawn_to_the_last_iteration(tmp_path: Path) -> None:
     events: list[Event] = [started(), probe(0), next(registration(0))]
     for iteration in range(0, 1000, 10):
-        events.append(Traced(0, "cma_mega", iteration, "0", (1.0, 2.0, 3.0 + iteration)))
+        events.append(Traced(0, "cma_mega", iteration, "0", 1.0, 2.0, 3.0 + iteration))
         events.append(SnapshotTaken(0, snapshot(iteration % 10)))
     rows = read(write(tmp_path / "a.rrd", events))
     highest = [

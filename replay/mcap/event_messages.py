@@ -1,0 +1,124 @@
+"""Events as the values of their messages, and back.
+
+A field that an event and its message share is taken over as it is; here is what is stored in
+another form. `sensor_messages` has the same for rigs and images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, get_args
+
+from chsel.errors import RecordingError
+from chsel.problem.mesh import mesh_digest
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import ArchiveSnapshot
+from chsel.problem.sdf_grid import SdfGrid
+from replay.events import Event, ProblemPosed, SessionStarted
+from replay.lost_attachment import LostAttachment
+from replay.mcap.plain_config import config_from_json, config_to_json
+from replay.mcap.schemas import FORMAT_VERSION, MESSAGES, RECORDS
+
+if TYPE_CHECKING:
+    import trimesh
+
+EVENTS: Mapping[str, type[Event]] = {kind.topic: kind for kind in get_args(Event)}
+"""The classes of events by their topics."""
+
+
+def shared_values(message: str, source: object) -> dict[str, Any]:
+    """The fields of a message that a value has as attributes."""
+    return {name: getattr(source, name) for name in MESSAGES[message] if hasattr(source, name)}
+
+
+def shared_arguments(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a dataclass that a message has, too."""
+    return {field.name: values[field.name] for field in fields(kind) if field.name in values}
+
+
+def event_values(event: Event) -> dict[str, Any]:
+    """An event as its message has it, where they have the same fields."""
+    return shared_values(RECORDS[event.topic], event)
+
+
+def event_from(topic: str, values: Mapping[str, Any]) -> Event:
+    """The event of a message with the same fields."""
+    kind = EVENTS[topic]
+    return kind(**shared_arguments(kind, values))
+
+
+def step_numbers(event: Event) -> dict[str, float]:
+    """The numbers of an event, by their names: scalar fields, and mappings to numbers."""
+    numbers: dict[str, float] = {}
+    for name, value in event_values(event).items():
+        if isinstance(value, Mapping):
+            numbers |= value
+        elif isinstance(value, float):
+            numbers[name] = value
+    return numbers
+
+
+def session_values(event: SessionStarted) -> dict[str, Any]:
+    """The message `Session`."""
+    mesh: Any = event.mesh
+    lost = [part.name for part in (event.mesh, event.sdf) if isinstance(part, LostAttachment)]
+    return shared_values("Session", event) | {
+        "format_version": FORMAT_VERSION,
+        "config": config_to_json(event.config),
+        "workspace": event.workspace.bounds,
+        "mesh_digest": mesh.digest if isinstance(mesh, LostAttachment) else mesh_digest(mesh),
+        "sdf_digest": event.sdf.digest,
+        "lost": lost,
+    }
+
+
+def session_from(
+    values: Mapping[str, Any], points: KnownPoints, mesh: trimesh.Trimesh, sdf: SdfGrid
+) -> SessionStarted:
+    """The start of a session, with its points and attachments."""
+    parts = {
+        "config": config_from_json(values["config"]),
+        "workspace": workspace_from(values),
+        "initial_points": points,
+        "mesh": mesh,
+        "sdf": sdf,
+    }
+    return SessionStarted(**shared_arguments(SessionStarted, values) | parts)
+
+
+def problem_values(event: ProblemPosed, *, repeats_elites: bool) -> dict[str, Any]:
+    """The message `Problem`; repeats_elites: its low-cost set is the elites of the last result."""
+    problem = event.problem
+    values = shared_values("Problem", problem) | {
+        "step": event.step,
+        "workspace": problem.workspace.bounds,
+        "key_seed": problem.key.seed,
+        "key_step": problem.key.step,
+        "points_digest": problem.points.digest,
+        "sdf_digest": problem.sdf.digest,
+    }
+    return values | {"low_cost_set": None} if repeats_elites else values
+
+
+def archive_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
+    """The message `ArchiveSnapshot`."""
+    return {"step": step} | shared_values("ArchiveSnapshot", archive)
+
+
+def archive_from(values: Mapping[str, Any]) -> ArchiveSnapshot:
+    """The archive in a message; RecordingError unless it has its digest."""
+    archive = ArchiveSnapshot(**shared_arguments(ArchiveSnapshot, values))
+    check_digest(f"an archive of step {values['step']}", archive.digest, values["digest"])
+    return archive
+
+
+def workspace_from(values: Mapping[str, Any]) -> Workspace:
+    """The workspace of a message."""
+    return Workspace(*values["workspace"].tolist())
+
+
+def check_digest(what: str, digest: str, recorded: str) -> None:
+    """Raise RecordingError unless a digest is the recorded one."""
+    if digest != recorded:
+        raise RecordingError(f"{what} has digest {digest}, not {recorded} as recorded")
