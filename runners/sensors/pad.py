@@ -17,7 +17,7 @@ from chsel.sensing.regions import depth_regions, main_regions, small_regions
 from replay.events import SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.depth_camera import DepthSource, View, intrinsics_of, metres, recorded
-from runners.sensors.log.image_file import read_image
+from runners.sensors.log.images import read_image
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
 from runners.sensors.session_report import Counts

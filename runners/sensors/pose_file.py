@@ -12,9 +12,9 @@ import yaml
 
 from chsel.errors import PoseError, SessionError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.file_checks import refuse_special_file
 from chsel.problem.poses import nearest_rigid
 from replay.files import new_file, whole_file
+from runners.sensors.yaml_file import read_yaml
 
 SUFFIX = ".pose.yaml"
 KEY = "world_from_object"
@@ -75,19 +75,10 @@ def write_pose(
 
 
 def _values(path: Path) -> dict[str, Any]:
-    refuse_special_file(f"pose file {path}", path, SessionError)
     try:
-        with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
-        values = yaml.safe_load(data) if len(data) <= _MOST_BYTES else None
-    except OSError as error:
-        reason = error.strerror or error
-        raise SessionError(f"pose file {path} cannot be read ({reason}); {_ACCEPTED}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise SessionError(f"pose file {path} is no YAML ({reason}); {_ACCEPTED}") from None
-    if not isinstance(values, dict):
-        raise SessionError(f"pose file {path} is not such a file; {_ACCEPTED}")
+        values = read_yaml(path, _MOST_BYTES)
+    except SessionError as error:
+        raise SessionError(f"pose file {path}: {error}; {_ACCEPTED}") from None
     return {str(key): value for key, value in values.items()}
 
 

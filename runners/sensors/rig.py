@@ -2,236 +2,202 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Annotated, Any
 
-from chsel.errors import SettingError, require_at_most, require_choice, require_positive
+from chsel.errors import SettingError
 from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
+from chsel.problem.settings import Check, CheckedSettings, at_most, not_negative, one_of, positive
 
+_LARGEST = 1e6  # seconds, newtons, metres
+_LARGEST_HAND = 100.0  # metres
+_LEAST_FORCE = 0.001  # N
+_LONGEST = 1e9  # seconds; they are counted in nanoseconds
 _MOST = 1_000_000  # pixels, metres, shares
 
 
+def _fits(accepted: str, is_accepted: Callable[[Any], bool]) -> Check:
+    """What a value must be, in words and as a condition; NaN fulfils none."""
+
+    def check(name: str, value: Any) -> None:
+        if not is_accepted(value):
+            raise SettingError(f"{name} is {value!r}; accepted: {accepted}")
+
+    return check
+
+
+def _points(name: str, value: Any) -> None:
+    """Finite points."""
+    for index, point in enumerate(value):
+        frozen(f"{name}[{index}]", point, (3,), error=SettingError)
+
+
+Vector = tuple[float, float, float]
+Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+Name = Annotated[str, _fits("letters, digits and _", lambda name: name.replace("_", "").isalnum())]
+Unit = Annotated[float | None, positive]
+Depths = Annotated[
+    tuple[float, float],
+    _fits("[nearest, furthest], metres", lambda depths: 0.0 <= depths[0] < depths[1]),
+]
+Fraction = Annotated[float, _fits("above 0, at most 1", lambda part: 0.0 < part <= 1.0)]
+Part = Annotated[float, _fits("from 0 to 1", lambda part: 0.0 <= part <= 1.0)]
+Quantile = Annotated[float, _fits("from 0 to below 1", lambda part: 0.0 <= part < 1.0)]
+Force = Annotated[float, _fits(f"from {_LEAST_FORCE:g} N", lambda force: force >= _LEAST_FORCE)]
+
+
 @dataclass(frozen=True)
-class GateRig:
-    """When pixels and points are connected, and which of their regions are left out."""
+class CameraRig(CheckedSettings):
+    """A depth camera that looks at the workspace; its rays are free (CHSEL, Sec. V-B)."""
 
-    jump: float = 0.01
-    """Neighbouring pixels are connected unless their depths differ by more than this share of the
-    depth, besides what a surface inclined by up to 76 degrees explains."""
+    name: Name
+    depth: str  # topic of its images
+    info: str  # topic of its intrinsics
+    frame: str | None = None  # of the optical centre; null: that of the messages
+    unit: Unit = None  # metres a unit of the image; null: 0.001 for integers, else 1
+    range: Depths = (0.2, 5.0)  # metres, depths beyond are invalid
+    fraction: Fraction = 0.95  # how far along its ray each depth is free
+    edge: Annotated[float | None, positive] = 0.05
+    """Metres; pixels within `edge_reach` pixels of a larger jump of depth are left out, as edges
+    are measured badly; null: all pixels count."""
 
-    gap: float = 0.02
-    """Points of clouds are connected up to this distance, metres, or up to four times the typical
-    distance between neighbours where that is more."""
+    rate: Annotated[float | None, positive] = 2.0  # images a second at most; null: all
+    rays: Annotated[str, one_of("traversal", "scaled_images")] = "traversal"
+    """Traversal of every voxel, or the reference's scaled images."""
 
-    part: float = 0.05
-    """Of an object, regions with fewer pixels or points than this share of the largest are left
-    out; 0: none is for its size."""
+    views: Annotated[int, positive] = 1  # in so many images a voxel must have been seen to be free
+    edge_reach: Annotated[int, positive, at_most(100)] = 5  # pixels
 
-    speckle: int = 100
-    """Where fewer pixels than this are connected, a camera's rays are free up to the least depth
-    around them alone; 0: nowhere."""
+
+@dataclass(frozen=True)
+class BubbleRig(CheckedSettings):
+    """A soft-bubble pad: a depth camera behind a membrane that gives way (CHSEL, Sec. V-B)."""
+
+    name: Name
+    depth: str  # topic of its images
+    info: str  # topic of its intrinsics
+    frame: str | None = None  # as of a camera
+    unit: Unit = None
+    range: Depths = (0.01, 0.5)
+    kind: Annotated[str, one_of("depth", "deformation")] = "depth"
+    """Whether its images are of depth, whose change against a reference is the deformation, or of
+    deformation."""
+
+    reference: str | None = None
+    """An image file (.png, .npy) of the untouched membrane; null: the median of the first images
+    before the first probe."""
+
+
+@dataclass(frozen=True)
+class ContactRig(CheckedSettings):
+    """How contacts follow from deformations (CHSEL, Sec. V-B; methods, Sec. 10.2)."""
+
+    filter: Annotated[int, positive, at_most(200)] = 10  # side of the mean filter, pixels
+    quantile: Quantile = 0.9
+    """A pixel is in contact if its deformation is above this quantile of its image's, and above
+    `threshold`."""
+
+    threshold: Annotated[float, positive] = 0.004  # metres
+    pixels: Annotated[int, positive] = 6  # fewer of them are no contact
+    points: Annotated[int, positive] = 50  # of a contact at most, a random subset
+    per: Annotated[str, one_of("contact", "camera")] = "contact"
+    """Whether `points` are those of a contact, which the pads share, or of each camera."""
+
+    reference_images: Annotated[int, positive] = 10  # so many make up a missing reference
+
+
+@dataclass(frozen=True)
+class BoxRig:
+    """A box of the hand in its frame."""
+
+    size: Vector  # full sides, metres
+    position: Vector = (0.0, 0.0, 0.0)  # of its centre, metres
+    rotation: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw, radians
 
     def __post_init__(self) -> None:
-        for name in ("jump", "gap"):
-            require_positive(name, getattr(self, name))
-            require_at_most(name, getattr(self, name), _MOST)
-        if not 0.0 <= self.part <= 1.0:
-            raise SettingError(f"part is {self.part}; accepted: from 0 to 1")
-        require_positive("speckle", self.speckle, zero=True)
-        require_at_most("speckle", self.speckle, _MOST)
-
-
-_MOST_POINTS = 1000
-_LEAST_FORCE = 0.001  # N
-_LARGEST = 1e6  # seconds, newtons, metres
+        largest = at_most(_LARGEST_HAND)
+        for side in self.size:
+            positive("size", side)
+            largest("size", side)
+        for distance in frozen("position", self.position, (3,), error=SettingError).tolist():
+            largest("distance from the hand's frame", abs(distance))
 
 
 @dataclass(frozen=True)
-class ForceRig:
+class HandRig(CheckedSettings):
+    """The hand, whose way is free space."""
+
+    frame: str  # its transform frame
+    pose: str | None = None  # topic of its pose, in place of transforms
+    boxes: tuple[BoxRig, ...] = ()  # its solid parts, in its frame
+    urdf: str | None = None  # file whose links' collision shapes belong to the hand
+    root: str | None = None  # the link of the urdf that is `frame`; null: its base
+    joints: str | None = None  # topic of the joints that pose the links
+    sweep: Annotated[str, one_of("path", "backwards")] = "path"
+    """All of the path, or as the reference the pads' surfaces and what is between them, drawn
+    backwards along the hand's z axis."""
+
+
+@dataclass(frozen=True)
+class CloudRig(CheckedSettings):
+    """A topic of points, in the frame of its messages."""
+
+    topic: str
+    role: Annotated[str, one_of("rays", "surface", "contacts")]
+    """Points whose way from the frame's origin is free; points on the object; or the same, within
+    probes alone."""
+
+    fraction: Annotated[float, positive] = 0.95  # of rays, as of a camera
+
+
+@dataclass(frozen=True)
+class ForceRig(CheckedSettings):
     """A topic of forces and torques on the hand."""
 
     topic: str
     frame: str | None = None  # in which, and about whose origin, they are; null: the messages'
-    threshold: float = 3.0  # newtons beyond the tare, above which there is a contact
-    samples: int = 3  # so many in a row; fewer are a spike
-    acts: str = "on_hand"
-    """Whether forces are those "on_hand", as the object pushes it, or "by_hand", as it pushes."""
+    threshold: Annotated[Force, at_most(_LARGEST)] = 3.0
+    """Newtons beyond the tare, above which there is a contact."""
+
+    samples: Annotated[int, positive, at_most(1000)] = 3  # so many in a row; fewer are a spike
+    acts: Annotated[str, one_of("on_hand", "by_hand")] = "on_hand"
+    """Whether forces are those on the hand, as the object pushes it, or by it, as it pushes."""
 
     torque: bool = True
     """Whether torques tell where the contact is; otherwise it is where the hand is furthest against
     the force. Also used while all torques are 0."""
 
-    tare: float = 1.0
+    tare: Annotated[float, positive, at_most(_LARGEST)] = 1.0
     """Seconds before a probe's begin, whose median is subtracted: the hand's weight and drift."""
 
-    reach: float = 0.01  # metres by which the line of force may miss the hand
-    points: int = 5  # of a probe at most, the strongest of those in different voxels
+    reach: Annotated[float, positive, at_most(_LARGEST)] = 0.01
+    """Metres by which the line of force may miss the hand."""
 
-    def __post_init__(self) -> None:
-        for name in ("threshold", "tare", "reach"):
-            require_positive(name, getattr(self, name))
-            require_at_most(name, getattr(self, name), _LARGEST)
-        if self.threshold < _LEAST_FORCE:
-            raise SettingError(
-                f"threshold is {self.threshold:g} N; accepted: from {_LEAST_FORCE:g} N"
-            )
-        for name in ("samples", "points"):
-            require_positive(name, getattr(self, name))
-            require_at_most(name, getattr(self, name), _MOST_POINTS)
-        require_choice("acts", self.acts, ("on_hand", "by_hand"))
-
-
-_LARGEST_HAND = 100.0  # metres
-_LONGEST = 1e9  # seconds; they are counted in nanoseconds
-
-Vector = tuple[float, float, float]
-Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    points: Annotated[int, positive, at_most(1000)] = 5
+    """Of a probe at most, the strongest of those in different voxels."""
 
 
 @dataclass(frozen=True)
-class CameraRig:
-    """A depth camera that looks at the workspace; its rays are free (CHSEL, Sec. V-B).
+class GateRig(CheckedSettings):
+    """When pixels and points are connected, and which of their regions are left out."""
 
-    depth, info: topics. frame: of the optical centre; null: that of the messages. unit: metres a
-    unit of the image; null: 0.001 for integers, 1 for floating point. range: metres, depths beyond
-    are invalid. fraction: how far along its ray each pixel's depth is free. edge: metres; pixels
-    within `edge_reach` pixels of a larger jump of depth are left out, as occlusion edges are
-    measured badly; null: all pixels count. rate: images a second that are used at most; null: all.
-    rays: "traversal" of every voxel, or the reference's "scaled_images". views: in so many images a
-    voxel must have been seen to be free.
-    """
+    jump: Annotated[float, positive, at_most(_MOST)] = 0.01
+    """Neighbouring pixels are connected unless their depths differ by more than this share of the
+    depth, besides what a surface inclined by up to 76 degrees explains."""
 
-    name: str
-    depth: str
-    info: str
-    frame: str | None = None
-    unit: float | None = None
-    range: tuple[float, float] = (0.2, 5.0)
-    fraction: float = 0.95
-    edge: float | None = 0.05
-    rate: float | None = 2.0
-    rays: str = "traversal"
-    views: int = 1
-    edge_reach: int = 5
+    gap: Annotated[float, positive, at_most(_MOST)] = 0.02
+    """Points of clouds are connected up to this distance, metres, or up to four times the typical
+    distance between neighbours where that is more."""
 
-    def __post_init__(self) -> None:
-        _check_camera(self.name, self.unit, self.range)
-        require_positive("edge_reach", self.edge_reach)
-        require_at_most("edge_reach", self.edge_reach, 100)
-        require_positive("fraction", self.fraction)
-        if self.fraction > 1.0:
-            raise SettingError(f"fraction is {self.fraction}; accepted: above 0, at most 1")
-        require_choice("rays", self.rays, ("traversal", "scaled_images"))
-        for name in ("edge", "rate"):
-            if getattr(self, name) is not None:
-                require_positive(name, getattr(self, name))
-        require_positive("views", self.views)
+    part: Part = 0.05
+    """Of an object, regions with fewer pixels or points than this share of the largest are left
+    out; 0: none is for its size."""
 
-
-@dataclass(frozen=True)
-class BubbleRig:
-    """A soft-bubble pad: a depth camera behind a membrane that gives way (CHSEL, Sec. V-B).
-
-    kind: its topic has "depth" images, whose change against a reference is the deformation, or
-    "deformation" images. reference: an image file (.png, .npy) of the untouched membrane; null: the
-    median of the first images before the first probe.
-    """
-
-    name: str
-    depth: str
-    info: str
-    frame: str | None = None
-    unit: float | None = None
-    range: tuple[float, float] = (0.01, 0.5)
-    kind: str = "depth"
-    reference: str | None = None
-
-    def __post_init__(self) -> None:
-        _check_camera(self.name, self.unit, self.range)
-        require_choice("kind", self.kind, ("depth", "deformation"))
-
-
-@dataclass(frozen=True)
-class ContactRig:
-    """How contacts follow from deformations (CHSEL, Sec. V-B; methods, Sec. 10.2).
-
-    filter: side in pixels of the mean filter. quantile, threshold: a pixel is in contact if its
-    deformation is above this quantile of its image's and above so many metres. pixels: fewer of
-    them are no contact. points: of a contact at most, a random subset. per: a "contact", whose
-    points the pads share, or each "camera". reference_images: so many make up a missing reference.
-    """
-
-    filter: int = 10
-    quantile: float = 0.9
-    threshold: float = 0.004
-    pixels: int = 6
-    points: int = 50
-    per: str = "contact"
-    reference_images: int = 10
-
-    def __post_init__(self) -> None:
-        for name in ("filter", "threshold", "pixels", "points", "reference_images"):
-            require_positive(name, getattr(self, name))
-        require_at_most("filter", self.filter, 200)
-        if not 0.0 <= self.quantile < 1.0:
-            raise SettingError(f"quantile is {self.quantile}; accepted: from 0 to below 1")
-        require_choice("per", self.per, ("contact", "camera"))
-
-
-@dataclass(frozen=True)
-class BoxRig:
-    """A box of the hand in its frame: full sides, centre, metres; roll, pitch, yaw, radians."""
-
-    size: Vector
-    position: Vector = (0.0, 0.0, 0.0)
-    rotation: Vector = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        for side in self.size:
-            require_positive("size", side)
-            require_at_most("size", side, _LARGEST_HAND)
-        for distance in frozen("position", self.position, (3,), error=SettingError).tolist():
-            require_at_most("distance from the hand's frame", abs(distance), _LARGEST_HAND)
-
-
-@dataclass(frozen=True)
-class HandRig:
-    """The hand, whose way is free space.
-
-    frame: its transform frame; pose: a topic with its pose in place of transforms. boxes, urdf: its
-    solid parts, in that frame; urdf: a file whose links' collision shapes, posed by the messages
-    of `joints`, belong to the hand; root: the link of the urdf that is `frame`; null: its base.
-    sweep: all of the "path", or as the reference the pads' surfaces and what is between them,
-    drawn "backwards" along the hand's z axis.
-    """
-
-    frame: str
-    pose: str | None = None
-    boxes: tuple[BoxRig, ...] = ()
-    urdf: str | None = None
-    root: str | None = None
-    joints: str | None = None
-    sweep: str = "path"
-
-    def __post_init__(self) -> None:
-        require_choice("sweep", self.sweep, ("path", "backwards"))
-
-
-@dataclass(frozen=True)
-class CloudRig:
-    """A topic of points, in the frame of its messages.
-
-    role: "rays", whose way from the frame's origin is free; "surface", points on the object; or
-    "contacts", the same, within probes alone. fraction: of "rays", as of a camera.
-    """
-
-    topic: str
-    role: str
-    fraction: float = 0.95
-
-    def __post_init__(self) -> None:
-        require_choice("role", self.role, ("rays", "surface", "contacts"))
-        require_positive("fraction", self.fraction)
+    speckle: Annotated[int, not_negative, at_most(_MOST)] = 100
+    """Where fewer pixels than this are connected, a camera's rays are free up to the least depth
+    around them alone; 0: nowhere."""
 
 
 @dataclass(frozen=True)
@@ -243,65 +209,50 @@ class ProbeTimes:
 
 
 @dataclass(frozen=True)
-class ExtraContacts:
-    """Contacts that no sensor told: points (C, 3) in the world, or the mean of the bubbles'
-    `foremost` points furthest along the hand's z axis at the end of the probe's push."""
+class ExtraContacts(CheckedSettings):
+    """Contacts that no sensor told."""
 
     probe: int
-    points: tuple[Vector, ...] = ()
-    foremost: int = 0
-
-    def __post_init__(self) -> None:
-        for index, point in enumerate(self.points):
-            frozen(f"points[{index}]", point, (3,), error=SettingError)
-        require_positive("foremost", self.foremost, zero=True)
+    points: Annotated[tuple[Vector, ...], _points] = ()  # (C, 3), metres, world
+    foremost: Annotated[int, not_negative] = 0
+    """The mean of so many points of the bubbles, those furthest along the hand's z axis at the end
+    of the probe's push."""
 
 
 @dataclass(frozen=True)
 class Annotations:
-    """What a person knows about one log. exclude: probes whose contacts are not used."""
+    """What a person knows about one log."""
 
-    exclude: tuple[int, ...] = ()
+    exclude: tuple[int, ...] = ()  # probes whose contacts are not used
     contacts: tuple[ExtraContacts, ...] = ()
 
 
 @dataclass(frozen=True)
-class ClockRig:
-    """Which times count. stamp: "header", by the sender, or "log".
+class ClockRig(CheckedSettings):
+    """Which times count."""
 
-    offset: seconds by which a topic's stamps may differ from the log's clock more than those of
-    other topics do; beyond that they are shifted. gap: seconds between two transforms over which
-    none is interpolated. jump: seconds by which the log's time may step before it is reported.
-    """
+    stamp: Annotated[str, one_of("header", "log")] = "header"  # of the sender, or of the log
+    offset: Annotated[float, positive, at_most(_LONGEST)] = 1.0
+    """Seconds by which a topic's stamps may differ from the log's clock more than those of other
+    topics do; beyond that they are shifted."""
 
-    stamp: str = "header"
-    offset: float = 1.0
-    gap: float = 0.5
-    jump: float = 10.0
+    gap: Annotated[float, positive, at_most(_LONGEST)] = 0.5
+    """Seconds between two transforms over which none is interpolated."""
 
-    def __post_init__(self) -> None:
-        require_choice("stamp", self.stamp, ("header", "log"))
-        for name in ("offset", "gap", "jump"):
-            require_positive(name, getattr(self, name))
-            require_at_most(name, getattr(self, name), _LONGEST)
+    jump: Annotated[float, positive, at_most(_LONGEST)] = 10.0
+    """Seconds by which the log's time may step before it is reported."""
 
 
 @dataclass(frozen=True)
-class Rig:
-    """All about a rig.
-
-    world: frame of the workspace and of all known points. workspace: x, y, z bounds, metres.
-    boundary: the workspace's six faces are free ("box_shell"), or not ("none"). markers: topic that
-    says where probes begin and end, with texts "begin N" and "end", integers (below 0: end), or
-    true and false. probes: their times in place of markers; without either the whole log is one.
-    surface_resolution: metres; one surface point a voxel of this side is kept of clouds and masks.
-    gate: which pixels and points are left out, as they are not connected with the others.
-    """
+class Rig(CheckedSettings):
+    """All about a rig."""
 
     name: str
-    world: str
-    workspace: Bounds | None = None
-    boundary: str = "box_shell"
+    world: str  # frame of the workspace and of all known points
+    workspace: Bounds | None = None  # of x, y and z, metres
+    boundary: Annotated[str, one_of("box_shell", "none")] = "box_shell"
+    """Whether the workspace's six faces are free."""
+
     cameras: tuple[CameraRig, ...] = ()
     bubbles: tuple[BubbleRig, ...] = ()
     contact: ContactRig = field(default_factory=ContactRig)
@@ -309,15 +260,21 @@ class Rig:
     clouds: tuple[CloudRig, ...] = ()
     forces: tuple[ForceRig, ...] = ()
     markers: str | None = None
+    """Topic of the begins and ends of probes: texts "begin N" and "end", integers (below 0: end),
+    or true and false."""
+
     probes: tuple[ProbeTimes, ...] | None = None
+    """Times in place of markers; without either the whole log is one probe."""
+
     clock: ClockRig = field(default_factory=ClockRig)
     annotations: Annotations = field(default_factory=Annotations)
-    surface_resolution: float = 0.005
+    surface_resolution: Annotated[float, positive] = 0.005
+    """Metres; one surface point a voxel of this side is kept of clouds and masks."""
+
     gate: GateRig = field(default_factory=GateRig)
 
     def __post_init__(self) -> None:
-        require_choice("boundary", self.boundary, ("box_shell", "none"))
-        require_positive("surface_resolution", self.surface_resolution)
+        super().__post_init__()
         if self.workspace is not None:
             self.box()
         names = [sensor.name for sensor in self.sensors]
@@ -340,12 +297,3 @@ class Rig:
             raise SettingError("workspace is missing; accepted: [[x0, x1], [y0, y1], [z0, z1]]")
         (x0, x1), (y0, y1), (z0, z1) = self.workspace
         return Workspace((x0, y0, z0), (x1, y1, z1))
-
-
-def _check_camera(name: str, unit: float | None, reach: tuple[float, float]) -> None:
-    if not name or not name.replace("_", "").isalnum():
-        raise SettingError(f"name is {name!r}; accepted: letters, digits and _")
-    if unit is not None:
-        require_positive("unit", unit)
-    if not 0.0 <= reach[0] < reach[1]:
-        raise SettingError(f"range is {list(reach)}; accepted: [nearest, furthest], metres")

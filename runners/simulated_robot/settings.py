@@ -1,17 +1,34 @@
-"""How the twin records: its sensors, its motion, and what goes wrong in its log."""
+"""How the simulated robot records: its sensors, its motion, and what goes wrong in its log."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import pi, tan
-from typing import Self
+from typing import Annotated, Any, Self
 
-from chsel.errors import SettingError, require_at_most, require_positive
+from chsel.errors import SettingError
+from chsel.problem.settings import Check, CheckedSettings, at_most, not_negative, positive
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 
-_LARGEST = 4096  # pixels
-_FASTEST = 50.0  # Hz: of the simulated clock
+_DEPTH = 0.25  # m: that a push may go
+
+
+def _from_to(low: float, high: float, unit: str = "") -> Check:
+    """A number between two."""
+
+    def check(name: str, value: Any) -> None:
+        if not low <= value <= high:
+            raise SettingError(f"{name} is {value}; accepted: {low:g} to {high:g}{unit}")
+
+    return check
+
+
+Width = Annotated[int, _from_to(16, 4096, " pixels")]
+Rate = Annotated[float, positive, at_most(50.0)]  # Hz: of the simulated clock at most
+Length = Annotated[float, not_negative]
+Speed = Annotated[float, positive]
+Duration = Annotated[float, not_negative, at_most(60.0)]
 
 
 @dataclass(frozen=True)
@@ -30,25 +47,15 @@ class RenderedCamera(PinholeCamera):
 
 
 @dataclass(frozen=True)
-class CameraSettings:
-    """The depth camera outside. Its image is three quarters as high as wide.
+class CameraSettings(CheckedSettings):
+    """The depth camera outside. Its image is three quarters as high as wide."""
 
-    width: pixels. view: horizontal, degrees. rate: images a second. noise: standard deviation of
-    a depth of 1 m, metres; it grows with the depth squared. baseline: metres, between the two eyes
-    of a stereo camera, of which one sees past edges what the other does not.
-    """
-
-    width: int = 640
-    view: float = 80.0
-    rate: float = 2.0
-    noise: float = 0.0025
-    baseline: float = 0.05
-
-    def __post_init__(self) -> None:
-        _check_sensor(self.width, self.rate, self.noise)
-        require_positive("baseline", self.baseline, zero=True)
-        if not 1.0 <= self.view <= 150.0:
-            raise SettingError(f"view is {self.view}; accepted: 1 to 150 degrees")
+    width: Width = 640  # pixels
+    view: Annotated[float, _from_to(1, 150, " degrees")] = 80.0  # horizontal, degrees
+    rate: Rate = 2.0  # images a second
+    noise: Length = 0.0025  # standard deviation at 1 m, metres; it grows with the depth squared
+    baseline: Length = 0.05
+    """Metres between its two eyes, of which one sees past edges what the other does not."""
 
     @property
     def pinhole(self) -> RenderedCamera:
@@ -58,18 +65,12 @@ class CameraSettings:
 
 
 @dataclass(frozen=True)
-class BubbleSettings:
-    """The depth cameras in the two pads, which just see all of their membranes.
+class BubbleSettings(CheckedSettings):
+    """The depth cameras in the two pads, which just see all of their membranes."""
 
-    width: pixels, along the longer side. rate: images a second. noise: standard deviation, metres.
-    """
-
-    width: int = 224
-    rate: float = 10.0
-    noise: float = 0.0003
-
-    def __post_init__(self) -> None:
-        _check_sensor(self.width, self.rate, self.noise)
+    width: Width = 224  # pixels, along the longer side
+    rate: Rate = 10.0  # images a second
+    noise: Length = 0.0003  # standard deviation, metres
 
     @property
     def pinhole(self) -> RenderedCamera:
@@ -79,56 +80,30 @@ class BubbleSettings:
 
 
 @dataclass(frozen=True)
-class RobotSettings:
-    """How the twin records.
+class RobotSettings(CheckedSettings):
+    """How the robot probes and records."""
 
-    probes: how many of the configuration's grid; null: all. push_step, push_steps: metres, and how
-    many of them a push has at most. push_speed, move_speed: metres a second. standing: seconds
-    before the first probe. dwell: seconds at the end of a push. spread: standard deviation of the
-    wrist's place in a probe, metres. compressed: PNG messages of the outer camera's images.
-    Faults: drop, part of the images that are lost; clock_offset, seconds by which the outer
-    camera's clock is ahead.
-    """
-
-    probes: int | None = None
+    probes: Annotated[int | None, positive] = None  # of the configuration's grid; null: all
     camera: CameraSettings = field(default_factory=CameraSettings)
     bubbles: BubbleSettings = field(default_factory=BubbleSettings)
-    push_step: float = 0.05
-    push_steps: int = 5
-    push_speed: float = 0.05
-    move_speed: float = 0.15
-    standing: float = 1.5
-    dwell: float = 0.6
-    spread: float = 0.003
-    compressed: bool = False
-    drop: float = 0.02
-    clock_offset: float = 0.0
+    push_step: Annotated[float, positive] = 0.05  # metres
+    push_steps: Annotated[int, positive] = 5  # of a push at most
+    push_speed: Speed = 0.05  # metres a second
+    move_speed: Speed = 0.15
+    standing: Duration = 1.5  # seconds before the first probe
+    dwell: Duration = 0.6  # seconds at the end of a push
+    spread: Annotated[float, _from_to(0, 0.01, " m")] = 0.003
+    """Standard deviation of the wrist's place in a probe."""
+
+    compressed: bool = False  # the outer camera's images as PNG
+    drop: Annotated[float, _from_to(0, 0.9)] = 0.02  # part of the images that are lost
+    clock_offset: Annotated[float, _from_to(-1e6, 1e6, " s")] = 0.0
+    """Seconds by which the outer camera's clock is ahead."""
 
     def __post_init__(self) -> None:
-        for name in ("push_step", "push_steps", "push_speed", "move_speed"):
-            require_positive(name, getattr(self, name))
-        for name in ("standing", "dwell", "spread", "drop"):
-            require_positive(name, getattr(self, name), zero=True)
-        if self.probes is not None:
-            require_positive("probes", self.probes)
-        if self.push_step * self.push_steps > 0.25 + 1e-9:
+        super().__post_init__()
+        if self.push_step * self.push_steps > _DEPTH + 1e-9:
             raise SettingError(
                 f"push_step {self.push_step} m times push_steps {self.push_steps} is beyond the "
-                "cabinet's depth; accepted: 0.25 m at most"
+                f"cabinet's depth; accepted: {_DEPTH} m at most"
             )
-        if self.drop > 0.9:
-            raise SettingError(f"drop is {self.drop}; accepted: 0 to 0.9")
-        if self.spread > 0.01:
-            raise SettingError(f"spread is {self.spread}; accepted: 0 to 0.01 m")
-        for name in ("standing", "dwell"):
-            require_at_most(name, getattr(self, name), 60.0)
-        if not -1e6 <= self.clock_offset <= 1e6:
-            raise SettingError(f"clock_offset is {self.clock_offset}; accepted: -1e6 to 1e6 s")
-
-
-def _check_sensor(width: int, rate: float, noise: float) -> None:
-    if not 16 <= width <= _LARGEST:
-        raise SettingError(f"width is {width}; accepted: 16 to {_LARGEST} pixels")
-    require_positive("rate", rate)
-    require_at_most("rate", rate, _FASTEST)
-    require_positive("noise", noise, zero=True)

@@ -165,7 +165,7 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
         ((*NEAR, "pose=some.yaml"), "accepted: either position=[x,y,z]"),
         (("position=[0,0]",), "align.position has 2 entries; accepted: 3"),
         (("position=[0,0,nan]",), "is not finite"),
-        (("pose=none.yaml",), "pose file none.yaml cannot be read"),
+        (("pose=none.yaml",), "pose file none.yaml: cannot be read"),
         ((*NEAR, "search.reach=-1"), "reach is -1"),
         ((*NEAR, "threads=10000"), "threads is 10000; accepted: an integer from 1 to 256"),
         ((*NEAR, "serch.reach=1"), "has no key 'serch'"),

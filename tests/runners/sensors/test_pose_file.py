@@ -51,17 +51,17 @@ def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not such a file"),
+        ("", "no mapping of keys to values"),
         ("world_from_object: [1, 2, 3]", "no world_from_object of 4 x 4 numbers"),
         (ROWS.replace("0.5", ".nan"), "no world_from_object of 4 x 4 numbers"),
         (ROWS.replace("0.5", "true"), "no world_from_object of 4 x 4 numbers"),
         (ROWS.replace("[[1,", "[[2,"), "world_from_object is not rigid"),
         (ROWS.replace("[[1,", "[[-1,"), "world_from_object is not rigid"),
-        ("world_from_object: [[[", "is no YAML"),
-        ("a: &a [*a, *a]\nworld_from_object: *a", "no world_from_object of 4 x 4 numbers"),
-        ("[" * 20_000, "is no YAML"),
-        ("x: " + "y" * 1_000_001, "is not such a file"),
-        ("world_from_object: !!python/object/apply:os.getcwd []", "is no YAML"),
+        ("world_from_object: [[[", "not YAML"),
+        ("a: &a [*a, *a]\nworld_from_object: *a", "an alias"),
+        ("[" * 20_000, "nested too deep"),
+        ("x: " + "y" * 1_000_001, "too large"),
+        ("world_from_object: !!python/object/apply:os.getcwd []", "not YAML"),
     ],
 )
 def test_another_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:

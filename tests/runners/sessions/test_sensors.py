@@ -506,7 +506,7 @@ def test_a_pose_beside_the_log_is_the_true_one(tmp_path: Path) -> None:
     np.testing.assert_array_equal(session.world_from_object, pose)
     assert "the true pose is that of log.pose.yaml" in lines(session.probes(), "info")
     assert open_log(log, pose="none").world_from_object is None
-    with pytest.raises(SessionError, match=r"other.yaml cannot be read"):
+    with pytest.raises(SessionError, match=r"other.yaml: cannot be read"):
         open_log(log, pose=str(tmp_path / "other.yaml"))
 
 
