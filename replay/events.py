@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -204,8 +204,8 @@ Event = (
 )
 
 
-class Recorder(Protocol):
-    """Writes events down."""
+class Recorder:
+    """Writes events down; each kind of recorder does more in some of these methods."""
 
     def record(self, event: Event) -> None:
         """Take one event; events of one session come in the order in which things happen."""

@@ -53,6 +53,7 @@ def new_file(path: Path) -> Iterator[Path]:
     or after, and if it cannot be written.
     """
     require_new(path)
+    require_folder(path)
     beside = _beside(path)
     try:
         with _placed(beside, path, _rename):
@@ -102,9 +103,13 @@ def _placed(beside: Path, path: Path, rename: Callable[[Path, Path], object]) ->
 
 
 def require_new(path: Path) -> None:
-    """Raise RecordingError unless `path` is free and its folder exists."""
+    """Raise RecordingError if there is something at `path`."""
     if os.path.lexists(path):
         raise RecordingError(f"{path} exists; accepted: the name of a new file")
+
+
+def require_folder(path: Path) -> None:
+    """Raise RecordingError unless the folder of `path` exists."""
     if not path.parent.is_dir():
         raise RecordingError(f"folder {path.parent} does not exist; accepted: a file in one")
 

@@ -1,24 +1,20 @@
-"""Recorders that write nothing themselves."""
+"""The chain between a session and its files: in order, to each file, in the background."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
+from queue import Queue
+from threading import Thread
 
+from chsel.errors import RecordingError
 from replay.events import Event, Recorder
 
 
 class NullRecorder(Recorder):
     """Writes nothing down."""
-
-    def record(self, event: Event) -> None:
-        """Ignore it."""
-
-    def flush(self) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
 
 
 class ListRecorder(Recorder):
@@ -30,12 +26,6 @@ class ListRecorder(Recorder):
     def record(self, event: Event) -> None:
         """Keep it."""
         self.events.append(event)
-
-    def flush(self) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
 
 
 class TeeRecorder(Recorder):
@@ -60,3 +50,89 @@ class TeeRecorder(Recorder):
         with ExitStack() as stack:
             for recorder in reversed(self._recorders):
                 stack.callback(recorder.close)
+
+
+class BackgroundRecorder(Recorder):
+    """Hands every event to another recorder, in order, in a thread of its own.
+
+    Events are frozen values, and nobody may change their arrays. `flush` and `close` return when
+    the other recorder has done the same. An error of the other recorder is raised by the next call;
+    what was recorded in between is dropped, as if the caller had stopped at the event that failed.
+    """
+
+    def __init__(
+        self, recorder: Recorder, *, most: int = 16, patient: bool = True, optional: str = ""
+    ) -> None:
+        """A recorder in front of another one.
+
+        most: events that may wait; whoever records another one then waits for its place. patient:
+        False lets `flush` only ask for it. optional: what to do about a recording that is not
+        written; where this is given, a RecordingError is a warning that ends with it, and no more
+        is recorded.
+        """
+        self._recorder = recorder
+        self._jobs: Queue[Callable[[], None] | None] = Queue(most)
+        self._error: BaseException | None = None
+        self._closed = False
+        self._patient = patient
+        self._optional = optional
+        # A daemon, so that a run that ends without closing its recorder does end.
+        self._thread = Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    def record(self, event: Event) -> None:
+        """Let the event be recorded soon."""
+        if self._closed:
+            self._recorder.record(event)
+        else:
+            self._raise_error()
+            self._jobs.put(partial(self._recorder.record, event))
+
+    def flush(self) -> None:
+        """Wait until all events so far are recorded and flushed, or only have it done soon."""
+        if self._closed:
+            self._recorder.flush()
+        else:
+            self._jobs.put(self._recorder.flush)
+            if self._patient:
+                self._jobs.join()
+            self._raise_error()
+
+    def close(self) -> None:
+        """Record what waits, and close the other recorder, also after an error."""
+        if not self._closed:
+            self._closed = True
+            self._jobs.put(None)
+            self._thread.join()
+            try:
+                self._run(self._recorder.close)
+            finally:
+                self._raise_error()
+
+    def _work(self) -> None:
+        """What the thread does: one job after the other, none after an error."""
+        while (job := self._jobs.get()) is not None:
+            try:
+                if self._error is None:
+                    self._run(job)
+            except BaseException as error:
+                self._error = error
+            finally:
+                self._jobs.task_done()
+
+    def _run(self, job: Callable[[], None]) -> None:
+        try:
+            job()
+        except RecordingError as error:
+            if not self._optional:
+                raise
+            warnings.warn(f"{error}; {self._optional}", stacklevel=2)
+            self._recorder = NullRecorder()
+
+    def _raise_error(self) -> None:
+        """Raise an error once; the jobs behind it are dropped by then."""
+        if self._error is not None:
+            if not self._closed:
+                self._jobs.join()
+            error, self._error = self._error, None
+            raise error

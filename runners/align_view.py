@@ -12,8 +12,8 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.rerun.blueprint import at_last_probe, scene_view
 from replay.rerun.clock import PROBE
-from replay.rerun.file_stream import new_file_stream
 from replay.rerun.scene import Scene, display_mesh
+from replay.rerun.stream import new_file_stream
 
 APPLICATION = "chsel alignment"
 _GUESS = (240, 140, 40, 60)
@@ -30,13 +30,14 @@ def save_view(
 
     Raises RecordingError if the file exists or cannot be written.
     """
-    stream = new_file_stream(path, APPLICATION)
-    stream.set_time(PROBE, sequence=problem.key.step)
-    view = scene_view(problem.workspace, name="The object where it was found; orange: the guess")
-    stream.send_blueprint(at_last_probe(rrb.Vertical(view)))
-    scene = Scene(stream)
-    scene.set_up(mesh, problem.workspace, found)
-    pose = rr.Transform3D(translation=guess[:3, 3], mat3x3=guess[:3, :3])
-    stream.log("scene/guess", display_mesh(mesh, _GUESS), pose, static=True)
-    scene.add_points(problem.points, new=False)
-    stream.disconnect()
+    with new_file_stream(path, APPLICATION) as stream:
+        stream.set_time(PROBE, sequence=problem.key.step)
+        view = scene_view(
+            problem.workspace, name="The object where it was found; orange: the guess"
+        )
+        stream.send_blueprint(at_last_probe(rrb.Vertical(view)))
+        scene = Scene(stream)
+        scene.set_up(mesh, problem.workspace, found)
+        pose = rr.Transform3D(translation=guess[:3, 3], mat3x3=guess[:3, :3])
+        stream.log("scene/guess", display_mesh(mesh, _GUESS), pose, static=True)
+        scene.add_points(problem.points, new=False)

@@ -21,8 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 from chsel.errors import ChselError, RecordingError
 from replay.console import Console, print_error
 from replay.mcap.reader import Recording, read_recording
-from replay.rerun.headless import headless_viewer
-from replay.screenshot import save_screenshot
+from replay.screenshot import headless_viewer, save_screenshot
 from runners.reporting.fault_pictures import KINDS
 from runners.reporting.figures import small_png
 

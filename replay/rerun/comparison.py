@@ -28,11 +28,11 @@ from replay.rerun.comparison_layout import (
 )
 from replay.rerun.curves import SHOWN_UNIT
 from replay.rerun.eye import bounds_in_sight
-from replay.rerun.file_stream import new_file_stream
 from replay.rerun.hypotheses import HypothesisMeshes, coarsened, shown_hypotheses
 from replay.rerun.legend import Legend
 from replay.rerun.plane import color_array, on_screen, texts
 from replay.rerun.scene import Scene, bare_mesh
+from replay.rerun.stream import new_file_stream
 
 APPLICATION = "chsel comparison"
 _FACES = 24_000  # of all methods' meshes of one colour together
@@ -55,14 +55,8 @@ def save_comparison(
     if not steps:
         raise RecordingError("there is no result to compare; accepted: at least one")
     recording.checked_steps(sorted(steps))
-    stream = new_file_stream(path, APPLICATION)
-    try:
+    with new_file_stream(path, APPLICATION) as stream:
         _draw(stream, recording, results, steps)
-    except BaseException:
-        stream.disconnect()
-        path.unlink(missing_ok=True)
-        raise
-    stream.disconnect()
 
 
 def _draw(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
 import warnings
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from functools import singledispatchmethod
 from pathlib import Path
 
@@ -13,8 +16,9 @@ from chsel.errors import RecordingError
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay import events
 from replay.events import Recorder
-from replay.files import sync_file, sync_folder
+from replay.files import require_new
 from replay.mcap.event_messages import step_numbers
+from replay.mcap.reader import Recording
 from replay.mcap.schemas import NUMBERS
 from replay.rerun.archive import ArchiveMap, map_frame
 from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
@@ -25,15 +29,17 @@ from replay.rerun.eye import Bounds, bounds_in_sight
 from replay.rerun.hand import HandMesh
 from replay.rerun.hypotheses import HypothesisMeshes
 from replay.rerun.legend import Legend
-from replay.rerun.live import live_sink
 from replay.rerun.plane import Frame
 from replay.rerun.scene import Scene, bare_mesh
 from replay.rerun.sensors import SensorImages
+from replay.rerun.stream import RrdFile, abandon, new_stream
 from replay.rerun.text import session_markdown
+from replay.rerun.viewer import live_sink
 
 APPLICATION = "chsel"
 _LOG_LEVELS = {"info": rr.TextLogLevel.INFO, "warning": rr.TextLogLevel.WARN}
 _FLUSH_SECONDS = 10.0
+_LONG_FLUSH = 5.0  # seconds
 
 
 class RerunRecorder(Recorder):
@@ -46,11 +52,12 @@ class RerunRecorder(Recorder):
     """
 
     def __init__(self, path: Path | None, *, live: bool = False, follow: bool = False) -> None:
-        self._stream = rr.RecordingStream(APPLICATION, send_properties=False)
-        self._stream.set_log_time_enabled(False)
-        self._stream.set_log_tick_enabled(False)
-        self._path = path
-        self._open(path, live=live)
+        self._file = None if path is None else RrdFile(path)
+        self._live = live
+        sinks = [] if self._file is None else [self._file.sink]
+        viewer = live_sink() if live else None
+        self._stream = new_stream(APPLICATION, *sinks, *([viewer] if viewer else []))
+        self._grown = False  # whether something that takes space was drawn since the last flush
         self._closed = False
         self._clock = Clock(self._stream)
         self._scene = Scene(self._stream)
@@ -72,23 +79,37 @@ class RerunRecorder(Recorder):
 
     def record(self, event: events.Event) -> None:
         """Draw one event."""
+        if self._closed:
+            return
         self._clock.set_probe(
             max(getattr(event, "step", 0), 0)
         )  # what precedes all is of the first
         self._draw(event)
         if isinstance(event, events.Probe | events.Logged) and not self._clock.registering:
             self._early.append(event)
+        self._grown |= isinstance(event, events.SessionStarted | events.Probe | events.Logged)
 
     def flush(self) -> None:
-        """Hand all events so far to the operating system, and to the viewer if there is one."""
+        """Hand all events so far to the operating system, and to the viewer if there is one.
+
+        Raises RecordingError if the file does not get them; nothing more is drawn then.
+        """
+        if self._closed:
+            return
         self._curves.send_traces()
         self._archive.send()
+        begun = time.monotonic()
         try:
             self._stream.flush(timeout_sec=_FLUSH_SECONDS)
         except RuntimeError as error:
             if not self._lagging:
                 self._lagging = True
                 warnings.warn(f"the live view or the file does not follow: {error}", stacklevel=2)
+        late = time.monotonic() - begun > _LONG_FLUSH
+        if self._file is not None and not self._live:  # a slow viewer may hold the file up, too
+            with self._last_error():
+                self._file.check(grown=self._grown, late=late)
+        self._grown = False
 
     def close(self) -> None:
         """Finish the file, and wait until it is on the disk. Closing twice is closing once.
@@ -96,38 +117,22 @@ class RerunRecorder(Recorder):
         Raises RecordingError if it does not get there.
         """
         if not self._closed:
-            self._closed = True
             self.flush()
+            self._closed = True
             self._stream.disconnect()
-            if self._path is not None:
-                self._sync(self._path)
+            if self._file is not None:
+                with self._last_error():
+                    self._file.finish(whole=not self._live)
 
-    def _sync(self, path: Path) -> None:
+    @contextmanager
+    def _last_error(self) -> Iterator[None]:
+        """Draw no more after an error of the file."""
         try:
-            sync_file(path)
-        except OSError as error:
-            raise RecordingError(
-                f"{path} cannot be written ({error.strerror}); accepted: a new .rrd file"
-            ) from None
-        sync_folder(path.parent)
-
-    def _open(self, path: Path | None, *, live: bool) -> None:
-        sinks: list[rr.FileSink | rr.GrpcSink] = []
-        if path is not None:
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.open("wb").close()
-            except OSError as error:
-                raise RecordingError(
-                    f"{path} cannot be written ({error.strerror}); accepted: a new .rrd file"
-                ) from None
-            sinks.append(rr.FileSink(path))
-        if live and (viewer := live_sink()) is not None:
-            sinks.append(viewer)
-        if sinks:
-            self._stream.set_sinks(*sinks)
-        else:
-            self._stream.disconnect()
+            yield
+        except RecordingError:
+            self._closed = True
+            abandon(self._stream)
+            raise
 
     @singledispatchmethod
     def _draw(self, event: events.Event) -> None:
@@ -262,3 +267,28 @@ class RerunRecorder(Recorder):
                 follow=self._follow or not self._clock.registering,
             )
             self._stream.send_blueprint(layout)
+
+
+def draw_recording(recording: Recording, path: Path, *, last: int | None = None) -> None:
+    """Write to `path`, a new file, what the run wrote beside its MCAP file.
+
+    last: the last probe that is drawn, where the viewer opens; None: all are, and the viewer opens
+    at the first registration.
+    Raises RecordingError if the file exists, cannot be written, or a problem of the recording is
+    not the recorded one; nothing is left of the file then.
+    """
+    require_new(path)
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    recorder = RerunRecorder(path, follow=last is not None)
+    try:
+        with closing(recorder):
+            for event in recording.events():
+                if last is not None and getattr(event, "step", last) > last:
+                    break
+                if isinstance(event, events.Probe):
+                    recorder.flush()
+                recorder.record(event)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise

@@ -31,6 +31,7 @@ from replay.comparing.contenders import METHODS_HELP, Contender, contenders
 from replay.comparing.csv_file import write_csv
 from replay.comparing.plausible import PlausibleSets
 from replay.console import Console, Progress, TextColumn
+from replay.files import require_folder, require_new
 from replay.mcap.reader import Recording, read_recording
 
 _FEW_STEPS = 3
@@ -98,10 +99,8 @@ def _check_outputs(given: argparse.Namespace) -> None:
     """Raise before any work what would make it end in nothing."""
     paths = [path for path in (given.save_csv, given.save_plot, given.save_rerun) if path]
     for path in paths:
-        if path.exists() or path.is_symlink():
-            raise RecordingError(f"{path} exists; accepted: a new file")
-        if not path.parent.is_dir():
-            raise RecordingError(f"{path.parent} is no folder; accepted: a file in one that exists")
+        require_new(path)
+        require_folder(path)
         if paths.count(path) > 1:
             raise RecordingError(f"{path} is named twice; accepted: a file for each")
     if given.save_plot is not None:

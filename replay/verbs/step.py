@@ -20,9 +20,10 @@ from chsel.methods import METHODS
 from replay.arguments import path_argument
 from replay.comparing.comparison import common_cost, numbers_under
 from replay.console import Console
+from replay.files import require_new
 from replay.mcap.reader import Recording, read_recording
 from replay.registration import other_method
-from replay.rerun.drawing import check_new, draw_recording
+from replay.rerun.recorder import draw_recording
 from replay.step_again import StepAgain, register_step_again
 
 
@@ -62,7 +63,7 @@ def run(given: argparse.Namespace) -> int:
     if interval is not None and interval < 0:
         raise SettingError(f"--snapshot-interval is {interval}; accepted: 0 or more")
     if given.save_rerun is not None:
-        check_new(given.save_rerun)
+        require_new(given.save_rerun)
     recording = read_recording(given.file)
     method = other_method(recording, name, changes)
     path = given.out or Path(f"{recording.path.stem}_step{given.step}_{method.name}.mcap")

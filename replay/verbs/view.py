@@ -11,8 +11,9 @@ from pathlib import Path
 from chsel.errors import RecordingError
 from replay.arguments import path_argument
 from replay.console import Console
+from replay.files import require_new
 from replay.mcap.reader import Recording, read_recording
-from replay.rerun.drawing import check_new, draw_recording
+from replay.rerun.recorder import draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
 
 _STEP_HELP = (
@@ -35,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> int:
     """Draw the recording and show it."""
     if given.save is not None:
-        check_new(given.save)
+        require_new(given.save)
     elif not given.web and not has_screen():
         raise RecordingError(
             f"there is no screen to show {given.file} on; accepted: --save OUT.rrd, or --web"

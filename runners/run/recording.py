@@ -9,15 +9,15 @@ from datetime import datetime
 from pathlib import Path
 
 from chsel.errors import RecordingError, require_positive
-from replay.background_recorder import BackgroundRecorder
 from replay.events import Recorder
 from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
-from replay.recorder import TeeRecorder
-from runners.pictures import open_pictures
+from replay.recorder import BackgroundRecorder, TeeRecorder
 
 IN_RUN_FOLDER = "a logs=DIR that can be written"
 """What is accepted where a file of a run cannot be written."""
+# What Rerun itself would print of a failing disk, over several lines; one line of ours says it.
+_LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,17 @@ def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
     """A recorder to all files that `config` asks for, each written by a thread of its own.
 
     After every step the run waits for the MCAP file, the full record, and not for the pictures.
+    Beside it, pictures that cannot be written are a warning.
     """
     recorders: list[Recorder] = []
     if config.mcap:
         recorders.append(BackgroundRecorder(McapRecorder(folder / "recording.mcap")))
     if config.rerun or config.live:
+        os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
+        from replay.rerun.recorder import RerunRecorder
+
         path = folder / "recording.rrd" if config.rerun else None
-        pictures = open_pictures(path, live=config.live, alone=not config.mcap)
-        recorders.append(BackgroundRecorder(pictures, patient=False))
+        pictures = RerunRecorder(path, live=config.live)
+        optional = "`replay view` makes it anew" if config.mcap else ""
+        recorders.append(BackgroundRecorder(pictures, patient=False, optional=optional))
     return TeeRecorder(recorders)

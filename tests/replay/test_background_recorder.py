@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from chsel.errors import RecordingError
-from replay.background_recorder import BackgroundRecorder
 from replay.events import Measured, Probe
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
+from replay.recorder import BackgroundRecorder
 
 
 class Gate:
@@ -171,7 +171,7 @@ def test_closing_twice_is_closing_once_and_ends_the_thread(tmp_path, events):
 
 _SCRIPT = """
 import runpy, sys
-from replay.background_recorder import BackgroundRecorder
+from replay.recorder import BackgroundRecorder
 from replay.mcap.writer import McapRecorder
 events = runpy.run_path(sys.argv[1])["example_events"]()
 recorder = BackgroundRecorder(McapRecorder(sys.argv[2]))

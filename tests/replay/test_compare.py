@@ -301,7 +301,7 @@ def test_everything_is_saved(path, tmp_path, capsys):
     again = ["compare", str(path), *methods, "--save-csv", str(saved["csv"])]
     content = saved["csv"].read_bytes()
     assert main(again) == 2
-    assert "out.csv exists; accepted: a new file" in capsys.readouterr().err
+    assert "out.csv exists; accepted: the name of a new file" in capsys.readouterr().err
     assert saved["csv"].read_bytes() == content
 
 
@@ -309,7 +309,7 @@ def test_everything_is_saved(path, tmp_path, capsys):
     ("words", "message"),
     [
         (["--save-plot", "out.jpg"], "out.jpg is no name of a picture; accepted: *.png, *.svg"),
-        (["--save-plot", "nowhere/out.png"], "nowhere is no folder"),
+        (["--save-plot", "nowhere/out.png"], "folder nowhere does not exist"),
         (["--save-plot", "out.png", "--save-csv", "out.png"], "out.png is named twice"),
         (["--threads", "0"], "--threads is 0; accepted: an integer from 1 to 256"),
         (["--steps", "7"], "there is no step 7; accepted: 0, 1, 2"),

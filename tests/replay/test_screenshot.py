@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from chsel.errors import RecordingError
-from replay.rerun import headless
-from replay.rerun.headless import headless_viewer
-from replay.screenshot import main, save_screenshot
+from replay import screenshot
+from replay.rerun import viewer as rerun_viewer
+from replay.screenshot import headless_viewer, main, save_screenshot
 
 # A viewer that listens at its port and answers nothing; or one that ends with a message.
 _SILENT = """
@@ -82,9 +82,9 @@ def viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Viewer:
         path = tmp_path / "viewer"
         path.write_text(f"#!{sys.executable}\n{code}")
         path.chmod(0o755)
-        monkeypatch.setattr(headless, "viewer_program", lambda: path)
-        monkeypatch.setattr(headless, "ViewerClient", SimpleNamespace(connect=client))
-        monkeypatch.setattr(headless, "SETTLE_SECONDS", 0.0)
+        monkeypatch.setattr(rerun_viewer, "viewer_program", lambda: path)
+        monkeypatch.setattr(screenshot, "ViewerClient", SimpleNamespace(connect=client))
+        monkeypatch.setattr(screenshot, "SETTLE_SECONDS", 0.0)
 
     return program
 
@@ -132,7 +132,7 @@ def test_a_viewer_that_never_paints_is_one_error(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(headless, "LIMIT_SECONDS", 2.0)
+    monkeypatch.setattr(screenshot, "LIMIT_SECONDS", 2.0)
     client = Client(TimeoutError("not painted\n  within 15 s"))
     viewer(_SILENT, lambda _: client)
     assert main([str(rrd), str(rrd.with_suffix(".png"))]) == 2
@@ -145,7 +145,7 @@ def test_a_viewer_that_never_paints_is_one_error(
 def test_a_viewer_that_hangs_is_given_up(
     rrd: Path, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(headless, "LIMIT_SECONDS", 2.0)
+    monkeypatch.setattr(screenshot, "LIMIT_SECONDS", 2.0)
     viewer(_SILENT, HangingClient)
     begun = time.monotonic()
     with pytest.raises(RecordingError, match="gave no picture: after 2 s, "):

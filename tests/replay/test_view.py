@@ -27,8 +27,7 @@ from replay import __main__
 from replay.events import Event, SessionStarted, Timed
 from replay.mcap.reader import read_recording
 from replay.rerun import viewer as rerun_viewer
-from replay.rerun.drawing import draw_recording
-from replay.rerun.recorder import RerunRecorder
+from replay.rerun.recorder import RerunRecorder, draw_recording
 from replay.rerun.viewer import web_server
 from tests.replay.rerun.test_recorder import opens_at
 
@@ -186,7 +185,7 @@ def test_save_writes_a_new_file_and_opens_nothing(
     assert content(saved) == content(tmp_path / "drawn.rrd")
     before = saved.read_bytes()
     assert __main__.main(["view", str(file), "--save", str(saved)]) == 2
-    assert "saved.rrd exists; accepted: a new .rrd file" in capsys.readouterr().err
+    assert "saved.rrd exists; accepted: the name of a new file" in capsys.readouterr().err
     assert saved.read_bytes() == before
 
 

@@ -14,10 +14,10 @@ import pytest
 
 from chsel.errors import RecordingError
 from replay.__main__ import main as replay_main
-from replay.events import Logged
 from replay.mcap.reader import Recording, read_recording
-from replay.recorder import NullRecorder
-from runners.pictures import CheckedPictures
+from replay.recorder import BackgroundRecorder
+from replay.rerun.recorder import RerunRecorder
+from replay.rerun.stream import RrdFile
 from runners.run.recording import RecordingConfig, open_recorder
 from tests.tools.kill_sessions import points_session, reported_probes
 
@@ -172,43 +172,43 @@ def test_two_runs_never_share_a_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("content", "whole"), [(b"...RRF2FOOT....", True), (b"...", False)])
-def test_pictures_without_their_end_are_an_error_or_a_warning(
-    tmp_path: Path, recwarn: pytest.WarningsRecorder, content: bytes, whole: bool
+def test_pictures_without_their_end_are_an_error(
+    tmp_path: Path, content: bytes, whole: bool
+) -> None:
+    file = RrdFile(tmp_path / "recording.rrd")
+    (tmp_path / "recording.rrd").write_bytes(content)
+    if whole:
+        file.finish()
+    else:
+        with pytest.raises(RecordingError, match="cannot be written to its end"):
+            file.finish()
+
+
+def test_pictures_that_no_longer_grow_are_an_error_at_the_next_check(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    file = RrdFile(path)
+    for content in (b"...", b"......"):
+        path.write_bytes(content)
+        file.check(grown=True)
+    file.check(grown=False)  # nothing was drawn since
+    with pytest.raises(RecordingError, match="cannot be written: the disk may be full"):
+        file.check(grown=True)
+
+
+def test_pictures_that_are_gone_are_an_error_or_one_warning(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
 ) -> None:
     path = tmp_path / "recording.rrd"
-    path.write_bytes(content)
-    for alone in (False, True):
-        pictures = CheckedPictures(NullRecorder(), path, alone=alone)
-        pictures.flush()
-        if alone and not whole:
-            with pytest.raises(RecordingError, match="cannot be written to its end"):
-                pictures.close()
+    for optional in ("", "`replay view` makes it anew"):
+        recorder = BackgroundRecorder(RerunRecorder(path), optional=optional)
+        path.unlink()
+        if optional:
+            recorder.flush()
+            recorder.flush()  # warns once
+            recorder.close()
         else:
-            pictures.close()
-        pictures.close()  # once more is nothing more
-    assert len(recwarn) == (0 if whole else 1)
-
-
-def test_pictures_that_no_longer_grow_are_told_at_the_next_flush(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    path.write_bytes(b"...")
-    pictures = CheckedPictures(NullRecorder(), path, alone=True)
-    for text in ("a", "b"):
-        pictures.record(Logged(0, "info", text))
-        path.write_bytes(path.read_bytes() + b"...")
-        pictures.flush()
-    pictures.flush()  # nothing to draw since
-    pictures.record(Logged(0, "info", "c"))
-    with pytest.raises(RecordingError, match="cannot be written: the disk may be full"):
-        pictures.flush()
-    pictures.close()
-
-
-def test_pictures_that_are_gone_are_told_at_the_next_flush(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    beside = CheckedPictures(NullRecorder(), path, alone=False)
-    with pytest.warns(UserWarning, match="is not there any more; `replay view` makes it anew"):
-        beside.flush()
-    beside.flush()  # tells it once
-    with pytest.raises(RecordingError, match="is not there any more"):
-        CheckedPictures(NullRecorder(), path, alone=True).flush()
+            with pytest.raises(RecordingError, match="is not there any more"):
+                recorder.flush()
+            recorder.close()
+    (warning,) = recwarn
+    assert "is not there any more; `replay view` makes it anew" in str(warning.message)

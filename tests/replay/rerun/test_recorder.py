@@ -26,7 +26,6 @@ from chsel.problem.poses import compose, inverse, random_rotations
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.background_recorder import BackgroundRecorder
 from replay.events import (
     Event,
     HypothesesFound,
@@ -40,7 +39,8 @@ from replay.events import (
     Timed,
     Traced,
 )
-from replay.rerun import live as rerun_live
+from replay.recorder import BackgroundRecorder
+from replay.rerun import viewer as rerun_viewer
 from replay.rerun.hypotheses import LEVELS, MOST
 from replay.rerun.recorder import RerunRecorder
 
@@ -617,8 +617,8 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def test_without_a_viewer_the_live_view_is_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rerun_live, "is_listening", lambda port: False)
-    monkeypatch.setattr(rerun_live, "viewer_program", lambda: tmp_path / "no_viewer")
+    monkeypatch.setattr(rerun_viewer, "is_listening", lambda port: False)
+    monkeypatch.setattr(rerun_viewer, "viewer_program", lambda: tmp_path / "no_viewer")
     with pytest.warns(UserWarning, match="no live view: the viewer no_viewer cannot be started"):
         recorder = RerunRecorder(tmp_path / "a.rrd", live=True)
     recorder.record(started())
