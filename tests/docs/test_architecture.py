@@ -5,31 +5,49 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
 from chsel import CompiledCost
 from replay.mcap.reader import Recording, read_recording
+from runners.reporting.evaluation_folder import open_evaluation
 from tests.docs.page import commands_in, named_blocks, section, shell, take_over
+from tests.runners.made_up_evaluations import made_up_rows, write_evaluation
 
 PAGE = "architecture.md"
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGES = ("chsel", "conf", "replay", "runners")
 RECIPES = ("Adding a method", "Adding an object", "Adding a session kind", "Adding an event")
+REPORT_RECIPES = ("Adding a figure", "Adding a column")
 
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the repository in which all recipes were carried out, one after the other."""
-    folder = tmp_path_factory.mktemp("copy")
+    return carried_out(RECIPES, tmp_path_factory.mktemp("copy"))
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy in which the recipes of reports were carried out on a made-up evaluation."""
+    folder = tmp_path_factory.mktemp("reported")
+    rows = made_up_rows(["can", "mustard"], [0, 1], 2, ["chsel", "icp"])
+    write_evaluation(folder / "logs" / "evaluation" / "smoke", rows)
+    return carried_out(REPORT_RECIPES, folder)
+
+
+def carried_out(recipes: Sequence[str], folder: Path) -> Path:
+    """The folder, with a copy of the repository in which recipes were carried out in order."""
     unwanted = shutil.ignore_patterns("__pycache__")
     for package in PACKAGES:
         shutil.copytree(REPOSITORY / package, folder / package, ignore=unwanted)
     shutil.copy(REPOSITORY / "pyproject.toml", folder)
-    for title in RECIPES:
+    for title in recipes:
         recipe = section(PAGE, title)
         assert take_over(recipe, folder)
         for command in commands_in(recipe):
@@ -125,12 +143,35 @@ def test_recordings_of_before_the_event_stay_readable(copy: Path) -> None:
     assert "all checksums and digests are right" in " ".join(info.split())
 
 
+def test_a_figure_is_in_the_report_with_its_numbers_and_its_title(reported: Path) -> None:
+    report = reported / "logs" / "evaluation" / "smoke" / "report"
+    rows = open_evaluation(report.parent).last_half
+    drawn = pd.read_csv(report / "diversity_and_time.csv", index_col="method")
+    assert list(drawn.index) == ["chsel", "icp"]
+    for method, numbers in drawn.iterrows():
+        own = rows[rows["method"] == method]
+        assert numbers["diversity"] == pytest.approx(own["diversity"].median())
+        assert numbers["seconds"] == pytest.approx(own["seconds"].median())
+    picture = (report / "diversity_and_time.svg").read_text()
+    assert "<!-- Medians of PD and time, made_up -->" in picture
+    assert "(diversity_and_time.svg)" in (report / "report.md").read_text()
+
+
+def test_a_column_is_in_its_table(reported: Path) -> None:
+    text = (reported / "beside" / "report.md").read_text()
+    header, _, chsel, _ = text.split("PD and its ratios")[1].split("\n\n")[1].splitlines()
+    assert header.endswith("| s, mean | s, greatest |")
+    rows = open_evaluation(reported / "logs" / "evaluation" / "smoke").rows
+    greatest = rows.loc[rows["method"] == "chsel", "seconds"].max()
+    assert float(chsel.split("|")[-2]) == pytest.approx(greatest, rel=5e-3)
+
+
 def test_files_and_classes_that_the_page_names_exist() -> None:
     prose = re.sub(r"^```.*?^```$", "", (REPOSITORY / "docs" / PAGE).read_text(), flags=re.M | re.S)
     words = set(re.findall(r"`([\w./-]+)`", prose))
     files = [file for package in PACKAGES for file in (REPOSITORY / package).rglob("*.*")]
     files += (REPOSITORY / "tests").rglob("*.*")
-    recipes = "".join(section(PAGE, title) for title in RECIPES)
+    recipes = "".join(section(PAGE, title) for title in (*RECIPES, *REPORT_RECIPES))
     paths = {"/" + name for name, _, _ in named_blocks(recipes)}
     paths |= {"/" + file.relative_to(REPOSITORY).as_posix() for file in files}
     named = {word for word in words if word.endswith((".py", ".yaml", ".json"))}
