@@ -6,7 +6,6 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
@@ -137,65 +136,6 @@ def test_the_same_evaluation_gives_the_same_bytes(whole: Path, tmp_path: Path) -
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
 
 
-def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path: Path) -> None:
-    values = {0: (1000.0, 10.0, 20.0), 1: (1000.0, 30.0, 60.0)}  # PD of seeds at steps 4, 5, 6
-    rows = [
-        row("can", seed, method, step, diversity=factor * value, seconds=0.01 * factor)
-        for seed, found in values.items()
-        for method, factor in (("chsel", 1.0), ("icp", 2.0))
-        for step, value in zip((4, 5, 6), found, strict=True)
-    ]
-    write_evaluation(tmp_path, rows)
-    assert run(report.main, str(tmp_path)).returncode == 0
-    tables = page_of(tmp_path / "report").tables
-    # 10, 20, 30, 60: the middle step of three is of the last half
-    expected = ["can", "4", "25 [17.5, 37.5]", "50 [35, 75]"]
-    assert tables["PD in mm² by object"] == [["object", "n", "CHSEL", "ICP"], expected]
-    assert tables["PD in mm² by configuration"][1] == expected
-    assert tables["PD in mm² of can by step"][2] == ["5", "2", "20 [15, 25]", "40 [30, 50]"]
-    assert tables["Time per registration in ms"][1:] == [
-        ["CHSEL", "10", "0", "10 [10, 10]", "6", "0"],
-        ["ICP", "20", "0", "20 [20, 20]", "6", "0"],
-    ]
-    html = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
-    assert '<td class="best">25<small>' in html
-    assert '<td class="best">50<small>' not in html
-
-
-def test_what_has_no_number_is_left_out_and_said(tmp_path: Path) -> None:
-    rows = [
-        row("can", 0, "chsel", 4, diversity=8.0, seconds=0.1),
-        row("can", 1, "chsel", 4, seconds=0.3) | {"status": "no plausible set: too few points"},
-        row("can", 0, "icp", 4, diversity=float("nan"), seconds=None),
-        row("can", 1, "icp", None) | {"status": "failed: the worker was killed"},
-    ]
-    methods = {"chsel": {}, "icp": {}, "svgd": {}}
-    write_evaluation(tmp_path, rows, configurations=["can"], seeds=[0, 1, 2], methods=methods)
-    assert run(report.main, str(tmp_path)).returncode == 0
-    tables = page_of(tmp_path / "report").tables
-    assert tables["PD in mm² by object"][1] == [
-        "can",
-        "1",
-        "8 [8, 8] 1 left out",
-        "-",
-        "- 1 left out",
-    ]
-    assert tables["Time per registration in ms"][1:] == [
-        ["CHSEL", "200", "100", "200 [150, 250]", "2", "0"]
-    ]
-    assert [line[:7] for line in tables["What is there"][1:]] == [
-        ["CHSEL", "2 of 3", "0", "1", "2", "0", "1"],
-        ["SVGD", "0 of 3", "0", "3", "0", "0", "0"],
-        ["ICP", "1 of 3", "1", "1", "1", "1", "1"],
-    ]
-    assert tables["What is missing"][1:] == [
-        ["can", "1", "chsel", "4", "no plausible set: too few points"],
-        ["can", "1", "icp", "all", "failed: the worker was killed"],
-        ["can", "0..2", "svgd", "all", "not there"],
-        ["can", "2", "chsel, icp", "all", "not there"],
-    ]
-
-
 def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Path) -> None:
     write_evaluation(tmp_path, None, configurations=["can"], seeds=[0], methods={"icp": {}})
     trial = tmp_path / "trials" / "can" / "seed_0"
@@ -212,6 +152,38 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
     ]
     assert run(report.main, str(tmp_path)).returncode == 0
     assert "no table of the whole" in (tmp_path / "report" / "report.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("kind", "begins", "on_page"),
+    [("svg", b"<?xml", "image/svg+xml"), ("pdf", b"%PDF-", "image/png")],
+)
+def test_figures_are_files_of_a_format_the_same_each_time_with_the_evaluations_name(
+    tmp_path: Path, kind: str, begins: bytes, on_page: str
+) -> None:
+    folder = write_evaluation(tmp_path, made_up_rows(["can"], [0, 1], 2, ["icp"]), name="$own$ 1")
+    contents = []
+    for name in ("first", "again"):
+        assert (
+            run(report.main, str(folder), f"out={tmp_path / name}", f"format={kind}").stderr == ""
+        )
+        files = sorted((tmp_path / name).iterdir())
+        contents.append([path.read_bytes() for path in files if path.suffix == f".{kind}"])
+    assert contents[0] == contents[1]
+    assert len(contents[0]) == 4
+    assert {path.suffix for path in files} == {f".{kind}", ".csv", ".html", ".md"}
+    assert all(content.startswith(begins) for content in contents[0])
+    if kind == "svg":
+        assert b"<!-- Plausible diversity by object and method, $own$ 1 -->" in contents[0][1]
+    sources = [
+        attributes["src"] or ""
+        for tag, attributes in page_of(tmp_path / "first").tags
+        if tag == "img"
+    ]
+    assert [source.split(";")[0] for source in sources] == [f"data:{on_page}"] * 4
+    text = (tmp_path / "again" / "report.md").read_text("utf-8")
+    assert f"](pd_boxes.{kind})" in text
+    assert f"format={kind}" in text.split("How it was made")[1]
 
 
 @pytest.mark.parametrize(
@@ -269,6 +241,7 @@ def test_settings_of_the_sequence_choose_trial_methods_and_steps(
         (["{}/good", "sequence.trial=clamp"], "accepted: CONFIGURATION/SEED"),
         (["{}/good", "sequence.view=zz"], "view is 'zz'; accepted: xz, xy, yz"),
         (["{}/good", "sequence.steps=[]"], "steps is empty"),
+        (["{}/good", "format=gif"], "format is 'gif'; accepted: png, svg, pdf"),
         (["{}/good", "colour=red"], "has no key 'colour'"),
         (["{}/good", "{}/empty"], "one argument too many; accepted: DIR KEY=VALUE"),
         (["{}/good", "out={}/good/experiment.json/x"], "cannot be written"),
@@ -289,25 +262,3 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: st
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
     assert json.loads((tmp_path / "good" / "experiment.json").read_text())["name"] == "made_up"
-
-
-def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -> None:
-    names = ["cabinet_drill", "cabinet_mustard"]
-    rows = made_up_rows(names, [0, 1], 2, ["chsel"])
-    write_evaluation(tmp_path, rows, configurations=names, seeds=[0, 1, 2])
-    for index, (name, seed) in enumerate([(names[0], 0), (names[0], 1), (names[1], 0)]):
-        truth: dict[str, Any] = {"cost": 0.001, "guess_cost": 0.1, "mean_distance": 0.001}
-        truth["violations"] = index
-        truth["from_guess"] = {"position": 0.002 * index, "rotation": 0.034906585 * index}
-        if name == names[0]:
-            truth["from_simulated"] = {"position": 0.003 + 0.002 * index, "rotation": 0.01745329}
-        folder = tmp_path / "trials" / name / f"seed_{seed}"
-        folder.mkdir(parents=True)
-        (folder / "session.json").write_text(json.dumps({"truth": truth}))
-    done = run(report.main, str(tmp_path))
-    assert (done.returncode, done.stderr) == (0, "")
-    table = page_of(tmp_path / "report").tables["True poses found"]
-    assert [line[:2] for line in table[1:]] == [[names[0], "2"], [names[1], "1"], ["all", "3"]]
-    assert table[1][2:] == ["1 [1]", "0.5 [1]", "1 [2]", "1 [2]", "4 [5]", "1 [1]"]
-    assert table[2][3:] == ["2 [2]", "4 [4]", "4 [4]", "-", "-"]
-    assert "True poses found" in (tmp_path / "report" / "report.md").read_text()

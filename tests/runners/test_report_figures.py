@@ -7,28 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.container import BarContainer
-from matplotlib.contour import QuadContourSet
 from matplotlib.patches import PathPatch
-from matplotlib.quiver import Quiver
 
-from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import apply, inverse
-from replay.mcap.reader import Recording, read_recording
-from runners.reporting.cost_gradients import picture_of_gradients, recorded_cost
 from runners.reporting.diversity import picture_of_boxes, picture_over_probes
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_style import method_styles
 from runners.reporting.over_iterations import picture_over_iterations, tables_over_iterations
-from runners.reporting.probing_sequence import picture_of_sequence
 from runners.reporting.registration_times import picture_of_times, times_of
-from runners.reporting.silhouette import CONTACT
-from tests.runners.drawn_figures import bands_of, legend_of, line_of, outlines_of
-from tests.runners.made_up_evaluations import REPLAYS, row, write_evaluation
-
-DRILL, HAMMER = REPLAYS / "drill_chsel.mcap", REPLAYS / "hammer_icp.mcap"
+from tests.runners.drawn_figures import bands_of, legend_of, line_of
+from tests.runners.made_up_evaluations import METHODS, row, write_evaluation
 
 
 def looks(styles: Any) -> dict[str, tuple[object, object, object]]:
@@ -180,112 +169,10 @@ def test_numbers_over_iterations_are_medians_and_quartiles_and_costs_of_one_kind
     ]
 
 
-def section_at(
-    recording: Recording, x: FloatArray, z: FloatArray, lookup: str
-) -> tuple[FloatArray, FloatArray]:
-    """Signed distances (N,) and normals (N, 2) in the drawn plane, of the object's SDF grid."""
-    sdf = recording.start.sdf
-    inside = (sdf.values < 0.0).sum(axis=(0, 2))
-    y = sdf.origin[1] + sdf.resolution * int(np.argmax(inside))
-    points = np.stack([x, np.full(len(x), y), z], axis=1)
-    values, gradients = sdf.query(points, lookup=lookup)
-    return np.asarray(values), np.asarray(gradients)[:, [0, 2]]
-
-
-def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surface() -> None:
-    recording = read_recording(DRILL)
-    settings = recorded_cost(recording.start.config, "chsel")
-    tolerance = settings.penetration_tolerance
-    picture = picture_of_gradients(DRILL)
-    figure = picture.figure
-    free, occupied, known = (axes for axes in figure.axes)
-    # Where each of them is pushed, and along which multiple of the outward normal.
-    pushed = {
-        free: (lambda s: s < tolerance, lambda s: tolerance - s),
-        occupied: (lambda s: s > -tolerance, lambda s: -tolerance - s),
-        known: (lambda s: abs(s) > 0.0, lambda s: -s),
-    }
-    for axes, (violated, strength) in pushed.items():
-        (arrows,) = (one for one in axes.collections if isinstance(one, Quiver))
-        drawn = np.column_stack([arrows.U, arrows.V])
-        assert len(drawn) > 20
-        distances, normals = section_at(recording, arrows.X, arrows.Y, settings.lookup)
-        assert violated(distances).all(), axes.get_title()
-        push = strength(distances)[:, None] * normals
-        along = (drawn * push).sum(axis=1)
-        lengths = np.hypot(*drawn.T) * np.hypot(*push.T)
-        np.testing.assert_allclose(along, lengths, rtol=1e-6, err_msg=axes.get_title())
-        order = np.argsort(np.hypot(*push.T))
-        assert (np.diff(np.hypot(*drawn.T)[order]) > -1e-9).all()  # longer where more is violated
-    assert [axes.get_title() for axes in figure.axes] == [
-        "free points leave the object",
-        "occupied points enter it",
-        "surface points go to its surface",
-    ]
-
-
-def test_lines_of_a_section_are_the_surface_and_the_tolerance_of_each_class() -> None:
-    recording = read_recording(DRILL)
-    tolerance = recorded_cost(recording.start.config, "chsel").penetration_tolerance
-    figure = picture_of_gradients(DRILL).figure
-    levels = {0: [0.0, tolerance], 1: [0.0, -tolerance], 2: [0.0]}
-    for panel, axes in enumerate(figure.axes):
-        contours = [one for one in axes.collections if isinstance(one, QuadContourSet)]
-        assert len(contours) == len(levels[panel])
-        for contour, level in zip(contours, levels[panel], strict=True):
-            vertices = np.concatenate([path.vertices for path in contour.get_paths()])
-            assert len(vertices) > 20
-            distances, _ = section_at(recording, *vertices.T, lookup="trilinear")
-            np.testing.assert_allclose(distances, level, atol=1e-9)
-        assert axes.get_xlabel() == "x in m"
-
-
-def test_a_probing_sequence_shows_poses_in_the_world_and_the_contacts_so_far() -> None:
-    recording = read_recording(HAMMER)
-    styles = method_styles(["chsel"])
-    touching = {probe.step for probe in recording.probes if len(probe.contacts)}
-    last = max(touching & set(recording.steps[1:]))
-    shown = [last - 1, last]  # before and after a contact
-    picture = picture_of_sequence({"chsel": HAMMER}, styles, steps=shown, view="xz")
-    figure = picture.figure
-    assert [axes.get_title() for axes in figure.axes] == [f"step {step}" for step in shown]
-    assert figure.axes[0].get_ylabel() == "CHSEL\nz in m"
-    for axes, step in zip(figure.axes, shown, strict=True):
-        assert axes.get_xlabel() == "x in m"
-        check_outlines(axes, recording, step, styles["chsel"].color)
-        check_contacts(axes, recording, step)
-
-
-def check_outlines(axes: Axes, recording: Recording, step: int, color: str) -> None:
-    start = recording.start
-    lower = np.array([axes.get_xlim()[0], axes.get_ylim()[0]])
-    upper = np.array([axes.get_xlim()[1], axes.get_ylim()[1]])
-    pixel = (upper - lower).max() / 160.0
-    poses = inverse(recording.hypotheses(step).object_from_world)
-    expected = [(pose, color, "solid") for pose in poses[::-1]]  # the best on top
-    expected.append((start.world_from_object, "#000000", "dashed"))
-    outlines = outlines_of(axes)
-    assert len(outlines) == len(expected) == 31
-    for (vertices, drawn_color, style), (pose, wanted_color, wanted_style) in zip(
-        outlines, expected, strict=True
-    ):
-        assert (drawn_color, style) == (wanted_color, wanted_style)
-        corners = apply(pose, np.asarray(start.mesh.vertices))[:, [0, 2]]
-        in_view = np.clip([corners.min(axis=0), corners.max(axis=0)], lower, upper)
-        np.testing.assert_allclose(
-            [vertices.min(axis=0), vertices.max(axis=0)], in_view, atol=2.5 * pixel
-        )
-
-
-def check_contacts(axes: Axes, recording: Recording, step: int) -> None:
-    probes = [probe for probe in recording.probes if probe.step <= step]
-    contacts = np.concatenate([probe.contacts for probe in probes])
-    assert len(contacts) > 0
-    orange = [line for line in axes.lines if line.get_color() == CONTACT["color"]]
-    dots = [line.get_xydata()[0] for line in orange if line.get_marker() == "o"]
-    np.testing.assert_array_equal(dots, contacts[:, [0, 2]])
-    ways = [line.get_xydata() for line in orange if line.get_marker() != "o"]
-    np.testing.assert_array_equal([way[1] for way in ways], contacts[:, [0, 2]])
-    lengths = [np.hypot(*(way[1] - way[0])) for way in ways]
-    assert max(lengths) == pytest.approx(0.05, abs=1e-3)  # metres, the probes move along x
-    assert all(way[0][0] < way[1][0] for way in ways)
+def test_a_method_looks_the_same_in_every_figure_and_like_no_other() -> None:
+    names = [*METHODS, "chsel@paper", "mine", "icp#small"]
+    styles = method_styles(names)
+    assert len({style.color for style in styles.values()}) == len(names)
+    assert len({style.marker for style in styles.values()}) == len(names)
+    assert method_styles(["icp", "svgd"])["icp"] == styles["icp"]
+    assert list(method_styles(names[::-1])) == list(styles)
