@@ -18,35 +18,30 @@ from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from replay.console import Console
 from runners.benchmarks import report
-from runners.benchmarks.alone import MEASURES
 from runners.benchmarks.comparison import WHAT, compare
-from runners.benchmarks.machine import load, machine
-from runners.benchmarks.ours import Steps
+from runners.benchmarks.measures import MEASURES
 from runners.benchmarks.plot import draw
 from runners.benchmarks.problems import PROBLEMS
-from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
-from runners.benchmarks.scope import Scope
+from runners.benchmarks.registrations import Scope, Steps
+from runners.benchmarks.timing import load, machine
 from runners.command.program import command, plain
+from runners.published_package.environment import PackageConfig, interpreter
+from runners.published_package.process import PublishedPackage
 from runners.run.recording import make_run_folder, write_in_run_folder
 
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
-    """conf/benchmark.yaml, which has all defaults, checked.
+    """conf/benchmark.yaml, which has all defaults, checked."""
 
-    problems: which to register. alone: what else to measure of this library. free_points,
-    hypotheses: the sizes that show how the time grows. device: where evaluation takes many poses,
-    besides the processor.
-    """
-
-    problems: tuple[str, ...]
-    alone: tuple[str, ...]
-    free_points: tuple[int, ...]
+    problems: tuple[str, ...]  # which to register
+    alone: tuple[str, ...]  # what else to measure of this library
+    free_points: tuple[int, ...]  # sizes that show how the time grows
     hypotheses: tuple[int, ...]
     package: PackageConfig
     steps: Steps
     logs: str
-    device: str
+    device: str  # where evaluation takes many poses, besides the processor
     repeats: int
     seed: int
     quick: bool
@@ -71,7 +66,7 @@ class BenchmarkConfig:
         return self.device == "cuda" or (self.device == "auto" and gpus() > 0)
 
     def shortened(self) -> BenchmarkConfig:
-        """As much as takes under a minute; its times are no ones to quote."""
+        """As much as takes under a minute; its times are not to be quoted."""
         return replace(
             self,
             problems=("real_20",),

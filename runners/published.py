@@ -15,16 +15,17 @@ from omegaconf import DictConfig
 
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
-from runners.benchmarks.published import PackageConfig, PublishedPackage, interpreter
 from runners.command.program import command, plain
 from runners.evaluation.display import Display
-from runners.evaluation.package_files import PackageFiles
-from runners.evaluation.package_session import PackageSession
 from runners.evaluation.plan import Trial
 from runners.evaluation.repeats import repeat_seed, require_repeats
 from runners.evaluation.schedule import Progress
 from runners.evaluation.selection import chosen_seeds
 from runners.evaluation.trial_session import read_told
+from runners.published_package.environment import PackageConfig, interpreter
+from runners.published_package.files import PackageFiles
+from runners.published_package.process import PublishedPackage
+from runners.published_package.session import PackageSession
 
 _SEED = re.compile(r"seed_(\d{1,19})")
 

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.numerics.threads import threads as use_threads
 from chsel.problem.points import Lattice, Workspace
 from chsel.problem.poses import axis_angle, compose
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges, valid_pixels
 from chsel.sensing.free_space import SCALES, FreeGrid
-from runners.benchmarks.machine import cores
-from runners.benchmarks.scope import Scope
-from runners.benchmarks.timing import Row, in_turn
+from runners.benchmarks.registrations import Scope
+from runners.benchmarks.timing import Row, cores, in_turn, milliseconds
 
 WORKSPACE = Workspace((0.7, -0.2, 0.31), (1.1, 0.2, 0.6))  # the paper's cabinet
 SPACING = 0.01
@@ -38,14 +35,12 @@ def depth_images(scope: Scope) -> Iterator[Row]:
     scaled = partial(grids["scaled"].scaled_images, depth, CAMERA, POSE, mask)
     numpy_grid = np.zeros(grids["scaled"].shape, dtype=bool)
     cases = {
-        "traversal, 1": partial(_taken, traversal, 1),
-        f"traversal, all {cores()}": partial(_taken, traversal, cores()),
-        "scaled images, 1": partial(_taken, scaled, 1),
-        "scaled images, numpy": partial(_taken, partial(_scaled, depth, mask, numpy_grid), 1),
-        "valid pixels and edges": partial(_taken, partial(_checked, depth), 1),
+        "traversal, 1": partial(milliseconds, traversal, 1),
+        f"traversal, all {cores()}": partial(milliseconds, traversal, cores()),
+        "scaled images, 1": partial(milliseconds, scaled, 1),
+        "scaled images, numpy": partial(milliseconds, partial(_scaled, depth, mask, numpy_grid), 1),
+        "valid pixels and edges": partial(milliseconds, partial(_checked, depth), 1),
     }
-    for case in cases.values():
-        case()
     for name, samples in in_turn(scope.repeats, cases).items():
         yield Row("depth image, threads", name, "", "ms", samples)
     found = {name: grid.count for name, grid in grids.items()} | {"numpy": int(numpy_grid.sum())}
@@ -64,14 +59,6 @@ def scene() -> FloatArray:
     rest = b**2 - a * ((_BALL - eye) @ (_BALL - eye) - _RADIUS**2)
     ball = np.where(rest > 0.0, (b - np.sqrt(np.maximum(rest, 0.0))) / a, _FAR)
     return np.min([np.where(d > 0.0, d, _FAR) for d in (floor, wall, ball)], axis=0)
-
-
-def _taken(run: Callable[[], object], count: int) -> float:
-    """Milliseconds of a run on so many threads."""
-    with use_threads(count):
-        begun = time.perf_counter()
-        run()
-        return 1000.0 * (time.perf_counter() - begun)
 
 
 def _scaled(depth: FloatArray, mask: BoolArray, free: BoolArray) -> None:

@@ -16,9 +16,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from runners.benchmarks.machine import peak_memory
-from runners.benchmarks.ours import Steps, register
-from runners.benchmarks.problems import PosedProblem
+from runners.benchmarks.registrations import Steps, method
+from runners.published_package.problem_file import load_problem
 
 _CACHE = "CHSEL_CACHE_DIR"
 
@@ -69,9 +68,22 @@ def main(task: dict[str, Any]) -> None:
 
         torch.set_num_threads(1)
         steps = Steps(**task["steps"])
-        posed = PosedProblem.load(Path(task["problem"]))
-        register(posed, task["preset"], steps, steps.search)
+        problem = load_problem(Path(task["problem"]))
+        method(task["preset"], steps, steps.search).register(problem)
     sys.stdout.write(json.dumps({"bytes": peak_memory()}) + "\n")
+
+
+def peak_memory() -> int:
+    """Peak memory of this process in bytes."""
+    # Not getrusage where there is another way: a new process inherits its parent's peak there.
+    try:
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(status.split("VmHWM:")[1].split()[0])
+    except (OSError, IndexError):
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else 1024 * peak
 
 
 if __name__ == "__main__":

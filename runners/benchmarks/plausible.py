@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.threads import threads as use_threads
 from chsel.plausible.plausible_set import plausible_set, rotation_seed
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_scan import grid_around
@@ -17,8 +15,8 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
 from replay.events import Probe
 from runners.benchmarks.problems import PROBLEMS, drill, pose
-from runners.benchmarks.scope import Scope
-from runners.benchmarks.timing import Row, in_turn
+from runners.benchmarks.registrations import Scope
+from runners.benchmarks.timing import Row, in_turn, milliseconds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.sessions import open_session, session_settings
 
@@ -34,12 +32,10 @@ def plausible_sets(scope: Scope) -> Iterator[Row]:
     """One set on one thread and on two, in turn: after a probe session, and of posed problems."""
     scenes = _scenes(scope.seed)
     cases = {
-        (name, count): partial(_found, scene, count)
+        (name, count): partial(milliseconds, partial(plausible_set, *scene, _SETTINGS), count)
         for name, scene in scenes.items()
         for count in _THREADS
     }
-    for case in cases.values():
-        case()
     named = {f"{name}, {count}": case for (name, count), case in cases.items()}
     samples = in_turn(scope.repeats, named)
     for (_, count), (name, taken) in zip(cases, samples.items(), strict=True):
@@ -47,14 +43,6 @@ def plausible_sets(scope: Scope) -> Iterator[Row]:
     for name, (problem, truth) in scenes.items():
         grid = grid_around(truth, _SETTINGS.grid, rotation_seed(problem, _SETTINGS))
         yield Row("plausible, grid", name, "default", "poses", (float(len(grid)),))
-
-
-def _found(scene: Scene, count: int) -> float:
-    """Milliseconds of one set."""
-    with use_threads(count):
-        begun = time.perf_counter()
-        plausible_set(*scene, _SETTINGS)
-        return 1000.0 * (time.perf_counter() - begun)
 
 
 def _scenes(seed: int) -> dict[str, Scene]:

@@ -17,6 +17,7 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from chsel.problem.streams import StreamKey
 from runners.objects.loader import ObjectConfig, load_object
+from runners.published_package.problem_file import save_problem
 
 SDF_RESOLUTION = 0.01
 FREE_POINTS = 20_000
@@ -93,39 +94,8 @@ class PosedProblem:
         }
 
     def save(self, path: Path) -> None:
-        """Write the arrays for another process."""
-        np.savez(
-            path,
-            sdf_origin=self.sdf.origin,
-            sdf_resolution=self.sdf.resolution,
-            sdf_values=self.sdf.values,
-            sdf_gradients=self.sdf.gradients,
-            free=self.free,
-            contacts=self.contacts,
-            free_spacing=self.free_spacing,
-            initial_set=self.initial_set,
-            workspace=self.workspace.bounds,
-            object_bounds=self.object_bounds,
-            world_from_object=self.world_from_object,
-        )
-
-    @classmethod
-    def load(cls, path: Path) -> PosedProblem:
-        """Read what `save` wrote."""
-        with np.load(path) as data:
-            parts = [data[f"sdf_{name}"] for name in ("origin", "resolution", "values")]
-            sdf = SdfGrid(parts[0], float(parts[1]), parts[2], data["sdf_gradients"])
-            lower, upper = data["workspace"].tolist()
-            return cls(
-                sdf,
-                data["free"],
-                data["contacts"],
-                float(data["free_spacing"]),
-                data["initial_set"],
-                Workspace(tuple(lower), tuple(upper)),
-                data["object_bounds"],
-                data["world_from_object"],
-            )
+        """Write the problem for another process."""
+        save_problem(self.registration_problem(), self.object_bounds, path)
 
 
 def pose(problem: Problem, seed: int) -> PosedProblem:

@@ -12,8 +12,8 @@ from chsel.problem.points import KnownPoints
 from replay.environment import environment
 from replay.events import HypothesesFound, Probe, ProblemPosed, Recorder, SessionStarted
 from replay.registration import StepObserver
-from runners.benchmarks.ours import Steps, method
 from runners.benchmarks.problems import PosedProblem, drill
+from runners.benchmarks.registrations import Steps, method
 from runners.benchmarks.timing import in_turn
 from runners.run.recording import RecordingConfig, open_recorder
 
@@ -37,8 +37,6 @@ def recorded_registrations(
             recorder = open_recorder(folder / name, files)
             stack.callback(recorder.close)
             sessions[name] = _session(recorder, posed, preset, steps, files.snapshot_interval)
-        for register_once in sessions.values():
-            register_once()
         return in_turn(repeats, sessions)
 
 

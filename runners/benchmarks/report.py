@@ -12,7 +12,7 @@ from rich.box import MARKDOWN, SIMPLE_HEAD, Box
 from rich.table import Table
 
 from replay.console import Console
-from runners.benchmarks.ours import PRESETS
+from runners.benchmarks.registrations import PRESETS
 from runners.run.recording import write_in_run_folder
 
 Values = Mapping[str, Any]

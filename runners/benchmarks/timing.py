@@ -1,28 +1,35 @@
-"""Repeated measurements of one thing, and what is said of them."""
+"""Repeated measurements, and the machine on which they are taken."""
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
+
+from chsel.cost.torch_cost import gpus
+from chsel.numerics.threads import threads
+from replay.environment import environment
+from replay.startup import package_version
+
+_PACKAGES = ("numba", "llvmlite", "scipy")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table.
+    """One line of a table."""
 
-    measure: what was varied or looked at. case: the value of it. who: which registration.
-    samples: in `unit`, in the order in which they were taken. at: the case as a number, to plot.
-    """
-
-    measure: str
-    case: str
-    who: str
+    measure: str  # what was varied or looked at
+    case: str  # the value of it
+    who: str  # which registration
     unit: str
-    samples: tuple[float, ...]
-    at: float | None = None
+    samples: tuple[float, ...]  # in the order in which they were taken
+    at: float | None = None  # the case as a number, to plot
 
     @property
     def median(self) -> float:
@@ -38,25 +45,47 @@ class Row:
     def mapping(self) -> dict[str, Any]:
         """The row as the report's file has it."""
         lower, upper = self.quartiles
-        return {
-            "measure": self.measure,
-            "case": self.case,
-            "who": self.who,
-            "at": self.at,
-            "unit": self.unit,
-            "median": self.median,
-            "lower_quartile": lower,
-            "upper_quartile": upper,
-            "samples": list(self.samples),
-        }
+        quartiles = {"lower_quartile": lower, "upper_quartile": upper}
+        samples = {"samples": list(self.samples)}
+        return {**vars(self), "median": self.median, **quartiles, **samples}
 
 
 def in_turn(
-    repeats: int, measured: Mapping[str, Callable[[], float]]
+    repeats: int, measured: Mapping[str, Callable[[], float]], *, first_counts: bool = False
 ) -> dict[str, tuple[float, ...]]:
-    """Take every measurement once, then all of them again: A B A B, never two at a time."""
+    """Take every measurement once, then all of them again: A B A B, never two at a time.
+
+    first_counts: else each is taken once more, before all others, and that is left out.
+    """
     samples: dict[str, list[float]] = {name: [] for name in measured}
-    for _ in range(repeats):
+    for _ in range(repeats if first_counts else repeats + 1):
         for name, measure in measured.items():
             samples[name].append(measure())
-    return {name: tuple(values) for name, values in samples.items()}
+    return {name: tuple(values[-repeats:]) for name, values in samples.items()}
+
+
+def milliseconds(run: Callable[[], object], count: int | None = None) -> float:
+    """What a run takes, on so many threads where that is given."""
+    with nullcontext() if count is None else threads(count):
+        begun = time.perf_counter()
+        run()
+        return 1000.0 * (time.perf_counter() - begun)
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores, GPU, Python and versions."""
+    values: dict[str, Any] = {**environment(), "cores": os.cpu_count(), "cores_usable": cores()}
+    values["gpu"] = torch.cuda.get_device_name() if gpus() else None
+    return values | {f"package {name}": package_version(name) for name in _PACKAGES}
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def load() -> float | None:
+    """Processes that ran or waited on average over the last minute, where the system says so."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None

@@ -7,8 +7,7 @@ import pytest
 
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.benchmarks.depth_images import CAMERA, POSE, depth_images, scene
-from runners.benchmarks.ours import Steps
-from runners.benchmarks.scope import Scope
+from runners.benchmarks.registrations import Scope, Steps
 
 
 def test_the_scene_is_a_ball_on_the_floor_in_front_of_a_wall() -> None:

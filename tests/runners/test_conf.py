@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from chsel.plausible.true_pose import TruePoseSettings
-from runners.benchmarks.ours import Steps
-from runners.benchmarks.published import PackageConfig
+from runners.benchmarks.registrations import Steps
 from runners.command.choices import CONF
 from runners.evaluation.metrics import MetricsConfig
+from runners.published_package.environment import PackageConfig
 from runners.reporting.section import SequenceConfig
 from runners.run.recording import RecordingConfig
 from runners.sessions.points import PointsSettings

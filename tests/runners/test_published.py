@@ -15,9 +15,10 @@ import torch
 from chsel.problem.poses import inverse
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
-from runners.benchmarks.published import BenchmarkError, RefusedError
-from runners.benchmarks.published_worker import Worker
 from runners.evaluation.repeats import repeat_seed
+from runners.published_package.environment import PackageError
+from runners.published_package.process import RefusedError
+from runners.published_package.worker import Worker
 from tests.runners.in_process import Done, run
 from tests.runners.test_evaluate import SMALL, table
 
@@ -176,7 +177,7 @@ def test_a_process_that_ends_stops_all_and_leaves_what_is_finished(
     register(folder, tmp_path)
 
     def die(*_: object, **__: object) -> None:
-        raise BenchmarkError("its process ended: Killed")
+        raise PackageError("its process ended: Killed")
 
     monkeypatch.setattr(stand_in, "ask", die)
     done = register(folder, tmp_path, "draws=2")

@@ -14,22 +14,19 @@ from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Observer
 from chsel.problem.settings import in_preset
-from runners.benchmarks.problems import PosedProblem
+from runners.benchmarks.problems import PosedProblem, Problem, pose
 
 PRESETS = ("reference", "paper", "default")
 
 
 @dataclass(frozen=True)
 class Steps:
-    """How much every registration does, by either package; none stops early.
+    """How much every registration does, by either package; none stops early."""
 
-    restarts x adam: Adam steps. search: CMA-MEGA iterations; long_search: in the longer row.
-    """
-
-    restarts: int = 10
-    adam: int = 50
-    search: int = 100
-    long_search: int = 500
+    restarts: int = 10  # of descent
+    adam: int = 50  # Adam steps of a restart
+    search: int = 100  # CMA-MEGA iterations
+    long_search: int = 500  # the same, in the longer row
 
     def __post_init__(self) -> None:
         for name in ("restarts", "adam", "search", "long_search"):
@@ -62,6 +59,28 @@ def register(
     problem = posed.registration_problem()
     hypotheses = method(preset, steps, search).register(problem, observer)
     return time.perf_counter() - begun, hypotheses
+
+
+@dataclass(frozen=True)
+class Scope:
+    """How much is measured of this library alone."""
+
+    steps: Steps
+    repeats: int
+    seed: int
+    free_points: tuple[int, ...] = ()  # sizes that show how the time grows
+    hypotheses: tuple[int, ...] = ()
+    gpu: bool = False  # whether evaluation is measured there, too
+
+    def timed(self, problem: Problem, preset: str) -> tuple[float, ...]:
+        """Milliseconds of repeated registrations of a problem, after one that is not counted."""
+        posed = pose(problem, self.seed)
+        self.seconds(posed, preset)
+        return tuple(1000.0 * self.seconds(posed, preset) for _ in range(self.repeats))
+
+    def seconds(self, posed: PosedProblem, preset: str) -> float:
+        """Seconds of one registration."""
+        return register(posed, preset, self.steps, self.steps.search)[0]
 
 
 def common_costs(posed: PosedProblem, poses: FloatArray) -> FloatArray:

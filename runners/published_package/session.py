@@ -18,7 +18,8 @@ from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import in_preset
 from chsel.problem.streams import Purpose
 from chsel.qd.selection import repeated
-from runners.benchmarks.published import PublishedPackage, RefusedError
+from runners.published_package.problem_file import save_problem
+from runners.published_package.process import PublishedPackage, RefusedError
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
 HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")
@@ -77,7 +78,7 @@ class PackageSession:
     def _registered(self, problem: RegistrationProblem, mesh: trimesh.Trimesh) -> PackageSet:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "problem.npz"
-            save_problem(problem, mesh, path)
+            save_problem(problem, mesh.bounds, path)
             self.package.ask("load", problem=str(path))
         # It draws from generators of its own, of one number that follows from ours.
         seed = int(problem.key.stream(Purpose.EMITTER).integers(2**32))
@@ -95,22 +96,3 @@ class PackageSession:
         found = Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites)
         seconds, cpu = float(answer["seconds"]), float(answer["cpu_seconds"])
         return PackageSet(found, seconds, cpu, int(answer["free_points"]))
-
-
-def save_problem(problem: RegistrationProblem, mesh: trimesh.Trimesh, path: Path) -> None:
-    """Write the arrays from which the package's process starts."""
-    np.savez(
-        path,
-        sdf_origin=problem.sdf.origin,
-        sdf_resolution=problem.sdf.resolution,
-        sdf_values=problem.sdf.values,
-        sdf_gradients=problem.sdf.gradients,
-        object_bounds=np.asarray(mesh.bounds, dtype=np.float64),
-        free=problem.points.free,
-        free_spacing=problem.free_resolution,
-        contacts=problem.points.known,
-        known_sdf=problem.points.sdf,
-        occupied=problem.points.occupied,
-        initial_set=problem.initial_set,
-        low_cost_set=problem.low_cost_set,
-    )

@@ -13,9 +13,9 @@ import numpy as np
 
 from replay.files import file_digest, whole_file
 from runners.evaluation.external_results import REPEAT_FOLDER
-from runners.evaluation.package_session import PackageSet
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.repeats import repeat_label
+from runners.published_package.session import PackageSet
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Registers with the published package `chsel`, in the interpreter that has it, on request.
 
 A program of its own that imports nothing of this project, whose package has the same name. It
-reads requests and writes answers, one JSON object a line; see runners/benchmarks/published.py.
+reads requests and writes answers, one JSON object a line; see process.py.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Worker:
                 cache_path=str(Path(folder) / "sdf.pkl"),
             )
         free, contacts = self._data["free"], self._data["contacts"]
-        occupied = self._data.get("occupied", np.zeros((0, 3)))
+        occupied = self._data["occupied"]
         classes = self._chsel.SemanticsClass
         points = np.concatenate([free, contacts, occupied])
         self._positions = torch.tensor(points, dtype=torch.float32)

@@ -14,6 +14,8 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
+from chsel.methods import METHODS, build_method
+from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads as use_threads
 from chsel.problem.online_registration import OnlineSettings, first_initial_set
@@ -21,15 +23,14 @@ from chsel.problem.settings import in_preset
 from chsel.problem.streams import StreamKey
 from runners.benchmarks.depth_images import depth_images
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
-from runners.benchmarks.methods import methods
-from runners.benchmarks.ours import PRESETS, StageTimer, register
 from runners.benchmarks.plausible import plausible_sets
 from runners.benchmarks.problems import PROBLEMS, PosedProblem, Problem, pose
 from runners.benchmarks.recorded import recorded_registrations
-from runners.benchmarks.scope import Scope
-from runners.benchmarks.timing import Row, in_turn
+from runners.benchmarks.registrations import PRESETS, Scope, StageTimer, register
+from runners.benchmarks.timing import Row, in_turn, milliseconds
 
 _PROBLEM = "real_20"
+_BESIDE = "chsel"
 _THREADED = ("real_20", "large_20")
 _THREADS = (1, 2)
 _POSES = 100_000
@@ -64,8 +65,6 @@ def threads(scope: Scope) -> Iterator[Row]:
         posed = pose(PROBLEMS[problem], scope.seed)
         for preset in PRESETS:
             cases = {str(count): partial(measured, posed, preset, count) for count in _THREADS}
-            for case in cases.values():
-                case()
             for name, samples in in_turn(scope.repeats, cases).items():
                 yield Row("threads", f"{problem}, {name}", preset, "ms", samples, float(name))
 
@@ -87,6 +86,22 @@ def hypotheses(scope: Scope) -> Iterator[Row]:
         for preset in PRESETS:
             samples = scope.timed(Problem(hypotheses=count), preset)
             yield Row("hypotheses", str(count), preset, "ms", samples, float(count))
+
+
+def methods(scope: Scope) -> Iterator[Row]:
+    """Every method in preset default, stopping when it does, in turn; and as times of CHSEL's."""
+    posed = pose(PROBLEMS[_PROBLEM], scope.seed)
+
+    def measured(method: Method) -> float:  # from arrays to hypotheses
+        return milliseconds(lambda: method.register(posed.registration_problem()))
+
+    cases = {name: partial(measured, build_method(name)) for name in METHODS}
+    samples = in_turn(scope.repeats, cases)
+    for name, taken in samples.items():
+        yield Row("method", name, "default", "ms", taken)
+    for name, taken in samples.items():
+        ratios = tuple(np.divide(taken, samples[_BESIDE]).tolist())
+        yield Row(f"method, {_BESIDE} = 1", name, "default", "x", ratios)
 
 
 def evaluation(scope: Scope) -> Iterator[Row]:

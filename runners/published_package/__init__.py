@@ -1,0 +1,1 @@
+"""The authors' published package `chsel`, in an environment and a process of its own."""

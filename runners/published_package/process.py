@@ -1,0 +1,99 @@
+"""A process that registers with the published package, on request."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from runners.published_package.environment import PUBLISHED, PackageError, last_line
+
+_WORKER = Path(__file__).with_name("worker.py")
+_ACCEPTED = f"accepted: an interpreter that has chsel=={PUBLISHED}, or package.skip=true"
+
+
+class RefusedError(PackageError):
+    """The package cannot do what it was asked for; its process goes on."""
+
+
+class PublishedPackage:
+    """A process that registers with the package, one request at a time."""
+
+    def __init__(self, python: Path) -> None:
+        """Raises PackageError if `python` is no interpreter that has the package."""
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+        self._printed = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close)
+        try:
+            self._process = subprocess.Popen(
+                [str(python), "-I", str(_WORKER)],  # -I: no chsel but the installed one
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._printed,
+                env=environment,
+                text=True,
+            )
+        except OSError as error:
+            self._printed.close()
+            raise PackageError(
+                f"package.python {python} does not run ({error.strerror}); {_ACCEPTED}"
+            ) from None
+        try:
+            self._answer()
+            self.versions = self.ask("describe")
+        except PackageError as error:
+            self.close()
+            raise PackageError(
+                f"{python} cannot use the published package: {error}; {_ACCEPTED}"
+            ) from None
+        if self.versions["chsel"] != PUBLISHED:
+            self.close()
+            raise PackageError(f"{python} has chsel {self.versions['chsel']}; {_ACCEPTED}")
+
+    def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
+        """Have the process do a task (a method of the worker's) and return its answer."""
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):  # the missing answer tells more
+            self._process.stdin.write(json.dumps({"task": task, **arguments}) + "\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._printed.seek(0)
+            printed = self._printed.read().decode(errors="replace")
+            raise PackageError(f"its process ended: {last_line(printed)}")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            text = " ".join(answer["error"].split())
+            hint = "; on Debian, apt install libusb-1.0-0" if "libusb" in text else ""
+            raise RefusedError(f"{text}{hint}")
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with suppress(BrokenPipeError):
+            self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.kill()
+        self._process.wait()
+        self._printed.close()
+
+    def __enter__(self) -> PublishedPackage:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
