@@ -13,7 +13,7 @@ from chsel.sensing.regions import depth_regions, speckle_free
 from replay.events import SensorImage
 from runners.sensors.cell import Cell
 from runners.sensors.log.messages import ImageMessage
-from runners.sensors.rig import BubbleRig, CameraRig
+from runners.sensors.rig import BubbleRig, CameraRig, GateRig
 from runners.sensors.session_report import Counts
 
 INTEGER_UNIT = 0.001  # m: of 16-bit depth images, as all the world has it
@@ -80,6 +80,39 @@ def intrinsics_of(camera: PinholeCamera) -> FloatArray:
 _EARLY = 0.95  # of the interval between two images: stamps are not exact
 
 
+def edge_pixels(rig: CameraRig, depth: FloatArray, valid: BoolArray) -> BoolArray:
+    """Valid pixels (H, W) beside a jump of depth (H, W), metres; none, if the rig asks for all."""
+    if rig.edge is None:
+        return np.zeros_like(valid)
+    return occlusion_edges(depth, valid, rig.edge, reach=rig.edge_reach)
+
+
+def ray_ends(
+    depth: FloatArray, valid: BoolArray, usable: BoolArray, camera: PinholeCamera, gate: GateRig
+) -> tuple[FloatArray, int]:
+    """Depths (H, W) up to which rays of usable pixels are free, and how many end before their own.
+
+    The rays of speckles end at the least depth of the valid pixels around them.
+    """
+    regions = depth_regions(depth, usable, camera, gate.jump)
+    return speckle_free(depth, valid, regions, gate.speckle)
+
+
+def mark_rays(
+    grid: FreeGrid,
+    rig: CameraRig,
+    ends: FloatArray,
+    camera: PinholeCamera,
+    world_from_camera: FloatArray,
+    usable: BoolArray,
+) -> None:
+    """Mark what the rays of usable pixels (H, W) pass on their way to `ends` (H, W), metres."""
+    if rig.rays == "scaled_images":
+        grid.scaled_images(ends, camera, world_from_camera, usable)
+    else:
+        grid.from_depth(ends, camera, world_from_camera, usable, fraction=rig.fraction)
+
+
 class DepthCamera:
     """Marks what it sees through (CHSEL, Sec. V-B: rays to 95 % of the depth)."""
 
@@ -101,18 +134,14 @@ class DepthCamera:
         view = self._source.view(time, message, counts)
         if view is None:
             return
-        usable = view.valid
-        if self._rig.edge is not None:
-            edges = occlusion_edges(
-                view.metres, view.valid, self._rig.edge, reach=self._rig.edge_reach
-            )
-            counts.edges += int(edges.sum())
-            usable = view.valid & ~edges
+        edges = edge_pixels(self._rig, view.metres, view.valid)
+        counts.edges += int(edges.sum())
+        usable = view.valid & ~edges
         if not usable.any():
             counts.unusable += 1
             self._cell.warnings.warn(f"{self._rig.name}: an image without a pixel that counts")
             return
-        self._mark(view, self._ends(view, usable, counts), usable, counts)
+        self._mark(view, usable, counts)
         counts.used += 1
         self._last_time, self._last = time, (view, usable)
 
@@ -133,26 +162,17 @@ class DepthCamera:
             view.world_from_camera,
         )
 
-    def _ends(self, view: View, usable: BoolArray, counts: Counts) -> FloatArray:
-        """Depths (H, W) up to which rays are free: of speckles the least of what is around them."""
-        gate = self._cell.gate
-        regions = depth_regions(view.metres, usable, self._source.camera, gate.jump)
-        ends, small = speckle_free(view.metres, view.valid, regions, gate.speckle)
-        counts.small += small
-        return ends
-
     def _too_soon(self, time: int) -> bool:
         if self._rig.rate is None or self._last_time is None:
             return False
         return 0 <= time - self._last_time < _EARLY * 1e9 / self._rig.rate
 
-    def _mark(self, view: View, ends: FloatArray, usable: BoolArray, counts: Counts) -> None:
+    def _mark(self, view: View, usable: BoolArray, counts: Counts) -> None:
+        camera = self._source.camera
+        ends, small = ray_ends(view.metres, view.valid, usable, camera, self._cell.gate)
+        counts.small += small
         with self._cell.free.by(counts) as grid:
             target = grid if self._own is None else self._own
-            arguments = (ends, self._source.camera, view.world_from_camera, usable)
-            if self._rig.rays == "scaled_images":
-                target.scaled_images(*arguments)
-            else:
-                target.from_depth(*arguments, fraction=self._rig.fraction)
+            mark_rays(target, self._rig, ends, camera, view.world_from_camera, usable)
             if self._own is not None:
                 grid.at(self._own.new())

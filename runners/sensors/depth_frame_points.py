@@ -13,11 +13,12 @@ from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply
-from chsel.sensing.depth_camera import occlusion_edges, valid_pixels
+from chsel.sensing.depth_camera import valid_pixels
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.regions import depth_regions, main_regions, speckle_free
+from chsel.sensing.regions import depth_regions, main_regions
+from runners.sensors.depth_camera import edge_pixels, mark_rays, ray_ends
 from runners.sensors.depth_frame import DepthFrame
-from runners.sensors.rig import CameraRig, Rig
+from runners.sensors.rig import Rig
 from runners.sensors.session_report import Counts
 
 LABEL_MARGIN = 2  # pixels: by so much a label's outline may be off the depth image's
@@ -55,7 +56,7 @@ def depth_frame_points(
             f"no pixel of depth lies in the range of camera {camera.name}, {nearest:g} m to "
             f"{furthest:g} m; its median is {typical:.4g} m: check depth_scale"
         )
-    edges = _edges(frame, camera, valid)
+    edges = edge_pixels(camera, frame.depth, valid)
     measured = frame.camera.back_project(frame.depth)
     counts = Counts(images=1, used=1, pixels=valid.size, invalid=int((~valid).sum()))
     counts.edges = int(edges.sum())
@@ -66,14 +67,14 @@ def depth_frame_points(
         surface = _connected(frame, rig, surface, measured, diameter, labelled)
         rays &= surface | ~frame.label
         counts.outline, counts.far = labelled.outline, labelled.far
-    regions = depth_regions(frame.depth, rays, frame.camera, rig.gate.jump)
-    ends, small = speckle_free(frame.depth, valid, regions, rig.gate.speckle)
+    ends, small = ray_ends(frame.depth, valid, rays, frame.camera, rig.gate)
     counts.small = small + (0 if labelled is None else labelled.small)
     on_object = apply(frame.world_from_camera, measured[surface])
     workspace = _workspace(rig, on_object, diameter)
-    free = _free_voxels(frame, ends, camera, workspace, free_resolution, rays)
+    grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
+    mark_rays(grid, camera, ends, frame.camera, frame.world_from_camera, rays)
     points = KnownPoints(
-        free=_outside_of(on_object, free, free_resolution),
+        free=_outside_of(on_object, grid.new(), free_resolution),
         known=one_per_voxel(on_object, rig.surface_resolution),
     )
     counts.contacts, counts.free = len(points.known), len(points.free)
@@ -88,12 +89,6 @@ def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
     nearest_first = np.argsort(distance, kind="stable")
     _, first = np.unique(voxels[nearest_first], axis=0, return_index=True)
     return points[np.sort(nearest_first[first])]
-
-
-def _edges(frame: DepthFrame, camera: CameraRig, valid: BoolArray) -> BoolArray:
-    if camera.edge is None:
-        return np.zeros_like(valid)
-    return occlusion_edges(frame.depth, valid, camera.edge, reach=camera.edge_reach)
 
 
 def _surface_pixels(
@@ -143,24 +138,6 @@ def _workspace(rig: Rig, on_object: FloatArray, diameter: float | None) -> Works
             "[[x0, x1], [y0, y1], [z0, z1]]"
         )
     return Workspace.around(on_object, diameter)
-
-
-def _free_voxels(
-    frame: DepthFrame,
-    ends: FloatArray,
-    camera: CameraRig,
-    workspace: Workspace,
-    free_resolution: float,
-    pixels: BoolArray,
-) -> FloatArray:
-    """Centres (N, 3) of the voxels that rays of pixels passed on their way to `ends` (H, W)."""
-    grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
-    view = (ends, frame.camera, frame.world_from_camera, pixels)
-    if camera.rays == "scaled_images":
-        grid.scaled_images(*view)
-    else:
-        grid.from_depth(*view, fraction=camera.fraction)
-    return grid.new()
 
 
 def _outside_of(on_object: FloatArray, free: FloatArray, spacing: float) -> FloatArray:

@@ -67,7 +67,7 @@ def compressed_image(frame: str, values: np.ndarray, stamp: int) -> dict[str, An
 
 def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]:
     """A sensor_msgs/CameraInfo of a camera without distortion."""
-    cx, cy, f = camera.cx, camera.cy, camera.fx
+    cx, cy, fx, fy = camera.cx, camera.cy, camera.fx, camera.fy
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width", "do_rectify"), 0)
     return {
         "header": header(frame, stamp),
@@ -75,9 +75,9 @@ def camera_info(frame: str, camera: PinholeCamera, stamp: int) -> dict[str, Any]
         "width": camera.width,
         "distortion_model": "plumb_bob",
         "d": [0.0] * 5,
-        "k": [f, 0.0, cx, 0.0, f, cy, 0.0, 0.0, 1.0],
+        "k": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        "p": [f, 0.0, cx, 0.0, 0.0, f, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+        "p": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
         "binning_x": 0,
         "binning_y": 0,
         "roi": region,

@@ -25,7 +25,9 @@ from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer
 from PIL import Image
 
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log.ros2_definitions import full_definition
+from runners.simulated_robot.ros_messages import camera_info, header, image, joint_state
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
@@ -72,26 +74,13 @@ def write_foxglove(path: Path, sent: Sequence[tuple[str, Any, int]]) -> bytes:
     return path.read_bytes()
 
 
-def header(frame: str, stamp: int) -> dict[str, Any]:
-    """A std_msgs/Header."""
-    seconds, nanoseconds = divmod(stamp, SECOND)
-    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
-
-
 def ros2_image(values: np.ndarray, stamp: int, **changes: Any) -> dict[str, Any]:
     """A sensor_msgs/Image, its rows with four bytes of padding."""
     rows = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), -1)
     rows = np.pad(rows, ((0, 0), (0, 4)))
-    message = {
-        "header": header("camera", stamp),
-        "height": values.shape[0],
-        "width": values.shape[1],
-        "encoding": "16UC1" if values.dtype.itemsize == 2 else "32FC1",
-        "is_bigendian": int(values.dtype.byteorder == ">"),
-        "step": rows.shape[1],
-        "data": rows.tobytes(),
-    }
-    return {**message, **changes}
+    return (
+        image("camera", values, stamp) | {"step": rows.shape[1], "data": rows.tobytes()} | changes
+    )
 
 
 def ros2_transform(
@@ -147,87 +136,47 @@ def depth(seed: int = 0) -> np.ndarray:
 def ros2_sent(count: int = 4) -> list[Sent]:
     """What a robot sends in a few seconds; log times are 1 ms after the stamps."""
     sent: list[Sent] = []
-    camera = {
-        "header": header("camera", BEGIN),
-        "height": 3,
-        "width": 5,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5,
-        "k": [400.0, 0.0, 2.0, 0.0, 410.0, 1.0, 0.0, 0.0, 1.0],
-        "r": [0.0] * 9,
-        "p": [0.0] * 12,
-        "binning_x": 0,
-        "binning_y": 0,
-        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
-    }
     for step in range(count):
         stamp = BEGIN + step * SECOND
-        quantised = struct.pack("<iff", 1, 100.0, -20.0) + png(depth(step))
+        camera, base = {"header": header("camera", stamp)}, {"header": header("base", stamp)}
+        fixed = ros2_transform("base", "camera", (0.0, 0.0, 1.0), stamp)
+        moved = ros2_transform("world", "base", (step, 0.0, 0.0), stamp)
+        info = camera_info("camera", PinholeCamera(5, 3, 400.0, 410.0, 2.0, 1.0), stamp)
+        packed = {**camera, "format": "png", "data": png(depth(step))}
+        quantised = struct.pack("<iff", 1, 100.0, -20.0) + packed["data"]
+        inverse = {**camera, "format": "32FC1; compressedDepth png", "data": quantised}
         pose = {
             "position": {"x": 1.0, "y": 2.0, "z": 3.0},
             "orientation": dict(zip("xyzw", QUARTER_TURN, strict=True)),
         }
+        wrench = {
+            "force": {"x": 1.0, "y": 2.0, "z": -3.0},
+            "torque": {"x": 0.25, "y": 0.0, "z": 0.5},
+        }
+        joints = joint_state(["elbow", "wrist"], [0.5, -0.25], stamp)
+        cloud = ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)
         of_step: list[tuple[str, str, Any]] = [
-            ("/tf_static", "tf2_msgs/TFMessage", [("base", "camera", (0.0, 0.0, 1.0))]),
-            ("/tf", "tf2_msgs/TFMessage", [("world", "base", (step, 0.0, 0.0))]),
+            ("/tf_static", "tf2_msgs/TFMessage", {"transforms": [fixed]}),
+            ("/tf", "tf2_msgs/TFMessage", {"transforms": [moved]}),
             ("/depth", "sensor_msgs/Image", ros2_image(depth(step), stamp)),
-            (
-                "/compressed",
-                "sensor_msgs/CompressedImage",
-                {"header": header("camera", stamp), "format": "png", "data": png(depth(step))},
-            ),
-            (
-                "/quantised",
-                "sensor_msgs/CompressedImage",
-                {
-                    "header": header("camera", stamp),
-                    "format": "32FC1; compressedDepth png",
-                    "data": quantised,
-                },
-            ),
-            ("/info", "sensor_msgs/CameraInfo", {**camera, "header": header("camera", stamp)}),
-            ("/pose", "geometry_msgs/PoseStamped", {"header": header("base", stamp), "pose": pose}),
-            (
-                "/poses",
-                "geometry_msgs/PoseArray",
-                {"header": header("base", stamp), "poses": [pose, pose]},
-            ),
-            (
-                "/point",
-                "geometry_msgs/PointStamped",
-                {"header": header("base", stamp), "point": {"x": 1.0, "y": 0.0, "z": 2.0}},
-            ),
+            ("/compressed", "sensor_msgs/CompressedImage", packed),
+            ("/quantised", "sensor_msgs/CompressedImage", inverse),
+            ("/info", "sensor_msgs/CameraInfo", info),
+            ("/pose", "geometry_msgs/PoseStamped", {**base, "pose": pose}),
+            ("/poses", "geometry_msgs/PoseArray", {**base, "poses": [pose, pose]}),
+            ("/point", "geometry_msgs/PointStamped", {**base, "point": {"x": 1.0, "z": 2.0}}),
             (
                 "/wrench",
                 "geometry_msgs/WrenchStamped",
-                {
-                    "header": header("hand", stamp),
-                    "wrench": {
-                        "force": {"x": 1.0, "y": 2.0, "z": -3.0},
-                        "torque": {"x": 0.25, "y": 0.0, "z": 0.5},
-                    },
-                },
+                {"header": header("hand", stamp), "wrench": wrench},
             ),
-            (
-                "/joints",
-                "sensor_msgs/JointState",
-                {
-                    "header": header("", stamp),
-                    "name": ["elbow", "wrist"],
-                    "position": [0.5, -0.25],
-                    "velocity": [],
-                    "effort": [],
-                },
-            ),
-            ("/cloud", "sensor_msgs/PointCloud2", ros2_cloud(np.arange(6.0).reshape(2, 3), stamp)),
+            ("/joints", "sensor_msgs/JointState", joints),
+            ("/cloud", "sensor_msgs/PointCloud2", cloud),
             ("/probe", "std_msgs/String", {"data": f"begin {step}"}),
             ("/touch", "std_msgs/Bool", {"data": step % 2 == 0}),
             ("/count", "std_msgs/Int32", {"data": -step}),
         ]
-        for topic, kind, message in of_step:
-            if kind == "tf2_msgs/TFMessage":
-                message = {"transforms": [ros2_transform(*one, stamp) for one in message]}
-            sent.append((topic, kind, message, stamp + 10**6))
+        sent += [(*one, stamp + 10**6) for one in of_step]
     return sent
 
 
