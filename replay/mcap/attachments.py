@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from chsel.errors import RecordingError
+from chsel.problem.mesh import mesh_digest
 from chsel.problem.sdf_grid import SdfGrid
 from replay.mcap.encoding import decode, encode
 from replay.mcap.schemas import MESH, SDF_GRID
-from replay.mcap.validation import check_mesh
+from replay.mcap.validation import check_digest, check_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -65,6 +67,19 @@ def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
         raise RecordingError(f"attachment {MESH} has a face that is no triangle")
     check_mesh(vertices, indices)
     return trimesh.Trimesh(vertices.astype(np.float64), indices, process=False)
+
+
+def attached(attachments: Mapping[str, bytes], name: str, digest: str) -> trimesh.Trimesh | SdfGrid:
+    """The mesh or the grid among attachments; RecordingError unless it has the digest."""
+    if name not in attachments:
+        raise RecordingError(f"it lacks the attachment {name}")
+    if name == MESH:
+        mesh = mesh_from_ply(attachments[name])
+        check_digest(f"attachment {name}", mesh_digest(mesh), digest)
+        return mesh
+    sdf = sdf_from_bytes(attachments[name])
+    check_digest(f"attachment {name}", sdf.digest, digest)
+    return sdf
 
 
 def sdf_to_bytes(sdf: SdfGrid) -> bytes:

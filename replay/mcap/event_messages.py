@@ -10,15 +10,16 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, get_args
 
-from chsel.errors import RecordingError
 from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.registration_problem import ArchiveSnapshot
+from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.events import Event, ProblemPosed, SessionStarted
 from replay.lost_attachment import LostAttachment
 from replay.mcap.plain_config import config_from_json, config_to_json
 from replay.mcap.schemas import FORMAT_VERSION, MESSAGES, RECORDS
+from replay.mcap.validation import check_digest
 
 if TYPE_CHECKING:
     import trimesh
@@ -101,6 +102,19 @@ def problem_values(event: ProblemPosed, *, repeats_elites: bool) -> dict[str, An
     return values | {"low_cost_set": None} if repeats_elites else values
 
 
+def problem_from(
+    values: Mapping[str, Any], sdf: SdfGrid, points: KnownPoints
+) -> RegistrationProblem:
+    """The problem in a message that has its low-cost set, with its grid and points."""
+    parts = {
+        "workspace": workspace_from(values),
+        "key": StreamKey(values["key_seed"], values["key_step"]),
+        "sdf": sdf,
+        "points": points,
+    }
+    return RegistrationProblem(**shared_arguments(RegistrationProblem, values) | parts)
+
+
 def archive_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
     """The message `ArchiveSnapshot`."""
     return {"step": step} | shared_values("ArchiveSnapshot", archive)
@@ -116,9 +130,3 @@ def archive_from(values: Mapping[str, Any]) -> ArchiveSnapshot:
 def workspace_from(values: Mapping[str, Any]) -> Workspace:
     """The workspace of a message."""
     return Workspace(*values["workspace"].tolist())
-
-
-def check_digest(what: str, digest: str, recorded: str) -> None:
-    """Raise RecordingError unless a digest is the recorded one."""
-    if digest != recorded:
-        raise RecordingError(f"{what} has digest {digest}, not {recorded} as recorded")

@@ -10,11 +10,9 @@ import numpy as np
 
 from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.mesh import mesh_digest
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
 from replay.events import (
     Event,
     HypothesesFound,
@@ -26,16 +24,15 @@ from replay.events import (
     SnapshotTaken,
 )
 from replay.lost_attachment import LostAttachment
-from replay.mcap.attachments import MESH, SDF_GRID, mesh_from_ply, sdf_from_bytes
+from replay.mcap.attachments import MESH, SDF_GRID, attached
 from replay.mcap.contents import Contents
 from replay.mcap.encoding import check_message, decode, message_class
 from replay.mcap.event_messages import (
     archive_from,
-    check_digest,
     event_from,
+    problem_from,
     session_from,
     shared_arguments,
-    workspace_from,
 )
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import CLOUDS, VIEWS, cloud_points, log_level_and_text
@@ -49,11 +46,11 @@ from replay.mcap.schemas import (
 )
 from replay.mcap.seal import CONTENTS, SEAL
 from replay.mcap.sensor_messages import ImagePlace, check_pixels, plausible_pixels, rig_from
-from replay.mcap.validation import EventOrder, check_cells
+from replay.mcap.validation import EventOrder, check_cells, check_digest
 from replay.mcap.wire import parsed
 
 if TYPE_CHECKING:
-    import trimesh
+    pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,28 +59,24 @@ class RecordedProblem:
 
     topic: ClassVar[str] = ProblemPosed.topic
 
-    step: int
-    initial_set: FloatArray
-    low_cost_set: FloatArray
-    workspace: Workspace
-    free_resolution: float
-    key: StreamKey
-    points_digest: str
-    digest: str
+    values: Mapping[str, Any]  # of the message `Problem`, the low-cost set included
+
+    @property
+    def step(self) -> int:
+        """Of the registration."""
+        return int(self.values["step"])
+
+    @property
+    def seed(self) -> int:
+        """Of the random streams."""
+        return int(self.values["key_seed"])
 
     def completed(self, sdf: SdfGrid, points: KnownPoints) -> RegistrationProblem:
         """The whole problem; RecordingError unless it is the one that was recorded."""
-        problem = RegistrationProblem(
-            sdf=sdf,
-            points=points,
-            initial_set=self.initial_set,
-            workspace=self.workspace,
-            free_resolution=self.free_resolution,
-            key=self.key,
-            low_cost_set=self.low_cost_set,
-        )
-        check_digest(f"the problem of step {self.step}", problem.digest, self.digest)
-        check_digest(f"all points of step {self.step}", points.digest, self.points_digest)
+        problem = problem_from(self.values, sdf, points)
+        check_digest(f"the problem of step {self.step}", problem.digest, self.values["digest"])
+        recorded = self.values["points_digest"]
+        check_digest(f"all points of step {self.step}", points.digest, recorded)
         return problem
 
 
@@ -126,8 +119,7 @@ class EventReader:
             raise RecordingError(f"a message on {topic} is out of place")
         step = message.log_time // STEP_TIME - 1
         if topic in CLOUDS:
-            if step != self._opening.get("step", BEFORE_ALL_STEPS):
-                raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
+            _check_step(topic, self._opening.get("step", BEFORE_ALL_STEPS), step)
             self._clouds[topic] = cloud_points(data, CLOUDS[topic])
         elif topic == "/log":
             self._append(Logged(step, *log_level_and_text(data)))
@@ -137,8 +129,7 @@ class EventReader:
             if topic == "/session":
                 self.version = _checked_version(data)
             values = decode(RECORDS[topic], data)
-            if values.get("step", step) != step:
-                raise RecordingError(f"a message on {topic} has a time of step {step}, not its own")
+            _check_step(topic, values.get("step", step), step)
             check_message(RECORDS[topic], values)
             if topic in ("/session", "/probe"):
                 self.within, self._opening = topic, values
@@ -235,56 +226,36 @@ class EventReader:
             raise RecordingError("its images have more pixels than a file of its size can hold")
 
     def _problem(self, values: dict[str, Any]) -> RecordedProblem:
-        step, low_cost_set = values["step"], values["low_cost_set"]
-        low_cost_set = self._last_elites if low_cost_set is None else low_cost_set
-        if low_cost_set is None:
-            raise RecordingError(f"the low-cost set of step {step} is missing")
+        step = values["step"]
+        if values["low_cost_set"] is None:
+            if self._last_elites is None:
+                raise RecordingError(f"the low-cost set of step {step} is missing")
+            values["low_cost_set"] = self._last_elites
         if self.version < SEALED_SINCE:
-            check_digest(
-                f"all points before the problem of step {step}",
-                self._points_digest,
-                values["points_digest"],
-            )
-        check_digest(
-            f"the SDF grid of the problem of step {step}", self._sdf_digest, values["sdf_digest"]
-        )
-        return RecordedProblem(
-            step=step,
-            initial_set=values["initial_set"],
-            low_cost_set=low_cost_set,
-            workspace=workspace_from(values),
-            free_resolution=values["free_resolution"],
-            key=StreamKey(values["key_seed"], values["key_step"]),
-            points_digest=values["points_digest"],
-            digest=values["digest"],
-        )
+            before = f"all points before the problem of step {step}"
+            check_digest(before, self._points_digest, values["points_digest"])
+        grid = f"the SDF grid of the problem of step {step}"
+        check_digest(grid, self._sdf_digest, values["sdf_digest"])
+        return RecordedProblem(values)
 
     def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
-        archive, step = None, values["step"]
-        if values["archive"] is not None:
-            archive = archive_from(values["archive"])
+        step, archive = values["step"], values["archive"]
+        if archive is not None:
+            archive = archive_from(archive)
         elif values["archive_is_last_snapshot"]:
-            if self._last_snapshot is None:
-                raise RecordingError(f"the archive of step {step} is missing")
             archive = self._last_snapshot
+            if archive is None:
+                raise RecordingError(f"the archive of step {step} is missing")
             check_cells(values["cell"], archive.shape)
         found = Hypotheses(**shared_arguments(Hypotheses, values | {"archive": archive}))
-        check_digest(f"the hypotheses of step {values['step']}", found.digest, values["digest"])
+        check_digest(f"the hypotheses of step {step}", found.digest, values["digest"])
         self._last_elites = found.elites
-        return HypothesesFound(values["step"], found)
+        return HypothesesFound(step, found)
 
 
-def attached(attachments: Mapping[str, bytes], name: str, digest: str) -> trimesh.Trimesh | SdfGrid:
-    """The mesh or the grid among attachments; RecordingError unless it has the digest."""
-    if name not in attachments:
-        raise RecordingError(f"it lacks the attachment {name}")
-    if name == MESH:
-        mesh = mesh_from_ply(attachments[name])
-        check_digest(f"attachment {name}", mesh_digest(mesh), digest)
-        return mesh
-    sdf = sdf_from_bytes(attachments[name])
-    check_digest(f"attachment {name}", sdf.digest, digest)
-    return sdf
+def _check_step(topic: str, step: int, timed: int) -> None:
+    if step != timed:
+        raise RecordingError(f"a message on {topic} has a time of step {timed}, not its own")
 
 
 def _checked_version(data: bytes) -> int:

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import quaternions
-from replay.mcap.cumulative_points import LEVELS
 from replay.mcap.schemas import PACKAGE, RECORDS
 from replay.mcap.texts import check_text
 from replay.mcap.wire import parsed
 
 POINT_CLASSES = ("free", "occupied", "known")
+LEVELS = 4
+"""Clouds of all points so far of each class, see `viewer_messages.CumulativePoints`."""
+
 SCENE: Mapping[str, type[Message]] = {
     "/object_mesh": SceneUpdate,
     "/object_surface": PointCloud,
@@ -30,7 +33,7 @@ SCENE: Mapping[str, type[Message]] = {
     "/hypothesis_surfaces": PointCloud,
     **{f"/all_points/{kind}/{n}": PointCloud for kind in POINT_CLASSES for n in range(LEVELS)},
 }
-"""Topics of `scene_messages`, which recordings of older programs do not have."""
+"""Topics of `viewer_messages`, which recordings of older programs do not have."""
 
 VIEWS: Mapping[str, type[Message]] = {
     "/object_pose": FrameTransform,
@@ -59,7 +62,7 @@ TOPIC_SCHEMAS: Mapping[str, str] = {
 """The full name of the message on every topic of a recording."""
 
 WORLD = "world"
-OBJECT = "object"
+UNMOVED = Pose(orientation=Quaternion(w=1.0))
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING}
 _NAMES = ("x", "y", "z", "sdf")
 
@@ -67,14 +70,15 @@ _NAMES = ("x", "y", "z", "sdf")
 def point_cloud(points: FloatArray, time: int) -> bytes:
     """Points (N, 3), or (N, 4) with their signed distance, in the world; exact."""
     columns = points.shape[1]
-    message = PointCloud(
+    cloud = PointCloud(
+        timestamp=stamp(time),
         frame_id=WORLD,
+        pose=UNMOVED,
         point_stride=8 * columns,
         fields=_fields(columns),
         data=np.ascontiguousarray(points, "<f8").tobytes(),
     )
-    message.pose.orientation.w = 1.0
-    return _stamped(message, time)
+    return serialized(cloud)
 
 
 def cloud_points(data: bytes, columns: int) -> FloatArray:
@@ -91,30 +95,12 @@ def cloud_points(data: bytes, columns: int) -> FloatArray:
     return np.frombuffer(message.data, "<f8").astype(np.float64, copy=False).reshape(-1, columns)
 
 
-def poses_in_world(world_from_body: FloatArray, time: int) -> bytes:
-    """Poses (B, 4, 4) as positions and quaternions: for viewing, rounded."""
-    message = PosesInFrame(frame_id=WORLD)
-    turned = quaternions(world_from_body[:, :3, :3]).tolist()
-    for position, quaternion in zip(world_from_body[:, :3, 3].tolist(), turned, strict=True):
-        set_pose(message.poses.add(), position, quaternion)
-    return _stamped(message, time)
-
-
-def object_in_world(world_from_object: FloatArray, time: int) -> bytes:
-    """The pose (4, 4) of the object as a transform between frames: for viewing, rounded."""
-    message = FrameTransform(parent_frame_id=WORLD, child_frame_id=OBJECT)
-    x, y, z = world_from_object[:3, 3].tolist()
-    message.translation.x, message.translation.y, message.translation.z = x, y, z
-    _set_quaternion(message.rotation, quaternions(world_from_object[None, :3, :3])[0].tolist())
-    return _stamped(message, time)
-
-
 def log_line(level: str, text: str, time: int) -> bytes:
     """A line of text of level "info" or "warning"."""
     if level not in _LEVELS:
         raise RecordingError(f"log level is {level!r}; accepted: {', '.join(_LEVELS)}")
     check_text("a log line", text)
-    return _stamped(Log(level=_LEVELS[level], message=text), time)
+    return serialized(Log(timestamp=stamp(time), level=_LEVELS[level], message=text))
 
 
 def log_level_and_text(data: bytes) -> tuple[str, str]:
@@ -134,22 +120,13 @@ def _fields(columns: int) -> list[PackedElementField]:
     ]
 
 
-def _stamped(message: Any, time: int) -> bytes:
-    set_stamp(message.timestamp, time)
+def stamp(time: int) -> Timestamp:
+    """A log time, nanoseconds."""
+    seconds, nanos = divmod(time, 10**9)
+    return Timestamp(seconds=seconds, nanos=nanos)
+
+
+def serialized(message: Message) -> bytes:
+    """The bytes of a message, the same each time."""
     data: bytes = message.SerializeToString(deterministic=True)
     return data
-
-
-def set_stamp(stamp: Any, time: int) -> None:
-    """Set a protobuf timestamp to nanoseconds."""
-    stamp.seconds, stamp.nanos = divmod(time, 10**9)
-
-
-def set_pose(message: Any, position: list[float], quaternion: list[float]) -> None:
-    """Set position and orientation (x y z w) of a pose."""
-    message.position.x, message.position.y, message.position.z = position
-    _set_quaternion(message.orientation, quaternion)
-
-
-def _set_quaternion(message: Any, quaternion: list[float]) -> None:
-    message.x, message.y, message.z, message.w = quaternion

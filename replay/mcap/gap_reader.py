@@ -11,10 +11,10 @@ from chsel.problem.points import GrowingPoints
 from chsel.problem.sdf_grid import SdfGrid
 from replay.events import HypothesesFound, Probe, ProblemPosed, SensorImage, SessionStarted
 from replay.lost_attachment import LostAttachment
-from replay.mcap.attachments import MESH, SDF_GRID
+from replay.mcap.attachments import MESH, SDF_GRID, attached
 from replay.mcap.contents import Row, rows
 from replay.mcap.encoding import decode
-from replay.mcap.event_reader import Entry, EventReader, RecordedProblem, attached
+from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
 from replay.mcap.plain_config import config_from_json
 from replay.mcap.schemas import RECORDS
 from replay.mcap.sensor_messages import image_from

@@ -126,8 +126,8 @@ class Recording:
     @property
     def seed(self) -> int:
         """Of the random streams of its registrations; without any that of the session."""
-        keys = (entry.key for entry in self._entries if isinstance(entry, RecordedProblem))
-        return next((key.seed for key in keys), self.start.seed)
+        seeds = (entry.seed for entry in self._entries if isinstance(entry, RecordedProblem))
+        return next(seeds, self.start.seed)
 
     @cached_property
     def has_timings(self) -> bool:

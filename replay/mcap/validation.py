@@ -202,6 +202,12 @@ def check_cells(cell: np.ndarray, shape: tuple[int, ...]) -> None:
         raise RecordingError(f"cell is out of range; accepted: -1 to {cells - 1}")
 
 
+def check_digest(what: str, digest: str, recorded: str) -> None:
+    """Raise RecordingError unless a digest is the recorded one."""
+    if digest != recorded:
+        raise RecordingError(f"{what} has digest {digest}, not {recorded} as recorded")
+
+
 class EventOrder:
     """Follows the events of one session: steps ascend, and a step has one problem, one result.
 

@@ -47,11 +47,11 @@ from replay.mcap.foxglove_messages import (
     log_line,
     point_cloud,
 )
-from replay.mcap.scene_messages import STARTING_EMPTY, Views, empty_cloud
 from replay.mcap.schemas import BEFORE_ALL_STEPS, PROFILE, RECORDS, STEP_TIME
 from replay.mcap.seal import CONTENTS, SEAL, Chain
 from replay.mcap.sensor_messages import image_values, rig_values
 from replay.mcap.validation import EventOrder
+from replay.mcap.viewer_messages import STARTING_EMPTY, Views, empty_cloud
 
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
 _NEVER = 2**62  # the size at which the library would end a chunk by itself, without a seal

@@ -1,0 +1,277 @@
+"""What a viewer draws of a session without our help: the object, the hypotheses, all points.
+
+Foxglove draws the meshes. Rerun passes them by and draws the clouds. All of it repeats what other
+messages say, rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse, quaternions
+from chsel.problem.registration_problem import Hypotheses
+from replay.events import Event, HypothesesFound, Probe, SessionStarted
+from replay.lost_attachment import is_lost
+from replay.mcap.foxglove_messages import (
+    LEVELS,
+    POINT_CLASSES,
+    UNMOVED,
+    VIEWS,
+    WORLD,
+    serialized,
+    stamp,
+)
+from replay.rerun.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
+from replay.rerun.colors import OBJECT as OBJECT_COLOR
+
+if TYPE_CHECKING:
+    import trimesh
+
+POINT_COLORS: Mapping[str, ColorArray] = {
+    "free": np.array(FREE, np.uint8),
+    "occupied": np.array(OCCUPIED, np.uint8),
+    "known": np.array(CONTACT, np.uint8),
+}
+STARTING_EMPTY = tuple(
+    name for name in VIEWS if name.startswith("/all_points/") or name == "/hypothesis_surfaces"
+)
+"""Topics of clouds that come later. Rerun reports an error for those that have no message yet."""
+
+_OBJECT_OPACITY = 0.6
+_BEST_OPACITY, _OTHER_OPACITY = 0.9, 0.25
+_SURFACE_POINTS = 100  # of each hypothesis
+_OBJECT = "object"  # the frame
+_MOST_FACES = 400
+_FINEST, _COARSEST = 40, 4  # cells along the longest side of a mesh's bounds
+_BLOCKS = 8  # that one level of all points holds before they move to the next
+_POINT = np.dtype([("position", "<f4", 3), ("color", "u1", 4)])
+
+
+View = tuple[str, Callable[[int], bytes]]
+"""A topic, and what makes its message of the log time, nanoseconds."""
+
+
+class Views:
+    """Makes the messages for viewers that follow those of an event."""
+
+    def __init__(self) -> None:
+        self._points = {name: CumulativePoints() for name in POINT_CLASSES}
+        self._scene: SceneMessages | None = None
+
+    def after(self, event: Event) -> Iterator[View]:
+        """Messages in their order; each is made when it is written."""
+        match event:
+            case SessionStarted():
+                self._scene = None if is_lost(event.mesh) else SceneMessages(event.mesh)
+                yield from self._all_points(event.initial_points)
+                if event.world_from_object is not None:
+                    yield "/object_pose", partial(object_in_world, event.world_from_object)
+                    if self._scene is not None:
+                        yield "/object_mesh", self._scene.object_mesh
+                        yield "/object_surface", self._scene.object_surface
+            case Probe():
+                yield from self._all_points(event.new_points)
+                if len(event.gripper_path) > 0:
+                    yield "/gripper_path", partial(poses_in_world, event.gripper_path)
+            case HypothesesFound() if len(event.hypotheses.object_from_world) > 0:
+                found = event.hypotheses
+                yield "/hypothesis_poses", partial(poses_in_world, inverse(found.object_from_world))
+                if self._scene is not None:
+                    yield "/hypothesis_meshes", partial(self._scene.hypothesis_meshes, found)
+                    yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, found)
+
+    def _all_points(self, new: KnownPoints) -> Iterator[View]:
+        """The clouds of all points so far that change with new ones."""
+        for name, cumulative in self._points.items():
+            points = getattr(new, name)
+            for level, cloud in cumulative.add(points).items() if len(points) else ():
+                topic = f"/all_points/{name}/{level}"
+                yield topic, partial(colored_cloud, cloud, POINT_COLORS[name])
+
+
+class SceneMessages:
+    """Makes the messages of one object."""
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self._vertices, faces = simple_mesh(mesh)
+        step = -(-len(self._vertices) // _SURFACE_POINTS)
+        self._surface = self._vertices[::step]  # (S, 3)
+        points = [Point3(x=x, y=y, z=z) for x, y, z in self._vertices.tolist()]
+        self._triangles = TriangleListPrimitive(points=points, indices=faces.ravel().tolist())
+
+    def object_mesh(self, time: int) -> bytes:
+        """The object where the frame "object" is."""
+        color = (*OBJECT_COLOR, _OBJECT_OPACITY)
+        return self._scene("object", _OBJECT, np.eye(4)[None], [color], time)
+
+    def object_surface(self, time: int) -> bytes:
+        """Vertices of the object where the frame "object" is."""
+        color = np.array(OBJECT_COLOR, np.uint8)
+        return colored_cloud(self._vertices, color, time, frame=_OBJECT)
+
+    def hypothesis_meshes(self, found: Hypotheses, time: int) -> bytes:
+        """The object at each distinct hypothesis, the best one bright."""
+        poses, colors = _shown(found)
+        opacities = [_BEST_OPACITY, *[_OTHER_OPACITY] * len(poses)]
+        shown = [(*color, a) for color, a in zip(colors.tolist(), opacities, strict=False)]
+        return self._scene("hypotheses", WORLD, poses, shown, time)
+
+    def hypothesis_surfaces(self, found: Hypotheses, time: int) -> bytes:
+        """The same as points of the surface."""
+        poses, colors = _shown(found)
+        points = self._surface @ poses[:, :3, :3].swapaxes(-1, -2) + poses[:, None, :3, 3]
+        return colored_cloud(
+            points.reshape(-1, 3), np.repeat(colors, len(self._surface), axis=0), time
+        )
+
+    def _scene(
+        self,
+        name: str,
+        frame: str,
+        poses: FloatArray,
+        colors: list[tuple[float, ...]],
+        time: int,
+    ) -> bytes:
+        """The object at poses (B, 4, 4), each in a color: red, green, blue to 255, opacity to 1."""
+        entity = SceneEntity(timestamp=stamp(time), id=name, frame_id=frame, frame_locked=True)
+        for pose, (r, g, b, a) in zip(_poses(poses), colors, strict=True):
+            triangles = entity.triangles.add()
+            triangles.CopyFrom(self._triangles)
+            triangles.pose.CopyFrom(pose)
+            triangles.color.CopyFrom(Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=a))
+        return serialized(SceneUpdate(entities=[entity]))
+
+
+class CumulativePoints:
+    """Spreads points over levels: the newest at level 0, each further level 8 times as large.
+
+    The levels together hold all points. A level is written anew when it changes, so that a point
+    is written about 4 times at each level it passes, however long the session. Writing all points
+    anew at every step would take quadratic space.
+    """
+
+    def __init__(self) -> None:
+        self._levels: list[list[FloatArray]] = [[] for _ in range(LEVELS)]
+
+    def add(self, points: FloatArray) -> dict[int, FloatArray]:
+        """Take new points (N, 3); the levels that change, and all points (M, 3) of each."""
+        changed: dict[int, FloatArray] = {}
+        moving = [points]
+        for level, blocks in enumerate(self._levels):
+            if len(blocks) < _BLOCKS - 1 or level == LEVELS - 1:
+                blocks.append(np.concatenate(moving))
+                changed[level] = np.concatenate(blocks)
+                break
+            moving = [*blocks, *moving]
+            blocks.clear()
+            changed[level] = np.zeros((0, 3))
+        return changed
+
+
+def poses_in_world(world_from_body: FloatArray, time: int) -> bytes:
+    """Poses (B, 4, 4) as positions and quaternions."""
+    poses = _poses(world_from_body)
+    return serialized(PosesInFrame(timestamp=stamp(time), frame_id=WORLD, poses=poses))
+
+
+def object_in_world(world_from_object: FloatArray, time: int) -> bytes:
+    """The pose (4, 4) of the object as a transform between frames."""
+    (pose,) = _poses(world_from_object[None])
+    transform = FrameTransform(
+        timestamp=stamp(time),
+        parent_frame_id=WORLD,
+        child_frame_id=_OBJECT,
+        translation=pose.position,
+        rotation=pose.orientation,
+    )
+    return serialized(transform)
+
+
+def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str = WORLD) -> bytes:
+    """Points (N, 3), rounded to float32, in one color (3,) or a color each (N, 3)."""
+    data = np.zeros(len(points), _POINT)
+    with np.errstate(over="ignore"):
+        data["position"] = points
+    data["color"][:, :3] = color
+    data["color"][:, 3] = 255
+    cloud = PointCloud(
+        timestamp=stamp(time),
+        frame_id=frame,
+        pose=UNMOVED,
+        point_stride=_POINT.itemsize,
+        data=data.tobytes(),
+    )
+    for index, name in enumerate(("x", "y", "z")):
+        cloud.fields.add(name=name, offset=4 * index, type=PackedElementField.FLOAT32)
+    for index, name in enumerate(("red", "green", "blue", "alpha")):
+        cloud.fields.add(name=name, offset=12 + index, type=PackedElementField.UINT8)
+    return serialized(cloud)
+
+
+def empty_cloud(time: int) -> bytes:
+    """A cloud of no points."""
+    return colored_cloud(np.zeros((0, 3)), np.zeros(3, np.uint8), time)
+
+
+def _poses(poses: FloatArray) -> list[Pose]:
+    """Poses (B, 4, 4) as positions and quaternions."""
+    turned = quaternions(poses[:, :3, :3]).tolist()
+    return [
+        Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(poses[:, :3, 3].tolist(), turned, strict=True)
+    ]
+
+
+def _shown(found: Hypotheses) -> tuple[FloatArray, ColorArray]:
+    """world_from_object (D, 4, 4) of distinct hypotheses, best first, and colors (D, 3) by rank."""
+    kept = ~found.duplicate & np.isfinite(found.object_from_world).all(axis=(1, 2))
+    poses = inverse(found.object_from_world[kept])
+    return poses, cost_colors(np.arange(len(poses)) / max(1, len(poses) - 1))
+
+
+def simple_mesh(mesh: trimesh.Trimesh, most: int = _MOST_FACES) -> tuple[FloatArray, IntArray]:
+    """Vertices (V, 3) and at most `most` faces (F, 3) that look like a mesh, in its frame.
+
+    Vertices are joined cell by cell of a grid that becomes coarser until the faces are few enough.
+    """
+    vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    cells = _FINEST
+    while len(faces) > most and cells >= _COARSEST:
+        vertices, faces = _joined(vertices, faces, cells)
+        cells -= 1
+    used, faces = np.unique(faces[:most], return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
+
+
+def _joined(vertices: FloatArray, faces: IntArray, cells: int) -> tuple[FloatArray, IntArray]:
+    """The vertices of each cell as one, their mean; without the faces that vanish."""
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    side = max(float((upper - lower).max()) / cells, np.finfo(np.float64).tiny)
+    place = np.minimum(np.floor((vertices - lower) / side), cells - 1).astype(np.int64)
+    cell = (place[:, 0] * cells + place[:, 1]) * cells + place[:, 2]
+    _, joined, counts = np.unique(cell, return_inverse=True, return_counts=True)
+    sums = [np.bincount(joined, weights=vertices[:, axis]) for axis in range(3)]
+    vertices = np.stack(sums, axis=-1) / counts[:, None]
+    faces = joined[faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return vertices, faces[np.sort(first)]
