@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from numpy.typing import NDArray
 
-from chsel.problem.poses import inverse
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
+from chsel.problem.poses import inverse, quaternions
+from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import chosen_steps
+from replay.events import SensorImage
 from replay.export import Exported, require_any
-from replay.export_images import exported_images
 from replay.mcap.contents import Contents
 from replay.mcap.event_messages import step_numbers
-from replay.mcap.foxglove_messages import poses_in_world
+from replay.mcap.foxglove_messages import POINT_CLASSES
 from replay.mcap.reader import Recording
 from replay.mcap.schemas import NUMBERS
 
@@ -23,6 +24,7 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _ENTRIES = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 _OF_HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell")
 _OF_ARCHIVES = ("cells", "objectives", "measures", "solutions", "lower", "upper")
+_OF_IMAGES = ("values", "mask", "intrinsics", "world_from_camera")
 
 
 def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
@@ -36,18 +38,29 @@ def exported_hypotheses(recording: Recording, steps: str | None) -> Exported:
     results = [step for step in recording.steps if recording.has_result(step)]
     require_any(recording, "result", results)
     found = {step: recording.hypotheses(step) for step in chosen_steps(steps, results)}
-    arrays: dict[str, Any] = {"steps": np.array(list(found), dtype=np.int64)}
-    listed = []
-    for step, hypotheses in found.items():
-        parts = {name: getattr(hypotheses, name) for name in _OF_HYPOTHESES}
-        arrays |= {f"step_{step}/{name}": part for name, part in parts.items()}
-        listed.append({"step": step, **parts})
+    parts = {s: {name: getattr(found[s], name) for name in _OF_HYPOTHESES} for s in found}
     truth = recording.start.world_from_object
+    arrays: dict[str, Any] = {"steps": np.array(list(found), dtype=np.int64)}
+    for step, part in parts.items():
+        arrays |= _in_folder(f"step_{step}", part)
     if truth is not None:
         arrays["true_world_from_object"] = truth
+    listed = [{"step": step, **part} for step, part in parts.items()]
     document = {"true_world_from_object": truth, "steps": listed}
     header = ("step", "rank", "cost", "duplicate", "cell", *_POSE, *_ENTRIES)
-    rows = (row for step, hypotheses in found.items() for row in _hypothesis_rows(step, hypotheses))
+    rows = (
+        (step, rank, *row)
+        for step, each in found.items()
+        for rank, row in enumerate(
+            _rows(
+                each.cost,
+                each.duplicate,
+                each.cell,
+                *_positions_and_quaternions(inverse(each.object_from_world)),
+                each.object_from_world.reshape(-1, 16),
+            )
+        )
+    )
     return Exported(arrays.items(), document, header, rows)
 
 
@@ -61,14 +74,12 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
     """
     probes = recording.probes
     news = [(probe.step, probe.new_points) for probe in probes]
-    first = probes[0].step if probes else 0
-    news.insert(0, (first, recording.start.initial_points))
+    news.insert(0, (probes[0].step if probes else 0, recording.start.initial_points))
     require_any(recording, "point", any(new.count for _, new in news))
-    existing = list(dict.fromkeys(step for step, _ in news))
-    chosen = set(chosen_steps(steps, existing))
+    chosen = set(chosen_steps(steps, list(dict.fromkeys(step for step, _ in news))))
     news = [(step, new) for step, new in news if step in chosen]
     arrays: dict[str, Any] = {}
-    for name in ("free", "occupied", "known"):
+    for name in POINT_CLASSES:
         groups = [getattr(new, name) for _, new in news]
         arrays[name] = np.concatenate([np.zeros((0, 3)), *groups])
         counts = [len(group) for group in groups]
@@ -77,7 +88,16 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
     if recording.start.world_from_object is not None:
         arrays["world_from_object"] = recording.start.world_from_object
     header = ("x", "y", "z", "kind", "sdf", "step")
-    return Exported(arrays.items(), arrays, header, _point_rows(arrays))
+    rows = (
+        (*point, kind, distance, step)
+        for kind in POINT_CLASSES
+        for *point, distance, step in _rows(
+            arrays[kind],
+            arrays["known_sdf"] if kind == "known" else np.full(len(arrays[kind]), None),
+            arrays[f"{kind}_step"],
+        )
+    )
+    return Exported(arrays.items(), arrays, header, rows)
 
 
 def exported_archive(recording: Recording, steps: str | None, *, last: bool = False) -> Exported:
@@ -90,21 +110,29 @@ def exported_archive(recording: Recording, steps: str | None, *, last: bool = Fa
     taken = {step: _archives(recording, step, last=last) for step in recording.steps}
     taken = {step: archives for step, archives in taken.items() if archives}
     require_any(recording, "archive", taken)
-    taken = {step: taken[step] for step in chosen_steps(steps, list(taken))}
-    arrays: dict[str, Any] = {"steps": np.array(list(taken), dtype=np.int64)}
+    chosen = chosen_steps(steps, list(taken))
+    numbered = [(step, *pair) for step in chosen for pair in enumerate(taken[step])]
+    arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     listed = []
-    for step, archives in taken.items():
-        for index, archive in enumerate(archives):
-            parts = _archive_parts(archive)
-            arrays |= {f"step_{step}/snapshot_{index}/{name}": p for name, p in parts.items()}
-            listed.append({"step": step, "snapshot": index, **parts})
-    every = [archive for archives in taken.values() for archive in archives]
-    measures = max((archive.measures.shape[1] for archive in every), default=0)
-    length = max((archive.solutions.shape[1] for archive in every), default=0)
+    for step, index, archive in numbered:
+        parts = _archive_parts(archive)
+        arrays |= _in_folder(f"step_{step}/snapshot_{index}", parts)
+        listed.append({"step": step, "snapshot": index, **parts})
+    measures = max((archive.measures.shape[1] for *_, archive in numbered), default=0)
+    length = max((archive.solutions.shape[1] for *_, archive in numbered), default=0)
     named = ("step", "snapshot", "iteration", "refinement", "cell", "objective")
     of_measures = tuple(f"measure_{i}" for i in range(measures))
     header = (*named, *of_measures, *(f"solution_{i}" for i in range(length)))
-    rows = _archive_rows(taken, measures, length)
+    rows = (
+        (step, index, archive.iteration, archive.refinement, *row)
+        for step, index, archive in numbered
+        for row in _rows(
+            archive.cells,
+            archive.objectives,
+            _widened(archive.measures, measures),
+            _widened(archive.solutions, length),
+        )
+    )
     return Exported(arrays.items(), {"snapshots": listed}, header, rows)
 
 
@@ -130,6 +158,23 @@ def exported_metrics(recording: Recording, steps: str | None) -> Exported:
     return Exported(arrays.items(), listed, header, rows)
 
 
+def exported_images(recording: Recording, steps: str | None) -> Exported:
+    """The depth and deformation images of each step's sensors, in their order.
+
+    npz: `steps` (S,), those with images; for image I of sensor NAME at step K, `step_K/NAME_I/`
+    with `values` (H, W), `unit` (metres that 1 stands for; 0 is no measurement), `mask` (H, W),
+    the pixels that count, `intrinsics` (4,), fx, fy, cx, cy in pixels, and `world_from_camera`
+    (4, 4). csv, json: a row an image, without its pixels; m00 to m33 are world_from_camera.
+    """
+    require_any(recording, "image of a sensor", recording.image_steps)
+    chosen = chosen_steps(steps, recording.image_steps)
+    named = ("step", "sensor", "image", "kind", "height", "width", "counting", "unit")
+    header = (*named, "fx", "fy", "cx", "cy", *_ENTRIES)
+    rows = [_image_row(number, seen) for number, seen in _numbered(recording, chosen)]
+    document = [dict(zip(header, row, strict=True)) for row in rows]
+    return Exported(_image_arrays(recording, chosen), document, header, rows)
+
+
 EXPORTS = {
     "hypotheses": exported_hypotheses,
     "points": exported_points,
@@ -140,24 +185,29 @@ EXPORTS = {
 """By the name that `--what` takes."""
 
 
-def _hypothesis_rows(step: int, hypotheses: Hypotheses) -> Iterator[tuple[Any, ...]]:
-    poses = PosesInFrame.FromString(poses_in_world(inverse(hypotheses.object_from_world), 0)).poses
-    columns = (hypotheses.cost, hypotheses.duplicate, hypotheses.cell)
-    flat = hypotheses.object_from_world.reshape(-1, 16)
-    for rank, (pose, entries, *values) in enumerate(
-        zip(poses, flat.tolist(), *(column.tolist() for column in columns), strict=True)
-    ):
-        position, turn = pose.position, pose.orientation
-        seven = (position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w)
-        yield (step, rank, *values, *seven, *entries)
+def _in_folder(folder: str, parts: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{folder}/{name}": part for name, part in parts.items()}
 
 
-def _point_rows(arrays: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
-    for kind in ("free", "occupied", "known"):
-        sdf = arrays["known_sdf"].tolist() if kind == "known" else [None] * len(arrays[kind])
-        steps = arrays[f"{kind}_step"].tolist()
-        for point, distance, step in zip(arrays[kind].tolist(), sdf, steps, strict=True):
-            yield (*point, kind, distance, step)
+def _rows(*columns: NDArray[Any]) -> Iterator[list[Any]]:
+    """Plain values of arrays (N,) and (N, k), row by row."""
+    for parts in zip(*(column.tolist() for column in columns), strict=True):
+        row: list[Any] = []
+        for part in parts:
+            row.extend(part if isinstance(part, list) else [part])
+        yield row
+
+
+def _positions_and_quaternions(poses: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Positions (B, 3) and unit quaternions x, y, z, w (B, 4) of poses (B, 4, 4)."""
+    return poses[:, :3, 3], quaternions(poses[:, :3, :3])
+
+
+def _widened(values: NDArray[Any], width: int) -> NDArray[Any]:
+    """Values (N, k) with columns of None up to a width."""
+    wide = np.full((len(values), width), None)
+    wide[:, : values.shape[1]] = values
+    return wide
 
 
 def _archives(recording: Recording, step: int, *, last: bool) -> list[ArchiveSnapshot]:
@@ -179,22 +229,6 @@ def _archive_parts(archive: ArchiveSnapshot) -> dict[str, Any]:
     }
 
 
-def _archive_rows(
-    taken: dict[int, list[ArchiveSnapshot]], measures: int, length: int
-) -> Iterator[tuple[Any, ...]]:
-    for step, archives in taken.items():
-        for index, archive in enumerate(archives):
-            columns = (archive.cells, archive.objectives, archive.measures, archive.solutions)
-            of_cells = zip(*(column.tolist() for column in columns), strict=True)
-            for cell, objective, measure, solution in of_cells:
-                named = (step, index, archive.iteration, archive.refinement, cell, objective)
-                yield (*named, *_padded(measure, measures), *_padded(solution, length))
-
-
-def _padded(values: Sequence[float], length: int) -> list[float | None]:
-    return [*values, *[None] * (length - len(values))]
-
-
 def _metric_rows(recording: Recording) -> Iterator[tuple[int, str, str, float]]:
     """Step, source, name and value: what is known after all probes, then step by step."""
     contents = Contents()
@@ -211,3 +245,26 @@ def _metric_rows(recording: Recording) -> Iterator[tuple[int, str, str, float]]:
             for name in ("hypotheses", "distinct", "best_cost"):
                 yield row.step, "contents", name, float(getattr(row, name))
     yield from numbers
+
+
+def _numbered(recording: Recording, steps: Sequence[int]) -> Iterator[tuple[int, SensorImage]]:
+    """The images of some steps, one at a time, each with its number of its sensor and step."""
+    counts: Counter[tuple[int, str]] = Counter()
+    for seen in recording.sensor_images(steps):
+        yield counts[seen.step, seen.sensor], seen
+        counts[seen.step, seen.sensor] += 1
+
+
+def _image_arrays(recording: Recording, steps: Sequence[int]) -> Iterator[tuple[str, NDArray[Any]]]:
+    yield "steps", np.array(steps, dtype=np.int64)
+    for number, seen in _numbered(recording, steps):
+        folder = f"step_{seen.step}/{seen.sensor}_{number}"
+        yield f"{folder}/unit", np.array(seen.unit)
+        for name in _OF_IMAGES:
+            yield f"{folder}/{name}", getattr(seen, name)
+
+
+def _image_row(number: int, seen: SensorImage) -> tuple[Any, ...]:
+    size = (*seen.values.shape, int(seen.mask.sum()), seen.unit)
+    pose = seen.world_from_camera.ravel().tolist()
+    return (seen.step, seen.sensor, number, seen.kind, *size, *seen.intrinsics.tolist(), *pose)

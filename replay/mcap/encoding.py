@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
 
@@ -68,6 +68,16 @@ def field_kinds(name: str) -> dict[str, Kind]:
             narrow=bool(array and array[2]),
         )
     return kinds
+
+
+def shared_values(message: str, source: object) -> dict[str, Any]:
+    """The fields of a message that a value has as attributes."""
+    return {name: getattr(source, name) for name in MESSAGES[message] if hasattr(source, name)}
+
+
+def shared_arguments(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a dataclass that a message has, too."""
+    return {field.name: values[field.name] for field in fields(kind) if field.name in values}
 
 
 def check_message(name: str, values: Mapping[str, Any]) -> None:

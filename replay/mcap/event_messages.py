@@ -1,13 +1,12 @@
 """Events as the values of their messages, and back.
 
 A field that an event and its message share is taken over as it is; here is what is stored in
-another form. `sensor_messages` has the same for rigs and images.
+another form, and in `sensor_messages`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any, get_args
 
 from chsel.problem.mesh import mesh_digest
@@ -15,10 +14,19 @@ from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.events import Event, ProblemPosed, SessionStarted
+from replay.events import (
+    Event,
+    ProblemPosed,
+    RigDescribed,
+    SensorImage,
+    SessionStarted,
+    SnapshotTaken,
+)
 from replay.lost_attachment import LostAttachment
+from replay.mcap.encoding import shared_arguments, shared_values
 from replay.mcap.plain_config import config_from_json, config_to_json
-from replay.mcap.schemas import FORMAT_VERSION, MESSAGES, RECORDS
+from replay.mcap.schemas import FORMAT_VERSION, RECORDS
+from replay.mcap.sensor_messages import image_values, rig_from, rig_values
 from replay.mcap.validation import check_digest
 
 if TYPE_CHECKING:
@@ -28,25 +36,27 @@ EVENTS: Mapping[str, type[Event]] = {kind.topic: kind for kind in get_args(Event
 """The classes of events by their topics."""
 
 
-def shared_values(message: str, source: object) -> dict[str, Any]:
-    """The fields of a message that a value has as attributes."""
-    return {name: getattr(source, name) for name in MESSAGES[message] if hasattr(source, name)}
-
-
-def shared_arguments(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a dataclass that a message has, too."""
-    return {field.name: values[field.name] for field in fields(kind) if field.name in values}
-
-
 def event_values(event: Event) -> dict[str, Any]:
-    """An event as its message has it, where they have the same fields."""
-    return shared_values(RECORDS[event.topic], event)
+    """An event as its message has it; results may repeat an archive, see `McapRecorder`."""
+    match event:
+        case SessionStarted():
+            return _session_values(event)
+        case ProblemPosed():
+            return _problem_values(event)
+        case SnapshotTaken():
+            return archive_values(event.step, event.archive)
+        case RigDescribed():
+            return rig_values(event)
+        case SensorImage():
+            return image_values(event)
+        case _:
+            return shared_values(RECORDS[event.topic], event)
 
 
 def event_from(topic: str, values: Mapping[str, Any]) -> Event:
-    """The event of a message with the same fields."""
+    """The event of a message that is all of it."""
     kind = EVENTS[topic]
-    return kind(**shared_arguments(kind, values))
+    return rig_from(values) if kind is RigDescribed else kind(**shared_arguments(kind, values))
 
 
 def step_numbers(event: Event) -> dict[str, float]:
@@ -60,7 +70,7 @@ def step_numbers(event: Event) -> dict[str, float]:
     return numbers
 
 
-def session_values(event: SessionStarted) -> dict[str, Any]:
+def _session_values(event: SessionStarted) -> dict[str, Any]:
     """The message `Session`."""
     mesh: Any = event.mesh
     lost = [part.name for part in (event.mesh, event.sdf) if isinstance(part, LostAttachment)]
@@ -88,10 +98,10 @@ def session_from(
     return SessionStarted(**shared_arguments(SessionStarted, values) | parts)
 
 
-def problem_values(event: ProblemPosed, *, repeats_elites: bool) -> dict[str, Any]:
-    """The message `Problem`; repeats_elites: its low-cost set is the elites of the last result."""
+def _problem_values(event: ProblemPosed) -> dict[str, Any]:
+    """The message `Problem`, with its low-cost set."""
     problem = event.problem
-    values = shared_values("Problem", problem) | {
+    return shared_values("Problem", problem) | {
         "step": event.step,
         "workspace": problem.workspace.bounds,
         "key_seed": problem.key.seed,
@@ -99,7 +109,6 @@ def problem_values(event: ProblemPosed, *, repeats_elites: bool) -> dict[str, An
         "points_digest": problem.points.digest,
         "sdf_digest": problem.sdf.digest,
     }
-    return values | {"low_cost_set": None} if repeats_elites else values
 
 
 def problem_from(

@@ -26,13 +26,12 @@ from replay.events import (
 from replay.lost_attachment import LostAttachment
 from replay.mcap.attachments import MESH, SDF_GRID, attached
 from replay.mcap.contents import Contents
-from replay.mcap.encoding import check_message, decode, message_class
+from replay.mcap.encoding import check_message, decode, message_class, shared_arguments
 from replay.mcap.event_messages import (
     archive_from,
     event_from,
     problem_from,
     session_from,
-    shared_arguments,
 )
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import CLOUDS, VIEWS, cloud_points, log_level_and_text
@@ -45,7 +44,7 @@ from replay.mcap.schemas import (
     STEP_TIME,
 )
 from replay.mcap.seal import CONTENTS, SEAL
-from replay.mcap.sensor_messages import ImagePlace, check_pixels, plausible_pixels, rig_from
+from replay.mcap.sensor_messages import ImagePlace, check_pixels, plausible_pixels
 from replay.mcap.validation import EventOrder, check_cells, check_digest
 from replay.mcap.wire import parsed
 
@@ -168,8 +167,6 @@ class EventReader:
         match topic:
             case "/known_points":
                 return self._close(values)
-            case "/rig":
-                return rig_from(values)
             case "/sensor_image":
                 return self._image(values)
             case "/problem":

@@ -11,8 +11,7 @@ import zstandard
 
 from chsel.errors import RecordingError
 from replay.events import RigDescribed, SensorImage
-from replay.mcap.encoding import check_message
-from replay.mcap.event_messages import shared_arguments, shared_values
+from replay.mcap.encoding import check_message, shared_arguments, shared_values
 
 _LEVEL = 3  # of compression: a higher one takes longer for hardly less
 _VALUE = np.dtype("<u2")

@@ -14,8 +14,8 @@ from replay.mcap.foxglove_messages import (
     cloud_points,
     log_level_and_text,
     point_cloud,
-    poses_in_world,
 )
+from replay.mcap.viewer_messages import poses_in_world
 
 
 def quaternions(world_from_body: np.ndarray) -> np.ndarray:

@@ -217,7 +217,7 @@ def test_a_hand_that_is_no_mesh_is_refused_by_writer_and_reader(
 def stored(path: Path, monkeypatch: pytest.MonkeyPatch, events: list[Event], **values: Any) -> Path:
     """A recording whose images are stored with other values."""
     monkeypatch.setattr(
-        "replay.mcap.writer.image_values", lambda event: image_values(event) | values
+        "replay.mcap.event_messages.image_values", lambda event: image_values(event) | values
     )
     recorder = McapRecorder(path)
     for event in events:

@@ -112,7 +112,7 @@ def test_chunks_are_compressed_and_all_of_the_data_has_a_checksum(events, write)
 def test_every_chunk_ends_with_a_seal_also_within_a_step(
     tmp_path, make_events, assert_same, monkeypatch
 ):
-    monkeypatch.setattr("replay.mcap.writer._CHUNK_SIZE", 1500)
+    monkeypatch.setattr("replay.mcap.sealed_file._CHUNK_SIZE", 1500)
     events, path = make_events(steps=3, free=200), tmp_path / "a.mcap"
     recorder = McapRecorder(path)
     for event in events:

@@ -20,14 +20,13 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse, rotation_matrices
 from replay.comparing.recording_diff import recording_diff
 from replay.events import Event, HypothesesFound, Probe, SessionStarted
-from replay.mcap.cumulative_points import CumulativePoints
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, SCENE, VIEWS
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
-from replay.mcap.simple_mesh import simple_mesh
-from replay.mcap.writer import McapRecorder
+from replay.mcap.sealed_file import SealedFile
+from replay.mcap.viewer_messages import CumulativePoints, simple_mesh
 
-_ADD = McapRecorder._add
+_ADD = SealedFile.add
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
 
 
@@ -141,9 +140,9 @@ def test_all_points_of_a_long_session_are_written_a_few_times_each():
 @pytest.mark.parametrize("subdivisions", [1, 4])
 def test_a_simple_mesh_has_few_faces_and_the_same_shape(subdivisions):
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.1)
-    simple = simple_mesh(ball)
-    assert len(simple.faces) <= min(400, len(ball.faces))
-    found = trimesh.Trimesh(simple.vertices, simple.faces, process=False)
+    vertices, faces = simple_mesh(ball)
+    assert len(faces) <= min(400, len(ball.faces))
+    found = trimesh.Trimesh(vertices, faces, process=False)
     assert np.linalg.norm(found.vertices, axis=1).min() > 0.09
     assert found.volume == pytest.approx(ball.volume, rel=0.1)  # faces still point outwards
 
@@ -152,10 +151,10 @@ def test_a_mesh_of_loose_vertices_and_points_in_one_place_stays_small():
     loose = trimesh.Trimesh(
         np.concatenate([np.eye(3), np.zeros((5000, 3))]), [[0, 1, 2]] * 900, process=False
     )
-    simple = simple_mesh(loose)
-    assert (len(simple.vertices), len(simple.faces)) == (3, 1)
+    vertices, faces = simple_mesh(loose)
+    assert (len(vertices), len(faces)) == (3, 1)
     point = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]] * 900, process=False)
-    assert len(simple_mesh(point).faces) == 0
+    assert len(simple_mesh(point)[1]) == 0
 
 
 def test_rerun_draws_points_of_the_recording_by_itself(events, write):
@@ -181,7 +180,7 @@ def test_rerun_draws_points_of_the_recording_by_itself(events, write):
 
 def test_readers_do_not_look_at_what_viewers_get(events, write, assert_same, monkeypatch):
     monkeypatch.setattr(
-        "replay.mcap.writer.McapRecorder._add", _with_nonsense_for_viewers, raising=True
+        "replay.mcap.sealed_file.SealedFile.add", _with_nonsense_for_viewers, raising=True
     )
     path = write(events)
     monkeypatch.undo()
