@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn
 from rich.table import Table
 
@@ -20,7 +21,6 @@ from chsel.problem.registration_problem import Hypotheses
 from replay.arguments import STEPS_HELP, chosen_steps, path_argument
 from replay.comparing.columns import PLAUSIBLE, Column, columns_in_table
 from replay.comparing.comparison import (
-    CommonCost,
     Outcome,
     common_cost,
     compared,
@@ -30,7 +30,7 @@ from replay.comparing.comparison import (
 from replay.comparing.contenders import METHODS_HELP, Contender, contenders
 from replay.comparing.csv_file import write_csv
 from replay.comparing.plausible import PlausibleSets
-from replay.console import Console, Progress, TextColumn
+from replay.console import Console, Progress, TextColumn, plain_table
 from replay.files import require_folder, require_new
 from replay.mcap.reader import Recording, read_recording
 
@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Print a table of medians, of all steps if wanted; 1 if a registration failed."""
-    _check_outputs(given)
+    outputs = _checked_outputs(given)
     require_threads("--threads", given.threads)
     recording = read_recording(given.file)
     if not recording.steps:
@@ -79,24 +79,50 @@ def run(given: argparse.Namespace) -> int:
     labels = [word for word in given.methods if "=" not in word]
     changes = [word for word in given.methods if "=" in word]
     methods = contenders(recording, labels, changes)
-    cost = common_cost(recording)
     sets = PlausibleSets(recording, given.plausible, given.definition)
     with threads(given.threads):
-        outcomes = _compared(recording, methods, steps, cost, sets)
+        outcomes = _outcomes(recording, methods, steps, sets)
     console = Console()
-    each = given.each or len(steps) <= _FEW_STEPS
-    of_sets = f"plausible sets by definition {given.definition}"
-    _tell(console, recording, methods, outcomes, cost, of_sets, each=each, count=given.threads)
-    _save(given, recording, methods, outcomes, cost)
-    for path in (given.save_csv, given.save_plot, given.save_rerun):
-        if path is not None:
-            console.print(f"written: {path}", soft_wrap=True)
-    again = {method.label for method in methods}
-    return int(any(outcome.failure for outcome in outcomes if outcome.label in again))
+    cost = common_cost(recording)
+    columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
+    for title, found in (
+        (f"costs of all by {cost.name}", [c for c in columns if c.name not in PLAUSIBLE]),
+        (
+            f"plausible sets by definition {given.definition}",
+            [c for c in columns if c.name in PLAUSIBLE],
+        ),
+    ):
+        if found:
+            each = given.each or len(steps) <= _FEW_STEPS
+            _print_tables(console, title, found, outcomes, each=each)
+    console.print(_legend(columns, given.threads))
+    for method in methods:
+        if method.changes:
+            console.print(f"{method.label} with {', '.join(method.changes)}", soft_wrap=True)
+        _print_bits(console, method, [o for o in outcomes if o.label == method.label])
+    failed = [outcome for outcome in outcomes if outcome.failure]
+    for outcome in failed:
+        what = f"step {outcome.step}, {outcome.label}: {outcome.failure}"
+        console.print(what, soft_wrap=True)
+    if given.save_csv is not None:
+        write_csv(given.save_csv, outcomes, methods, cost, given.definition)
+    if given.save_plot is not None:
+        from replay.comparing.plot import write_plot
+
+        start = recording.start
+        title = f"{start.object}, {start.session} session, seed {start.seed}, costs of all by "
+        write_plot(given.save_plot, outcomes, title + cost.name)
+    if given.save_rerun is not None:
+        from replay.rerun.comparison import save_comparison
+
+        save_comparison(given.save_rerun, recording, _results(recording, outcomes))
+    for path in outputs:
+        console.print(f"written: {path}", soft_wrap=True)
+    return int(any(outcome.label != recorded_label(recording) for outcome in failed))
 
 
-def _check_outputs(given: argparse.Namespace) -> None:
-    """Raise before any work what would make it end in nothing."""
+def _checked_outputs(given: argparse.Namespace) -> list[Path]:
+    """The files to write. Raises before any work what would make it end in nothing."""
     paths = [path for path in (given.save_csv, given.save_plot, given.save_rerun) if path]
     for path in paths:
         require_new(path)
@@ -107,13 +133,13 @@ def _check_outputs(given: argparse.Namespace) -> None:
         from replay.comparing.plot import require_picture
 
         require_picture(given.save_plot)
+    return paths
 
 
-def _compared(
+def _outcomes(
     recording: Recording,
     methods: Sequence[Contender],
     steps: Sequence[int],
-    cost: CommonCost,
     plausible: PlausibleSets,
 ) -> list[Outcome]:
     waiting = Console(stderr=True)
@@ -123,41 +149,13 @@ def _compared(
         *columns, console=waiting, transient=True, disable=not waiting.is_terminal
     ) as progress:
         task = progress.add_task("registering", total=len(steps) * (len(methods) + 1))
-        for outcome in compared(recording, methods, steps, cost, plausible):
+        for outcome in compared(recording, methods, steps, common_cost(recording), plausible):
             outcomes.append(outcome)
             progress.update(task, advance=1, description=f"step {outcome.step}")
     return outcomes
 
 
-def _tell(
-    console: Console,
-    recording: Recording,
-    methods: Sequence[Contender],
-    outcomes: Sequence[Outcome],
-    cost: CommonCost,
-    of_sets: str,
-    *,
-    each: bool,
-    count: int,
-) -> None:
-    columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
-    to_sets = tuple(column for column in columns if column.name in PLAUSIBLE)
-    of_all = tuple(column for column in columns if column.name not in PLAUSIBLE)
-    _tell_tables(console, _costs(cost), of_all, outcomes, each=each)
-    if to_sets:
-        _tell_tables(console, of_sets, to_sets, outcomes, each=each)
-    console.print(_legend(columns, count))
-    for method in methods:
-        if method.changes:
-            console.print(f"{method.label} with {', '.join(method.changes)}", soft_wrap=True)
-        _tell_bits(console, method, [o for o in outcomes if o.label == method.label])
-    for outcome in outcomes:
-        if outcome.failure:
-            what = f"step {outcome.step}, {outcome.label}: {outcome.failure}"
-            console.print(what, soft_wrap=True)
-
-
-def _tell_tables(
+def _print_tables(
     console: Console,
     what: str,
     columns: Sequence[Column],
@@ -166,24 +164,33 @@ def _tell_tables(
     each: bool,
 ) -> None:
     """A row for each step and method if wanted, and the medians over several steps."""
-    labels = list(dict.fromkeys(outcome.label for outcome in outcomes))
     steps = list(dict.fromkeys(outcome.step for outcome in outcomes))
+    headings = [column.heading for column in columns]
     if each:
-        table = _table(f"each step, {what}", ["step", "method"], columns)
-        for step in steps:
-            for outcome in (outcome for outcome in outcomes if outcome.step == step):
+        table = plain_table(f"each step, {what}", texts=["step", "method"], numbers=headings)
+        for step, of_step in groupby(outcomes, lambda outcome: outcome.step):
+            for outcome in of_step:
                 _add(table, [str(step), outcome.label], columns, outcome)
             table.add_section()
         console.print(table, "")
     if len(steps) > 1:
         some_failed = any(outcome.failure for outcome in outcomes)
         texts = ["method", "steps"] if some_failed else ["method"]
-        table = _table(f"medians over {len(steps)} steps, {what}", texts, columns)
-        for label in labels:
+        title = f"medians over {len(steps)} steps, {what}"
+        table = plain_table(title, texts=texts, numbers=headings)
+        for label in dict.fromkeys(outcome.label for outcome in outcomes):
             found = [o for o in outcomes if o.label == label and not o.failure]
-            cells = [label, str(len(found))] if some_failed else [label]
+            cells = [label, str(len(found))][: len(texts)]
             _add(table, cells, columns, Outcome(0, label, None, medians(found)))
         console.print(table, "")
+
+
+def _add(table: Table, texts: list[str], columns: Sequence[Column], outcome: Outcome) -> None:
+    cells = [column.shown(outcome.numbers.get(column.name)) for column in columns]
+    if outcome.failure:
+        cells[0] = "failed"
+    style = "dim" if outcome.label.startswith("recorded:") else ""
+    table.add_row(*texts, *cells, style=style)
 
 
 def _legend(columns: Sequence[Column], count: int) -> str:
@@ -195,36 +202,7 @@ def _legend(columns: Sequence[Column], count: int) -> str:
     return text + f"ms: of one registration by {count} thread{'s' if count > 1 else ''}"
 
 
-def _costs(cost: CommonCost) -> str:
-    return f"costs of all by {cost.name}"
-
-
-def _table(title: str, texts: Sequence[str], columns: Sequence[Column]) -> Table:
-    table = Table(
-        title=title,
-        title_justify="left",
-        box=SIMPLE_HEAD,
-        collapse_padding=True,
-        pad_edge=False,
-        show_edge=False,
-    )
-    for text in texts:
-        justify = "left" if text == "method" else "right"
-        table.add_column(text, justify=justify, overflow="fold")  # type: ignore[arg-type]
-    for column in columns:
-        table.add_column(column.heading, justify="right", no_wrap=True)
-    return table
-
-
-def _add(table: Table, texts: list[str], columns: Sequence[Column], outcome: Outcome) -> None:
-    cells = [column.shown(outcome.numbers.get(column.name)) for column in columns]
-    style = "dim" if outcome.label.startswith("recorded:") else ""
-    if outcome.failure and columns:
-        cells[0] = "failed"
-    table.add_row(*texts, *cells, style=style)
-
-
-def _tell_bits(console: Console, method: Contender, outcomes: Sequence[Outcome]) -> None:
+def _print_bits(console: Console, method: Contender, outcomes: Sequence[Outcome]) -> None:
     """Whether a method with the recorded settings gives what was recorded."""
     known = [outcome for outcome in outcomes if outcome.as_recorded is not None]
     other = [str(outcome.step) for outcome in known if not outcome.as_recorded]
@@ -237,27 +215,6 @@ def _tell_bits(console: Console, method: Contender, outcomes: Sequence[Outcome])
     else:
         text += f"its {len(known)} results are those recorded, to the bit"
     console.print(text, soft_wrap=True)
-
-
-def _save(
-    given: argparse.Namespace,
-    recording: Recording,
-    methods: Sequence[Contender],
-    outcomes: Sequence[Outcome],
-    cost: CommonCost,
-) -> None:
-    if given.save_csv is not None:
-        write_csv(given.save_csv, outcomes, methods, cost, given.definition)
-    if given.save_plot is not None:
-        from replay.comparing.plot import write_plot
-
-        start = recording.start
-        title = f"{start.object}, {start.session} session, seed {start.seed}, {_costs(cost)}"
-        write_plot(given.save_plot, outcomes, title)
-    if given.save_rerun is not None:
-        from replay.rerun.comparison import save_comparison
-
-        save_comparison(given.save_rerun, recording, _results(recording, outcomes))
 
 
 def _results(recording: Recording, outcomes: Sequence[Outcome]) -> dict[str, dict[int, Hypotheses]]:

@@ -8,13 +8,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from replay.arguments import path_argument
-from replay.comparing.message_content import printable
 from replay.comparing.recording_diff import Ignored, RecordingDiff, TopicDiff, recording_diff
-from replay.console import Console
+from replay.console import Console, plain_table
 
 _SHOWN = 20
 _MANY_ULPS = 10**6
@@ -64,15 +62,14 @@ def run(given: argparse.Namespace) -> int:
 
 def _table(found: RecordingDiff) -> Table:
     """A row for each topic and attachment with a difference."""
-    table = Table(box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False, show_edge=False)
-    for name in ("topic", "steps", "fields"):
-        table.add_column(name, overflow="fold")
-    for name in ("differ", "of", "only\nin A", "only\nin B", "largest\nulp"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = plain_table(
+        texts=("topic", "steps", "fields"),
+        numbers=("differ", "of", "only\nin A", "only\nin B", "largest\nulp"),
+    )
     for name, topic in found.topics.items():
         if not topic.is_equal:
             counts = (topic.differing, topic.count, topic.only_first, topic.only_second)
-            texts = (printable(name), _ranges(topic.steps), _fields(topic))
+            texts = (name, _ranges(topic.steps), _fields(topic))
             table.add_row(*texts, *map(str, counts), _largest(topic))
     return table
 

@@ -13,12 +13,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.filesize import decimal
 from rich.table import Table
 
 from chsel.errors import RecordingError, SessionError
-from replay.console import Console, print_error
+from replay.console import Console, plain_table, print_error
 from replay.raw.log_display import fact_table, log_overview, show_log
 from replay.raw.log_info import LogInfo, is_other_programs, log_info
 from replay.recording_info import RecordingInfo, recording_info
@@ -143,11 +142,9 @@ def _environment(environment: Mapping[str, str]) -> str:
 
 def _step_table(steps: Sequence[Mapping[str, Any]], *, all_: bool) -> Table:
     """A row for each probe, or for the first and last of many."""
-    table = Table(title="known points after each probe, and what registering gave")
-    table.box, table.title_justify, table.collapse_padding = SIMPLE_HEAD, "left", True
     names = ("step", "free", "occupied", "known", "contacts", "hypotheses", "distinct", "best cost")
-    for name in names:
-        table.add_column(name, justify="right")
+    title = "known points after each probe, and what registering gave"
+    table = plain_table(title, numbers=names)
     many = not all_ and len(steps) > 2 * _EITHER_END + 2
     for index, step in enumerate(steps):
         if many and index == _EITHER_END:
@@ -156,7 +153,6 @@ def _step_table(steps: Sequence[Mapping[str, Any]], *, all_: bool) -> Table:
             table.add_row(*_cells(step))
     if many:
         table.caption = f"{len(steps) - 2 * _EITHER_END} more steps (--steps shows all)"
-        table.caption_justify = "left"
     return table
 
 

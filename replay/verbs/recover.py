@@ -8,11 +8,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-
 from replay.arguments import path_argument
-from replay.console import Console
+from replay.console import Console, plain_table
 from replay.mcap.recovery import Recovered, recover
 
 
@@ -49,10 +46,7 @@ def _tell_losses(console: Console, found: Recovered) -> None:
         return
     console.print(f"the file was not whole: it {found.damage}")
     if found.damages:
-        table = Table(title="bytes lost", title_justify="left", box=SIMPLE_HEAD)
-        table.add_column("from", justify="right")
-        table.add_column("to", justify="right")
-        table.add_column("why")
+        table = plain_table("bytes lost", texts=("from", "to", "why"))
         for damage in found.damages:
             table.add_row(str(damage.start), str(damage.end), damage.reason)
         Console().print(table)

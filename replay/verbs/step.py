@@ -11,15 +11,14 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import SettingError
 from chsel.methods import METHODS
 from replay.arguments import path_argument
-from replay.comparing.comparison import common_cost, numbers_under
-from replay.console import Console
+from replay.comparing.comparison import common_cost, numbers_under, recorded_label
+from replay.console import Console, plain_table
 from replay.files import require_new
 from replay.mcap.reader import Recording, read_recording
 from replay.registration import other_method
@@ -103,16 +102,14 @@ def _table(recording: Recording, again: StepAgain) -> Table:
             "; errors to the true pose modulo the object's symmetries, at its centre: "
             "best hypothesis, closest one"
         )
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
-    table.add_column("method")
     errors = ("mm", "°", "mm", "°") if truth else ()
-    for name in ("best cost", "median cost", "distinct", *errors):
-        table.add_column(name, justify="right")
-    if again.recorded is not None:
-        numbers = numbers_under(judge, again.recorded, recording.start)
-        table.add_row(f"recorded: {recording.start.method}", *_cells(numbers, truth=truth))
-    numbers = numbers_under(judge, again.found, recording.start)
-    table.add_row(again.recording.start.method, *_cells(numbers, truth=truth))
+    numbers = ("best cost", "median cost", "distinct", *errors)
+    table = plain_table(title, texts=["method"], numbers=numbers)
+    rows = {recorded_label(recording): again.recorded, again.recording.start.method: again.found}
+    for label, found in rows.items():
+        if found is not None:
+            cells = _cells(numbers_under(judge, found, recording.start), truth=truth)
+            table.add_row(label, *cells)
     return table
 
 
