@@ -29,7 +29,7 @@ EPSILON = 0.001  # m: that of an object which no configuration file describes; u
 
 @dataclass(frozen=True)
 class SimulateRigConfig:
-    """conf/simulate_rig.yaml but for the settings of the twin. object: checked where it is used."""
+    """conf/simulate_rig.yaml but for the robot. object: checked where it is used."""
 
     configuration: str
     object: Any
@@ -70,11 +70,11 @@ def main(config: DictConfig) -> None:
         with _bar(console) as bar:
             task = bar.add_task("probes", total=count)
 
-            def told(push: Push) -> None:
+            def on_push(push: Push) -> None:
                 bar.advance(task)
                 bar.console.print(_line(push))
 
-            simulated = simulate_log(log, configuration, mesh, checked.seed, settings, told)
+            simulated = simulate_log(log, configuration, mesh, checked.seed, settings, on_push)
         with whole_file(truth) as beside:
             beside.write_text(_truth(checked, chosen, simulated))
     except WritingError as error:

@@ -1,4 +1,4 @@
-"""What all sensors of a robot cell share: where things are, what is free, what to remark."""
+"""What all sensors of a robot cell share: where things are, what is free, warnings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FreeMap:
     def __init__(self, workspace: Workspace, spacing: float) -> None:
         self.workspace = workspace
         self.grid = FreeGrid(workspace, spacing)
-        self._told = np.zeros(self.grid.shape, dtype=bool)
+        self._reported = np.zeros(self.grid.shape, dtype=bool)
 
     @contextmanager
     def by(self, counts: Counts) -> Iterator[FreeGrid]:
@@ -50,7 +50,7 @@ class FreeMap:
             beside = nearest[near]
             ahead = ((centres[near] - contacts[beside]) * normals[beside]).sum(axis=1)
             centres = np.delete(centres, near[ahead < 0.0], axis=0)
-        self._told[tuple(self.grid.lattice.voxels(centres).T)] = True
+        self._reported[tuple(self.grid.lattice.voxels(centres).T)] = True
         return centres
 
     def holds(self, points: FloatArray) -> BoolArray:
@@ -58,7 +58,7 @@ class FreeMap:
         voxels = self.grid.lattice.voxels(points)
         inside = ((voxels >= 0) & (voxels < self.grid.shape)).all(axis=1)
         held = np.zeros(len(points), dtype=bool)
-        held[inside] = self._told[tuple(voxels[inside].T)]
+        held[inside] = self._reported[tuple(voxels[inside].T)]
         return held
 
     def within(self, points: FloatArray) -> BoolArray:
@@ -86,7 +86,7 @@ class Cell:
         return self.free.grid.lattice.spacing
 
     def world_from(self, frame: str, time: int, sensor: str) -> FloatArray | None:
-        """Pose (4, 4) of a frame at a time in nanoseconds; None, with a remark, where unknown."""
+        """Pose (4, 4) of a frame at a time in nanoseconds; None, with a warning, where unknown."""
         try:
             return self.tree.lookup(self.world, frame, time, gap_s=self.gap)
         except TransformError:

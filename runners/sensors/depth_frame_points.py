@@ -1,4 +1,4 @@
-"""What one depth image tells: free space before what was measured, and points on the object."""
+"""Known points of one depth image: free space before what was measured, the object's surface."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LABEL_MARGIN = 2  # pixels: by so much a label's outline may be off the depth im
 
 @dataclass(frozen=True, eq=False)
 class FramePoints:
-    """What a frame tells, and how many of its pixels do not count."""
+    """What follows from a frame, and how many of its pixels do not count."""
 
     points: KnownPoints  # free voxels' centres, and surface points; metres, world
     workspace: Workspace  # where the object can be
@@ -43,7 +43,7 @@ def depth_frame_points(
 
     free_resolution: metres. diameter: of the object, metres; without a workspace in the rig, it is
     the bounds of the surface points, padded by this. Raises SettingError for a rig that does not
-    fit, SessionError for a frame that tells nothing.
+    fit, SessionError for a frame without a usable pixel.
     """
     if len(rig.cameras) != 1:
         raise SettingError(f"rig {rig.name} has {len(rig.cameras)} cameras; accepted: 1, a frame's")
@@ -100,7 +100,7 @@ def _surface_pixels(
     surface = within & valid & ~edges
     if not surface.any():
         raise SessionError(
-            f"none of the {int(label.sum())} pixels of label tells of the surface: outlines "
+            f"none of the {int(label.sum())} pixels of label is of the surface: outlines "
             "and edges of depth are left out, and pixels out of range"
         )
     counted = Counts(images=1, used=1, pixels=int(label.sum()))

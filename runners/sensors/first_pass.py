@@ -13,7 +13,7 @@ from runners.sensors.log.motion import JointHistory, Movements
 from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed_windows, whole_log
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.transforms import TransformTree
-from runners.sensors.log_checks import LogChecks, named_topics, require_topics, transform_topics
+from runners.sensors.log_checks import ScannedLog, named_topics, require_topics, transform_topics
 from runners.sensors.log_scan import LogScan
 from runners.sensors.pad import membrane_reference
 from runners.sensors.rig import Rig
@@ -63,10 +63,10 @@ def read_first_pass(
         warnings.warn(text)
     for text, count in moving.tree.faults.items():
         warnings.warn(text, count)
-    checks = LogChecks(log, rig, scan, moving, clocks, warnings)
-    checks.sensors()
-    windows = _windows(log, rig, scan, clocks, checks.times, warnings)
-    cameras = checks.cameras()
+    scanned = ScannedLog(log, scan, moving, clocks, warnings)
+    scanned.check_sensors()
+    windows = _windows(scanned)
+    cameras = scanned.cameras()
     return FirstPass(
         tree=moving.tree,
         transform_times=moving.times(),
@@ -74,30 +74,24 @@ def read_first_pass(
         clocks=clocks,
         windows=windows,
         cameras=cameras,
-        references=_references(log, rig, scan, cameras, windows, clocks, warnings),
+        references=_references(scanned, cameras, windows[0].begin),
         bulky=tuple(scan.message_times),
     )
 
 
-def _windows(
-    log: RawLog,
-    rig: Rig,
-    scan: LogScan,
-    clocks: ClockCorrection,
-    times: dict[str, IntArray],
-    warnings: LogWarnings,
-) -> list[ProbeWindow]:
-    """The probes of the log; all of it is one if nothing tells them apart."""
-    begin = log.begin + clocks.typical
-    first = min([begin, *(int(of[0]) for of in times.values())])
-    last = max([log.end + clocks.typical, *(int(of[-1]) for of in times.values())])
+def _windows(scanned: ScannedLog) -> list[ProbeWindow]:
+    """The probes of the log; all of it is one without markers."""
+    rig, clocks, warnings = scanned.rig, scanned.clocks, scanned.warnings
+    begin, times = scanned.log.begin + clocks.typical, scanned.times.values()
+    first = min([begin, *(int(topic[0]) for topic in times)])
+    last = max([scanned.log.end + clocks.typical, *(int(topic[-1]) for topic in times)])
     if rig.probes is not None:
         windows = timed_windows(rig.probes, begin, last, warnings)
         return windows or whole_log(first, last)
     if rig.markers:
         markers = [
             (clocks.time(received), received.content.text)
-            for received in scan.markers
+            for received in scanned.scan.markers
             if isinstance(received.content, MarkerMessage)
         ]
         windows = marked_windows(markers, first, last, warnings)
@@ -108,30 +102,27 @@ def _windows(
 
 
 def _references(
-    log: RawLog,
-    rig: Rig,
-    scan: LogScan,
-    cameras: dict[str, PinholeCamera],
-    windows: list[ProbeWindow],
-    clocks: ClockCorrection,
-    warnings: LogWarnings,
+    scanned: ScannedLog, cameras: dict[str, PinholeCamera], first_begin: int
 ) -> dict[str, FloatArray]:
-    """Depth images of the untouched membranes, by the names of pads."""
+    """Depth images of the untouched membranes, by the names of pads.
+
+    first_begin: time of the first probe, nanoseconds.
+    """
     references = {}
-    for pad in rig.bubbles:
-        camera, first = cameras[pad.name], scan.first_images[pad.depth]
+    for pad in scanned.rig.bubbles:
+        camera, first = cameras[pad.name], scanned.scan.first_images[pad.depth]
         size = (camera.height, camera.width)
         fitting = [
-            (clocks.time(received), received.content.values)
+            (scanned.clocks.time(received), received.content.values)
             for received in first
             if isinstance(received.content, ImageMessage) and received.content.values.shape == size
         ]
-        untouched = [values for time, values in fitting if time < windows[0].begin]
+        untouched = [values for time, values in fitting if time < first_begin]
         if pad.reference is None and pad.kind == "depth" and not untouched:
             untouched = [values for _, values in fitting]
-            warnings.warn(
+            scanned.warnings.warn(
                 f"{pad.name}: no image before the first probe; its reference is made of the first "
                 f"{len(untouched)} of the probe"
             )
-        references[pad.name] = membrane_reference(pad, untouched, camera, log.path.parent)
+        references[pad.name] = membrane_reference(pad, untouched, camera, scanned.log.path.parent)
     return references

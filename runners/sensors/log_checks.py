@@ -64,76 +64,70 @@ def transform_topics(log: RawLog) -> list[str]:
     ]
 
 
-class LogChecks:
-    """Looks at what a first pass gathered; raises SessionError for what no session can do without.
-
-    times: of the messages by topic (N,), nanoseconds, ascending.
-    """
+class ScannedLog:
+    """What a first pass gathered; raises SessionError for what no session can do without."""
 
     def __init__(
         self,
         log: RawLog,
-        rig: Rig,
         scan: LogScan,
         moving: Movements,
         clocks: ClockCorrection,
         warnings: LogWarnings,
     ) -> None:
-        self._log, self._rig, self._scan, self._moving = log, rig, scan, moving
-        self._warnings = warnings
-        self.times = {
-            topic: message_times.times(clocks)
-            for topic, message_times in scan.message_times.items()
-        }
+        self.log, self.rig, self.scan, self.moving = log, scan.rig, scan, moving
+        self.clocks, self.warnings = clocks, warnings
+        self.times = {topic: times.times(clocks) for topic, times in scan.message_times.items()}
+        """Of the messages by topic (N,), nanoseconds, ascending."""
 
-    def sensors(self) -> None:
+    def check_sensors(self) -> None:
         """Messages of every sensor, units, and the poses of sensors and hand."""
-        for sensor in self._rig.sensors:
+        for sensor in self.rig.sensors:
             self._require_messages(sensor.depth, sensor.name, "depth images")
             self._require_poses(sensor.name, sensor.depth, sensor.frame)
-            suspicious = self._scan.units[sensor.name].judge()
+            suspicious = self.scan.units[sensor.name].judge()
             if suspicious:
-                self._warnings.warn(suspicious)
+                self.warnings.warn(suspicious)
             lost = missing_images(self.times[sensor.depth])
             if lost:
                 count = len(self.times[sensor.depth])
-                self._warnings.note(
+                self.warnings.note(
                     f"{sensor.name}: about {lost} of {count + lost} images are missing"
                 )
-        for cloud in self._rig.clouds:
+        for cloud in self.rig.clouds:
             self._require_messages(cloud.topic, cloud.topic, "points")
             self._require_poses(cloud.topic, cloud.topic, None)
-        for force in self._rig.forces:
+        for force in self.rig.forces:
             self._require_messages(force.topic, force.topic, "forces")
             self._require_poses(force.topic, force.topic, force.frame)
-        if self._rig.hand is not None:
-            self._require_hand(self._rig.hand.frame)
+        if self.rig.hand is not None:
+            self._require_hand(self.rig.hand.frame)
 
     def cameras(self) -> dict[str, PinholeCamera]:
         """Intrinsics by the names of sensors."""
         cameras = {}
-        for sensor in self._rig.sensors:
-            info = self._scan.infos.get(sensor.info)
+        for sensor in self.rig.sensors:
+            info = self.scan.infos.get(sensor.info)
             if info is None:
                 raise SessionError(
-                    f"log {self._log.path}: no camera info of {sensor.name} on topic "
+                    f"log {self.log.path}: no camera info of {sensor.name} on topic "
                     f"{sensor.info}{self._reason(sensor.info)}"
                 )
-            sizes = self._scan.message_times[sensor.depth].sizes
+            sizes = self.scan.message_times[sensor.depth].sizes
             if (info.height, info.width) not in sizes:
                 (height, width), _ = sizes.most_common(1)[0]
                 raise SessionError(
-                    f"log {self._log.path}: images of {sensor.name} have {width} x {height} "
+                    f"log {self.log.path}: images of {sensor.name} have {width} x {height} "
                     f"pixels, and its camera info says {info.width} x {info.height}; accepted: "
                     "the same"
                 )
             if info.distorted:
-                self._warnings.warn(
+                self.warnings.warn(
                     f"{sensor.name}: its camera info names a distortion, which is not undone"
                 )
-            changes = self._scan.changed_infos.get(sensor.info, 0)
+            changes = self.scan.changed_infos.get(sensor.info, 0)
             if changes:
-                self._warnings.warn(f"{sensor.name}: another camera info than the first", changes)
+                self.warnings.warn(f"{sensor.name}: another camera info than the first", changes)
             cameras[sensor.name] = PinholeCamera(
                 info.width, info.height, info.fx, info.fy, info.cx, info.cy
             )
@@ -142,39 +136,39 @@ class LogChecks:
     def _require_messages(self, topic: str, sensor: str, what: str) -> None:
         if not len(self.times[topic]):
             raise SessionError(
-                f"log {self._log.path}: topic {topic} of {sensor} gives no {what}"
+                f"log {self.log.path}: topic {topic} of {sensor} gives no {what}"
                 f"{self._reason(topic)}"
             )
 
     def _reason(self, topic: str) -> str:
         """What was wrong with the messages of a topic, or what they are."""
-        for fault in self._log.faults:
+        for fault in self.log.faults:
             if fault.startswith(f"{topic}: "):
                 return f" ({fault.removeprefix(f'{topic}: ')})"
-        return f" (its schema is {self._log.topics[topic].schema})"
+        return f" (its schema is {self.log.topics[topic].schema})"
 
     def _require_poses(self, name: str, topic: str, frame: str | None) -> None:
-        frame = frame or self._scan.message_times[topic].frame
+        frame = frame or self.scan.message_times[topic].frame
         if not frame:
             raise SessionError(
-                f"log {self._log.path}: messages on {topic} of {name} name no frame; accepted: the "
+                f"log {self.log.path}: messages on {topic} of {name} name no frame; accepted: the "
                 "frame of a transform, in the messages or as frame in the rig"
             )
         self._require_known(name, frame, self.times[topic])
 
     def _require_hand(self, frame: str) -> None:
-        times = self._moving.times()
+        times = self.moving.times()
         if len(times):
             self._require_known("hand", frame, times)
         else:
-            self._warnings.warn("no transform of the log ever changes: the hand has no path")
+            self.warnings.warn("no transform of the log ever changes: the hand has no path")
 
     def _require_known(self, name: str, frame: str, times: IntArray) -> None:
         """Raise SessionError unless a frame's pose is known at one of the times at least."""
-        tree, world, gap = self._moving.tree, self._rig.world, self._rig.clock.gap
+        tree, world, gap = self.moving.tree, self.rig.world, self.rig.clock.gap
         try:
             known = tree.lookups(world, frame, times, gap_s=gap)[1]
             if not known.any():
                 tree.lookup(world, frame, int(times[len(times) // 2]), gap_s=gap)
         except TransformError as error:
-            raise SessionError(f"log {self._log.path}: {name}: {error}") from None
+            raise SessionError(f"log {self.log.path}: {name}: {error}") from None

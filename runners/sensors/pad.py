@@ -182,11 +182,11 @@ class Pad:
             return None
         known = self._reference > 0.0
         if self._rig.kind == "deformation":
-            told = known & np.isfinite(view.metres)
-            pressed = np.where(told, view.metres, 0.0)
+            measured = known & np.isfinite(view.metres)
+            pressed = np.where(measured, view.metres, 0.0)
             depth = self._reference - pressed
             nearest, furthest = self._rig.range
-            valid = told & (depth >= nearest) & (depth <= furthest)
+            valid = measured & (depth >= nearest) & (depth <= furthest)
             kept = self._main(depth, valid, counts)
             pressed[valid & ~kept] = 0.0
             valid, view = kept, View(depth, kept, view.world_from_camera)

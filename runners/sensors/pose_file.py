@@ -65,7 +65,7 @@ def write_pose(
 ) -> None:
     """Write a pose (4, 4), and what a person may want to know about it, plain values.
 
-    Raises RecordingError if there is such a file already, unless told to overwrite it, and
+    Raises RecordingError if there is such a file already, unless it may be overwritten, and
     ChselError if it cannot be written.
     """
     values = {KEY: np.asarray(world_from_object, dtype=np.float64).tolist(), **about}

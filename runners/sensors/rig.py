@@ -166,7 +166,7 @@ class ForceRig(CheckedSettings):
     """Whether forces are those on the hand, as the object pushes it, or by it, as it pushes."""
 
     torque: bool = True
-    """Whether torques tell where the contact is; otherwise it is where the hand is furthest against
+    """Whether torques locate the contact; otherwise it is where the hand is furthest against
     the force. Also used while all torques are 0."""
 
     tare: Annotated[float, positive, at_most(_LARGEST)] = 1.0
@@ -210,7 +210,7 @@ class ProbeTimes:
 
 @dataclass(frozen=True)
 class ExtraContacts(CheckedSettings):
-    """Contacts that no sensor told."""
+    """Contacts that no sensor measured."""
 
     probe: int
     points: Annotated[tuple[Vector, ...], _points] = ()  # (C, 3), metres, world

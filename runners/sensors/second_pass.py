@@ -91,7 +91,7 @@ class SecondPass:
                 self._cell.warnings.warn(suspicious)
 
     def _pad(self, sensor: BubbleRig, first_pass: FirstPass) -> Pad:
-        """A pad; where the reference's sweep is chosen, that alone tells of free space by it."""
+        """A pad; where the reference's sweep is chosen, no other free space follows from it."""
         return Pad(
             sensor,
             self._rig.contact,
@@ -146,8 +146,8 @@ class SecondPass:
             known=np.concatenate([contacts.points, surface]),
         )
         if self._images:
-            yield from self._seen(step, imprints)
-        yield from self._told(step, new, contacts)
+            yield from self._shown_images(step, imprints)
+        yield from self._summary(step, new, contacts)
         yield Probe(
             step,
             "contact" if len(contacts.points) else "free",
@@ -158,7 +158,7 @@ class SecondPass:
         )
 
     def _scanned(self, step: int, *, contacts: bool) -> FloatArray:
-        """Points (N, 3) of the topics that tell of contacts, or of those that tell of surface."""
+        """Points (N, 3) of topics of contacts, or of topics of surface points."""
         found = [np.zeros((0, 3))]
         for topic, cloud in self._clouds.items():
             if cloud.touches == contacts:
@@ -176,7 +176,7 @@ class SecondPass:
         ]
         return Contacts.joined([] if step in self._rig.annotations.exclude else found)
 
-    def _seen(self, step: int, imprints: dict[str, Imprint]) -> Iterator[SensorImage]:
+    def _shown_images(self, step: int, imprints: dict[str, Imprint]) -> Iterator[SensorImage]:
         """The images by which a person can follow what became known."""
         for camera in self._cameras.values():
             image = camera.image(step)
@@ -185,7 +185,7 @@ class SecondPass:
         for name, imprint in imprints.items():
             yield self._pads[name].image(step, imprint)
 
-    def _told(self, step: int, new: KnownPoints, contacts: Contacts) -> Iterator[Logged]:
+    def _summary(self, step: int, new: KnownPoints, contacts: Contacts) -> Iterator[Logged]:
         """What a probe came to, in a line; and whether its points contradict one another."""
         by_sensor = self._report.by_probe[step].items()
         free = ", ".join(f"{name} {counts.free}" for name, counts in by_sensor if counts.free)

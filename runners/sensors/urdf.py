@@ -97,9 +97,9 @@ _TYPES = (*_TURNING, "prismatic", "fixed", "floating", "planar")
 
 
 class Linkage:
-    """The part of a URDF that hangs on one link, and moves with it.
+    """The links of a URDF below one of them, which move with it.
 
-    path: of the file. root: the link whose frame is the hand's; None: the link that hangs on no
+    path: of the file. root: the link whose frame is the hand's; None: the link that is below no
     other. joint_names: joints whose values move any solid. warnings: on how the file was taken.
     Raises SettingError, which names the file, for one that cannot be used.
     """
@@ -142,7 +142,7 @@ class Linkage:
                 if link not in links:
                     raise self._error(f"joint {joint.name} holds link {link!r}, which is missing")
             if joint.child in children:
-                raise self._error(f"link {joint.child} hangs on two joints; accepted: one")
+                raise self._error(f"link {joint.child} has two parent joints; accepted: one")
             children.add(joint.child)
             self._check_joint(joint)
 
@@ -176,7 +176,7 @@ class Linkage:
         raise self._error(f"has several base links; set hand.root, accepted: {_some(bases)}")
 
     def _below(self, root: str) -> list[Any]:
-        """The joints below a link, each after the one that it hangs on."""
+        """The joints below a link, each after the one above it."""
         hanging: dict[str, list[Any]] = {}
         for joint in self._joints.values():
             hanging.setdefault(joint.parent, []).append(joint)
@@ -216,7 +216,7 @@ class Linkage:
         return origin @ compose(axis_angle(axis, value), np.zeros(3))
 
     def _value(self, joint: Any, joints: Mapping[str, float]) -> float:
-        """A joint's value: told of itself, or of the joint that it mimics, or 0."""
+        """A joint's value: its own, or by the joint that it mimics, or 0."""
         name, multiplier, offset = joint.name, 1.0, 0.0
         if name not in joints:
             name, multiplier, offset = self._driver(joint)

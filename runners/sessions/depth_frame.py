@@ -23,7 +23,7 @@ _MANY = 0.2  # of a label's pixels left out: rather a wrong label
 
 
 class DepthFrameSession:
-    """What a depth image tells, as a single probe; see `Session`."""
+    """The known points of a depth image as a single probe; see `Session`."""
 
     def __init__(
         self,

@@ -171,7 +171,7 @@ class SensorsSession:
         return free, free.new()
 
     def _find_pose(self, path: Path, chosen: str | None) -> None:
-        """The true pose, if a file tells."""
+        """The true pose, if there is a file of it."""
         if chosen == NO_POSE:
             return
         file = Path(chosen).expanduser() if chosen else beside(path)
@@ -180,7 +180,7 @@ class SensorsSession:
             self._opening.note(f"the true pose is that of {file.name}")
 
     def _shown(self, stage: str) -> Callable[[int, int], None]:
-        """Progress of a stage in bytes, told in megabytes."""
+        """Progress of a stage in bytes, shown in megabytes."""
 
         def show(done: int, total: int) -> None:
             self._progress(f"{stage}, MB", done // _MEGABYTE, -(-total // _MEGABYTE))

@@ -1,1 +1,1 @@
-"""The simulated twin of the paper's cabinet: a robot cell that writes a raw log."""
+"""A simulation of the paper's cabinet: a robot cell that writes a log."""

@@ -1,4 +1,4 @@
-"""The twin's sessions: the wrist pushes into the cabinet again and again, and a log tells of it."""
+"""The robot's sessions: the wrist pushes into the cabinet again and again, recorded in a log."""
 
 from __future__ import annotations
 
@@ -54,16 +54,13 @@ class SimulatedLog:
     messages: int
 
 
-Told = Callable[[Push], None]
-
-
 def simulate_log(
     path: Path,
     configuration: CabinetConfiguration,
     mesh: trimesh.Trimesh,
     seed: int,
     settings: RobotSettings,
-    told: Told | None = None,
+    on_push: Callable[[Push], None] | None = None,
 ) -> SimulatedLog:
     """Probe an object in the cabinet, and write the raw log; an older file of that name is gone.
 
@@ -83,8 +80,8 @@ def simulate_log(
         robot.stand(settings.standing)
         for step, offset in enumerate(grid):
             pushes.append(robot.probe(step, offset, StreamKey(seed, step)))
-            if told is not None:
-                told(pushes[-1])
+            if on_push is not None:
+                on_push(pushes[-1])
         robot.move(np.array(HOME), settings.move_speed)
         robot.stand(settings.dwell)
     return SimulatedLog(world_from_object, tuple(pushes), robot.seconds, log.messages)

@@ -9,25 +9,16 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
 from replay.mcap.texts import one_line
 from replay.raw.raw_file import ACCEPTED
 from replay.raw.raw_reading import RawMessage
+from runners.sensors.yaml_file import read_yaml
 
 _METADATA = "metadata.yaml"
 _ROS1_BAG = b"#ROSBAG "  # as long as MCAP0_MAGIC
-_METADATA_ERRORS = (
-    OSError,
-    yaml.YAMLError,
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    RecursionError,
-)
 _LONGEST_METADATA = 2**20  # bytes
 
 
@@ -60,16 +51,14 @@ def log_files(path: Path, warnings: list[str]) -> list[Path]:
 
 def _named_files(folder: Path, warnings: list[str]) -> list[Path]:
     """The files that a bag's metadata name, none if they cannot be read."""
-    try:
-        with (folder / _METADATA).open("rb") as file:
-            text = file.read(_LONGEST_METADATA)
-        about = yaml.safe_load(text)["rosbag2_bagfile_information"]
-        storage, names = about.get("storage_identifier", "mcap"), about["relative_file_paths"]
-        compression = about.get("compression_mode") or ""
-    except FileNotFoundError:
+    if not (folder / _METADATA).exists():
         warnings.append(f"{_METADATA} is missing: its .mcap files are read in the order of names")
         return []
-    except _METADATA_ERRORS as error:
+    try:
+        about = read_yaml(folder / _METADATA, _LONGEST_METADATA)["rosbag2_bagfile_information"]
+        storage, names = about.get("storage_identifier", "mcap"), about["relative_file_paths"]
+        compression = about.get("compression_mode") or ""
+    except (SessionError, LookupError, TypeError, AttributeError) as error:
         return _without_metadata(warnings, error)
     texts = [storage, compression, *names] if isinstance(names, list) else [names]
     if not all(isinstance(text, str) for text in texts):

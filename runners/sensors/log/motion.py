@@ -30,10 +30,10 @@ class JointHistory:
         self._states: list[tuple[int, Joints]] = []
 
     def add(self, time: int, positions: Mapping[str, float]) -> None:
-        """What a message said; joints that it does not name stay where they were."""
-        told = {name: positions[name] for name in self._names if name in positions}
-        state = (self._states[-1][1] if self._states else {}) | told
-        if told and len(self._states) < MOST_STATES and self._moved(state):
+        """Positions at a time; joints that it does not name stay where they were."""
+        new = {name: positions[name] for name in self._names if name in positions}
+        state = (self._states[-1][1] if self._states else {}) | new
+        if new and len(self._states) < MOST_STATES and self._moved(state):
             self._states.append((time, state))
 
     def first(self) -> Joints:
@@ -62,7 +62,7 @@ class JointHistory:
 
 
 class Movements:
-    """Where frames and joints were. topics: those that told."""
+    """Where frames and joints were. topics: those of such messages."""
 
     def __init__(self, rig: Rig, joint_names: Sequence[str]) -> None:
         """joint_names: of the joints that move the hand."""

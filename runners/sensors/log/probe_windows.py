@@ -1,4 +1,4 @@
-"""Which time belongs to which probe, as markers in the log or the rig tell."""
+"""Which time belongs to which probe, as markers in the log or the rig define it."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ def marked_windows(
     """The probes of markers (time, text) in a log from `first` to `last`; there may be none.
 
     Texts are "begin N", "begin", "end N", "end", integers (below 0: end) and true or false.
-    Whatever else they say, and begins and ends that do not fit, is remarked.
+    Other texts, and begins and ends that do not fit, are warnings.
     """
     spans = _Spans(warnings)
     for time, text in sorted(markers, key=lambda marker: marker[0]):
-        said = _meaning(text)
-        if said is None:
-            warnings.warn(f"a marker says {text[:40]!r}; understood: begin N, end")
-        elif said.begins:
-            spans.begin(time, said)
+        marker = _parsed(text)
+        if marker is None:
+            warnings.warn(f"a marker is {text[:40]!r}; accepted: begin N, end")
+        elif marker.begins:
+            spans.begin(time, marker)
         else:
-            spans.end(time, said)
+            spans.end(time, marker)
     spans.close(last)
     return _windows(spans.whole, first, last, warnings)
 
@@ -88,7 +88,7 @@ def whole_log(first: int, last: int) -> list[ProbeWindow]:
 
 @dataclass(frozen=True)
 class _Marker:
-    """index: of the probe, where told. repeated: such markers are sent all the time, as states."""
+    """index: of the probe, where given. repeated: such markers are sent all the time, as states."""
 
     begins: bool
     index: int | None
@@ -103,29 +103,31 @@ class _Spans:
         self._begun: tuple[int, int | None] | None = None
         self._warnings = warnings
 
-    def begin(self, time: int, said: _Marker) -> None:
-        """A begin; within the same probe it says nothing new."""
+    def begin(self, time: int, marker: _Marker) -> None:
+        """A begin; within the same probe it changes nothing."""
         if self._begun is not None:
             index = self._begun[1]
-            if said.index == index and (said.repeated or index is not None):
-                if not said.repeated:
+            if marker.index == index and (marker.repeated or index is not None):
+                if not marker.repeated:
                     self._warnings.warn(f"probe {index} begins twice without an end; taken as one")
                 return
-            if not said.repeated:
+            if not marker.repeated:
                 text = "has a begin and no end; the next begin ends it"
                 self._warnings.warn(f"{_name(index)} {text}")
             self.whole.append((self._begun[0], time, index))
-        self._begun = (time, said.index)
+        self._begun = (time, marker.index)
 
-    def end(self, time: int, said: _Marker) -> None:
+    def end(self, time: int, marker: _Marker) -> None:
         """An end of whatever probe has begun."""
         if self._begun is None:
-            if not said.repeated:
-                self._warnings.warn(f"{_name(said.index)} has an end and no begin; ignored")
+            if not marker.repeated:
+                self._warnings.warn(f"{_name(marker.index)} has an end and no begin; ignored")
             return
         begin, index = self._begun
-        if said.index is not None and index is not None and said.index != index:
-            self._warnings.warn(f"the end of probe {said.index} is taken as that of probe {index}")
+        if marker.index is not None and index is not None and marker.index != index:
+            self._warnings.warn(
+                f"the end of probe {marker.index} is taken as that of probe {index}"
+            )
         self.whole.append((begin, time, index))
         self._begun = None
 
@@ -137,8 +139,8 @@ class _Spans:
             self.whole.append((begin, max(last, begin), index))
 
 
-def _meaning(text: str) -> _Marker | None:
-    """What a marker says; None if that is not understood."""
+def _parsed(text: str) -> _Marker | None:
+    """The marker of a text; None if it is none."""
     lowered = text.strip().lower()
     if lowered in ("true", "false"):
         return _Marker(lowered == "true", None, True)
@@ -146,10 +148,10 @@ def _meaning(text: str) -> _Marker | None:
     if number:
         value = int(number.group(1))
         return _Marker(value >= 0, value if value >= 0 else None, True)
-    said = _TEXT.fullmatch(lowered)
-    if said is None:
+    match = _TEXT.fullmatch(lowered)
+    if match is None:
         return None
-    return _Marker(said.group(1) == "begin", int(said.group(2)) if said.group(2) else None, False)
+    return _Marker(match[1] == "begin", int(match[2]) if match[2] else None, False)
 
 
 def _name(index: int | None) -> str:
@@ -161,14 +163,14 @@ def _windows(spans: list[_Span], first: int, last: int, warnings: LogWarnings) -
     if len(spans) > MOST_PROBES:
         warnings.warn(f"the log marks {len(spans)} probes; the first {MOST_PROBES} count")
         spans = spans[:MOST_PROBES]
-    told = [index for _, _, index in spans if index is not None]
-    rising = all(a < b for a, b in itertools.pairwise(told))
+    named = [index for _, _, index in spans if index is not None]
+    rising = all(a < b for a, b in itertools.pairwise(named))
     steps = list(range(len(spans)))
-    if told and rising and len(told) == len(spans):
-        steps = told
-    elif told:
+    if named and rising and len(named) == len(spans):
+        steps = named
+    elif named:
         warnings.warn(
-            f"probes are marked {', '.join(map(str, told[:10]))}; as these do not rise, they are "
+            f"probes are marked {', '.join(map(str, named[:10]))}; as these do not rise, they are "
             f"counted from 0 to {len(spans) - 1}"
         )
     opens = [min(first, spans[0][0]) if k == 0 else span[0] for k, span in enumerate(spans)]

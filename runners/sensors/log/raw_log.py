@@ -1,4 +1,4 @@
-"""Raw logs of robots: MCAP files and rosbag2 folders, as messages that say something."""
+"""Raw logs of robots: MCAP files and rosbag2 folders, as messages that are decoded."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class RawLog:
 
     def digest(self, progress: Progress | None = None) -> str:
         """BLAKE2b (128 bit, hexadecimal) of the file, or of the digests of a folder's files."""
-        tell, done, digests = _seldom(progress, self.size), 0, []
+        report, done, digests = _seldom(progress, self.size), 0, []
         for path in self.files:
             state = hashlib.blake2b(digest_size=_DIGEST_SIZE)
             try:
@@ -113,7 +113,7 @@ class RawLog:
                     while block := file.read(_BLOCK):
                         state.update(block)
                         done += len(block)
-                        tell(done)
+                        report(done)
             except OSError as error:
                 raise SessionError(f"log {path} cannot be read: {error.strerror}") from None
             digests.append(state.hexdigest())
@@ -123,9 +123,9 @@ class RawLog:
         return hashlib.blake2b(whole, digest_size=_DIGEST_SIZE).hexdigest()
 
     def _received(self, wanted: Wanted, progress: Progress | None) -> Iterator[Received]:
-        fault, tell = self._new_faults(), _seldom(progress, self.size)
+        fault, report = self._new_faults(), _seldom(progress, self.size)
         decoders: dict[Channel, Decode | UnusableMessage] = {}
-        for message in self._raw_messages(wanted, fault, tell):
+        for message in self._raw_messages(wanted, fault, report):
             channel = message.channel
             if channel not in decoders:
                 decoders[channel] = _decoder(channel)
@@ -142,25 +142,25 @@ class RawLog:
                 fault(f"{channel.topic}: {error}")
 
     def _raw_messages(
-        self, wanted: Wanted, fault: Fault, tell: Callable[[int], None]
+        self, wanted: Wanted, fault: Fault, report: Callable[[int], None]
     ) -> Iterator[RawMessage]:
         done = [0] * len(self._parts)
         at_once = most_at_once(self._spans)
 
         def read(number: int) -> Iterator[RawMessage]:
-            def told(of_file: int) -> None:
+            def report_file(of_file: int) -> None:
                 done[number] = of_file
-                tell(sum(done))
+                report(sum(done))
 
-            return self._parts[number].messages(wanted, fault, told, at_once=at_once)
+            return self._parts[number].messages(wanted, fault, report_file, at_once=at_once)
 
         yield from merged(self._spans, read)
-        tell(self.size)
+        report(self.size)
 
     def _find_topics(self, progress: Progress | None) -> None:
         """From the indices of files; files without one are read through."""
-        told: list[int] = []
-        tell, done, fault = _seldom(progress, self.size), 0, self._new_faults()
+        all_times: list[int] = []
+        report, done, fault = _seldom(progress, self.size), 0, self._new_faults()
         for part in self._parts:
             counts: dict[Channel, int] = {}
             times = list(part.times or ())
@@ -168,7 +168,7 @@ class RawLog:
                 for number, channel in part.channels.by_id.items():
                     counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
             else:
-                for message in part.messages(Wanted(), fault, _after(done, tell)):
+                for message in part.messages(Wanted(), fault, _after(done, report)):
                     counts[message.channel] = counts.get(message.channel, 0) + 1
                     times = [min([message.log_time, *times]), max([message.log_time, *times])]
                 for channel in part.channels.by_id.values():
@@ -177,9 +177,9 @@ class RawLog:
                 self._add_topic(channel, count)
             done += part.size
             self._spans.append((min(times, default=0), max(times, default=0)))
-            told += times
-        if told:
-            self.begin, self.end = min(told), max(told)
+            all_times += times
+        if all_times:
+            self.begin, self.end = min(all_times), max(all_times)
 
     def _add_topic(self, channel: Channel, count: int) -> None:
         known = self.topics.get(channel.topic)
@@ -236,19 +236,19 @@ def _held(decode: Decode) -> Decode:
     return static
 
 
-def _after(before: int, tell: Callable[[int], None]) -> Callable[[int], None]:
-    """Tells of the bytes of one file as of those of all."""
-    return lambda done: tell(before + done)
+def _after(before: int, report: Callable[[int], None]) -> Callable[[int], None]:
+    """Reports the bytes of one file as those of all."""
+    return lambda done: report(before + done)
 
 
 def _seldom(progress: Progress | None, total: int) -> Callable[[int], None]:
     """Calls progress once in some megabytes, and at the end."""
-    told = 0
+    reported = 0
 
-    def tell(done: int) -> None:
-        nonlocal told
-        if progress is not None and (done >= told + _PROGRESS_STEP or done == total):
-            told = done
+    def report(done: int) -> None:
+        nonlocal reported
+        if progress is not None and (done >= reported + _PROGRESS_STEP or done == total):
+            reported = done
             progress(done, total)
 
-    return tell
+    return report

@@ -55,7 +55,7 @@ class TransformTree:
             self.faults["more frames have two parents" if is_new else fault] += 1
             return
         if not edge.add(stamp_ns, message):
-            self.faults[f"frame {message.child} is said to be static in several places"] += 1
+            self.faults[f"frame {message.child} is static in several places"] += 1
 
     def lookup(self, target: str, source: str, stamp_ns: int, *, gap_s: float) -> FloatArray:
         """target_from_source (4, 4) at a time, nanoseconds.
@@ -155,7 +155,7 @@ class _Edge:
         self._is_sorted = True
 
     def add(self, stamp: int, message: TransformMessage) -> bool:
-        """Whether the pose agrees with what was said before; of static ones the latest holds."""
+        """Whether the pose agrees with earlier ones; of static ones the latest holds."""
         rows = message.parent_from_child.tolist()
         numbers = (rows[0][3], rows[1][3], rows[2][3], *unit_quaternion(rows))
         if message.static:

@@ -340,7 +340,7 @@ def test_frames_and_rigs_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     assert frame.label is not None
     dots = np.zeros_like(frame.label)
     dots[25, 35:37] = True
-    with pytest.raises(SessionError, match="none of the 2 pixels of label tells of the surface"):
+    with pytest.raises(SessionError, match="none of the 2 pixels of label is of the surface"):
         depth_frame_points(
             dataclasses.replace(frame, label=dots), rig(), free_resolution=0.01, diameter=0.3
         )

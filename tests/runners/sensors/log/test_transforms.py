@@ -112,7 +112,7 @@ def test_of_static_transforms_the_latest_holds_and_a_change_is_a_fault() -> None
     for time, x in ((5, 1.0), (9, 2.0), (7, 3.0), (9, 2.0)):
         made.add(time, TransformMessage("a", "b", pose(x), static=True))
     np.testing.assert_allclose(made.lookup("a", "b", 10**18, gap_s=0.1), pose(2.0))
-    assert made.faults == {"frame b is said to be static in several places": 2}
+    assert made.faults == {"frame b is static in several places": 2}
 
 
 def test_ever_new_frames_take_neither_time_nor_memory() -> None:
