@@ -36,7 +36,7 @@ from runners.evaluation.selection import chosen_configurations, chosen_names, ch
 from runners.evaluation.sensor_logs import check_log, is_missing
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
-from runners.probe import PresetName
+from runners.run.scene import PresetName
 from runners.sessions.faults import CLEAN, LEVELS, without_clean_faults
 
 _GATHER = 300.0  # s between tables of what is finished so far

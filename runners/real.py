@@ -34,10 +34,10 @@ from runners.command.program import command, plain
 from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.selection import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
-from runners.probe import PresetName
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import Cell, Table, number, print_table, range_text
 from runners.run.compiling import Compiling
+from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sensors.rig import Rig
 from runners.sessions import open_session

@@ -26,8 +26,7 @@ from runners.evaluation.configurations import SENSORS
 from runners.evaluation.plan import Plan, Task, Trial
 from runners.evaluation.sensor_logs import ensure_log
 from runners.evaluation.true_poses import find_truth, known_at_the_end
-from runners.objects.loader import load_object
-from runners.objects.size_check import check_size
+from runners.objects.loader import check_size, load_object
 from runners.sessions import open_session
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from chsel.errors import SettingError, require_choice, require_positive
+from chsel.errors import MeshWarning, SettingError, require_choice, require_positive
 from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import clean_mesh, load_mesh
+from chsel.problem.points import Workspace
 from chsel.problem.sdf_grid import SdfGrid
 from runners.objects.scans import scan_file
 
@@ -102,6 +103,22 @@ def load_object(config: ObjectConfig, assets: Path) -> ObjectModel:
     """
     mesh = _load(config, assets)
     return ObjectModel(config.name, mesh, config.scale, config.epsilon, config.configuration)
+
+
+def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
+    """A warning for an object that is enlarged, or longer than the workspace.
+
+    The objects of simulated sessions are enlarged by default; given points are of real ones.
+    """
+    longest = float(model.mesh.extents.max())
+    side = float(np.ptp(workspace.bounds, axis=0).max())
+    if model.scale <= 1.0 and longest <= side:
+        return []
+    text = (
+        f"the object is {longest:.3g} m long at scale {model.scale:g}, the workspace "
+        f"{side:.3g} m; objects of real size have object.scale=1"
+    )
+    return [MeshWarning("object_size", text)]
 
 
 def _load(config: ObjectConfig, assets: Path) -> trimesh.Trimesh:

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from runners.objects.loader import ObjectConfig
 from runners.objects.scans import AssetsConfig
-from runners.probe import PresetName, ProbeConfig, open_scene
 from runners.run.display import Bar
 from runners.run.recording import RecordingConfig
+from runners.run.scene import PresetName, ProbeConfig, open_scene
 
 
 def test_a_bar_stands_there_before_the_work_begins() -> None:

@@ -6,8 +6,7 @@ import pytest
 import trimesh
 
 from chsel.problem.points import Workspace
-from runners.objects.loader import ObjectModel
-from runners.objects.size_check import check_size
+from runners.objects.loader import ObjectModel, check_size
 
 ROOM = Workspace((0.0, 0.0, 0.0), (0.4, 0.5, 0.3))
 

@@ -1,0 +1,159 @@
+"""What `runners.probe` is asked for, and the session and object that follow from it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from chsel.errors import InputWarning
+from chsel.numerics.threads import require_threads
+from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+from replay.environment import environment
+from replay.events import SessionStarted
+from runners.objects.loader import ObjectConfig, ObjectModel, check_size, load_object
+from runners.objects.scans import AssetsConfig
+from runners.run.recording import RecordingConfig
+from runners.sensors.session_report import Report
+from runners.sessions import open_session, session_settings
+from runners.sessions.depth_frame import DepthFrameSession
+from runners.sessions.faults import without_clean_faults
+from runners.sessions.recorded import RecordedSession
+from runners.sessions.sensors import SensorsSession
+from runners.sessions.session import Progress, Session, unwatched
+
+if TYPE_CHECKING:
+    import trimesh
+
+_OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
+_NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
+
+
+@dataclass(frozen=True)
+class PresetName:
+    """The preset that the other choices followed."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class ProbeConfig:
+    """conf/probe.yaml, which has all defaults, checked."""
+
+    object: ObjectConfig
+    session: Any  # checked by the session's kind
+    method: Any  # checked by the method
+    preset: PresetName
+    recording: RecordingConfig
+    assets: AssetsConfig
+    logs: str
+    seed: int
+    threads: int
+    configuration: str | None
+
+    def __post_init__(self) -> None:
+        StreamKey(self.seed, 0)
+        require_threads("threads", self.threads)
+
+
+@dataclass
+class Watcher:
+    """Hands progress on to whatever shows it at the time."""
+
+    show: Progress = unwatched
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """See `Progress`."""
+        self.show(stage, done, total)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The session and the object that it hides."""
+
+    session: Session
+    object_name: str
+    mesh: trimesh.Trimesh
+    sdf: SdfGrid
+    start: Start
+    watcher: Watcher = field(default_factory=Watcher)  # gets the progress of what is read
+    warnings: tuple[InputWarning, ...] = ()  # about the object
+
+    @property
+    def report(self) -> Report | None:
+        """What became of sensors' images, once they are read."""
+        session = self.session
+        return session.report if isinstance(session, SensorsSession | DepthFrameSession) else None
+
+    def online(self, settings: OnlineSettings, seed: int) -> OnlineRegistration:
+        """The loop of the session, before its first step; see `OnlineRegistration`."""
+        return OnlineRegistration(
+            self.sdf,
+            self.session.workspace,
+            self.session.free_resolution,
+            settings,
+            seed=seed,
+            points=self.session.initial_points,
+            start=self.start,
+        )
+
+
+def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
+    """Open the session with its object; a recorded session brings its own."""
+    watcher = Watcher(show)
+    session_config = dict(config.session)
+    kind = str(session_config.pop("kind", None))
+    settings = session_settings(kind, session_config)
+    if kind == "recorded":
+        recorded = RecordedSession(settings)
+        of = recorded.recorded
+        return Scene(recorded, of.object, of.mesh, of.sdf, recorded.start)
+    object_model, found = _load_object(config)
+    session = open_session(kind, settings, object_model, config.seed, watcher)
+    sdf = object_model.grid(settings, watcher)
+    start = Start(settings.start_contacts, settings.start_probe)
+    if kind in _OF_REAL_OBJECTS:
+        found += check_size(object_model, session.workspace)
+    name, mesh = object_model.name, object_model.mesh
+    return Scene(session, name, mesh, sdf, start, watcher, tuple(found))
+
+
+def _load_object(config: ProbeConfig) -> tuple[ObjectModel, list[InputWarning]]:
+    """The object, and warnings about its mesh, which belong into the recording."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        object_model = load_object(config.object, config.assets.folder)
+    found = []
+    for each in caught:
+        if isinstance(each.message, InputWarning):
+            found.append(each.message)
+        else:
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return object_model, found
+
+
+def session_started(
+    config: ProbeConfig, values: Mapping[str, Any], method_name: str, scene: Scene
+) -> SessionStarted:
+    """The first event of the recording."""
+    session = scene.session
+    recorded = {key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT}
+    recorded["session"] = without_clean_faults(values["session"])
+    return SessionStarted(
+        runner="probe",
+        object=scene.object_name,
+        session=str(config.session["kind"]),
+        method=method_name,
+        seed=config.seed,
+        config=recorded,
+        mesh=scene.mesh,
+        sdf=scene.sdf,
+        workspace=session.workspace,
+        free_resolution=session.free_resolution,
+        initial_points=session.initial_points,
+        world_from_object=session.world_from_object,
+        environment=environment(),
+    )
