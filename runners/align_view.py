@@ -12,7 +12,8 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.rerun.blueprint import at_last_probe, scene_view
 from replay.rerun.clock import PROBE
-from replay.rerun.scene import Scene, display_mesh
+from replay.rerun.meshes import display_mesh
+from replay.rerun.scene import Scene
 from replay.rerun.stream import new_file_stream
 
 APPLICATION = "chsel alignment"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -10,16 +10,26 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint import encodings
 
+from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
+from chsel.problem.poses import apply, inverse
+from chsel.problem.registration_problem import Hypotheses
+from replay.events import SessionStarted
 from replay.rerun.clock import PROBE, REGISTRATION, TIMELINES
 from replay.rerun.colors import BACKGROUND, GRID
 from replay.rerun.curves import SEARCH_FRAME, SPREADS
-from replay.rerun.eye import Bounds, eye_on
+from replay.rerun.hypotheses import shown_hypotheses
 from replay.rerun.legend import LEGEND_FRAME
 from replay.rerun.plane import Frame
 from replay.rerun.scene import CUMULATIVE
 from replay.rerun.sensors import SensorPicture
 
+Bounds = tuple[FloatArray, FloatArray]
+"""Lower and upper corner (3,) of a box in the world, metres."""
+_DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the box; probes move along +x
+_DISTANCE = 1.08  # in diagonals of the box
+_LOOK_DOWN = 0.07  # in heights of the box, whose near corner would be cut off
+_OUT_OF_SIGHT = 0.05  # of the hypotheses' corners, at either end of each axis
 PlayState = Literal["paused", "following"]
 USUAL_ARCHIVE = Frame(40, 40)
 """Cells of the map that is made room for until the first snapshot is there."""
@@ -111,7 +121,7 @@ def scene_view(
             stroke_width=1.0,
             color=GRID,
         ),
-        eye_controls=eye_on(in_sight or (lower, upper)),
+        eye_controls=_eye_on(in_sight or (lower, upper)),
         overrides={f"/{root}/{path}": _up_to_now() for path in CUMULATIVE},
     )
 
@@ -224,4 +234,37 @@ def _up_to_now() -> rrb.VisibleTimeRanges:
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=0)
     return rrb.VisibleTimeRanges(
         [rrb.VisibleTimeRange(name, start=start, end=end) for name in TIMELINES]
+    )
+
+
+def bounds_in_sight(started: SessionStarted, sets: Iterable[Hypotheses]) -> Bounds | None:
+    """What most hypotheses take up of the workspace, with the object if its pose is known.
+
+    None if there are no hypotheses.
+    """
+    shown = [found.object_from_world[shown_hypotheses(found)] for found in sets]
+    poses = inverse(np.concatenate([np.zeros((0, 4, 4)), *shown]))
+    if len(poses) == 0:
+        return None
+    if started.world_from_object is not None:
+        poses = np.concatenate([poses, started.world_from_object[None]])
+    import trimesh
+
+    corners = trimesh.bounds.corners(started.mesh.bounds)
+    places = np.concatenate([apply(pose, corners) for pose in poses])
+    ends = np.quantile(places, [_OUT_OF_SIGHT, 1.0 - _OUT_OF_SIGHT], axis=0)
+    lower, upper = np.clip(ends, *started.workspace.bounds)
+    return lower, upper
+
+
+def _eye_on(in_sight: Bounds) -> rrb.EyeControls3D:
+    """An eye that has a box in sight, obliquely from where the probes come from."""
+    lower, upper = in_sight
+    centre = (lower + upper) / 2
+    away = _DIRECTION / np.linalg.norm(_DIRECTION) * np.linalg.norm(upper - lower)
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=centre + _DISTANCE * away,
+        look_target=centre - (0.0, 0.0, _LOOK_DOWN * (upper[2] - lower[2])),
+        eye_up=(0.0, 0.0, 1.0),
     )

@@ -18,6 +18,7 @@ from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.comparing.comparison import CommonCost, common_cost, numbers_under
 from replay.events import Probe, ProblemPosed
 from replay.mcap.reader import Recording
+from replay.rerun.blueprint import bounds_in_sight
 from replay.rerun.clock import PROBE, REGISTRATION
 from replay.rerun.colors import SERIES, CostScale, Rgb, number
 from replay.rerun.comparison_layout import (
@@ -26,12 +27,12 @@ from replay.rerun.comparison_layout import (
     comparison_blueprint,
     entity_names,
 )
-from replay.rerun.curves import SHOWN_UNIT
-from replay.rerun.eye import bounds_in_sight
-from replay.rerun.hypotheses import HypothesisMeshes, coarsened, shown_hypotheses
+from replay.rerun.curves import SHOWN_UNIT, style_curve
+from replay.rerun.hypotheses import HypothesisMeshes, shown_hypotheses
 from replay.rerun.legend import Legend
+from replay.rerun.meshes import bare_mesh, coarsened
 from replay.rerun.plane import color_array, on_screen, texts
-from replay.rerun.scene import Scene, bare_mesh
+from replay.rerun.scene import Scene
 from replay.rerun.stream import new_file_stream
 
 APPLICATION = "chsel comparison"
@@ -186,9 +187,7 @@ class _Comparison:
     def _style(self, label: str, color: Rgb) -> None:
         """Name and colour the curves of a method, and say so below its view."""
         for name in CURVES:
-            line = rr.SeriesLines(names=[label], colors=[color], widths=[2.0])
-            point = rr.SeriesPoints(names=[label], colors=[color], marker_sizes=[2.5])
-            self._stream.log(self._curve(name, label), line, point, static=True)
+            style_curve(self._stream, self._curve(name, label), label, color)
         chip = rr.Points2D([(0.35, 0.5)], colors=color_array(color), radii=on_screen(6.0))
         self._stream.log(f"summary/{self._names[label]}/color", chip, static=True)
 

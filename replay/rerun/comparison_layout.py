@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 
 from chsel.problem.points import Workspace
 from replay.rerun.blueprint import (
+    Bounds,
     at_first_registration,
     curves_view,
     legend_view,
@@ -17,7 +18,6 @@ from replay.rerun.blueprint import (
     scene_view,
 )
 from replay.rerun.curves import SPREADS
-from replay.rerun.eye import Bounds
 from replay.rerun.plane import Frame
 
 SUMMARY_FRAME = Frame(12.0, 1.2)

@@ -112,10 +112,14 @@ class Curves:
             other.rpartition("/")[0] == entity.rpartition("/")[0] for other in self._named
         )
         self._named.add(entity)
-        colors = [color or SERIES[siblings % len(SERIES)]]
-        line = rr.SeriesLines(names=[name], colors=colors, widths=[2.0])
-        point = rr.SeriesPoints(names=[name], colors=colors, marker_sizes=[2.5])
-        self._stream.log(entity, line, point, static=True)
+        style_curve(self._stream, entity, name, color or SERIES[siblings % len(SERIES)])
+
+
+def style_curve(stream: rr.RecordingStream, entity: str, name: str, color: Rgb) -> None:
+    """Name and colour the curve at an entity."""
+    line = rr.SeriesLines(names=[name], colors=[color], widths=[2.0])
+    point = rr.SeriesPoints(names=[name], colors=[color], marker_sizes=[2.5])
+    stream.log(entity, line, point, static=True)
 
 
 class SearchPlot:

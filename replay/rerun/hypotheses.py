@@ -11,7 +11,7 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses
 from replay.rerun.colors import CostScale, cost_colors
-from replay.rerun.scene import display_mesh
+from replay.rerun.meshes import DISPLAY_FACES, HIDDEN, coarsened, display_mesh, mesh_poses
 
 if TYPE_CHECKING:
     import trimesh
@@ -20,13 +20,10 @@ LEVELS = 8
 """Steps of the cost scale; a mesh entity has one colour, so each step is an entity."""
 MOST = 200
 """More hypotheses than these are not drawn: the lowest in cost are."""
-DISPLAY_FACES = 6000
-"""Meshes with more faces are coarsened for display."""
 ALPHA = (48, 10)
 """Opacities of the lowest and the highest step, of 255."""
 
 _NO_POSES = np.zeros((0, 4, 4))
-_HIDDEN = np.zeros((1, 4, 4))  # without any pose, the viewer draws the mesh once, at the origin
 _NO_COST = np.full(1, np.nan)
 _BEST_ALPHA = 150
 
@@ -98,14 +95,10 @@ class HypothesisMeshes:
             if entity in self._hidden:
                 return
             self._hidden.add(entity)
-            world_from_object, cost = _HIDDEN, _NO_COST
+            world_from_object, cost = HIDDEN, _NO_COST
         else:
             self._hidden.discard(entity)
-        poses = rr.InstancePoses3D(
-            translations=world_from_object[:, :3, 3].astype(np.float32),
-            mat3x3=world_from_object[:, :3, :3].astype(np.float32),
-        )
-        self._stream.log(entity, poses, rr.AnyValues(cost=cost))
+        self._stream.log(entity, mesh_poses(world_from_object), rr.AnyValues(cost=cost))
 
 
 def shown_hypotheses(hypotheses: Hypotheses) -> IntArray:
@@ -117,28 +110,6 @@ def cost_levels(cost: FloatArray, scale: CostScale | None = None) -> IntArray:
     """The step of the cost scale, from 0, of each cost (B,); by default among its like."""
     fraction = (scale or CostScale.of(cost)).fraction(cost)
     return np.minimum((fraction * LEVELS).astype(np.int64), LEVELS - 1)
-
-
-def coarsened(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
-    """A mesh of roughly `most_faces` faces for the eye alone: vertices of a cell become one.
-
-    The cell is doubled in number of faces it swallows until few enough are left.
-    """
-    import trimesh
-
-    faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
-    cell = float(np.sqrt(mesh.area / max(most_faces, 1)))
-    coarse = mesh
-    while len(coarse.faces) > most_faces:
-        _, group = np.unique(np.rint(vertices / cell), axis=0, return_inverse=True)
-        group = group.reshape(-1)
-        count = np.bincount(group)
-        centres = [np.bincount(group, vertices[:, axis]) / count for axis in range(3)]
-        a, b, c = group[faces].T
-        kept = (a != b) & (b != c) & (c != a)
-        coarse = trimesh.Trimesh(np.stack(centres, axis=1), group[faces][kept], process=False)
-        cell *= 1.2
-    return coarse
 
 
 def _rgb(fraction: float) -> tuple[int, int, int]:

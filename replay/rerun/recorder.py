@@ -21,16 +21,15 @@ from replay.mcap.event_messages import step_numbers
 from replay.mcap.reader import Recording
 from replay.mcap.schemas import NUMBERS
 from replay.rerun.archive import ArchiveMap, map_frame
-from replay.rerun.blueprint import USUAL_ARCHIVE, session_blueprint
+from replay.rerun.blueprint import USUAL_ARCHIVE, Bounds, bounds_in_sight, session_blueprint
 from replay.rerun.clock import Clock
 from replay.rerun.colors import number
 from replay.rerun.curves import Curves, SearchPlot
-from replay.rerun.eye import Bounds, bounds_in_sight
-from replay.rerun.hand import HandMesh
 from replay.rerun.hypotheses import HypothesisMeshes
 from replay.rerun.legend import Legend
+from replay.rerun.meshes import HandMesh, bare_mesh
 from replay.rerun.plane import Frame
-from replay.rerun.scene import Scene, bare_mesh
+from replay.rerun.scene import Scene
 from replay.rerun.sensors import SensorImages
 from replay.rerun.stream import RrdFile, abandon, new_stream
 from replay.rerun.text import session_markdown

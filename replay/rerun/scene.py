@@ -22,6 +22,7 @@ from replay.rerun.colors import (
     PAST,
     Rgb,
 )
+from replay.rerun.meshes import display_mesh
 from replay.rerun.plane import color_array, on_screen
 
 if TYPE_CHECKING:
@@ -111,25 +112,6 @@ class Scene:
         self, name: str, what: rr.AsComponents, *more: rr.AsComponents, static: bool = False
     ) -> None:
         self._stream.log(f"{self._root}/{name}" if name else self._root, what, *more, static=static)
-
-
-def bare_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Vertices and faces alone, as an MCAP file keeps them; normals follow from these."""
-    import trimesh
-
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-
-
-def display_mesh(
-    mesh: trimesh.Trimesh, color: tuple[int, int, int, int] | None = None
-) -> rr.Mesh3D:
-    """A mesh for the viewer, float32, smoothly shaded; None leaves its one colour open."""
-    return rr.Mesh3D(
-        vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
-        triangle_indices=np.asarray(mesh.faces, dtype=np.uint32),
-        vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float32),
-        albedo_factor=color,
-    )
 
 
 def _path(path: np.ndarray, color: Rgb, width: float) -> rr.LineStrips3D:

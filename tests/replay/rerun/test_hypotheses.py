@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from replay.rerun.hypotheses import LEVELS, coarsened, cost_levels
+from replay.rerun.hypotheses import LEVELS, cost_levels
+from replay.rerun.meshes import coarsened
 
 
 def test_a_coarsened_mesh_has_fewer_faces_and_nearly_the_same_shape() -> None:

@@ -12,7 +12,7 @@ import trimesh
 
 from chsel.problem.poses import compose
 from replay.events import Event, Probe, RigDescribed, SensorImage
-from replay.rerun.hand import deepest
+from replay.rerun.meshes import deepest
 from replay.rerun.sensors import display_size, pixel_classes
 from tests.replay.rerun.test_recorder import (
     Row,
