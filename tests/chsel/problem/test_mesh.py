@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,6 +142,14 @@ def test_a_damaged_file_of_any_kind_is_named(tmp_path, suffix):
         load_mesh(path)
 
 
+def test_files_without_faces_are_no_mesh(tmp_path):
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
+    (tmp_path / "empty.stl").touch()
+    for name in ("cloud.ply", "empty.stl"):
+        with pytest.raises(MeshError, match=rf"{name} has no faces"):
+            load_mesh(tmp_path / name)
+
+
 @pytest.mark.parametrize("name", ["box.ply", "box.off", "box.stl"])
 def test_a_file_of_text_that_is_cut_is_refused(tmp_path, name):
     box = trimesh.creation.box(EXTENTS).subdivide()
@@ -166,47 +173,32 @@ def test_a_file_of_another_kind_is_refused_with_the_kinds_accepted(tmp_path, nam
         load_mesh(tmp_path / name)
 
 
-def test_a_point_cloud_is_no_mesh(tmp_path):
-    trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
-    with pytest.raises(MeshError, match=r"cloud\.ply has no faces"):
-        load_mesh(tmp_path / "cloud.ply")
+BOX = trimesh.creation.box(EXTENTS)
+BROKEN = BOX.vertices.copy()
+BROKEN[3, 1] = np.nan
 
 
-def test_an_empty_file_is_no_mesh(tmp_path: Path):
-    (tmp_path / "empty.stl").touch()
-    with pytest.raises(MeshError, match=r"empty\.stl has no faces"):
-        load_mesh(tmp_path / "empty.stl")
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        (BROKEN, BOX.faces, r"^bowl: vertices\[3\] is not finite"),
+        (BOX.vertices, BOX.faces - 1, r"faces\[0\] is \[.*\]; accepted: indices of its 8 vert"),
+        (BOX.vertices, BOX.faces + 1, r"faces\[\d\] is \[.*\]; accepted: indices of its 8 vert"),
+        (BOX.vertices, np.zeros((4, 4), dtype=int), r"faces has shape .*; accepted: \(any, 3\)"),
+        (BOX.vertices, np.zeros(12, dtype=int), r"faces has shape .*; accepted: \(any, 3\)"),
+        ([[0, 0, 0], [1, 1, 1]], [[0, 0, 1], [1, 0, 1]], "no face with an area"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "1 x 1 x 0 m: flat"),
+    ],
+)
+def test_a_mesh_that_cannot_be_is_named(vertices, faces, message):
+    with pytest.raises(MeshError, match=message):
+        clean_mesh(vertices, faces, name="bowl")
 
 
-def test_a_vertex_that_is_not_finite_is_named(box):
-    vertices = box.vertices.copy()
-    vertices[3, 1] = np.nan
-    with pytest.raises(MeshError, match=r"^bowl: vertices\[3\] is not finite"):
-        clean_mesh(vertices, box.faces, name="bowl")
-
-
-@pytest.mark.parametrize("index", [-1, 8])
-def test_a_face_without_its_vertex_is_named(box, index):
-    faces = box.faces.copy()
-    faces[5, 2] = index
-    with pytest.raises(MeshError, match=r"faces\[5\] is \[.*\]; accepted: indices of its 8 vert"):
-        clean_mesh(box.vertices, faces)
-
-
-@pytest.mark.parametrize("shape", [(4, 4), (12,)])
-def test_faces_of_another_shape_are_refused(box, shape):
-    with pytest.raises(MeshError, match=r"faces has shape .*; accepted: \(any, 3\)"):
-        clean_mesh(box.vertices, np.zeros(shape, dtype=int))
-
-
-def test_faces_without_area_are_no_mesh(box):
-    with pytest.raises(MeshError, match="no face with an area"):
-        clean_mesh([[0, 0, 0], [1, 1, 1]], [[0, 0, 1], [1, 0, 1]])
-
-
-def test_a_flat_mesh_is_refused():
-    with pytest.raises(MeshError, match=r"1 x 1 x 0 m: flat"):
-        clean_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_scale_that_is_not_positive_is_refused(scale):
+    with pytest.raises(SettingError, match="mesh scale"):
+        clean_mesh(BOX.vertices, BOX.faces, scale=scale)
 
 
 def test_millimetres_are_suspected_and_scaled_away(box):
@@ -228,12 +220,6 @@ def test_vertices_that_no_face_uses_have_no_say_in_the_size(box):
     mesh = clean_mesh(np.vstack([box.vertices, [[500.0, 0, 0]]]), box.faces)
     assert mesh.extents == pytest.approx(EXTENTS)
     assert len(mesh.vertices) == 8
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_scale_that_is_not_positive_is_refused(box, scale):
-    with pytest.raises(SettingError, match="mesh scale"):
-        clean_mesh(box.vertices, box.faces, scale=scale)
 
 
 def test_the_digest_names_content(box):
