@@ -529,32 +529,3 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(
         recover(path, out)
     assert out.read_bytes() == b"precious"
     assert len(list(tmp_path.iterdir())) == 2
-
-
-class Counting(io.BytesIO):
-    """Counts the bytes that are read."""
-
-    total = 0
-
-    def read(self, size: int | None = -1) -> bytes:
-        data = super().read(size)
-        self.total += len(data)
-        return data
-
-
-def test_thousands_of_chunks_within_chunks_are_not_all_tried() -> None:
-    """Each claims all that follows, so that believing their frames would take for ever."""
-    count, head = 6000, 53
-    size = 8 + count * head + 400_000
-    file = bytearray(MCAP0_MAGIC)
-    for index in range(count):
-        left = size - len(file) - head - index - 1  # ends that differ, where nothing can begin
-        file += struct.pack("<BQ", Opcode.CHUNK, left + 44)
-        file += struct.pack("<QQQII4sQ", 0, 0, left, 1, 4, b"zstd", left)
-    file += b"\xff" * (size - len(file))
-    counting = Counting(bytes(file))
-    *damages, last = Records(counting, LIMITS).whole()
-    assert all(isinstance(damage, Damage) for damage in damages)
-    assert isinstance(last, Damage)
-    assert last.reason == "there is more damage than can be searched"
-    assert counting.total < 256 * 2**20 + 101 * size

@@ -1,0 +1,212 @@
+"""Whatever damage a file takes: one clear error, or what the original says, in bounded time."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+
+from chsel.errors import RecordingError, SessionError
+from replay.events import Event, Logged, Probe, SessionEnded
+from replay.mcap.file import LIMITS
+from replay.mcap.reader import read_recording
+from replay.mcap.records import Record, Records
+from replay.mcap.recovery import recover, tells_loss
+from replay.raw.log_info import log_info
+from replay.raw.raw_file import RawFile
+from replay.raw.raw_reading import RawMessage, Wanted
+from replay.recording_info import recording_info
+from tests.replay.conftest import example_events, same_bits
+from tests.runners.sensors.small_logs import ros2_sent, write_ros2
+from tests.tools.fuzzing import peak_memory
+from tests.tools.small_recordings import write_recording
+
+PAGE = 4096
+MOST_SECONDS = 20.0  # of one file, on a busy machine
+MOST_MEMORY = 200.0  # MB more than before
+STORED = Path(__file__).parents[2] / "replays" / "points_exact_descent.mcap"  # of format 1
+examples = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.data_too_large],
+)
+
+
+@dataclass(repr=False)
+class Original:
+    """A file that is whole: its bytes, those of its chunks, and what it says."""
+
+    data: bytes
+    chunks: list[bytes]
+    events: Sequence[Event] = ()
+    messages: Counter[RawMessage] | None = None
+
+
+@st.composite
+def damages(draw: st.DrawFn) -> Callable[[bytes], bytes]:
+    """Up to three damages: bits flipped, bytes zeroed, removed or put in, or all cut off."""
+    kinds = st.sampled_from(["flip", "flip", "zero", "remove", "insert", "cut"])
+    lengths = st.sampled_from([1, 4, 60, 300, PAGE])
+    places = st.floats(0.0, 1.0, exclude_max=True)
+    ends = st.floats(0.97, 1.0, exclude_max=True)
+    drawn = draw(
+        st.lists(st.tuples(kinds, places | places | ends, lengths), min_size=1, max_size=3)
+    )
+
+    def damage(data: bytes) -> bytes:
+        for kind, place, length in drawn:
+            if not data:
+                break
+            start = int(place * len(data))
+            part = data[start : start + length]
+            replaced = {
+                "flip": bytes([part[0] ^ (1 << length % 8)]) + part[1:],
+                "zero": bytes(len(part)),
+                "remove": b"",
+                "insert": b"\x06" * length + part,
+                "cut": b"",
+            }[kind]
+            data = data[:start] + replaced + (b"" if kind == "cut" else data[start + length :])
+        return data
+
+    return damage
+
+
+@pytest.fixture(scope="module", params=["today", "format 1"])
+def original(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Original:
+    """A recording with a chunk for each of six probes, and a stored one of the oldest format."""
+    path = STORED
+    if request.param == "today":
+        path = tmp_path_factory.mktemp("whole") / "whole.mcap"
+        events = example_events(steps=6, free=400)
+        for at in range(len(events) - 1, 0, -1):
+            if isinstance(events[at], Probe):
+                events.insert(at, Logged(events[at].step - 1, "info", "a chunk ends here"))
+        write_recording(path, events)
+    chunks = []
+    with path.open("rb") as file:
+        for record in Records(file, LIMITS).whole():
+            if isinstance(record, Record) and record.opcode == Opcode.CHUNK:
+                chunks.append(path.read_bytes()[record.start : record.end])
+    return Original(path.read_bytes(), chunks, list(read_recording(path).events()))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Original:
+    path = tmp_path_factory.mktemp("log") / "whole.mcap"
+    data = write_ros2(path, ros2_sent(8), chunk_size=1500)
+    return Original(data, [], messages=Counter(messages_of(path)))
+
+
+def messages_of(path: Path) -> Iterator[RawMessage]:
+    return RawFile(path).messages(Wanted(), lambda fault: None, lambda done: None)
+
+
+@pytest.fixture(autouse=True)
+def _bounded() -> Iterator[None]:
+    before = peak_memory()
+    yield
+    assert peak_memory() - before < MOST_MEMORY
+
+
+def read(path: Path, *, partial: bool) -> list[Event] | None:
+    """All events, None if there is an error, which has to name the file on one line."""
+    try:
+        return list(read_recording(path, partial=partial).events())
+    except RecordingError as error:
+        assert str(path) in str(error)
+        assert "\n" not in str(error)
+        return None
+
+
+def same(read: Sequence[Event], written: Sequence[Event]) -> bool:
+    return len(read) == len(written) and all(map(same_bits, read, written))
+
+
+@examples
+@given(damage=damages())
+def test_reading_a_damaged_recording(
+    tmp_path: Path, original: Original, damage: Callable[[bytes], bytes]
+) -> None:
+    """All of it, or an error; what is read up to the damage is how it began."""
+    path, begun = tmp_path / "damaged.mcap", time.monotonic()
+    path.write_bytes(damage(original.data))
+    events = read(path, partial=False)
+    assert events is None or same(events, original.events)
+    assert (events is not None) == (path.read_bytes() == original.data)
+    before = read(path, partial=True)
+    assert before is None or same(before, original.events[: len(before)])
+    for check in (False, True):
+        try:
+            json.dumps(recording_info(path, check=check).plain(), allow_nan=False)
+        except RecordingError as error:
+            assert str(path) in str(error)
+    assert time.monotonic() - begun < MOST_SECONDS
+
+
+@examples
+@given(damage=damages())
+def test_recovering_a_damaged_recording(
+    tmp_path: Path, original: Original, damage: Callable[[bytes], bytes]
+) -> None:
+    """Every whole chunk behind the start comes back, and nothing that was not there."""
+    path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
+    out.unlink(missing_ok=True)
+    data, begun = damage(original.data), time.monotonic()
+    path.write_bytes(data)
+    whole = [chunk in data for chunk in original.chunks]
+    try:
+        found = recover(path, out)
+    except RecordingError as error:
+        assert not whole[0] or "is no MCAP file" in str(error)
+        assert "\n" not in str(error)
+        assert not out.exists()
+        return
+    assert path.read_bytes() == data
+    kept = [event for event in read_recording(out).events() if not tells_loss(event)]
+    if isinstance(kept[-1], SessionEnded) and "recovered: " in kept[-1].outcome:
+        del kept[-1]
+    left = iter(original.events[1:])  # the start may lack an attachment
+    for event in kept[1:]:
+        assert any(same_bits(event, written) for written in left), event
+    assert found.nothing_lost or found.damage is not None
+    if len(original.chunks) > 6:
+        steps = {e.step for e in kept if isinstance(e, Probe)}
+        assert steps >= {step for step, is_whole in enumerate(whole[1:7]) if is_whole}
+    assert time.monotonic() - begun < MOST_SECONDS
+
+
+@examples
+@given(damage=damages())
+def test_reading_a_damaged_log(
+    tmp_path: Path, log: Original, damage: Callable[[bytes], bytes]
+) -> None:
+    """No message that was not there, and a fault for every one that is missing."""
+    path, begun = tmp_path / "damaged.mcap", time.monotonic()
+    path.write_bytes(damage(log.data))
+    faults: Counter[str] = Counter()
+    assert log.messages is not None
+    try:
+        file = RawFile(path)
+    except SessionError as error:
+        assert "is no MCAP file" in str(error)
+        return
+    messages = Counter(file.messages(Wanted(), lambda text: faults.update([text]), lambda _: None))
+    assert messages <= log.messages
+    assert messages == log.messages or faults
+    for check in (False, True):
+        info = log_info(path, check=check)
+        json.dumps(info.plain(), allow_nan=False)
+        assert all("\n" not in text for text in info.faults)
+        assert not check or info.count == messages.total()
+        assert not check or info.damage is not None or messages == log.messages
+    assert time.monotonic() - begun < MOST_SECONDS
