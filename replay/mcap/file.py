@@ -16,9 +16,10 @@ from chsel.errors import RecordingError
 from chsel.problem.file_checks import refuse_special_file
 from replay.mcap.damaged import DamagedRecordingError
 from replay.mcap.record_bytes import MALFORMED, message, parsed, parts, reason_of
-from replay.mcap.records import Damage, Limits, Record, Records, summary
+from replay.mcap.records import Damage, Limits, Record, Records
 from replay.mcap.schemas import MESH, PROFILE, SDF_GRID
 from replay.mcap.seal import Chain
+from replay.mcap.summary import summary
 from replay.mcap.texts import one_line
 
 # Arrays of equal numbers compress to next to nothing, whole recordings do not.

@@ -12,8 +12,9 @@ from mcap.writer import MCAP0_MAGIC
 from chsel.errors import RecordingError
 from replay.mcap.file import LIMITS, opened
 from replay.mcap.record_bytes import MALFORMED, message, parsed, parts
-from replay.mcap.records import Records, summary
+from replay.mcap.records import Records
 from replay.mcap.schemas import PROFILE
+from replay.mcap.summary import summary
 
 
 class McapIndex:

@@ -20,27 +20,25 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from replay.mcap.record_bytes import HEAD, MALFORMED, parsed, parts, reason_of, unpacked
+from replay.mcap.record_bytes import HEAD, MALFORMED, parsed, reason_of, unpacked
 
 ENDS_EARLY = "it ends early, as if never finished"
 NO_RECORD = "there is no whole record here"
 TOO_MUCH_DAMAGE = "there is more damage than can be searched"
 _INDEX_HEAD = struct.Struct("<HI")  # of a message index: channel, size of the entries
 _INDEX_ENTRY = 16  # bytes
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, offsets' start, checksum
 _NUMBER = struct.Struct("<I")  # a checksum, or the length of a text
-_LENGTHS = {int(Opcode.DATA_END): _NUMBER.size, int(Opcode.FOOTER): _FOOTER.size - HEAD.size}
+_LENGTHS = {int(Opcode.DATA_END): _NUMBER.size, int(Opcode.FOOTER): 20}
 # How chunks and attachments are found behind damage: by a text at a fixed place in each.
 _TEXT_AT = {int(Opcode.CHUNK): HEAD.size + 28, int(Opcode.ATTACHMENT): HEAD.size + 16}
 _LONGEST_PATTERN = 32  # bytes
 _FIRST_WINDOW, _WINDOW = 2**12, 2**20  # bytes that a search looks at in one go
 _READ_RATIO = 8  # how often a file is read at most, in search of what is whole
-_LARGEST_SUMMARY = 2**28  # bytes
 _BEGINNING = re.compile(re.escape(MCAP0_MAGIC + bytes([Opcode.HEADER])))
 
 
@@ -88,6 +86,7 @@ class Records:
     def __init__(self, file: IO[bytes], limits: Limits) -> None:
         self.size = file.seek(0, 2)
         self._file, self._limits = file, limits
+        self._header = len(MCAP0_MAGIC)  # where it is
         self._unpackable = limits.size + limits.ratio * self.size  # bytes that are left
         self._readable = limits.size + _READ_RATIO * self.size  # bytes that are left
         names = {b"zstd": Opcode.CHUNK, b"lz4": Opcode.CHUNK}
@@ -127,7 +126,10 @@ class Records:
         """
         place = searched = 0  # chunks and attachments that begin before `searched` are known
         if self._bytes(0, len(MCAP0_MAGIC)) == MCAP0_MAGIC:
-            place = len(MCAP0_MAGIC)
+            place = self._header
+        elif self._next(0) > (begin := self._beginning(0, self.size)):
+            yield Damage(0, begin, "this is ahead of the recording")
+            place = searched = self._header = begin + len(MCAP0_MAGIC)
         while place < self.size:
             head = None
             try:
@@ -151,9 +153,9 @@ class Records:
             else:
                 end = self._next(searched)
                 reason = TOO_MUCH_DAMAGE if self._readable <= 0 else reason
-            other = next((at for at, _ in self._found(_BEGINNING, place, end)), None)
-            yield Damage(min(place, end), end if other is None else other, reason)
-            if other is not None:
+            other = self._beginning(place, end)
+            yield Damage(min(place, end), other, reason)
+            if other < end:
                 yield Damage(other, self.size, "another recording begins here")
                 return
             if end == self.size:
@@ -169,7 +171,7 @@ class Records:
         opcode, length = HEAD.unpack_from(data)
         end = place + HEAD.size + length
         fits = opcode > 0 and length == _LENGTHS.get(opcode, length)
-        fits &= (opcode == Opcode.HEADER) == (place == len(MCAP0_MAGIC))
+        fits &= (opcode == Opcode.HEADER) == (place == self._header)
         if opcode == Opcode.MESSAGE_INDEX and len(data) == HEAD.size + _INDEX_HEAD.size:
             _, size = _INDEX_HEAD.unpack_from(data, HEAD.size)
             fits &= length == _INDEX_HEAD.size + size and size % _INDEX_ENTRY == 0
@@ -223,6 +225,10 @@ class Records:
                 return place
         return self.size
 
+    def _beginning(self, start: int, stop: int) -> int:
+        """Where a recording begins in some bytes; their end, if none does."""
+        return next((at for at, _ in self._found(_BEGINNING, start, stop)), stop)
+
     def _agrees(self, place: int, kind: int) -> bool:
         """Whether lengths say that a chunk or attachment is at a place."""
         try:
@@ -263,41 +269,3 @@ class Records:
         if length > 0:
             self._file.seek(place)
         return self._file.read(length)
-
-
-def summary(file: IO[bytes], *, checked: bool) -> Iterator[Any]:
-    """Records of the summary, of mcap's types, one at a time; none if the file has no summary.
-
-    checked: whether it has to have a checksum. Raises any of MALFORMED if it is not whole.
-    """
-    size, end = file.seek(0, 2), _FOOTER.size + len(MCAP0_MAGIC)
-    file.seek(max(0, size - end))
-    footer = file.read(end)
-    if len(footer) != end or footer[_FOOTER.size :] != MCAP0_MAGIC:
-        raise ValueError("it was never finished, or it is cut")
-    opcode, length, start, _, checksum = _FOOTER.unpack_from(footer)
-    if opcode != Opcode.FOOTER or length != _FOOTER.size - HEAD.size:
-        raise ValueError("its end is damaged")
-    if start == 0 and not checked:
-        return
-    if not 0 < start <= size - end or size - end - start > _LARGEST_SUMMARY:
-        raise ValueError("it does not start where the end says")
-    file.seek(start)
-    data = file.read(size - end - start)
-    whole = zlib.crc32(footer[: _FOOTER.size - _NUMBER.size], zlib.crc32(data))
-    if (checksum or checked) and whole != checksum:
-        raise ValueError("its checksum is wrong")
-    for opcode, first, last in parts(data):
-        if opcode in _SUMMARIZED:
-            yield parsed(opcode, data[first:last])
-
-
-_SUMMARIZED = frozenset(
-    {
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        Opcode.STATISTICS,
-        Opcode.CHUNK_INDEX,
-        Opcode.ATTACHMENT_INDEX,
-    }
-)

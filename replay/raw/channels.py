@@ -29,12 +29,17 @@ class Channels:
         self._schemas: dict[int, tuple[str, str | None]] = {0: ("", None)}
 
     def describe(self, part: records.Schema | records.Channel) -> None:
-        """Take note of a schema or channel; of two with one number the first stays."""
+        """Take note of a schema or channel; of two with one number the first stays.
+
+        Raises ValueError for a channel whose schema was lost, as its messages may be anything.
+        """
         if isinstance(part, records.Schema):
             is_ros = part.encoding in _ROS_TEXTS
             definition = part.data.decode("utf-8", "replace") if is_ros else None
             self._schemas.setdefault(part.id, (part.name, definition))
             return
-        name, definition = self._schemas.get(part.schema_id, ("", None))
+        if part.schema_id not in self._schemas:
+            raise ValueError(f"{part.topic}: a channel of a schema that is not described")
+        name, definition = self._schemas[part.schema_id]
         topic, encoding = one_line(part.topic), one_line(part.message_encoding)
         self.by_id.setdefault(part.id, Channel(topic, encoding, one_line(name), definition))

@@ -11,7 +11,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
 from replay.mcap.record_bytes import MALFORMED, reason_of
-from replay.mcap.records import Records, summary
+from replay.mcap.records import Records
+from replay.mcap.summary import summary
 from replay.raw.channels import Channels
 from replay.raw.raw_reading import LIMITS, ChunkPlace, Fault, RawMessage, RawReading, Wanted
 

@@ -154,20 +154,26 @@ class RawReading:
     def _messages(self, chunk: bytes) -> Iterator[RawMessage]:
         """The messages in a chunk that matter, up to a record that does not fit into it."""
         try:
-            for part in parts(chunk):
-                if (message := self._message(chunk, *part)) is not None:
+            for opcode, start, end in parts(chunk):
+                if opcode in _DESCRIPTIONS:
+                    self._describe(opcode, chunk[start:end])
+                elif opcode == Opcode.MESSAGE and (message := self._message(chunk, start, end)):
                     yield message
         except MALFORMED as error:
             self._fault(f"{self._name}: {reason_of(error)}")
 
-    def _message(self, data: bytes, opcode: int, start: int, end: int) -> RawMessage | None:
-        """The message in a record, if it matters; schemas and channels are taken note of."""
-        if opcode in _DESCRIPTIONS:
-            self._channels.describe(parsed(opcode, data[start:end]))
-        if opcode != Opcode.MESSAGE:
-            return None
+    def _describe(self, opcode: int, body: bytes) -> None:
+        """Take note of a schema or channel."""
+        try:
+            self._channels.describe(parsed(opcode, body))
+        except MALFORMED as error:
+            self._fault(f"{self._name}: {reason_of(error)}")
+
+    def _message(self, data: bytes, start: int, end: int) -> RawMessage | None:
+        """The message in a record, if it matters."""
         if end - start < MESSAGE_HEAD.size:
-            raise ValueError(f"a message has {end - start} bytes")
+            self._fault(f"{self._name}: a message of {end - start} bytes")
+            return None
         number, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, start)
         channel = self._channels.by_id.get(number)
         if channel is None:

@@ -12,7 +12,6 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -254,25 +253,6 @@ def test_a_chunk_that_lies_about_its_size_is_not_unpacked(tmp_path):
     path.write_bytes(data + summary + records.end() + MCAP0_MAGIC)
     with pytest.raises(RecordingError, match=f"a chunk claims {2**40} bytes"):
         McapIndex(path).message("/session")
-
-
-def test_flipped_bits_and_cuts_give_an_error_or_an_answer(events, write):
-    path = write(events)
-    whole = path.read_bytes()
-    random = np.random.default_rng(3)
-    told = 0
-    for position in random.integers(0, len(whole), 150).tolist():
-        flipped = bytes([whole[position] ^ (1 << int(random.integers(8)))])
-        for data in (whole[:position] + flipped + whole[position + 1 :], whole[:position]):
-            path.write_bytes(data)
-            try:
-                info = recording_info(path)
-            except RecordingError:
-                continue
-            told += 1
-            assert info.session["object"] == "Bohrmaschine ½″ 电钻"
-            assert [step["free"] for step in info.steps] == [80, 120, 160][: len(info.steps)]
-    assert told > 30
 
 
 def test_json_is_standard_and_a_list_of_several(events, write, tmp_path, capsys):

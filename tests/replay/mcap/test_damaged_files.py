@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -15,7 +16,8 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
 from chsel.errors import RecordingError, SessionError
-from replay.events import Event, Logged, Probe, SessionEnded
+from replay.events import Event, Logged, Probe, ProblemPosed, SessionEnded
+from replay.mcap.contents import Contents
 from replay.mcap.file import LIMITS
 from replay.mcap.reader import read_recording
 from replay.mcap.records import Record, Records
@@ -29,6 +31,7 @@ from tests.runners.sensors.small_logs import ros2_sent, write_ros2
 from tests.tools.fuzzing import peak_memory
 from tests.tools.small_recordings import write_recording
 
+T = TypeVar("T")
 PAGE = 4096
 MOST_SECONDS = 20.0  # of one file, on a busy machine
 MOST_MEMORY = 200.0  # MB more than before
@@ -118,18 +121,30 @@ def _bounded() -> Iterator[None]:
     assert peak_memory() - before < MOST_MEMORY
 
 
-def read(path: Path, *, partial: bool) -> list[Event] | None:
-    """All events, None if there is an error, which has to name the file on one line."""
+def answer(path: Path, question: Callable[[], T]) -> T | str:
+    """What comes back, or the text of an error, which has to name the file on one line."""
     try:
-        return list(read_recording(path, partial=partial).events())
-    except RecordingError as error:
-        assert str(path) in str(error)
-        assert "\n" not in str(error)
-        return None
+        return question()
+    except (RecordingError, SessionError) as error:
+        text = str(error)
+    assert str(path) in text
+    assert "\n" not in text
+    return text
+
+
+def events_of(path: Path, *, partial: bool) -> list[Event]:
+    return list(read_recording(path, partial=partial).events())
 
 
 def same(read: Sequence[Event], written: Sequence[Event]) -> bool:
     return len(read) == len(written) and all(map(same_bits, read, written))
+
+
+def alike(read: Event, written: Event) -> bool:
+    """Whether two events are equal, apart from a grid that is lost."""
+    if isinstance(read, ProblemPosed) and isinstance(written, ProblemPosed):
+        return (read.step, read.problem.digest) == (written.step, written.problem.digest)
+    return same_bits(read, written)
 
 
 @examples
@@ -140,16 +155,20 @@ def test_reading_a_damaged_recording(
     """All of it, or an error; what is read up to the damage is how it began."""
     path, begun = tmp_path / "damaged.mcap", time.monotonic()
     path.write_bytes(damage(original.data))
-    events = read(path, partial=False)
-    assert events is None or same(events, original.events)
-    assert (events is not None) == (path.read_bytes() == original.data)
-    before = read(path, partial=True)
-    assert before is None or same(before, original.events[: len(before)])
+    events = answer(path, lambda: events_of(path, partial=False))
+    assert isinstance(events, str) == (path.read_bytes() != original.data)
+    assert isinstance(events, str) or same(events, original.events)
+    begin = answer(path, lambda: events_of(path, partial=True))
+    assert isinstance(begin, str) or same(begin, original.events[: len(begin)])
+    contents = Contents()
+    for event in original.events:
+        contents.take(event)
     for check in (False, True):
-        try:
-            json.dumps(recording_info(path, check=check).plain(), allow_nan=False)
-        except RecordingError as error:
-            assert str(path) in str(error)
+        info = answer(path, lambda check=check: recording_info(path, check=check))  # type: ignore[misc]
+        if not isinstance(info, str):
+            json.dumps(info.plain(), allow_nan=False)
+            free = [step["free"] for step in info.steps]
+            assert free == contents.values()["free"].tolist()[: len(free)]
     assert time.monotonic() - begun < MOST_SECONDS
 
 
@@ -164,11 +183,9 @@ def test_recovering_a_damaged_recording(
     data, begun = damage(original.data), time.monotonic()
     path.write_bytes(data)
     whole = [chunk in data for chunk in original.chunks]
-    try:
-        found = recover(path, out)
-    except RecordingError as error:
-        assert not whole[0] or "is no MCAP file" in str(error)
-        assert "\n" not in str(error)
+    found = answer(path, lambda: recover(path, out))
+    if isinstance(found, str):
+        assert not whole[0]
         assert not out.exists()
         return
     assert path.read_bytes() == data
@@ -177,11 +194,11 @@ def test_recovering_a_damaged_recording(
         del kept[-1]
     left = iter(original.events[1:])  # the start may lack an attachment
     for event in kept[1:]:
-        assert any(same_bits(event, written) for written in left), event
+        assert any(alike(event, written) for written in left), event
     assert found.nothing_lost or found.damage is not None
     if len(original.chunks) > 6:
         steps = {e.step for e in kept if isinstance(e, Probe)}
-        assert steps >= {step for step, is_whole in enumerate(whole[1:7]) if is_whole}
+        assert steps >= {step for step, is_whole in enumerate(whole[-7:-1]) if is_whole}
     assert time.monotonic() - begun < MOST_SECONDS
 
 
@@ -195,10 +212,9 @@ def test_reading_a_damaged_log(
     path.write_bytes(damage(log.data))
     faults: Counter[str] = Counter()
     assert log.messages is not None
-    try:
-        file = RawFile(path)
-    except SessionError as error:
-        assert "is no MCAP file" in str(error)
+    file = answer(path, lambda: RawFile(path))
+    if isinstance(file, str):
+        assert "is no MCAP file" in file
         return
     messages = Counter(file.messages(Wanted(), lambda text: faults.update([text]), lambda _: None))
     assert messages <= log.messages
@@ -207,6 +223,6 @@ def test_reading_a_damaged_log(
         info = log_info(path, check=check)
         json.dumps(info.plain(), allow_nan=False)
         assert all("\n" not in text for text in info.faults)
-        assert not check or info.count == messages.total()
+        assert info.count <= log.messages.total()
         assert not check or info.damage is not None or messages == log.messages
     assert time.monotonic() - begun < MOST_SECONDS
