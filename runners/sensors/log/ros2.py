@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from runners.sensors.log import message_fields as fields
+from runners.sensors.log import message_fields
 from runners.sensors.log.images import compressed_pixels, pixel_rows
 from runners.sensors.log.messages import (
     CameraInfoMessage,
@@ -27,8 +26,9 @@ from runners.sensors.log.messages import (
 )
 from runners.sensors.log.ros2_definitions import (
     DEFINITIONS,
+    Fields,
+    defined_fields,
     full_definition,
-    has_known_fields,
     short_name,
 )
 
@@ -40,29 +40,38 @@ _LARGEST_FORCE = 1e6  # N, Nm
 _TEXT_AT = 8  # bytes before the text of std_msgs/String
 
 
+_Decoder = tuple[Callable[[bytes], Any], int | None]
+"""Decodes so many bytes at the start of a message, or all."""
+
+
 def ros2_decoder(name: str, definition: str | None = None) -> Decode | None:
     """Decodes messages of this name; None for one that is not read.
 
-    definition: of the schema in the file, where there is one. Raises UnusableMessage if it has
-    other fields than by ROS 2 itself.
+    definition: of the schema in the file, where there is one. Raises UnusableMessage if it lacks a
+    field of ROS 2's, or has others than numbers and texts besides.
     """
     short = short_name(name)
     contents = _CONTENTS.get(short)
     if contents is None:
         return None
-    if definition and not has_known_fields(short, definition):
+    fields = defined_fields(short, definition or "")
+    if fields is None:
         raise UnusableMessage(f"messages {name} have other fields than those of ROS 2")
-    return lambda data: contents(_message(short, data))
+    decoders: list[_Decoder] = [(_decoder(short, fields), None)]
+    if short == "sensor_msgs/PointCloud2":
+        # A hostile one could otherwise claim more fields than fit into memory.
+        before_points = [field for _, field in fields].index("is_bigendian")
+        decoders.insert(0, (_decoder(short, fields[:before_points]), _HEAD))
+    return lambda data: contents(_message(short, decoders, data))
 
 
-def _message(name: str, data: bytes) -> Any:
+def _message(name: str, decoders: Sequence[_Decoder], data: bytes) -> Any:
     if len(data) > _SMALL and name not in _BULKY:
         raise UnusableMessage(f"a {name} of {len(data)} bytes; accepted: up to {_SMALL}")
+    message: Any = None
     try:
-        if name == "sensor_msgs/PointCloud2":
-            # A hostile one could otherwise claim more fields than fit into memory.
-            _decoder(name, until="is_bigendian")(data[:_HEAD])
-        message = _decoder(name)(data)
+        for decode, size in decoders:
+            message = decode(data[:size])
     except _ERRORS:
         raise UnusableMessage(f"a message is no whole {name}") from None
     if name == "std_msgs/String" and _TEXT_AT + len(message.data.encode()) + 1 > len(data):
@@ -70,13 +79,9 @@ def _message(name: str, data: bytes) -> Any:
     return message
 
 
-@cache
-def _decoder(name: str, *, until: str | None = None) -> Callable[[bytes], Any]:
-    """The decoder by our definition, as one from a file could make it run for ever.
-
-    until: its first field that is left out, with all that follow.
-    """
-    text = full_definition(name, until=until)
+def _decoder(name: str, fields: Fields) -> Callable[[bytes], Any]:
+    """The decoder of a message of these fields."""
+    text = full_definition(name, fields)
     schema = Schema(id=1, data=text.encode(), encoding="ros2msg", name=name)
     decoder = DecoderFactory().decoder_for("cdr", schema)
     assert decoder is not None
@@ -84,7 +89,7 @@ def _decoder(name: str, *, until: str | None = None) -> Callable[[bytes], Any]:
 
 
 def _stamp(header: Any) -> int | None:
-    return fields.stamp_of(header.stamp.sec, header.stamp.nanosec)
+    return message_fields.stamp_of(header.stamp.sec, header.stamp.nanosec)
 
 
 def _image(message: Any, frame: str) -> ImageMessage:
@@ -106,7 +111,7 @@ def _camera_info(message: Any, frame: str) -> CameraInfoMessage:
     """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
     region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
     fx, _, cx, _, fy, cy, *_ = message.k
-    return fields.intrinsics(
+    return message_fields.intrinsics(
         frame,
         ((region.width or message.width) // across, (region.height or message.height) // down),
         (fx / across, fy / down),
@@ -116,21 +121,23 @@ def _camera_info(message: Any, frame: str) -> CameraInfoMessage:
 
 
 def _pose(message: Any, frame: str) -> PoseMessage:
-    return PoseMessage(frame, fields.rigid(message.pose.position, message.pose.orientation))
+    return PoseMessage(frame, message_fields.rigid(message.pose.position, message.pose.orientation))
 
 
 def _poses(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, fields.positions(pose.position for pose in message.poses))
+    return CloudMessage(frame, message_fields.positions(pose.position for pose in message.poses))
 
 
 def _point(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, fields.positions([message.point]))
+    return CloudMessage(frame, message_fields.positions([message.point]))
 
 
 def _cloud(message: Any, frame: str) -> CloudMessage:
-    points = fields.packed_points(
+    points = message_fields.packed_points(
         message.data,
-        fields.named_fields((part.name, part.offset, part.datatype) for part in message.fields),
+        message_fields.named_fields(
+            (part.name, part.offset, part.datatype) for part in message.fields
+        ),
         message.point_step,
         size=(message.width, message.height),
         row=message.row_step,
@@ -140,20 +147,20 @@ def _cloud(message: Any, frame: str) -> CloudMessage:
 
 
 def _wrench(message: Any, frame: str) -> WrenchMessage:
-    force, torque = fields.positions([message.wrench.force, message.wrench.torque])
+    force, torque = message_fields.positions([message.wrench.force, message.wrench.torque])
     if not (np.abs([force, torque]) <= _LARGEST_FORCE).all():  # NaN is not
         raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
     return WrenchMessage(frame, force, torque)
 
 
 def _joints(message: Any, _: str) -> JointsMessage:
-    fields.require_length("positions", len(message.position), "names", len(message.name))
-    return fields.joints(zip(message.name, message.position, strict=True))
+    message_fields.require_length("positions", len(message.position), "names", len(message.name))
+    return message_fields.joints(zip(message.name, message.position, strict=True))
 
 
 def _transform(message: Any) -> Iterator[Decoded]:
     parent, child, moved = message.header.frame_id, message.child_frame_id, message.transform
-    content = fields.transform(parent, child, moved.translation, moved.rotation)
+    content = message_fields.transform(parent, child, moved.translation, moved.rotation)
     yield _stamp(message.header), content
 
 
@@ -164,14 +171,14 @@ def _transforms(message: Any) -> Iterator[Decoded]:
 
 def _marker(message: Any) -> Iterator[Decoded]:
     value = message.data
-    yield None, fields.marker(str(value).lower() if isinstance(value, bool) else str(value))
+    yield None, message_fields.marker(str(value).lower() if isinstance(value, bool) else str(value))
 
 
 def _stamped(content: Callable[[Any, str], Content]) -> Callable[[Any], Iterator[Decoded]]:
     """One content of a message with a header."""
 
     def contents(message: Any) -> Iterator[Decoded]:
-        frame = fields.frame_name(message.header.frame_id)
+        frame = message_fields.frame_name(message.header.frame_id)
         yield _stamp(message.header), content(message, frame)
 
     return contents

@@ -1,4 +1,4 @@
-"""The ROS 2 messages that are read and simulated: their fields, which never come from a file."""
+"""The ROS 2 messages that are read and simulated, and what definitions in files may add."""
 
 from __future__ import annotations
 
@@ -48,9 +48,16 @@ DEFINITIONS = {
 }
 """Fields by the name of the message, of which names in files have "/msg" besides."""
 
+Fields = tuple[tuple[str, str], ...]
+"""Types and names of the fields of a message, in their order."""
+
 _LONGEST_TEXT = 2**16
 _SEPARATOR = "\n" + "=" * 80 + "\n"
 _SAME = {"byte": "uint8", "char": "uint8"}
+_SCALARS = {"bool", "string", "float32", "float64"} | {
+    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
+}
+_NAME = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")  # of a field, by ROS 2
 _LIMIT = re.compile(r"<=\d+")
 
 
@@ -59,33 +66,45 @@ def short_name(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def full_definition(name: str, *, until: str | None = None) -> str:
+def full_definition(name: str, fields: Fields | None = None) -> str:
     """The definition of a message with those of all that it contains, as ROS 2 writes them.
 
-    until: its first field that is left out, with all that follow.
+    fields: in place of its own.
     """
-    fields = _fields(DEFINITIONS[name])
-    if until is not None:
-        fields = fields[: [field for _, field in fields].index(until)]
+    fields = _fields(DEFINITIONS[name]) if fields is None else fields
     parts = ["\n".join(f"{kind} {field}" for kind, field in fields)]
     for inner in _nested(fields):
         parts.append(f"MSG: {inner}\n" + DEFINITIONS[inner].replace("; ", "\n"))
     return _SEPARATOR.join(parts) + "\n"
 
 
-def has_known_fields(name: str, text: str) -> bool:
-    """Whether a definition in a file has the fields of the one that is read in its place.
+def defined_fields(name: str, text: str) -> Fields | None:
+    """The fields of a message by its definition in a file.
 
-    Texts of other parts than the message's own are those of ROS 2 itself, and not looked at.
+    Those of ROS 2 in their order, and among them further numbers and texts. None for others, as an
+    array of messages that a file defines could make the decoder run for ever. Of the definition's
+    other parts, those of ROS 2 itself are taken in their place, as for a message without a text.
     """
     if len(text) > _LONGEST_TEXT:
-        return False
+        return None
     own = re.split(r"^={3,}\s*$", text, maxsplit=1, flags=re.MULTILINE)[0]
     lines = "; ".join(line.split("#")[0] for line in own.splitlines())
-    return not lines.strip("; ") or _normalised(lines) == _normalised(DEFINITIONS[name])
+    missing = list(_fields(DEFINITIONS[name]))
+    if not lines.strip("; "):
+        return tuple(missing)
+    fields: list[tuple[str, str]] = []
+    for kind, field in map(_normalised, _fields(lines)):
+        if missing and (kind, field) == _normalised(missing[0]):
+            fields.append(missing.pop(0))
+        elif kind in _SCALARS and _NAME.fullmatch(field):
+            fields.append((kind, field))
+        else:
+            return None
+    is_readable = not missing and len({field for _, field in fields}) == len(fields)
+    return tuple(fields) if is_readable else None
 
 
-def _nested(fields: list[tuple[str, str]]) -> list[str]:
+def _nested(fields: Fields) -> list[str]:
     """The messages that fields are made of, each once, in the order of their use."""
     found: dict[str, None] = {}
     for kind, _ in fields:
@@ -95,20 +114,20 @@ def _nested(fields: list[tuple[str, str]]) -> list[str]:
     return list(found)
 
 
-def _normalised(text: str) -> list[tuple[str, str]]:
-    """Types without packages and limits, names in small letters: what all texts agree in."""
-    fields = []
-    for kind, name in _fields(text):
-        base, bracket, size = _LIMIT.sub("", kind).rsplit("/", 1)[-1].partition("[")
-        fields.append((_SAME.get(base, base) + bracket + size, name.lower()))
-    return fields
+def _normalised(field: tuple[str, str]) -> tuple[str, str]:
+    """A type without package and limit, and a name in small letters: what all texts agree in."""
+    base, bracket, size = _LIMIT.sub("", field[0]).rsplit("/", 1)[-1].partition("[")
+    return _SAME.get(base, base) + bracket + size, field[1].lower()
 
 
-def _fields(text: str) -> list[tuple[str, str]]:
+def _fields(text: str) -> Fields:
     """Types and names of the fields of a definition without comments; constants are none."""
-    parts = [part.split() for part in text.split(";")]
-    return [
-        (words[0], words[1])
-        for words in parts
-        if len(words) >= 2 and not any("=" in word for word in words[1:3])
-    ]
+    parts = [part.split(maxsplit=2) for part in text.split(";")]
+    return tuple(
+        (words[0], words[1]) for words in parts if len(words) >= 2 and not _is_constant(words)
+    )
+
+
+def _is_constant(words: list[str]) -> bool:
+    """Whether type, name and rest of a line are those of NAME=VALUE."""
+    return "=" in words[1] or words[-1].startswith("=")

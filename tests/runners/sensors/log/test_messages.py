@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
+from mcap_ros2.writer import Writer
 
 from runners.sensors.log.messages import (
     CameraInfoMessage,
@@ -28,7 +29,8 @@ from runners.sensors.log.messages import (
 )
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.ros2 import ros2_decoder
-from runners.sensors.log.ros2_definitions import has_known_fields
+from runners.sensors.log.ros2_definitions import defined_fields, full_definition
+from runners.simulated_robot.ros_messages import joint_state
 from tests.runners.sensors.small_logs import (
     BEGIN,
     SECOND,
@@ -220,8 +222,7 @@ def test_a_hostile_message_costs_neither_time_nor_memory(tmp_path: Path) -> None
     assert peak < 2**20
 
 
-def test_texts_may_differ_in_all_but_the_fields() -> None:
-    text = """
+JOINT_STATE = """
     # A comment; with uint8 nothing in it
     int32 MOST=7   # a constant
     Header header
@@ -229,14 +230,46 @@ def test_texts_may_differ_in_all_but_the_fields() -> None:
     float64[<=6] position 0.0
     float64[] velocity
     float64[] effort"""
-    assert has_known_fields("sensor_msgs/JointState", text)
-    assert not has_known_fields("sensor_msgs/JointState", f"uint8 more\n{text}")
-    assert not has_known_fields(
-        "sensor_msgs/JointState", text.replace("float64[] vel", "float32[] vel")
-    )
-    assert not has_known_fields("sensor_msgs/JointState", text.replace("[] effort", "[6] effort"))
-    assert has_known_fields("sensor_msgs/JointState", "")
-    assert not has_known_fields("sensor_msgs/JointState", " " * 10**6)
+
+
+@pytest.mark.parametrize(
+    ("text", "further"),
+    [
+        (JOINT_STATE, []),
+        ("", []),
+        (f"char more\n{JOINT_STATE}\nstring source", ["more", "source"]),
+        (f'{JOINT_STATE}\nstring source "a=b"\nuint8 MOST = 7\nuint8 LEAST =1', ["source"]),
+        (f"uint8[] more\n{JOINT_STATE}", None),
+        (f"uint8 a__b\n{JOINT_STATE}", None),
+        (f"{JOINT_STATE}\nOwn more", None),
+        (f"{JOINT_STATE}\nuint8 name", None),
+        (f"{JOINT_STATE}\nuint8 __class__", None),
+        (JOINT_STATE.replace("float64[] vel", "float32[] vel"), None),
+        (JOINT_STATE.replace("[] effort", "[6] effort"), None),
+        (JOINT_STATE.replace("float64[] effort", ""), None),
+        (" " * 10**6, None),
+    ],
+)
+def test_definitions_may_add_numbers_and_texts(text: str, further: list[str] | None) -> None:
+    fields = defined_fields("sensor_msgs/JointState", text)
+    known = [field for _, field in defined_fields("sensor_msgs/JointState", "") or ()]
+    if further is None:
+        assert fields is None
+    else:
+        assert sorted(field for _, field in fields or ()) == sorted(known + further)
+
+
+def test_messages_with_further_fields_are_read(tmp_path: Path) -> None:
+    text = full_definition("sensor_msgs/JointState")
+    own, _, parts = text.partition("=")
+    text = f"uint16 sequence\n{own}string source\n={parts}"
+    message = {"sequence": 7, **joint_state(["elbow"], [0.5], BEGIN), "source": "arm"}
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef("sensor_msgs/msg/JointState", text)
+        writer.write_message("/joints", schema, message, BEGIN)
+        writer.finish()
+    assert by_topic(tmp_path / "log.mcap")["/joints"].content == JointsMessage({"elbow": 0.5})
 
 
 def camera_info(path: Path, **changes: Any) -> tuple[object, str]:
