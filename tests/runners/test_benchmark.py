@@ -16,6 +16,7 @@ import torch
 
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
+from runners import benchmark
 from runners.benchmarks.comparison import BenchmarkError, require_equal
 from runners.benchmarks.measures import methods
 from runners.benchmarks.plausible import plausible_sets
@@ -27,6 +28,7 @@ from runners.published_package.environment import PackageError
 from runners.published_package.problem_file import load_problem
 from runners.published_package.process import PublishedPackage
 from runners.published_package.worker import GridSdf
+from tests.runners.in_process import run as in_process
 
 PUBLISHED_PYTHON = "CHSEL_PUBLISHED_PYTHON"
 FEW = ("quick=true", "repeats=2")
@@ -319,7 +321,7 @@ def test_with_the_package_it_is_measured_in_the_same_run(stand_in: Path, tmp_pat
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(tmp_path: Path, override: str, message: str) -> None:
-    done = run(tmp_path, override)
+    done = in_process(benchmark.main, *FEW, override, f"logs={tmp_path}")
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1

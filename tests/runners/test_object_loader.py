@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import types
 from pathlib import Path
@@ -14,11 +12,13 @@ from hydra import compose, initialize_config_dir
 
 from chsel.errors import MeshError, SettingError
 from chsel.problem.settings import build_settings
+from runners import fetch
 from runners.command.choices import CONF
 from runners.command.program import plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.models import MODELS
 from runners.objects.scans import SCANS, check_scan, scan_file
+from tests.runners.in_process import run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -155,37 +155,28 @@ def test_a_model_that_does_not_exist_is_named(tmp_path):
         load_object(chosen("object=hammer"), tmp_path)
 
 
-def run_fetch(
-    folder: Path, *overrides: str, **environment: str
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "runners.fetch", *overrides],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY), **environment},
-        capture_output=True,
-        text=True,
-    )
-
-
-def test_the_command_downloads_nothing_that_is_there_and_leaves_no_traces(ycb_directory, tmp_path):
-    result = run_fetch(tmp_path, "object=ycb/clamp", CHSEL_ASSETS=str(ycb_directory))
-    assert result.returncode == 0, result.stderr
-    assert "is there already: 583 vertices, 43.5 x 62.5 x 83.5 mm, watertight" in result.stdout
+def test_the_command_downloads_nothing_that_is_there_and_leaves_no_traces(
+    ycb_directory, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CHSEL_ASSETS", str(ycb_directory))
+    done = run(fetch.main, "object=ycb/clamp")
+    assert done.returncode == 0, done.stderr
+    assert "is there already: 583 vertices, 43.5 x 62.5 x 83.5 mm, watertight" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_says_of_an_object_without_scan_that_it_needs_none(tmp_path):
-    result = run_fetch(tmp_path, "object=drill")
-    assert result.returncode == 2
-    assert "error: this object needs no download; accepted: object=ycb/NAME" in result.stderr
-    assert "Traceback" not in result.stderr
+def test_the_command_says_of_an_object_without_scan_that_it_needs_none():
+    done = run(fetch.main, "object=drill")
+    message = "error: this object needs no download; accepted: object=ycb/NAME\n"
+    assert (done.returncode, done.stderr) == (2, message)
 
 
 def test_the_command_touches_no_folder_that_is_there_but_damaged(tmp_path):
     damaged = tmp_path / "035_power_drill/google_16k/nontextured.ply"
     damaged.parent.mkdir(parents=True)
     damaged.write_text("ply")
-    result = run_fetch(tmp_path, f"assets.dir={tmp_path}")
-    assert result.returncode == 2
-    assert "to download the scan again, move" in result.stderr
+    done = run(fetch.main, f"assets.dir={tmp_path}")
+    assert done.returncode == 2
+    assert "to download the scan again, move" in done.stderr
     assert damaged.read_text() == "ply"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import resource
 import signal
 import subprocess
 import sys
@@ -12,22 +10,23 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import pytest
-import trimesh
 import yaml
 
 import chsel
-from chsel.errors import RecordingError
+from chsel.errors import MeshError
 from chsel.methods import METHODS, build_method
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
-from chsel.problem.poses import apply, axis_angle, compose
+from chsel.problem.poses import apply
 from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
+from runners import probe
 from runners.run.display import MEANINGS
+from tests.runners.in_process import Done
+from tests.runners.in_process import run as in_process
+from tests.tools.kill_sessions import points_session
 
-POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
 QUICK = (
     "method.descent.restarts=2",
     "method.descent.iterations=20",
@@ -38,33 +37,12 @@ QUICK = (
 
 @pytest.fixture(scope="module")
 def points(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
-    """A session of three steps on a box, and the overrides that select it."""
-    folder = tmp_path_factory.mktemp("points")
-    box = trimesh.creation.box((0.1, 0.06, 0.2))
-    box.export(folder / "box.ply")
-    surface = apply(POSE, trimesh.sample.sample_surface(box, 15, seed=0)[0])
-    free = np.random.default_rng(0).uniform(0.3, 0.6, (40, 3))
-    np.savez(
-        folder / "box.npz",
-        surface=surface,
-        surface_step=np.arange(15) // 5,
-        free=free,
-        free_step=np.arange(40) % 3,
-        world_from_object=POSE,
-    )
-    return (
-        "session=points",
-        f"session.path={folder / 'box.npz'}",
-        "object=mesh",
-        f"object.path={folder / 'box.ply'}",
-        "session.object_resolution=0.005",
-    )
+    """A session of three steps on a box: the overrides that select it."""
+    return points_session(tmp_path_factory.mktemp("points"), probes=3)
 
 
-def run(folder: Path, *overrides: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "runners.probe", *overrides, f"logs={folder}"]
-    environment = {**os.environ, "COLUMNS": "120", "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment)
+def run(folder: Path, *overrides: str) -> Done:
+    return in_process(probe.main, *overrides, f"logs={folder}", columns=120)
 
 
 def run_folder(logs: Path) -> Path:
@@ -75,7 +53,7 @@ def run_folder(logs: Path) -> Path:
 @pytest.fixture(scope="module")
 def finished(
     points: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, subprocess.CompletedProcess[str]]:
+) -> tuple[Path, Done]:
     logs = tmp_path_factory.mktemp("logs")
     done = run(logs, *points, *QUICK)
     assert done.returncode == 0, done.stderr
@@ -83,7 +61,7 @@ def finished(
 
 
 def test_recorded_errors_are_modulo_symmetries(
-    finished: tuple[Path, subprocess.CompletedProcess[str]],
+    finished: tuple[Path, Done],
 ) -> None:
     recording = read_recording(finished[0] / "recording.mcap")
     symmetry = object_symmetry(recording.start.mesh)
@@ -98,7 +76,7 @@ def test_recorded_errors_are_modulo_symmetries(
 
 
 def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
-    finished: tuple[Path, subprocess.CompletedProcess[str]],
+    finished: tuple[Path, Done],
 ) -> None:
     folder, done = finished
     recording = read_recording(folder / "recording.mcap")
@@ -115,7 +93,7 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
 
 
 def test_a_run_leaves_recordings_config_and_summary(
-    finished: tuple[Path, subprocess.CompletedProcess[str]],
+    finished: tuple[Path, Done],
 ) -> None:
     folder, done = finished
     names = {file.name for file in folder.iterdir()}
@@ -138,7 +116,7 @@ def test_a_run_leaves_recordings_config_and_summary(
 
 
 def test_every_problem_of_the_recording_gives_the_recorded_result(
-    finished: tuple[Path, subprocess.CompletedProcess[str]],
+    finished: tuple[Path, Done],
 ) -> None:
     recording = read_recording(finished[0] / "recording.mcap")
     settings = dict(recording.start.config["method"])
@@ -152,16 +130,16 @@ def test_every_problem_of_the_recording_gives_the_recorded_result(
 
 
 def test_the_same_command_writes_the_same_bytes_and_no_path_or_clock(
-    points: tuple[str, ...], finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+    points: tuple[str, ...], finished: tuple[Path, Done], tmp_path: Path
 ) -> None:
-    logs = tmp_path / "elsewhere"
-    assert run(logs, *points, *QUICK, cwd=tmp_path).returncode == 0
-    again = (run_folder(logs) / "recording.mcap").read_bytes()
+    command = [sys.executable, "-m", "runners.probe", *points, *QUICK, "logs=elsewhere"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    again = (run_folder(tmp_path / "elsewhere") / "recording.mcap").read_bytes()
     assert again == (finished[0] / "recording.mcap").read_bytes()
 
 
 def test_recording_snapshots_and_threads_change_no_result(
-    points: tuple[str, ...], finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+    points: tuple[str, ...], finished: tuple[Path, Done], tmp_path: Path
 ) -> None:
     done = run(
         tmp_path, *points, *QUICK, "recording=none", "recording.snapshot_interval=0", "threads=2"
@@ -178,7 +156,7 @@ def test_recording_snapshots_and_threads_change_no_result(
 
 
 def test_a_recorded_session_repeats_the_probes_with_another_method(
-    finished: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+    finished: tuple[Path, Done], tmp_path: Path
 ) -> None:
     source = finished[0] / "recording.mcap"
     done = run(
@@ -220,49 +198,6 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
     recording = read_recording(recordings[0])
     assert recording.ended is not None
     assert recording.ended.outcome == "interrupted"
-
-
-def test_a_killed_run_leaves_every_probe_that_it_reported(
-    points: tuple[str, ...], tmp_path: Path
-) -> None:
-    command = [sys.executable, "-u", "-m", "runners.probe", *points, f"logs={tmp_path}"]
-    process = subprocess.Popen([*command, *QUICK], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    reported = 0
-    for line in process.stdout:
-        reported += line.startswith("probe ")
-        if reported == 2:
-            process.kill()
-            break
-    process.wait(timeout=60)
-    (path,) = tmp_path.rglob("recording.mcap")
-    with pytest.raises(RecordingError, match="unfinished"):
-        read_recording(path)
-    recording = read_recording(path, partial=True)
-    assert [probe.step for probe in recording.probes][:2] == [0, 1]
-    assert recording.steps[:2] == (0, 1)
-    assert recording.hypotheses(1).object_from_world.shape == (30, 4, 4)
-
-
-def test_a_full_disk_is_told_and_loses_nothing_that_was_written(
-    points: tuple[str, ...], tmp_path: Path
-) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-    size = 2_000_000
-    command = [sys.executable, "-m", "runners.probe", *points, f"logs={tmp_path}", *QUICK]
-    many = ["recording=mcap", "method.archive.bins=400", "method.emitter.iterations=200"]
-    done = subprocess.run([*command, *many], capture_output=True, text=True, preexec_fn=limit)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "recording.mcap cannot be written: File too large" in done.stderr
-    folder = run_folder(tmp_path)
-    recording = read_recording(folder / "recording.mcap", partial=True)
-    assert recording.start.object == "mesh"
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["outcome"].startswith("failed: ")
-    assert len(recording.steps) >= len(summary["steps"])
 
 
 def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> None:
@@ -326,12 +261,8 @@ def test_a_mistake_is_one_line_and_status_2(
     points: tuple[str, ...], tmp_path: Path, override: str, message: str
 ) -> None:
     chosen = () if override.startswith("session=") else points
-    overrides = [f"logs={tmp_path}", *chosen, *override.split()]
-    if override.startswith("logs="):
-        del overrides[0]
-    done = subprocess.run(
-        [sys.executable, "-m", "runners.probe", *overrides], capture_output=True, text=True
-    )
+    logs = () if override.startswith("logs=") else (f"logs={tmp_path}",)
+    done = in_process(probe.main, *logs, *chosen, *override.split())
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
@@ -340,9 +271,8 @@ def test_a_mistake_is_one_line_and_status_2(
 
 
 def test_traceback_is_shown_when_asked_for(points: tuple[str, ...], tmp_path: Path) -> None:
-    done = run(tmp_path, *points, "object.path=nothing.obj", "--traceback")
-    assert "Traceback" in done.stderr
-    assert "MeshError" in done.stderr
+    with pytest.raises(MeshError):  # which Python prints with its traceback
+        run(tmp_path, *points, "object.path=nothing.obj", "--traceback")
 
 
 def test_help_names_every_group_with_its_choices(tmp_path: Path) -> None:

@@ -73,18 +73,18 @@ class Reference:
     seconds: float
 
 
-def points_session(folder: Path) -> tuple[str, ...]:
+def points_session(folder: Path, probes: int = PROBES) -> tuple[str, ...]:
     """A point file of a box in `folder`, and the overrides that select it."""
     box = trimesh.creation.box((0.1, 0.06, 0.2))
     box.export(folder / "box.ply")
-    surface = apply(_POSE, trimesh.sample.sample_surface(box, 5 * PROBES, seed=0)[0])
-    free = np.random.default_rng(0).uniform(0.3, 0.6, (10 * PROBES, 3))
+    surface = apply(_POSE, trimesh.sample.sample_surface(box, 5 * probes, seed=0)[0])
+    free = np.random.default_rng(0).uniform(0.3, 0.6, (10 * probes, 3))
     np.savez(
         folder / "box.npz",
         surface=surface,
         surface_step=np.arange(len(surface)) // 5,
         free=free,
-        free_step=np.arange(len(free)) % PROBES,
+        free_step=np.arange(len(free)) % probes,
         world_from_object=_POSE,
     )
     return (

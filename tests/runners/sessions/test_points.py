@@ -122,7 +122,6 @@ def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path: Path, suffix
         ({"known": SURFACE}, "known and known_sdf stand only together"),
         ({"known": SURFACE, "known_sdf": np.zeros(2)}, r"known_sdf has shape \(2,\)"),
         ({"surface": SURFACE, "surface_step": np.zeros(3)}, "surface_step has type float64"),
-        ({"surface": SURFACE, "surface_step": np.array([0, -1, 0])}, r"surface_step\[1\] is -1"),
         ({"surface": SURFACE, "world_from_object": 2 * np.eye(4)}, "not a rigid transform"),
         ({"surface": np.zeros((0, 3))}, "holds no points"),
         ({"surface": np.array([[object()] * 3])}, "not a readable .npz"),
@@ -166,13 +165,6 @@ def test_files_that_are_not_what_their_suffix_says_are_refused(tmp_path: Path) -
         read_points(tmp_path / "points.txt")
     with pytest.raises(PointsError, match="does not exist"):
         read_points(tmp_path / "nothing.npz")
-
-
-def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
-    path = tmp_path / "evil.npz"
-    np.savez(path, surface=np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(PointsError, match=r"not a readable \.npz file"):
-        read_points(path)
 
 
 def test_workspace_is_that_of_the_points_padded_by_the_diameter(tmp_path: Path) -> None:
