@@ -176,8 +176,10 @@ def _set(message: Any, field: str, kind: Kind, value: Any, lengths: dict[str, in
 def _set_array(target: Any, kind: Kind, value: np.ndarray, lengths: dict[str, int]) -> None:
     _check_array(kind, value.dtype, value.shape, lengths)
     stored = value.astype(kind.dtype, copy=False)
-    if kind.narrow and (stored.astype(_NARROW).astype(kind.dtype) == stored).all():
-        stored = stored.astype(_NARROW)
+    if kind.narrow:
+        with np.errstate(over="ignore"):
+            narrow = stored.astype(_NARROW)
+        stored = narrow if (narrow == stored).all() else stored
     target.dtype = stored.dtype.str
     target.shape.extend(value.shape)
     target.data = stored.tobytes()

@@ -1,14 +1,31 @@
-"""Messages from the table of schemas: exact both ways, strict about types and shapes."""
+"""Messages of the table: exact both ways, strict about types, shapes and bytes."""
 
 from __future__ import annotations
 
+from contextlib import suppress
+from typing import Any
+
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from chsel.errors import RecordingError
-from replay.mcap.encoding import decode, encode, field_kinds, message_class
+from replay.mcap.encoding import Kind, check_message, decode, encode, field_kinds, message_class
+from replay.mcap.foxglove_messages import cloud_points, log_level_and_text, point_cloud
 from replay.mcap.schemas import MESSAGES
+from tests.replay.conftest import same_bits
 
+WHOLE = {"uint32": (0, 2**32 - 1), "uint64": (0, 2**64 - 1), "sint32": (-(2**31), 2**31 - 1)}
+SCALARS = {
+    "string": st.text(max_size=8),
+    "double": st.floats(),
+    "bool": st.booleans(),
+    "bytes": st.binary(max_size=8),
+    **{name: st.integers(*ends) for name, ends in WHOLE.items()},
+}
 ARCHIVE = {
     "step": -1,
     "iteration": 2**32 - 1,
@@ -25,61 +42,81 @@ ARCHIVE = {
 }
 
 
-def changed(**fields: tuple[str, list[int], bytes]) -> bytes:
-    """The archive with some of its Array messages replaced by (dtype, shape, data)."""
-    message = message_class("ArchiveSnapshot").FromString(encode("ArchiveSnapshot", ARCHIVE))
-    for name, (dtype, shape, data) in fields.items():
-        array = getattr(message, name)
-        array.Clear()
-        array.dtype, array.data = dtype, data
-        array.shape.extend(shape)
-    return message.SerializeToString()
+@st.composite
+def values_of(draw: st.DrawFn, name: str) -> dict[str, Any]:
+    """Any values that a message of the table can have."""
+    lengths: dict[str, int] = {}
+    return {field: draw(_value(kind, lengths, draw)) for field, kind in field_kinds(name).items()}
 
 
-def test_values_come_back_exactly():
-    values = decode("ArchiveSnapshot", encode("ArchiveSnapshot", ARCHIVE))
-    for name, value in ARCHIVE.items():
-        if isinstance(value, np.ndarray):
-            assert values[name].dtype == value.dtype
-            assert values[name].tobytes() == value.tobytes()
-            assert values[name].shape == value.shape
-        else:
-            assert values[name] == value
+def _value(kind: Kind, lengths: dict[str, int], draw: st.DrawFn) -> st.SearchStrategy[Any]:
+    if kind.dtype is not None:
+        shape = tuple(
+            int(side)
+            if side.isdigit()
+            else lengths.setdefault(side, draw(st.integers(0, 3), label=side))
+            for side in kind.shape
+        )
+        dtype = draw(st.sampled_from([kind.dtype, kind.dtype.newbyteorder(">")]))
+        found: st.SearchStrategy[Any] = arrays.arrays(dtype, shape)
+    elif kind.is_mapping:
+        value = SCALARS["double" if kind.type == "Number" else "string"]
+        found = st.dictionaries(st.text(max_size=3), value, max_size=3)
+    elif kind.is_message:
+        found = values_of(kind.type)
+    else:
+        found = SCALARS[kind.type]
+        found = st.lists(found, max_size=3).map(tuple) if kind.repeated else found
+    return st.one_of(st.none(), found) if kind.optional else found
 
 
-def test_arrays_are_little_endian_and_row_major_whatever_they_were():
-    array = np.asfortranarray(np.arange(18.0).reshape(2, 9)).astype(">f8")
-    values = ARCHIVE | {
-        "solutions": array,
-        "cells": np.arange(2),
-        "objectives": np.ones(2),
-        "measures": np.ones((4, 2))[::2],
-    }
-    data = encode("ArchiveSnapshot", values)
-    stored = message_class("ArchiveSnapshot").FromString(data).solutions
-    assert stored.dtype == "<f8"
-    assert stored.data == np.arange(18, dtype="<f8").tobytes()
-    assert decode("ArchiveSnapshot", data)["solutions"].tolist() == array.tolist()
+def native(value: Any) -> Any:
+    """Arrays in the machine's byte order and in C order, as a reader gets them."""
+    if isinstance(value, dict):
+        return {name: native(item) for name, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return np.ascontiguousarray(value, value.dtype.newbyteorder("="))
+    return value
 
 
-def test_absent_fields_are_none_and_required_ones_are_missed():
-    hypotheses = {
-        "step": 0,
-        "object_from_world": np.zeros((0, 4, 4)),
-        "cost": np.zeros(0),
-        "duplicate": np.zeros(0, dtype=bool),
-        "cell": np.zeros(0, dtype=np.int64),
-        "elites": np.zeros((0, 4, 4)),
-        "archive": None,
-        "archive_is_last_snapshot": False,
-        "digest": "",
-    }
-    data = encode("Hypotheses", hypotheses)
-    assert decode("Hypotheses", data)["archive"] is None
-    message = message_class("Hypotheses").FromString(data)
-    message.ClearField("elites")
-    with pytest.raises(RecordingError, match=r"Hypotheses\.elites is missing"):
-        decode("Hypotheses", message.SerializeToString())
+@pytest.mark.parametrize("name", MESSAGES)
+@given(data=st.data())
+def test_values_come_back_exactly_whatever_the_order_of_their_bytes(
+    name: str, data: st.DataObject
+) -> None:
+    values = data.draw(values_of(name))
+    written = encode(name, values)
+    assert same_bits(decode(name, written), native(values))
+    assert encode(name, decode(name, written)) == written
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+@given(data=st.data())
+def test_other_bytes_are_a_message_or_one_clear_error(name: str, data: st.DataObject) -> None:
+    written = bytearray(encode(name, data.draw(values_of(name))))
+    for place in data.draw(st.lists(st.integers(0, max(0, len(written) - 1)), max_size=3)):
+        written[place : place + 1] = data.draw(st.binary(max_size=2))
+    with suppress(RecordingError):
+        check_message(name, decode(name, bytes(written)))
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_field_numbers_follow_the_table(name: str) -> None:
+    fields = message_class(name).DESCRIPTOR.fields
+    assert [field.number for field in fields] == list(range(1, len(MESSAGES[name]) + 1))
+    assert [field.name for field in fields] == list(MESSAGES[name])
+
+
+def changed(**fields: tuple[str, list[int], bytes] | None) -> bytes:
+    """The archive with some arrays replaced by (dtype, shape, data), or left out."""
+    message: Any = message_class("ArchiveSnapshot").FromString(encode("ArchiveSnapshot", ARCHIVE))
+    for name, array in fields.items():
+        message.ClearField(name)
+        if array is not None:
+            stored = getattr(message, name)
+            stored.dtype, stored.data = array[0], array[2]
+            stored.shape.extend(array[1])
+    return bytes(message.SerializeToString())
 
 
 @pytest.mark.parametrize(
@@ -88,10 +125,8 @@ def test_absent_fields_are_none_and_required_ones_are_missed():
         ({"cells": ("|O", [1], b"\0" * 8)}, r"cells is of type '\|O'; accepted: '<i8'"),
         ({"cells": ("<f8", [1], b"\0" * 8)}, "cells is of type '<f8'; accepted: '<i8'"),
         ({"cells": ("<i8", [1], b"\0" * 7)}, r"cells has 7 bytes, which do not fill .* \(1,\)"),
-        (
-            {"objectives": ("<f8", [2], b"\0" * 16)},
-            r"objectives: .*\(2,\); accepted: float64 \(1\)",
-        ),
+        ({"cells": None}, "ArchiveSnapshot.cells is missing"),
+        ({"objectives": ("<f8", [2], b"\0" * 16)}, r"objectives: .*\(2,\); accepted: float64 \(1"),
         ({"measures": ("<f8", [1, 3], b"\0" * 24)}, r"measures: .*\(1, 3\); accepted: .*\(1, 2\)"),
         ({"solutions": ("<f8", [1], b"\0" * 8)}, r"solutions: .*\(1,\); accepted: .*\(1, d\)"),
         ({"solutions": ("<f8", [1, 2**63], b"")}, "solutions has 0 bytes"),
@@ -106,7 +141,9 @@ def test_absent_fields_are_none_and_required_ones_are_missed():
         ),
     ],
 )
-def test_arrays_that_are_not_as_the_table_says_are_refused(fields, message):
+def test_arrays_that_are_not_as_the_table_says_are_refused(
+    fields: dict[str, Any], message: str
+) -> None:
     with pytest.raises(RecordingError, match=message):
         decode("ArchiveSnapshot", changed(**fields))
 
@@ -114,32 +151,35 @@ def test_arrays_that_are_not_as_the_table_says_are_refused(fields, message):
 @pytest.mark.parametrize(
     "values", [{"iteration": -1}, {"iteration": 1.5}, {"digest": 3}, {"digest": "\ud800"}]
 )
-def test_values_that_do_not_fit_their_field_are_refused(values):
-    name = next(iter(values))
+def test_values_that_do_not_fit_their_field_are_refused(values: dict[str, Any]) -> None:
+    (name,) = values
     with pytest.raises(RecordingError, match=rf"ArchiveSnapshot\.{name} cannot be recorded: "):
         encode("ArchiveSnapshot", ARCHIVE | values)
 
 
-def test_truth_values_other_than_0_and_1_are_refused():
-    message = message_class("Hypotheses")()
-    for name in ("object_from_world", "cost", "duplicate"):
-        array = getattr(message, name)
-        kind = field_kinds("Hypotheses")[name]
-        array.dtype = kind.dtype.str
-        shape = [1, 4, 4][: len(kind.shape)]
-        array.shape.extend(shape)
-        array.data = b"\2" * (int(np.prod(shape)) * kind.dtype.itemsize)
-    with pytest.raises(RecordingError, match=r"duplicate holds bytes other than 0 and 1"):
-        decode("Hypotheses", message.SerializeToString())
-
-
-def test_bytes_that_are_no_message_are_refused():
+def test_bytes_that_are_no_message_and_truth_values_other_than_0_and_1_are_refused() -> None:
     with pytest.raises(RecordingError, match=r"a message is not a valid chsel\.Probe"):
         decode("Probe", b"\xff\xff\xff")
+    flags = message_class("Contents")()
+    for name, kind in field_kinds("Contents").items():
+        if kind.dtype is not None:
+            array = getattr(flags, name)
+            array.dtype, array.data = kind.dtype.str, b"\2" * kind.dtype.itemsize
+            array.shape.append(1)
+    with pytest.raises(RecordingError, match=r"posed holds bytes other than 0 and 1"):
+        decode("Contents", flags.SerializeToString())
 
 
-@pytest.mark.parametrize("name", MESSAGES)
-def test_field_numbers_follow_the_table(name):
-    fields = message_class(name).DESCRIPTOR.fields
-    assert [field.number for field in fields] == list(range(1, len(MESSAGES[name]) + 1))
-    assert [field.name for field in fields] == list(MESSAGES[name])
+@given(points=arrays.arrays(np.float64, st.tuples(st.integers(0, 4), st.sampled_from([3, 4]))))
+def test_clouds_keep_every_bit_and_their_columns(points: np.ndarray) -> None:
+    columns = points.shape[1]
+    assert cloud_points(point_cloud(points, 5), columns).tobytes() == points.tobytes()
+    with pytest.raises(RecordingError, match=r"a point cloud has other fields than x, y, z"):
+        cloud_points(point_cloud(points, 5), 7 - columns)
+
+
+def test_log_levels_of_other_programs_and_control_characters_are_refused() -> None:
+    with pytest.raises(RecordingError, match="level 5"):
+        log_level_and_text(Log(level=Log.FATAL, message="x").SerializeToString())
+    with pytest.raises(RecordingError, match="without control characters"):
+        log_level_and_text(Log(level=Log.INFO, message="\x1b[2J").SerializeToString())

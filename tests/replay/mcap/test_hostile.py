@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,7 +20,6 @@ from chsel.errors import RecordingError, SdfError, SettingError
 from chsel.methods.chsel import ChselSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.problem.online_registration import OnlineSettings
-from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey, normals
@@ -29,20 +27,11 @@ from chsel.qd.emitters import Draws, EmitterSettings
 from chsel.qd.selection import ArchiveSettings
 from replay.events import (
     Event,
-    HypothesesFound,
-    Logged,
-    Measured,
-    Probe,
     ProblemPosed,
-    SessionEnded,
-    Timed,
-    Traced,
 )
 from replay.mcap.encoding import message_class
-from replay.mcap.plain_config import DEEPEST, config_from_json, config_to_json
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import RECORDS
-from replay.mcap.writer import McapRecorder
 from tests.tools.mutations import file_of, joined, packed, split, unpacked
 from tests.tools.seals import resealed
 
@@ -237,158 +226,6 @@ def test_what_a_message_says_is_checked(
     refused: Callable[..., None], topic: str, change: Callable[[Any], None], message: str
 ) -> None:
     refused(changed_message(topic, change), message)
-
-
-def result(events: list[Event]) -> HypothesesFound:
-    return next(event for event in events if isinstance(event, HypothesesFound))
-
-
-def with_result(event: HypothesesFound, **values: Any) -> HypothesesFound:
-    return HypothesesFound(event.step, dataclasses.replace(event.hypotheses, **values))
-
-
-def with_archive(event: HypothesesFound, **values: Any) -> HypothesesFound:
-    archive = event.hypotheses.archive
-    assert archive is not None
-    return with_result(event, archive=dataclasses.replace(archive, **values))
-
-
-def turned(array: np.ndarray) -> np.ndarray:
-    return array[::-1].copy()
-
-
-WRONG: dict[str, Callable[[HypothesesFound], HypothesesFound]] = {
-    "cost .* out of order": lambda e: with_result(e, cost=turned(e.hypotheses.cost)),
-    "cost is -inf": lambda e: with_result(e, cost=np.array([-np.inf, 1, 2, 3, 4.0])),
-    r"object_from_world\[0\] is not a rigid": lambda e: with_result(
-        e, object_from_world=1.5 * e.hypotheses.object_from_world
-    ),
-    "object_from_world .* not finite where": lambda e: with_result(
-        e, object_from_world=np.nan * e.hypotheses.object_from_world
-    ),
-    r"elites\[0\] is not a rigid": lambda e: with_result(e, elites=0.0 * e.hypotheses.elites),
-    "cell .* out of range; accepted: -1 to 1599": lambda e: with_result(
-        e, cell=np.full(5, 1600, dtype=np.int64)
-    ),
-    "cell .* out of range; accepted: -1 to -1": lambda e: with_result(e, archive=None),
-    "has cells out of order": lambda e: with_archive(e, cells=np.zeros(12, dtype=np.int64)),
-    "has 2 axes, but names": lambda e: with_archive(e, measure_names=("x",)),
-    "has an empty range": lambda e: with_archive(e, lower=np.array([-0.3, 0.3])),
-    "objectives .* not finite": lambda e: with_archive(e, objectives=np.full(12, np.nan)),
-    r"cells, \(4294967295, 4294967295\)": lambda e: with_archive(e, shape=(2**32 - 1,) * 2),
-}
-
-
-@pytest.mark.parametrize("message", WRONG)
-def test_a_result_that_cannot_be_is_refused_by_writer_and_reader(
-    events: list[Event],
-    write: Callable[[list[Event]], Path],
-    monkeypatch: pytest.MonkeyPatch,
-    message: str,
-) -> None:
-    changed = [
-        WRONG[message](event) if isinstance(event, HypothesesFound) else event for event in events
-    ]
-    with pytest.raises(RecordingError, match=message):
-        write(changed)
-    monkeypatch.setattr("replay.mcap.writer.check_message", lambda name, values: None)
-    path = write(changed)
-    with pytest.raises(RecordingError, match=message):
-        read_recording(path)
-
-
-def test_a_diverged_start_of_infinite_cost_is_a_result(
-    events: list[Event], write: Callable[[list[Event]], Path], assert_same: Callable[..., None]
-) -> None:
-    index = max(i for i, event in enumerate(events) if isinstance(event, HypothesesFound))
-    last = events[index]
-    assert isinstance(last, HypothesesFound)
-    cost, poses = last.hypotheses.cost.copy(), last.hypotheses.object_from_world.copy()
-    cost[-1], poses[-1, :3] = np.inf, np.nan
-    events[index] = with_result(last, cost=cost, object_from_world=poses)
-    assert_same(read_recording(write(events)).events(), events)
-
-
-def swapped(first: type, second: type) -> Callable[[list[Event]], None]:
-    def change(events: list[Event]) -> None:
-        i = next(i for i, event in enumerate(events) if isinstance(event, first))
-        j = next(j for j, event in enumerate(events) if isinstance(event, second))
-        events[i], events[j] = events[j], events[i]
-
-    return change
-
-
-def repeated(kind: type) -> Callable[[list[Event]], None]:
-    def change(events: list[Event]) -> None:
-        i = next(i for i, event in enumerate(events) if isinstance(event, kind))
-        events.insert(i, events[i])
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda events: events.insert(3, Probe(0, "free", KnownPoints())), "probe 0 follows probe"),
-        (repeated(ProblemPosed), "step 1 has a second registration problem"),
-        (repeated(HypothesesFound), "/hypotheses of step 1 is in no registration of it"),
-        (swapped(Traced, HypothesesFound), "/archive of step 1 is in no registration"),
-        (swapped(ProblemPosed, Measured), "/trace of step 1 is in no registration of it"),
-        (repeated(SessionEnded), "an event follows the end of the session"),
-        (lambda events: events.insert(9, Logged(0, "info", "")), "step 0 follows one of step 1"),
-        (
-            lambda events: events.insert(3, Timed(0, {"a": np.inf})),
-            "seconds has a number that",
-        ),
-        (lambda events: events.insert(3, Logged(0, "info", "\x00")), "without control characters"),
-    ],
-)
-def test_events_out_of_order_are_refused_by_writer_and_reader(
-    events: list[Event],
-    write: Callable[[list[Event]], Path],
-    monkeypatch: pytest.MonkeyPatch,
-    change: Callable[[list[Event]], None],
-    message: str,
-) -> None:
-    change(events)
-    with pytest.raises(RecordingError, match=message):
-        write(events)
-    monkeypatch.setattr("replay.mcap.writer.check_message", lambda name, values: None)
-    with monkeypatch.context() as careless:
-        careless.setattr("replay.mcap.writer.EventOrder.take", _anything)
-        careless.setattr("replay.mcap.foxglove_messages.check_text", lambda what, text: None)
-        path = write(events)
-    with pytest.raises(RecordingError, match=message):
-        read_recording(path)
-
-
-def _anything(order: Any, topic: str, step: int) -> None:
-    order.step = max(order.step, step)
-
-
-def test_a_refused_event_is_not_in_the_recording(
-    tmp_path: Path, events: list[Event], assert_same: Callable[..., None]
-) -> None:
-    recorder = McapRecorder(tmp_path / "a.mcap")
-    recorder.record(events[0])
-    recorder.record(events[1])
-    with pytest.raises(RecordingError, match="accepted: contact, free, points"):
-        recorder.record(Probe(0, "gone", events[0].initial_points))
-    recorder.close()
-    assert_same(read_recording(tmp_path / "a.mcap").events(), events[:2])
-
-
-def test_a_configuration_comes_back_and_depth_is_bounded() -> None:
-    config = {"é": [1, 2.5, None, True, {"x": "\t\n"}], "seed": 2**64 - 1, "small": -1e-300}
-    assert config_from_json(config_to_json(config)) == config
-    nested: Any = 0
-    for _ in range(DEEPEST + 1):
-        nested = [nested]
-    for wrong in ({"a": nested}, {"a": float("nan")}, {"a": 10**30}, {"a\x00": 1}):
-        with pytest.raises(RecordingError, match="accepted"):
-            config_to_json(wrong)
-        with pytest.raises(RecordingError, match="accepted"):
-            config_from_json(json.dumps(wrong))
 
 
 def test_an_older_recording_without_newer_topics_and_optional_fields_is_read(

@@ -11,20 +11,22 @@ import numpy as np
 import pytest
 import trimesh
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from rerun.chunk import McapReader
+from scipy.spatial.transform import Rotation
 
 import replay
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import inverse, rotation_matrices
+from chsel.problem.poses import compose, inverse, rotation_matrices
 from replay.comparing.recording_diff import recording_diff
 from replay.events import Event, HypothesesFound, Probe, SessionStarted
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, SCENE, VIEWS
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
 from replay.mcap.sealed_file import SealedFile
-from replay.mcap.viewer_messages import CumulativePoints, simple_mesh
+from replay.mcap.viewer_messages import CumulativePoints, poses_in_world, simple_mesh
 
 _ADD = SealedFile.add
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
@@ -54,6 +56,33 @@ def placed(mesh: Any) -> np.ndarray:
     rotation = rotation_matrices(np.array([[q.x, q.y, q.z, q.w]]))[0]
     points = np.array([(point.x, point.y, point.z) for point in mesh.points])
     return points @ rotation.T + (p.x, p.y, p.z)
+
+
+def quaternions(world_from_body: np.ndarray) -> np.ndarray:
+    """What a viewer gets of poses, at a time of 3 s and 7 ns."""
+    message = PosesInFrame.FromString(poses_in_world(world_from_body, 3_000_000_007))
+    assert (message.timestamp.seconds, message.timestamp.nanos) == (3, 7)
+    turned = (pose.orientation for pose in message.poses)
+    return np.array([(q.x, q.y, q.z, q.w) for q in turned])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, 3.0, 1e-9])
+def test_a_turn_about_an_axis_has_the_textbook_quaternion(axis: int, angle: float) -> None:
+    vector = np.zeros(3)
+    vector[axis] = angle
+    rotation = Rotation.from_rotvec(vector).as_matrix()
+    quaternion = quaternions(compose(rotation[None], np.zeros((1, 3))))[0]
+    expected = np.zeros(4)
+    expected[axis], expected[3] = np.sin(angle / 2), np.cos(angle / 2)
+    quaternion *= np.sign(quaternion @ expected)
+    np.testing.assert_allclose(quaternion, expected, atol=1e-15)
+
+
+def test_quaternions_of_random_rotations_turn_vectors_alike() -> None:
+    rotations = Rotation.random(500, random_state=1).as_matrix()
+    found = quaternions(compose(rotations, np.ones((500, 3))))
+    np.testing.assert_allclose(Rotation.from_quat(found).as_matrix(), rotations, atol=1e-14)
 
 
 def test_a_scene_holds_the_object_at_each_distinct_hypothesis(events, write):
