@@ -12,7 +12,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,10 @@ from chsel.problem.poses import check_rigid
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.sensors.rig import (
     Annotations,
+    BoxRig,
     CloudRig,
     ExtraContacts,
     ForceRig,
-    GateRig,
     ProbeTimes,
     Rig,
 )
@@ -40,6 +40,8 @@ HANGS_AFTER = 10.0  # seconds of one case: the process ends with a traceback
 SLOWEST = 8.0  # seconds
 MOST_MEMORY = 1024  # MB above that of the first case
 _TIMES = (1, 10**6, 10**8, SECOND, 20 * SECOND, 10**14, 2**62)  # ns
+_TEXTS = ("hand", "camera_frame", "nowhere", "/tf", "/camera/depth", "/probe", "none", "log")
+_TEXTS += ("scaled_images", "deformation", "camera", "backwards")
 _NUMBERS = (0.0, -1.0, 1e-300, 1e-3, 0.5, 1.0, 3.0, 1e6, 1e300, np.nan, np.inf, -np.inf)
 
 
@@ -350,43 +352,37 @@ def other_topics(messages: list[Message], random: Random) -> list[Message]:
     return messages
 
 
-def other_threshold(rig: Rig, random: Random) -> Rig:
-    """A number of a rig's part is extreme."""
-    value: Any = float(random.choice(_NUMBERS))
-    camera, pad, contact, clock = rig.cameras[0], rig.bubbles[0], rig.contact, rig.clock
-    whole = int(value) if 0.0 <= value < 1e7 else -1
-    changes: list[Callable[[], dict[str, Any]]] = [
-        lambda: {"cameras": (replace(camera, fraction=value),)},
-        lambda: {"cameras": (replace(camera, edge=value),)},
-        lambda: {"cameras": (replace(camera, rate=value),)},
-        lambda: {"cameras": (replace(camera, unit=value),)},
-        lambda: {"cameras": (replace(camera, views=whole),)},
-        lambda: {"cameras": (replace(camera, edge_reach=whole),)},
-        lambda: {"cameras": (replace(camera, range=(0.1, value)),)},
-        lambda: {"cameras": (replace(camera, rays="scaled_images"),)},
-        lambda: {"bubbles": (replace(pad, range=(value, 0.5)),)},
-        lambda: {"bubbles": (replace(pad, unit=value),)},
-        lambda: {"bubbles": (replace(pad, kind="deformation"),)},
-        lambda: {"contact": replace(contact, filter=whole)},
-        lambda: {"contact": replace(contact, quantile=value)},
-        lambda: {"contact": replace(contact, threshold=value)},
-        lambda: {"contact": replace(contact, pixels=whole)},
-        lambda: {"contact": replace(contact, points=whole)},
-        lambda: {"contact": replace(contact, per="camera")},
-        lambda: {"contact": replace(contact, reference_images=whole)},
-        lambda: {"clock": replace(clock, gap=value)},
-        lambda: {"clock": replace(clock, offset=value)},
-        lambda: {"clock": replace(clock, jump=value)},
-        lambda: {"clock": replace(clock, stamp="log")},
-        lambda: {"surface_resolution": value},
-        lambda: {"gate": GateRig(jump=value)},
-        lambda: {"gate": GateRig(gap=value)},
-        lambda: {"gate": GateRig(part=value)},
-        lambda: {"gate": GateRig(speckle=whole)},
-        lambda: {"forces": (ForceRig("/pad/depth", threshold=value),)},
-        lambda: {"boundary": "none"},
-    ]
-    return replace(rig, **changes[int(random.integers(len(changes)))]())
+def other_setting(rig: Rig, random: Random) -> Rig:
+    """A number, a range, a text or a choice of the rig or of a part of it is another."""
+    part = str(random.choice(["", "cameras", "bubbles", "contact", "hand", "clock", "gate"]))
+    group = getattr(rig, part) if part else rig
+    several = isinstance(group, tuple)
+    settings = group[0] if several else group
+    if settings is None:  # as another change took the hand away
+        return rig
+    name = str(random.choice([one.name for one in fields(settings)]))
+    before, number = getattr(settings, name), float(random.choice(_NUMBERS))
+    whole = int(number) if 0.0 <= number < 1e7 else -1
+    after: Any
+    match before:
+        case bool() | int():
+            after = whole
+        case float():
+            after = number
+        case str():
+            after = str(random.choice(_TEXTS))
+        case None:
+            after = number if name in ("unit", "edge", "rate") else str(random.choice(_TEXTS))
+        case (float(), float()):
+            after = (0.1, number)
+        case tuple():
+            after = ()
+        case _:
+            return rig
+    changed = replace(settings, **{name: after})
+    if not part:
+        return changed
+    return replace(rig, **{part: (changed,) if several else changed})
 
 
 def other_workspace(rig: Rig, random: Random) -> Rig:
@@ -406,25 +402,18 @@ def other_workspace(rig: Rig, random: Random) -> Rig:
 
 
 def other_parts(rig: Rig, random: Random) -> Rig:
-    """Sensors, frames, hand, markers and annotations that there are not, or not otherwise."""
-    camera, pad, hand = rig.cameras[0], rig.bubbles[0], rig.hand or RIG.hand
+    """Sensors, probes and annotations that there are not, or not otherwise."""
+    pad, hand = rig.bubbles[0] if rig.bubbles else RIG.bubbles[0], rig.hand or RIG.hand
     assert hand is not None
     value = float(random.choice(_NUMBERS))
-    boxes = (replace(hand.boxes[0], position=(value, 0.0, 0.0)),)
+    box = replace(RIG.hand.boxes[0], position=(value, 0.0, 0.0)) if RIG.hand else None
     nearby = Annotations((0,), (ExtraContacts(1, ((0.9, 0.0, 0.4),), foremost=5),))
     changes: list[Callable[[], dict[str, Any]]] = [
-        lambda: {"world": str(random.choice(["hand", "camera_frame", "nowhere"]))},
-        lambda: {"cameras": (replace(camera, frame="hand"),)},
-        lambda: {"bubbles": (replace(pad, frame="nowhere"),)},
         lambda: {"bubbles": (replace(pad, depth="/camera/depth", info="/camera/info"),)},
         lambda: {"hand": None},
-        lambda: {"hand": replace(hand, frame=str(random.choice(["world", "nowhere"])))},
-        lambda: {"hand": replace(hand, sweep="backwards")},
-        lambda: {"hand": replace(hand, pose="/tf")},
-        lambda: {"hand": replace(hand, boxes=boxes)},
-        lambda: {"hand": replace(hand, boxes=(replace(hand.boxes[0], size=(value, 1.0, 1.0)),))},
-        lambda: {"markers": None},
-        lambda: {"markers": "/tf"},
+        lambda: {"hand": replace(hand, boxes=(box,))},
+        lambda: {"hand": replace(hand, boxes=(BoxRig((value, 1.0, 1.0)),))},
+        lambda: {"forces": (ForceRig("/pad/depth", threshold=value),)},
         lambda: {"probes": (ProbeTimes(1.0, 2.0), ProbeTimes(2.0, value))},
         lambda: {"probes": ()},
         lambda: {"annotations": nearby},
@@ -450,7 +439,7 @@ LOG_CHANGES: tuple[Callable[[list[Message], Random], list[Message]], ...] = (
     other_topics,
 )
 RIG_CHANGES: tuple[Callable[[Rig, Random], Rig], ...] = (
-    other_threshold,
+    other_setting,
     other_workspace,
     other_parts,
 )
