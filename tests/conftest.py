@@ -12,6 +12,15 @@ import torch
 from hypothesis import settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+LONGEST = (  # minutes each; files that start first end before others are done
+    "tests/docs/test_architecture.py",
+    "tests/determinism/test_matrix.py",
+    "tests/docs/test_writing_a_method.py",
+    "tests/runners/test_broken_disk.py",
+    "tests/runners/test_benchmark.py",
+    "tests/determinism/test_machine_code.py",
+    "tests/replay/test_kill.py",
+)
 settings.register_profile("random", deadline=None)  # --hypothesis-profile=random: other examples
 settings.register_profile("fixed", deadline=None, derandomize=True)
 settings.load_profile("fixed")
@@ -24,6 +33,11 @@ def _optional_data(part: str) -> Path:
     if not directory.is_dir():
         pytest.skip(f"optional data directory is missing: no folder {part}/ (set CHSEL_DATA)")
     return directory
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Take the longest files first, for `-n 2 --dist loadfile --no-loadscope-reorder`."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
 
 
 @pytest.fixture
