@@ -20,14 +20,15 @@ from replay.console import Console
 from runners.benchmarks import report
 from runners.benchmarks.comparison import WHAT, compare
 from runners.benchmarks.measures import MEASURES
-from runners.benchmarks.plot import draw
+from runners.benchmarks.plot import picture_of_benchmark
 from runners.benchmarks.problems import PROBLEMS
 from runners.benchmarks.registrations import Scope, Steps
 from runners.benchmarks.timing import load, machine
 from runners.command.program import command, plain
 from runners.published_package.environment import PackageConfig, interpreter
 from runners.published_package.process import PublishedPackage
-from runners.run.recording import make_run_folder, write_in_run_folder
+from runners.reporting.figures import FORMATS, drawing, write_picture
+from runners.run.recording import IN_RUN_FOLDER, make_run_folder, write_in_run_folder
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class BenchmarkConfig:
     steps: Steps
     logs: str
     device: str  # where evaluation takes many poses, besides the processor
+    format: str  # of the picture
     repeats: int
     seed: int
     quick: bool
@@ -56,6 +58,7 @@ class BenchmarkConfig:
             require_choice("problem", problem, PROBLEMS)
         for measure in self.alone:
             require_choice("alone", measure, MEASURES)
+        require_choice("format", self.format, FORMATS)
         require_choice("device", self.device, ("auto", "cpu", "cuda"))
         if self.device == "cuda":
             device_named("cuda")
@@ -97,7 +100,9 @@ def main(config: DictConfig) -> None:
         found = _run(checked, package, folder, console)
     report.show(console, found)
     report.write_markdown(folder / "speed.md", found)
-    draw(found, folder / "benchmark.png")
+    with drawing():
+        if (picture := picture_of_benchmark(found)) is not None:
+            write_picture(picture, folder, checked.format, accepted=IN_RUN_FOLDER)
     say(f"written: {folder}")
 
 

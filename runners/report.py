@@ -24,6 +24,7 @@ from runners.reporting.sections import sections_of
 from runners.reporting.tables import print_table
 
 HTML, MARKDOWN = "report.html", "report.md"
+_ACCEPTED = "an out=DIR that can be written"
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,10 @@ def _write(out: Path, subject: Subject, sections: list[Section], config: ReportC
     for section in sections:
         if (picture := section.picture) is not None:
             set_title(picture.figure, f"{section.title}, {subject.evaluation.name}")
-            contents[picture.name] = write_picture(picture, out, config.format)
+            contents[picture.name] = write_picture(picture, out, config.format, accepted=_ACCEPTED)
     page = page_of(subject.evaluation, sections, _command(config), config.format)
     for name, text in ((MARKDOWN, as_markdown(page)), (HTML, as_html(page, contents))):
-        with whole_file(out / name) as beside:
+        with whole_file(out / name, _ACCEPTED) as beside:
             beside.write_text(text, encoding="utf-8")
 
 

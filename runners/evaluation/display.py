@@ -17,10 +17,6 @@ from rich.table import Table
 from replay.console import Console, Progress, TextColumn
 from runners.evaluation import schedule
 from runners.evaluation.true_poses import FoundPose
-from runners.reporting.by_faults import tables_by_faults
-from runners.reporting.evaluation_folder import open_evaluation
-from runners.reporting.method_style import method_styles
-from runners.reporting.tables import print_table
 
 _SPARSE = 60.0  # s between lines where there is no terminal
 _MOST_SHOWN = 3  # units at work, failures
@@ -98,6 +94,12 @@ class Display:
 
     def faults(self, folder: Path) -> None:
         """By level of faults: whether sets hold the truth, and how far hypotheses are from it."""
+        # Pandas and matplotlib take a second to import, which an evaluation starts without.
+        from runners.reporting.by_faults import tables_by_faults
+        from runners.reporting.evaluation_folder import open_evaluation
+        from runners.reporting.method_style import method_styles
+        from runners.reporting.tables import print_table
+
         evaluation = open_evaluation(folder)
         styles = method_styles(evaluation.methods)
         for table in tables_by_faults(evaluation.rows, styles):

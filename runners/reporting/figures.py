@@ -115,17 +115,25 @@ def small_png(picture: bytes | Image.Image) -> bytes:
     return stream.getvalue()
 
 
-def write_picture(picture: Picture, folder: Path, kind: str, *, small: bool = False) -> bytes:
+def write_picture(
+    picture: Picture,
+    folder: Path,
+    kind: str,
+    *,
+    accepted: str = "a folder that can be written",
+    small: bool = False,
+) -> bytes:
     """Write the figure as a file of one of the FORMATS, and its data as CSV beside it.
 
-    small: a PNG file of few colours. Returns the content of the figure's file.
+    accepted: the end of the error if the folder cannot be written. small: a PNG file of few
+    colours. Returns the content of the figure's file.
     """
     content = file_content(picture.figure, kind)
     content = small_png(content) if small and kind == "png" else content
     path = folder / f"{picture.name}.{kind}"
-    with whole_file(path) as beside:
+    with whole_file(path, accepted) as beside:
         beside.write_bytes(content)
-    with whole_file(path.with_suffix(".csv")) as beside:
+    with whole_file(path.with_suffix(".csv"), accepted) as beside:
         picture.data.to_csv(beside, index=False, lineterminator="\n")
     return content
 

@@ -154,6 +154,7 @@ def test_a_figure_is_in_the_report_with_its_numbers_and_its_title(reported: Path
         assert numbers["seconds"] == pytest.approx(own["seconds"].median())
     picture = (report / "diversity_and_time.svg").read_text()
     assert "<!-- Medians of PD and time, made_up -->" in picture
+    assert "\\mathdefault" not in picture  # of an axis whose scale is not ours
     assert "(diversity_and_time.svg)" in (report / "report.md").read_text()
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.container import BarContainer
 
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
@@ -20,6 +21,7 @@ from runners import benchmark
 from runners.benchmarks.comparison import BenchmarkError, require_equal
 from runners.benchmarks.measures import methods
 from runners.benchmarks.plausible import plausible_sets
+from runners.benchmarks.plot import picture_of_benchmark
 from runners.benchmarks.problems import PROBLEMS, WORKSPACE, PosedProblem, Problem, drill, pose
 from runners.benchmarks.registrations import PRESETS, Scope, Steps
 from runners.benchmarks.report import number, ratios
@@ -267,7 +269,7 @@ def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
     folder, report = found(tmp_path)
     names = {file.name for file in folder.iterdir()}
-    assert names == {"benchmark.json", "benchmark.png", "config.yaml", "speed.md"}
+    assert names == {"benchmark.json", "benchmark.png", "benchmark.csv", "config.yaml", "speed.md"}
     assert (folder / "benchmark.png").read_bytes().startswith(b"\x89PNG")
     who = [row["who"] for row in report["comparison"]]
     assert who == [f"ours, {preset}" for preset in PRESETS]
@@ -357,3 +359,34 @@ def test_the_published_package_does_as_many_steps(problem: PosedProblem, tmp_pat
             rotation = np.array(answer["poses"])[:, :3, :3]
             product = np.einsum("bij,bkj->bik", rotation, rotation)
             np.testing.assert_allclose(product, np.tile(np.eye(3), (4, 1, 1)), atol=1e-4)
+
+
+def test_bars_are_medians_with_their_quartiles_and_times_ours() -> None:
+    medians = {"ours, reference": (10.0, 40.0), "package": (500.0, 1600.0)}
+    rows = [
+        {
+            "case": case,
+            "who": who,
+            "median": value,
+            "lower_quartile": 0.75 * value,
+            "upper_quartile": 1.5 * value,
+            "times_ours": {"reference": 50.0} if who == "package" else {},
+        }
+        for who, values in medians.items()
+        for case, value in zip(("real_5", "real_20"), values, strict=True)
+    ]
+    machine = dict.fromkeys(
+        ("processor", "python", "package torch", "load_before", "load_after"), "-"
+    )
+    picture = picture_of_benchmark({"comparison": rows, "alone": [], "machine": machine})
+    assert picture is not None
+    (axes,) = picture.figure.axes
+    bars = [one for one in axes.containers if isinstance(one, BarContainer)]
+    assert [one.get_label() for one in bars] == list(medians)
+    for one, values in zip(bars, medians.values(), strict=True):
+        assert [bar.get_height() for bar in one] == list(values)
+        ends = [part[:, 1].tolist() for part in one.errorbar[2][0].get_segments()]
+        assert ends == [[0.75 * value, 1.5 * value] for value in values]
+    assert [text.get_text() for text in axes.texts] == ["10.0", "40.0", "500\n50.0x", "1600\n50.0x"]
+    assert picture.data["median"].tolist() == [10.0, 40.0, 500.0, 1600.0]
+    assert picture_of_benchmark({"comparison": [], "alone": [], "machine": machine}) is None

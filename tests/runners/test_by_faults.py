@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -16,7 +17,7 @@ from runners.evaluation.plan import Task, Trial
 from runners.evaluation.selection import chosen_names
 from runners.evaluation.table import RESULTS, read_part, write_part
 from runners.evaluation.work import do_unit
-from runners.reporting.by_faults import tables_by_faults
+from runners.reporting.by_faults import picture_of_shares, shares_held, tables_by_faults
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_style import method_styles
 from runners.reporting.statistics import shares
@@ -150,6 +151,18 @@ def test_tables_have_a_line_a_level_and_one_of_all(made_up: Path) -> None:
     assert nearest[1][3] == "1.5 [0.75, 2.25]"
     assert tables["PD in mm²"][3][:2] == ["all levels", "8"]
     assert (made_up / "report" / "truth_held.png").stat().st_size > 5000
+
+
+def test_lines_are_the_intervals_of_the_shares_by_level_and_method(made_up: Path) -> None:
+    held = shares_held(open_evaluation(made_up).rows)
+    picture = picture_of_shares(held, method_styles(["own"]))
+    (axes,) = picture.figure.axes
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["clean", "mixed", "all levels"]
+    points, _, (lines,) = axes.containers[0]
+    np.testing.assert_allclose(points.get_xydata()[:, 0], [100.0, 25.0, 62.5])
+    ends = [line[:, 0] for line in lines.get_segments()]
+    np.testing.assert_allclose(ends, [[51.0, 100.0], [4.6, 69.9], [30.6, 86.3]], atol=0.05)
+    assert picture.data["count"].tolist() == [4, 1, 5]
 
 
 def test_evaluations_without_faults_have_no_such_section(tmp_path: Path) -> None:

@@ -244,7 +244,7 @@ def test_settings_of_the_sequence_choose_trial_methods_and_steps(
         (["{}/good", "format=gif"], "format is 'gif'; accepted: png, svg, pdf"),
         (["{}/good", "colour=red"], "has no key 'colour'"),
         (["{}/good", "{}/empty"], "one argument too many; accepted: DIR KEY=VALUE"),
-        (["{}/good", "out={}/good/experiment.json/x"], "cannot be written"),
+        (["{}/good", "out={}/good/experiment.json/x"], "accepted: an out=DIR that can be written"),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
