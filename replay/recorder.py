@@ -76,6 +76,7 @@ class BackgroundRecorder(Recorder):
         self._closed = False
         self._patient = patient
         self._optional = optional
+        self._ended = False  # by an error of what is optional
         # A daemon, so that a run that ends without closing its recorder does end.
         self._thread = Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -121,13 +122,15 @@ class BackgroundRecorder(Recorder):
                 self._jobs.task_done()
 
     def _run(self, job: Callable[[], None]) -> None:
+        if self._ended:
+            return
         try:
             job()
         except RecordingError as error:
             if not self._optional:
                 raise
             warnings.warn(f"{error}; {self._optional}", stacklevel=2)
-            self._recorder = NullRecorder()
+            self._ended = True
 
     def _raise_error(self) -> None:
         """Raise an error once; the jobs behind it are dropped by then."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import tokenize
 from pathlib import Path
 
 ALIASES = {"bless": "accept"}
@@ -11,8 +12,10 @@ ALIASES = {"bless": "accept"}
 
 def _summary(module: Path) -> str:
     """The first line of a module, which is read, not imported: that would take seconds."""
-    documented = ast.get_docstring(ast.parse(module.read_text(encoding="utf-8")))
-    return (documented or "").partition("\n")[0]
+    with module.open("rb") as file:
+        tokens = tokenize.tokenize(file.readline)
+        documented = next(token.string for token in tokens if token.type == tokenize.STRING)
+    return str(ast.literal_eval(documented)).partition("\n")[0]
 
 
 VERBS = {

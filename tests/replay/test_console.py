@@ -17,6 +17,9 @@ import replay.rerun.text
 from replay.__main__ import main
 from replay.console import Console, Progress, TextColumn, print_error, print_warning, printable
 from replay.events import SessionStarted
+from replay.mcap.reader import read_recording
+from replay.verbs import VERBS
+from tests.tools.verb_arguments import verb_arguments
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REPLAY = REPOSITORY / "tests" / "replays" / "spam_can_icp.mcap"
@@ -122,49 +125,32 @@ def hostile(tmp_path: Path) -> Path:
     return Path(shutil.copy(REPLAY, path))
 
 
-COMMANDS = {
-    "info": ["info", "FILE"],
-    "info of many": ["info", "FILE", "FILE", "FILE", "FILE"],
-    "verify": ["verify", "FILE", "--step", "STEP"],
-    "step": ["step", "FILE", "--step", "STEP", "-o", "OUT.mcap"],
-    "compare": ["compare", "FILE", "--methods", "icp", "--steps", "STEP", "--save-csv", "OUT.csv"],
-    "diff": ["diff", "FILE", "FILE"],
-    "view": ["view", "FILE", "--save", "OUT.rrd"],
-    "recover": ["recover", "FILE", "-o", "OUT.mcap"],
-    "export": ["export", "FILE", "--what", "points", "-o", "OUT.npz"],
-    "accept": ["accept", "FILE", "--yes"],
-}
-
-
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_takes_files_of_any_name(
-    name: str, hostile: Path, capsys: pytest.CaptureFixture[str]
+    verb: str, hostile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from replay.mcap.reader import read_recording
-
-    step = str(read_recording(hostile).steps[0])
-    names = {"FILE": str(hostile), "STEP": step}
-    for suffix in (".mcap", ".csv", ".rrd", ".npz"):
-        names[f"OUT{suffix}"] = f"{hostile}{suffix}"
-    assert main([names.get(word, word) for word in COMMANDS[name]]) == 0
+    out = hostile.with_suffix("")
+    step = read_recording(hostile).steps[0]
+    assert main(verb_arguments(verb, hostile, Path(f"{out} out"), step=step)) == 0
     printed = capsys.readouterr()
     assert not set(printed.out + printed.err) & set("\x1b\x07\x9b\u202e")
-    if name != "diff":  # which names no file
-        assert SHOWN in printed.out
-
-
-@pytest.mark.parametrize("verb", ["info", "verify", "accept", "diff", "recover"])
-def test_errors_name_files_of_any_name(
-    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    more = {"accept": ["--yes"], "diff": [str(REPLAY)], "recover": ["-o", str(tmp_path / "out")]}
-    assert main([verb, str(tmp_path / HOSTILE), *more.get(verb, [])]) == 2
+    if verb != "diff":  # which names no file
+        assert SHOWN.removesuffix(".mcap") in printed.out
+    nowhere = tmp_path / "nowhere" / HOSTILE
+    assert main(verb_arguments(verb, nowhere, tmp_path / "out")) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("error: ")
     assert SHOWN in printed.err
     assert printed.err.count("\n") == 1
     assert printed.err.strip().isprintable()
+
+
+def test_info_shows_many_files_of_any_name(
+    hostile: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", *[str(hostile)] * 4]) == 0
+    assert capsys.readouterr().out.count(SHOWN) == 4
 
 
 def test_unknown_arguments_are_shown(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,21 +1,36 @@
-"""Recorders that hand on or ignore what they get."""
+"""The chain of recorders: order, the same files, errors that reach the caller, a bounded queue."""
 
 from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
 
 import pytest
 
 from chsel.errors import RecordingError
-from replay.recorder import NullRecorder, TeeRecorder
+from replay.events import Measured, Probe
+from replay.mcap.reader import read_recording
+from replay.mcap.writer import McapRecorder
+from replay.recorder import BackgroundRecorder, TeeRecorder
 
 
-class Listing:
-    """Notes what is asked of it; fails at what it is told to."""
+class Gate:
+    """Notes what it gets once its gate is open; fails at the events that it is told of."""
 
-    def __init__(self, fails_at: str = "") -> None:
-        self.calls: list = []
-        self.fails_at = fails_at
+    def __init__(self, *fails_at: object, is_open: bool = True) -> None:
+        self.calls: list[object] = []
+        self.threads: set[str] = set()
+        self.gate = threading.Event()
+        self.entered = threading.Event()
+        self._fails_at = fails_at
+        if is_open:
+            self.gate.set()
 
-    def record(self, event) -> None:
+    def record(self, event: object) -> None:
         self._note(event)
 
     def flush(self) -> None:
@@ -24,35 +39,193 @@ class Listing:
     def close(self) -> None:
         self._note("close")
 
-    def _note(self, call) -> None:
+    def _note(self, call: object) -> None:
+        self.entered.set()
+        assert self.gate.wait(60)
         self.calls.append(call)
-        if call == self.fails_at:
+        self.threads.add(threading.current_thread().name)
+        if call in self._fails_at:
             raise RecordingError(f"no {call}")
 
 
 def test_a_tee_hands_everything_to_all_in_order():
-    listings = [Listing(), Listing()]
-    tee = TeeRecorder(listings)
+    gates = [Gate(), Gate()]
+    tee = TeeRecorder(gates)
     for event in ("first", "second"):
         tee.record(event)
     tee.flush()
     tee.close()
-    assert [listing.calls for listing in listings] == [["first", "second", "flush", "close"]] * 2
+    assert [gate.calls for gate in gates] == [["first", "second", "flush", "close"]] * 2
 
 
 @pytest.mark.parametrize("call", ["flush", "close"])
 def test_a_tee_reaches_all_even_if_one_fails(call):
-    listings = [Listing(fails_at=call), Listing()]
+    gates = [Gate(call), Gate()]
     with pytest.raises(RecordingError, match=f"no {call}"):
-        getattr(TeeRecorder(listings), call)()
-    assert [listing.calls for listing in listings] == [[call], [call]]
+        getattr(TeeRecorder(gates), call)()
+    assert [gate.calls for gate in gates] == [[call], [call]]
 
 
-def test_nothing_comes_of_a_null_recorder(events, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    recorder = NullRecorder()
+def record_often(recorder: BackgroundRecorder, event: object) -> None:
+    for _ in range(10_000):
+        recorder.record(event)
+
+
+def test_the_caller_goes_on_while_an_event_is_recorded():
+    gate = Gate(is_open=False)
+    recorder = BackgroundRecorder(gate)
+    recorder.record("first")
+    recorder.record("second")
+    assert gate.calls == []
+    gate.gate.set()
+    recorder.close()
+    assert gate.calls == ["first", "second", "close"]
+    assert "recorder" in gate.threads
+
+
+def test_an_impatient_flush_comes_soon_and_keeps_nobody_waiting():
+    gate = Gate(is_open=False)
+    recorder = BackgroundRecorder(gate, patient=False)
+    recorder.record("first")
+    recorder.flush()
+    assert gate.calls == []
+    gate.gate.set()
+    recorder.close()
+    assert gate.calls == ["first", "flush", "close"]
+
+
+def test_flush_returns_when_all_before_it_is_recorded_and_flushed():
+    gate = Gate()
+    recorder = BackgroundRecorder(gate)
+    for event in range(100):
+        recorder.record(event)
+    recorder.flush()
+    assert gate.calls == [*range(100), "flush"]
+    recorder.close()
+
+
+def test_who_records_faster_than_the_recorder_has_to_wait():
+    gate = Gate(is_open=False)
+    recorder = BackgroundRecorder(gate, most=3)
+    recorder.record("in work")
+    assert gate.entered.wait(60)
+    for event in range(3):
+        recorder.record(event)
+    fifth = threading.Thread(target=recorder.record, args=("fifth",))
+    fifth.start()
+    fifth.join(0.2)
+    assert fifth.is_alive()
+    gate.gate.set()
+    fifth.join(60)
+    recorder.close()
+    assert gate.calls == ["in work", 0, 1, 2, "fifth", "close"]
+
+
+def test_equal_events_give_the_bytes_of_a_recorder_without_a_thread(tmp_path, events, write):
+    path = tmp_path / "background.mcap"
+    recorder = BackgroundRecorder(McapRecorder(path))
     for event in events:
+        recorder.record(event)
+    recorder.close()
+    assert path.read_bytes() == write(events).read_bytes()
+
+
+def test_an_error_is_told_by_the_next_call_and_what_follows_it_is_dropped():
+    gate = Gate("bad", is_open=False)
+    recorder = BackgroundRecorder(gate)
+    for event in ("good", "bad", "dropped", "dropped"):
+        recorder.record(event)
+    gate.gate.set()
+    with pytest.raises(RecordingError, match="no bad"):
+        recorder.flush()
+    recorder.record("after")
+    recorder.close()
+    assert gate.calls == ["good", "bad", "after", "close"]
+
+
+def test_an_error_that_is_known_is_told_before_another_event_is_taken():
+    gate = Gate("bad")
+    recorder = BackgroundRecorder(gate)
+    with pytest.raises(RecordingError, match="no bad"):
+        record_often(recorder, "bad")  # the queue is bounded, so the error must come
+    recorder.close()
+    assert gate.calls == ["bad", "close"]
+
+
+@pytest.mark.parametrize("also", [(), ("close",)])  # of two errors the first is raised
+def test_an_error_is_raised_at_close_at_the_latest_and_all_is_closed(also):
+    gate = Gate("bad", *also, is_open=False)
+    recorder = BackgroundRecorder(gate)
+    recorder.record("bad")
+    gate.gate.set()
+    with pytest.raises(RecordingError, match="no bad"):
+        recorder.close()
+    assert gate.calls == ["bad", "close"]
+    recorder.close()
+
+
+def test_what_is_optional_ends_with_a_warning(recwarn):
+    gate = Gate("bad")
+    recorder = BackgroundRecorder(gate, optional="it can be made anew")
+    for event in ("good", "bad", "dropped"):
         recorder.record(event)
     recorder.flush()
     recorder.close()
-    assert list(tmp_path.iterdir()) == []
+    assert gate.calls == ["good", "bad"]
+    assert [str(warning.message) for warning in recwarn] == ["no bad; it can be made anew"]
+
+
+def test_closing_twice_is_closing_once_and_ends_the_thread(tmp_path, events):
+    path = tmp_path / "recording.mcap"
+    before = threading.active_count()
+    recorder = BackgroundRecorder(McapRecorder(path))
+    recorder.record(events[0])
+    recorder.close()
+    assert threading.active_count() == before
+    closed = path.read_bytes()
+    recorder.close()
+    recorder.flush()
+    assert path.read_bytes() == closed
+    with pytest.raises(RecordingError, match="closed"):
+        recorder.record(events[1])
+
+
+_SCRIPT = """
+import runpy, sys
+from replay.recorder import BackgroundRecorder
+from replay.mcap.writer import McapRecorder
+events = runpy.run_path(sys.argv[1])["example_events"]()
+recorder = BackgroundRecorder(McapRecorder(sys.argv[2]))
+for event in events:
+    recorder.record(event)
+    if type(event).__name__ == "Measured":
+        recorder.flush()
+        break
+"""
+
+
+def run_script(end: str, path: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", _SCRIPT + end, str(Path(__file__).with_name("conftest.py"))]
+    return subprocess.run(
+        [*command, str(path)], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL on Windows")
+def test_all_that_was_flushed_survives_sigkill(tmp_path, events, assert_same):
+    path = tmp_path / "killed.mcap"
+    done = run_script("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", path)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    last = next(i for i, event in enumerate(events) if isinstance(event, Measured))
+    assert_same(read_recording(path, partial=True).events(), events[: last + 1])
+
+
+def test_a_run_that_dies_ends_and_leaves_what_was_flushed(tmp_path, events):
+    path = tmp_path / "died.mcap"
+    done = run_script("raise ValueError('died')", path)
+    assert done.returncode == 1
+    assert "ValueError: died" in done.stderr
+    recording = read_recording(path, partial=True)
+    assert recording.steps == (1,)
+    probes = [event for event in events if isinstance(event, Probe)]
+    assert [probe.step for probe in recording.probes] == [probe.step for probe in probes[:2]]

@@ -16,10 +16,12 @@ from chsel.errors import ChselError, MeshError, PointsError, SessionError
 from chsel.problem.file_checks import refuse_special_file
 from chsel.problem.mesh import load_mesh
 from replay.__main__ import main
+from replay.verbs import VERBS
 from runners.sensors.depth_frame import read_depth_frame
 from runners.sensors.pose_file import read_pose
 from runners.sessions.point_files import read_points
 from runners.sessions.problem_source import open_source
+from tests.tools.verb_arguments import verb_arguments
 
 DESCENT = Path(__file__).resolve().parents[1] / "replays" / "cracker_box_gradient_descent.mcap"
 
@@ -55,19 +57,6 @@ def special(folder: Path, kind: str, name: str) -> Path:
     return path
 
 
-VERBS = {
-    "info": [],
-    "verify": [],
-    "step": ["--step", "8"],
-    "compare": ["--methods", "gradient_descent"],
-    "view": ["--save", "out.rrd"],
-    "recover": ["-o", "out.mcap"],
-    "export": ["--what", "metrics"],
-    "accept": ["--yes"],
-    "diff": [str(DESCENT)],
-}
-
-
 @pytest.mark.parametrize("kind", ["FIFO", "socket", "device", "folder"])
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_verb_refuses_what_is_no_file_in_one_line(
@@ -79,7 +68,7 @@ def test_a_verb_refuses_what_is_no_file_in_one_line(
 ) -> None:
     path = special(tmp_path, kind, "a.mcap")
     monkeypatch.chdir(tmp_path)
-    assert main([verb, str(path), *VERBS[verb]]) == 2
+    assert main(verb_arguments(verb, path, tmp_path / "out", other=DESCENT)) == 2
     shown = capsys.readouterr()
     assert shown.err.startswith("error: ")
     assert shown.err.count("\n") == 1

@@ -29,7 +29,7 @@ from replay.mcap.reader import read_recording
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.recorder import RerunRecorder, draw_recording
 from replay.rerun.viewer import web_server
-from tests.replay.rerun.test_recorder import opens_at
+from tests.tools.rrd_rows import opens_at
 
 QUICK = ("recording=both", "recording.snapshot_interval=5")
 KINEMATIC = (

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.blueprint.components import PlayState
-from rerun.chunk import RrdReader
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
@@ -24,14 +23,13 @@ from replay.rerun.colors import cost_colors, number
 from replay.rerun.comparison import ranked, save_comparison
 from replay.rerun.comparison_layout import CURVES, entity_names
 from replay.rerun.hypotheses import LEVELS
+from tests.tools.rrd_rows import Row, read, shown_at
 
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box
 
 PAUSED = int(PlayState.Paused.value)
 TARGET = "EyeControls3D:look_target"
 DISPLAYED = "ViewBlueprint:display_name"
-Rows = dict[str, list[tuple[int | None, dict[str, Any]]]]
-"""By entity: probe, None for what stays, and values by component."""
 AWKWARD = "Ωther/way, b=½ {x} \\"
 
 
@@ -69,34 +67,13 @@ def saved(recording: Recording, results: dict[str, dict[int, Hypotheses]], tmp_p
     return path
 
 
-def read(path: Path, *, blueprint: bool = False) -> Rows:
-    reader = RrdReader(path)
-    (store,) = reader.blueprints() if blueprint else reader.recordings()
-    found: dict[str, list[tuple[bytes, int | None, dict[str, Any]]]] = {}
-    for chunk in reader.stream(store=store).to_chunks():
-        for row in chunk.to_record_batch().to_pylist():
-            key, probe = row.pop("rerun.controls.RowId"), row.pop("probe", None)
-            values = {name: value for name, value in row.items() if value is not None}
-            found.setdefault(chunk.entity_path, []).append((key, probe, values))
-    return {
-        entity: [(probe, values) for _, probe, values in sorted(rows, key=lambda row: row[0])]
-        for entity, rows in found.items()
-    }
-
-
-def at_probe(rows: list[tuple[int | None, dict[str, Any]]], step: int) -> dict[str, Any]:
-    """What a view shows at a probe: the last value of each component, or the one that stays."""
-    shown: dict[str, Any] = {}
-    for probe, values in rows:
-        shown |= values if probe is None or probe <= step else {}
-    return shown
-
-
-def drawn(rows: Rows, name: str, step: int) -> dict[float, tuple[np.ndarray, tuple[int, ...]]]:
+def drawn(
+    rows: dict[str, list[Row]], name: str, step: int
+) -> dict[float, tuple[np.ndarray, tuple[int, ...]]]:
     """World_from_object and colour of the hypotheses of a method, by their cost."""
     found = {}
     for entity in ("best", *(f"cost_step_{n + 1}" for n in range(LEVELS))):
-        shown = at_probe(rows[f"/hypotheses/{name}/{entity}"], step)
+        shown = shown_at(rows[f"/hypotheses/{name}/{entity}"], step)
         for cost, where, turn in zip(
             shown["cost"],
             shown["InstancePoses3D:translations"],
@@ -114,7 +91,7 @@ def test_the_scene_is_there_once_and_the_hypotheses_for_each_method(saved: Path)
     roots = {entity.split("/")[1] for entity in rows}
     assert roots == {"__properties", "scene", "legend", "hypotheses", "summary", "curves"}
     assert len(rows["/scene/object"]) == 1
-    assert [probe for probe, _ in rows["/scene/free/new"]] == [0, 1, 2]
+    assert [times["probe"] for times, _ in rows["/scene/free/new"]] == [0, 1, 2]
     names = {entity.split("/")[2] for entity in rows if entity.startswith("/hypotheses/")}
     assert names == set(entity_names(["chsel", AWKWARD]).values())
 
@@ -146,7 +123,7 @@ def test_one_scale_colours_all_methods_of_a_step(saved: Path, results: dict[str,
             assert color == tuple(cost_colors((level + 0.5) / LEVELS))
     best = [shown[min(shown)][1] for shown in both]
     assert best[0] != best[1]
-    labels = at_probe(rows["/legend/cost"], 1)["Points2D:labels"]
+    labels = shown_at(rows["/legend/cost"], 1)["Points2D:labels"]
     assert (labels[0], labels[2]) == (number(low), number(high))
 
 
@@ -157,8 +134,8 @@ def test_a_step_without_a_result_hides_the_method_and_says_so(
     chsel, other = entity_names(list(results)).values()
     assert drawn(rows, other, 2) == {}
     assert len(drawn(rows, chsel, 2)) == 3
-    assert at_probe(rows[f"/summary/{other}/text"], 2)["Points2D:labels"] == ["no result"]
-    assert "3 of 5 drawn" in at_probe(rows[f"/summary/{chsel}/text"], 2)["Points2D:labels"][0]
+    assert shown_at(rows[f"/summary/{other}/text"], 2)["Points2D:labels"] == ["no result"]
+    assert "3 of 5 drawn" in shown_at(rows[f"/summary/{chsel}/text"], 2)["Points2D:labels"][0]
 
 
 def test_curves_are_the_numbers_of_the_table(
@@ -177,7 +154,7 @@ def test_curves_are_the_numbers_of_the_table(
         assert spreads is not None
         numbers |= {"spread_position": spreads.position, "spread_rotation": spreads.rotation}
         for curve, title in CURVES.items():
-            shown = at_probe(rows[f"/curves/{curve}/{name}"], step)
+            shown = shown_at(rows[f"/curves/{curve}/{name}"], step)
             unit = 1e3 if "[mm]" in title else 180.0 / np.pi if "[°]" in title else 1.0
             assert shown["Scalars:scalars"] == [pytest.approx(unit * numbers[curve], rel=1e-9)]
             assert shown["SeriesLines:names"] == ["chsel"]
@@ -197,8 +174,8 @@ def test_it_opens_at_the_first_compared_step_with_all_that_was_known_by_then(
     assert panel["TimePanelBlueprint:timeline"] == ["registration"]
     assert panel["TimePanelBlueprint:play_state"] == [PAUSED]
     rows = read(path)
-    assert [row["registration"] for _, row in rows["/scene/free/new"]] == [2, 2, 2]
-    assert {row["registration"] for _, row in rows["/curves/best_cost/chsel"][1:]} == {2}
+    assert [times["registration"] for times, _ in rows["/scene/free/new"]] == [2, 2, 2]
+    assert {times["registration"] for times, _ in rows["/curves/best_cost/chsel"][1:]} == {2}
 
 
 def test_the_eye_of_every_view_turns_to_the_sets_compared(
@@ -224,7 +201,7 @@ def test_it_ends_at_the_last_compared_step(
     recording: Recording, results: dict[str, dict[int, Hypotheses]], saved: Path
 ) -> None:
     assert recording.steps == (1, 2, 3)
-    probes = {probe for rows in read(saved).values() for probe, _ in rows if probe is not None}
+    probes = {times.get("probe", 0) for rows in read(saved).values() for times, _ in rows}
     assert probes == {0, 1, 2}
 
 

@@ -43,6 +43,15 @@ from replay.recorder import BackgroundRecorder
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.hypotheses import LEVELS, MOST
 from replay.rerun.recorder import RerunRecorder
+from tests.tools.rrd_rows import (
+    Row,
+    at_probe,
+    in_layout,
+    opens_at,
+    read,
+    until_probe,
+    views_of_the_last_layout,
+)
 
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
 MESH = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
@@ -53,9 +62,6 @@ MESH_ENTITIES = [
     "/scene/hypotheses/best",
     *(f"/scene/hypotheses/cost_step_{n + 1}" for n in range(LEVELS)),
 ]
-
-Row = tuple[dict[str, int], dict[str, Any]]
-"""Times by timeline, and values by component."""
 
 
 def started(world_from_object: np.ndarray | None = TRUTH) -> SessionStarted:
@@ -166,31 +172,6 @@ def write(path: Path, events: Iterable[Event]) -> Path:
         recorder.record(event)
     recorder.close()
     return path
-
-
-def read(path: Path) -> dict[str, list[Row]]:
-    """All rows of a recording by entity, in the order in which they were logged."""
-    rows: dict[str, list[tuple[bytes, Row]]] = {}
-    for chunk in RrdReader(path).stream().to_chunks():
-        batch = chunk.to_record_batch()
-        for row in batch.to_pylist():
-            times = {name: row.pop(name) for name in chunk.timeline_names}
-            key = row.pop("rerun.controls.RowId")
-            values = {name: value for name, value in row.items() if value is not None}
-            rows.setdefault(chunk.entity_path, []).append((key, (times, values)))
-    return {
-        entity: [row for _, row in sorted(pairs, key=lambda pair: pair[0])]
-        for entity, pairs in rows.items()
-    }
-
-
-def at_probe(rows: list[Row], step: int) -> list[dict[str, Any]]:
-    return [values for times, values in rows if times.get("probe") == step]
-
-
-def until_probe(rows: list[Row], step: int) -> list[dict[str, Any]]:
-    """What a view at a probe draws from: the last value counts."""
-    return [values for times, values in rows if times.get("probe", step + 1) <= step]
 
 
 @pytest.fixture(scope="module")
@@ -472,34 +453,6 @@ def test_costs_of_zero_are_drawn_as_the_lowest(tmp_path: Path) -> None:
     rows = read(write(tmp_path / "a.rrd", [started(), HypothesesFound(0, found)]))
     first = at_probe(rows["/scene/hypotheses/cost_step_1"], 0)[-1]
     assert first["cost"] == [0.0, 0.0]
-
-
-def last_layout(path: Path) -> list[dict[str, Any]]:
-    """The rows of the blueprint that counts."""
-    reader, layouts = RrdReader(path), []
-    for store in reader.blueprints():
-        batches = [chunk.to_record_batch() for chunk in reader.stream(store=store).to_chunks()]
-        rows = [row for batch in batches for row in batch.to_pylist()]
-        layouts.append((min(row["rerun.controls.RowId"] for row in rows), rows))
-    return max(layouts, key=lambda layout: layout[0])[1]
-
-
-def views_of_the_last_layout(path: Path) -> set[str]:
-    """Their titles."""
-    rows = last_layout(path)
-    return {name for row in rows for name in row.get("ViewBlueprint:display_name") or ()}
-
-
-def in_layout(path: Path, name: str) -> Any:
-    """The one value of a component that the last layout has once."""
-    ((value,),) = [row[name] for row in last_layout(path) if row.get(name)]
-    return value
-
-
-def opens_at(path: Path) -> tuple[str, PlayState]:
-    """The timeline that the viewer shows first, and whether it rests at its first moment."""
-    timeline = in_layout(path, "TimePanelBlueprint:timeline")
-    return timeline, PlayState(in_layout(path, "TimePanelBlueprint:play_state"))
 
 
 def late_session() -> list[Event]:

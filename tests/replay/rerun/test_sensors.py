@@ -14,17 +14,8 @@ from chsel.problem.poses import compose
 from replay.events import Event, Probe, RigDescribed, SensorImage
 from replay.rerun.meshes import deepest
 from replay.rerun.sensors import display_size, pixel_classes
-from tests.replay.rerun.test_recorder import (
-    Row,
-    at_probe,
-    probe,
-    read,
-    registration,
-    started,
-    until_probe,
-    views_of_the_last_layout,
-    write,
-)
+from tests.replay.rerun.test_recorder import probe, registration, started, write
+from tests.tools.rrd_rows import Row, at_probe, read, until_probe, views_of_the_last_layout
 
 HAND = trimesh.creation.box((0.1, 0.08, 0.06))
 POSE = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.1, 0.2, 0.9]))
