@@ -5,7 +5,6 @@ And a check that `chsel` is this project's package: the authors' published one h
 
 from __future__ import annotations
 
-import importlib.metadata
 import signal
 import sys
 import threading
@@ -62,6 +61,8 @@ def chsel_is_ours() -> bool:
 
 def package_version(package: str = "chsel-replay") -> str:
     """The version of an installed package, "not installed" without one."""
+    import importlib.metadata  # a third of what `python -m replay --help` would take
+
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
