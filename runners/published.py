@@ -32,12 +32,9 @@ _SEED = re.compile(r"seed_(\d{1,19})")
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """conf/published.yaml, which has all defaults, checked.
+    """conf/published.yaml, which has all defaults, checked."""
 
-    What is Any is checked by whoever it concerns.
-    """
-
-    configurations: Any
+    configurations: Any  # checked by `found_trials`, as are seeds
     seeds: Any
     package: PackageConfig
     dir: str | None
@@ -121,10 +118,10 @@ def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
     """
     folder = Path(config.dir or "").expanduser()
     found = []
-    for told in folder.glob("trials/*/seed_*/session.json"):
-        seed, session = _SEED.fullmatch(told.parent.name), told.with_suffix(".mcap")
+    for description in folder.glob("trials/*/seed_*/session.json"):
+        seed, session = _SEED.fullmatch(description.parent.name), description.with_suffix(".mcap")
         if seed is not None and session.is_file():
-            found.append((Trial(int(seed[1]), told.parent.parent.name), session))
+            found.append((Trial(int(seed[1]), description.parent.parent.name), session))
     if not found:
         raise SettingError(
             f"dir {folder} has no sessions; accepted: a folder that runners.evaluate has written"

@@ -27,20 +27,16 @@ _YAW = 0.5
 
 @dataclass(frozen=True)
 class Problem:
-    """One problem, still to be made.
+    """One problem, still to be made."""
 
-    scale: of the drill; 1 is its real size, 2.5 that of the simulator. contacts: points on its
-    surface. free_points: about how many there are. hypotheses: B. long: the longer search.
-    spread: free points of the same spacing as ever fill a box around the object as large as their
-    number needs, instead of the workspace as densely.
-    """
-
-    scale: float = 1.0
-    contacts: int = 20
-    free_points: int = FREE_POINTS
-    hypotheses: int = 30
-    long: bool = False
+    scale: float = 1.0  # of the drill; 1 is its real size, 2.5 that of the simulator
+    contacts: int = 20  # points on its surface
+    free_points: int = FREE_POINTS  # about how many there are
+    hypotheses: int = 30  # B
+    long: bool = False  # the longer search
     spread: bool = False
+    """Free points fill a box as large as their number needs at the usual spacing, instead of the
+    workspace as densely as they must."""
 
 
 _SIZES = {"real": 1.0, "large": 2.5}
@@ -53,21 +49,16 @@ PROBLEMS = {
 
 @dataclass(frozen=True, eq=False)
 class PosedProblem:
-    """The arrays of a problem, from which either package starts.
-
-    free (N, 3), contacts (M, 3): in the world, metres. free_spacing: of the lattice, metres.
-    initial_set: E_0 (B, 4, 4), object_from_world. workspace: what the free points fill.
-    object_bounds (2, 3): of the mesh, in its frame. world_from_object (4, 4): the truth.
-    """
+    """The arrays of a problem, from which either package starts."""
 
     sdf: SdfGrid
-    free: FloatArray
-    contacts: FloatArray
-    free_spacing: float
-    initial_set: FloatArray
-    workspace: Workspace
-    object_bounds: FloatArray
-    world_from_object: FloatArray
+    free: FloatArray  # (N, 3), world, metres
+    contacts: FloatArray  # (M, 3), world, metres
+    free_spacing: float  # of the lattice, metres
+    initial_set: FloatArray  # E_0 (B, 4, 4), object_from_world
+    workspace: Workspace  # what the free points fill
+    object_bounds: FloatArray  # (2, 3), of the mesh, in its frame, metres
+    world_from_object: FloatArray  # (4, 4), the truth
 
     def registration_problem(self) -> RegistrationProblem:
         """The same as this library takes it."""

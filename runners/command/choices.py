@@ -70,7 +70,7 @@ def _store_with_presets(
 
     choices: of groups below GROUP, with their usual option.
     """
-    with suppress(SettingError):  # of an installed method; whoever chooses it gets the message
+    with suppress(SettingError):  # of an installed method; who chooses it gets the message
         for preset in PRESETS:
             _store(f"{group}/presets/{name}", preset, settings_mapping(settings(preset)))
         defaults = [{f"presets/{name}@_here_": "${preset}"}, *choices, "_self_"]

@@ -24,21 +24,15 @@ KINDS = ("model", "scan", "file")
 
 @dataclass(frozen=True)
 class ObjectConfig:
-    """Which object, and how large.
-
-    name: its short name. kind: "model" (ships with the project), "scan" (of the YCB set, in the
-    assets folder) or "file". scale: multiplies the mesh into the metres of the session. epsilon:
-    tolerance of the plausible set, metres (CHSEL, Sec. V). path: the mesh, for "file". scan:
-    official folder name, for "scan". configuration: how simulated sessions place and probe it.
-    """
+    """Which object, and how large."""
 
     name: str
-    scale: float
-    epsilon: float
-    configuration: str
-    kind: str = "model"
-    path: str | None = None
-    scan: str | None = None
+    scale: float  # multiplies the mesh into the metres of the session
+    epsilon: float  # tolerance of the plausible set, metres (CHSEL, Sec. V)
+    configuration: str  # how simulated sessions place and probe it
+    kind: str = "model"  # ships with the project; "scan": of the YCB set; or "file"
+    path: str | None = None  # the mesh, for "file"
+    scan: str | None = None  # official folder name, for "scan"
 
     def __post_init__(self) -> None:
         require_choice("kind", self.kind, KINDS)

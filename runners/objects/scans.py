@@ -29,13 +29,10 @@ MESH_FILE = "nontextured.ply"
 
 @dataclass(frozen=True)
 class AssetsConfig:
-    """Where scans lie, and where they come from.
+    """Where scans lie, and where they come from."""
 
-    dir: the folder; ~ is the home folder. url: address of the folder of the official archives.
-    """
-
-    dir: str
-    url: str
+    dir: str  # the folder; ~ is the home folder
+    url: str  # address of the folder of the official archives
 
     def __post_init__(self) -> None:
         if not self.dir.strip():

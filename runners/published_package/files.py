@@ -59,20 +59,20 @@ class PackageFiles:
     def write(self, found: Mapping[int, PackageSet | str]) -> None:
         """The sets of the steps, or why there is none."""
         arrays: dict[str, Any] = {}
-        told: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
+        figures: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
         for step, one in found.items():
             if isinstance(one, str):
-                told["failed"][str(step)] = one
+                figures["failed"][str(step)] = one
                 continue
             arrays[f"step_{step}"] = one.world_from_object
             arrays[f"cost_{step}"] = one.hypotheses.cost
             arrays[f"seconds_{step}"] = np.array(one.seconds)
-            told["cpu_seconds"][str(step)] = one.cpu_seconds
-            told["free_points"][str(step)] = one.free_points
+            figures["cpu_seconds"][str(step)] = one.cpu_seconds
+            figures["free_points"][str(step)] = one.free_points
         with whole_file(self.sets) as beside, beside.open("wb") as file:
             np.savez(file, **arrays)
         with whole_file(self.about) as beside:
-            beside.write_text(json.dumps({**self._made_of(), **told}, indent=2) + "\n")
+            beside.write_text(json.dumps({**self._made_of(), **figures}, indent=2) + "\n")
 
     def _made_of(self) -> dict[str, Any]:
         return {

@@ -25,7 +25,7 @@ class PublishedPackage:
     """A process that registers with the package, one request at a time."""
 
     def __init__(self, python: Path) -> None:
-        """Raises PackageError if `python` is no interpreter that has the package."""
+        """Raises PackageError if `python` is not an interpreter that has the package."""
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close)
         try:
@@ -57,7 +57,7 @@ class PublishedPackage:
     def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
         """Have the process do a task (a method of the worker's) and return its answer."""
         assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # the missing answer tells more
+        with suppress(BrokenPipeError):  # the missing answer says more
             self._process.stdin.write(json.dumps({"task": task, **arguments}) + "\n")
             self._process.stdin.flush()
         return self._answer()

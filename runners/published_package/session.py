@@ -28,16 +28,12 @@ HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")
 
 @dataclass(frozen=True, eq=False)
 class PackageSet:
-    """What the package has found.
-
-    seconds: that it took, its constructor included. cpu_seconds: those of its one thread alone,
-    which are fewer where others keep the processor busy. free_points: that it knew of.
-    """
+    """What the package has found."""
 
     hypotheses: Hypotheses
-    seconds: float
-    cpu_seconds: float
-    free_points: int
+    seconds: float  # that it took, its constructor included
+    cpu_seconds: float  # of its one thread alone: fewer where others keep the processor busy
+    free_points: int  # that it knew of
 
     @property
     def world_from_object(self) -> FloatArray:

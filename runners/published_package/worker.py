@@ -201,7 +201,7 @@ def _free_points(voxels: Any) -> int:
 def main() -> None:
     """Answer requests until stdin ends."""
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what the package prints is no answer
+    os.dup2(2, 1)  # what the package prints is not an answer
 
     def answer(values: dict[str, Any]) -> None:
         answers.write(json.dumps(values) + "\n")

@@ -135,7 +135,7 @@ class Display:
         self._console.print(table)
 
     def sensed(self, report: Report) -> None:
-        """What a robot's sensors told, probe by probe, and what was wrong with it."""
+        """What became of a robot's sensor data, probe by probe, and what was wrong with it."""
         if report.by_probe:
             self._console.print(_sensor_table(report))
         for level, text in report.lines:
@@ -175,12 +175,12 @@ def _viewer() -> str:
 
 
 def _sensor_table(report: Report) -> Table:
-    """Counts by probe and sensor, of those that told anything, and the totals."""
+    """Counts by probe and sensor, of those that have images, and the totals."""
     rows: list[tuple[str, str, Counts]] = []
     total = {"all": report.total()} if len(report.by_probe) > 1 else {}
     for step, by_sensor in [*report.by_probe.items(), *total.items()]:
-        told = [(sensor, counts) for sensor, counts in by_sensor.items() if counts.images]
-        rows += [("" if k else str(step), *entry) for k, entry in enumerate(told)]
+        used = [(sensor, counts) for sensor, counts in by_sensor.items() if counts.images]
+        rows += [("" if k else str(step), *entry) for k, entry in enumerate(used)]
     columns = {
         "used": [f"{counts.used}/{counts.images}" for _, _, counts in rows],
         "no pose": [str(counts.lost or "") for _, _, counts in rows],

@@ -22,18 +22,14 @@ _LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
 @dataclass(frozen=True)
 class RecordingConfig:
-    """mcap, rerun: which files to write. live: show the session in the viewer while it runs.
+    """What is written down of a session."""
 
-    snapshot_interval: quality-diversity iterations between archive snapshots; 0 for the first and
-    last alone. timings: also wall-clock seconds by stage, with which no two recordings are equal
-    to the byte.
-    """
-
-    mcap: bool = True
-    rerun: bool = True
-    live: bool = False
-    snapshot_interval: int = 25
+    mcap: bool = True  # write recording.mcap
+    rerun: bool = True  # write recording.rrd
+    live: bool = False  # show the session in the viewer while it runs
+    snapshot_interval: int = 25  # iterations between archives; 0: the first and the last alone
     timings: bool = False
+    """Also wall-clock seconds by stage, with which no two recordings are equal to the byte."""
 
     def __post_init__(self) -> None:
         require_positive("snapshot_interval", self.snapshot_interval, zero=True)

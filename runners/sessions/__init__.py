@@ -37,7 +37,7 @@ def open_session(
     seed: int,
     progress: Progress = unwatched,
 ) -> Session:
-    """Open a session with settings from `session_settings`; `progress` is told of long readings.
+    """Open a session with settings from `session_settings`; `progress` follows long readings.
 
     Raises SessionError if it cannot be opened, or if a configuration is one of another object.
     """

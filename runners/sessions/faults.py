@@ -50,7 +50,7 @@ class FaultSettings(CheckedSettings):
     foreign_contacts: Annotated[float, partial(_within, low=0.0, high=0.5)] = 0.0
     # m: greatest distance between a foreign contact and the true one that it comes with.
     foreign_reach: Annotated[float, between(_NEAREST, 1.0)] = 0.1
-    # Share of the voxels told free among those inside the object, beside swept ones, not deeper
+    # Share of the voxels reported free among those inside the object, beside swept ones, not deeper
     # than free_reach.
     free_error: Annotated[float, partial(_within, low=0.0, high=1.0)] = 0.0
     # Sides of a free voxel: greatest depth in the object of the centre of a wrong one.
@@ -146,7 +146,7 @@ class Faults:
         return contacts, np.concatenate([normals_out, others])
 
     def wrongly_free(self, step: int, swept: FloatArray) -> FloatArray:
-        """Centres (N', 3) of voxels inside the object told free beside swept ones (N, 3).
+        """Centres (N', 3) of voxels inside the object reported free beside swept ones (N, 3).
 
         Each voxel has one chance in a session, when the first one beside it is swept.
         """
@@ -184,7 +184,7 @@ class Faults:
         return np.array(found).reshape(-1, 3), _directions(stream, len(found))
 
     def _place_beside(self, contact: FloatArray, stream: np.random.Generator) -> FloatArray | None:
-        """A place (3,) off the object in no voxel told free; None if none was found."""
+        """A place (3,) off the object in no voxel reported free; None if none was found."""
         away = uniforms(stream, _NEAREST, self._settings.foreign_reach, (_TRIES, 1))
         places = contact + away * _directions(stream, _TRIES)
         lower, upper = self._workspace.bounds

@@ -36,7 +36,7 @@ def open_kinematic(
 
 
 class KinematicEngine:
-    """The hand goes where it is told until a point of its surface meets the object, and waits."""
+    """The hand follows its targets until a point of its surface meets the object, and waits."""
 
     def __init__(
         self, mesh: trimesh.Trimesh, world_from_object: FloatArray, settings: ProbingSettings

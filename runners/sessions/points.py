@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from chsel.errors import PointsError, SettingError, require_positive
 from chsel.problem.defaults import FREE_RESOLUTION, OBJECT_PADDING, workspace_around
 from chsel.problem.input_checks import check_points
@@ -19,22 +17,17 @@ from runners.sessions.session import Progress, unwatched
 
 @dataclass(frozen=True)
 class PointsSettings:
-    """path: .npz, .csv, .ply, .off, .xyz or .stl. workspace: x, y, z bounds, metres
-    [[x0, x1], [y0, y1], [z0, z1]]; by default the bounds of the points, padded by the object's
-    diameter. free_resolution: voxel side of free space, metres. merge_free: keep one free point
-    a voxel, at its centre. object_resolution, object_padding: of the SDF grid, metres; by default
-    the resolution that `object_grid` takes. start_contacts, start_probe: a registration needs so
-    many contacts and this probe index. With the defaults, `chsel.register` has the same bits.
-    """
+    """A file of known points. With the defaults, `chsel.register` has the same bits."""
 
-    path: str | None = None
+    path: str | None = None  # .npz, .csv, .ply, .off, .xyz or .stl
     workspace: tuple[tuple[float, float], ...] | None = None
-    free_resolution: float = FREE_RESOLUTION
-    merge_free: bool = False
-    object_resolution: float | None = None
-    object_padding: float = OBJECT_PADDING
-    start_contacts: int = 0
-    start_probe: int = 0
+    """[[x0, x1], [y0, y1], [z0, z1]], metres; None: around the points, padded by the diameter."""
+    free_resolution: float = FREE_RESOLUTION  # voxel side of free space, metres
+    merge_free: bool = False  # keep one free point a voxel, at its centre
+    object_resolution: float | None = None  # of the SDF grid, metres; None: that of `object_grid`
+    object_padding: float = OBJECT_PADDING  # of the SDF grid, metres
+    start_contacts: int = 0  # a registration needs so many contacts
+    start_probe: int = 0  # and this index of the probe
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
@@ -67,7 +60,7 @@ class PointsSession:
         every = KnownPoints.joined([self._file.at(step) for step in self._steps])
         given = _given_workspace(settings)
         try:  # before any work; warnings are given when the points become known
-            check_points(every, _diameter(object_model), self.free_resolution, given)
+            check_points(every, object_model.diameter, self.free_resolution, given)
         except PointsError as error:
             raise PointsError(f"point file {settings.path}: {error}") from None
         self.workspace = given or workspace_around(every, object_model.grid(settings, progress))
@@ -93,8 +86,3 @@ def _given_workspace(settings: PointsSettings) -> Workspace | None:
         return None
     (x0, x1), (y0, y1), (z0, z1) = settings.workspace
     return Workspace((x0, y0, z0), (x1, y1, z1))
-
-
-def _diameter(object_model: ObjectModel) -> float:
-    """Diagonal in metres of the box around the object."""
-    return float(np.sqrt((np.asarray(object_model.mesh.extents) ** 2).sum()))

@@ -40,40 +40,28 @@ NOISE_ROWS = 5000  # of the table that all methods share
 
 @dataclass(frozen=True)
 class ProbingSettings:
-    """How the gripper probes, and what is written down of it.
+    """How the gripper probes, and what is written down of it."""
 
-    configuration: name of one of the 17; the object's own if None. boundary: voxels known to be
-    free from the start, two layers below the floor, the six faces of the workspace, or both.
-    workspace: the hammer's is larger in "reference" and like all others in "paper".
-    sweep: free space is what the hand's interior sweeps at every mini-step, or only where control
-    steps end. free_resolution: side of a free voxel, m. object_resolution, object_padding: of the
-    object's SDF grid, m. interior_spacing, interior_depth: of the hand's interior points, m.
-    collision_mesh: what PyBullet's contacts are with, the mesh itself or its convex parts.
-    start_contacts, start_probe: registration begins when there are so many contacts, and after
-    the probe of that index. step_length: of a control step at full command, m. push_steps: most
-    control steps of a push. stop_force: ends a push, N. max_force: of the hand's holder, N.
-    noise: standard deviation of the noise on a command between -1 and 1. faults: of what is
-    reported, and of the registered mesh.
-    """
-
-    configuration: str | None = None
+    configuration: str | None = None  # name of one of the 17; None: the object's own
     boundary: str = "floor_slab"
-    workspace: str = "reference"
-    sweep: str = "mini_steps"
-    collision_mesh: str = "visual"
-    free_resolution: float = 0.025
-    object_resolution: float = 0.010
-    object_padding: float = 0.05
-    interior_spacing: float = 0.005
-    interior_depth: float = 0.010
-    start_contacts: int = 4
-    start_probe: int = 4
-    step_length: float = 0.03
-    push_steps: int = 10
-    stop_force: float = 5.0
-    max_force: float = 30.0
-    noise: float = 0.005
+    """Voxels free from the start: two layers below the floor, the workspace's faces, or both."""
+    workspace: str = "reference"  # in which the hammer's is larger; in "paper" all are alike
+    sweep: str = "mini_steps"  # where free space is swept, or only where control steps end
+    collision_mesh: str = "visual"  # of PyBullet: the mesh itself, or its convex parts
+    free_resolution: float = 0.025  # side of a free voxel, m
+    object_resolution: float = 0.010  # of the object's SDF grid, m
+    object_padding: float = 0.05  # of the object's SDF grid, m
+    interior_spacing: float = 0.005  # of the hand's interior points, m
+    interior_depth: float = 0.010  # of the hand's interior points, m
+    start_contacts: int = 4  # registration begins when there are so many contacts
+    start_probe: int = 4  # and after the probe of this index
+    step_length: float = 0.03  # of a control step at full command, m
+    push_steps: int = 10  # most control steps of a push
+    stop_force: float = 5.0  # ends a push, N
+    max_force: float = 30.0  # of the hand's holder, N
+    noise: float = 0.005  # standard deviation, of a command between -1 and 1
     faults: FaultSettings = field(default_factory=FaultSettings)
+    """Of what is reported, and of the registered mesh."""
 
     presets: ClassVar[Presets] = {
         "paper": {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,18 +36,15 @@ _LONGEST_HEADER = 4096  # bytes
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What a file holds: the object, its true pose (4, 4) where known, and problems by step.
-
-    epsilon: of the object, metres; None where the file does not say. digest: of the file's bytes.
-    """
+    """What a file holds."""
 
     object: str
     mesh: trimesh.Trimesh
-    world_from_object: FloatArray | None
-    epsilon: float | None
+    world_from_object: FloatArray | None  # (4, 4), where known
+    epsilon: float | None  # of the object, metres; None where the file does not say
     steps: tuple[int, ...]
     problems: Problems
-    digest: str
+    digest: str  # of the file's bytes
 
 
 class Problems(Protocol):
@@ -70,7 +66,7 @@ def open_source(
 ) -> Source:
     """A recording; else a raw log or a file of known points, for which the object must be named.
 
-    session: its settings, for what is no recording; raw logs need those of kind "sensors", with
+    session: its settings, for what is not a recording; raw logs need those of kind "sensors", with
     which a .yaml is a depth image.
     """
     refuse_special_file(str(path), path, SettingError)
@@ -83,7 +79,7 @@ def open_source(
     if is_mcap or path.is_dir() or is_frame:
         if not of_sensors:
             raise SettingError(
-                f"{path} is no recording; accepted for a raw log: session=sensors "
+                f"{path} is not a recording; accepted for a raw log: session=sensors "
                 "session/rig=NAME object=NAME"
             )
         # Images are for the eye; a pose beside the log is what is sought here.
@@ -127,7 +123,7 @@ def _of_session(
         opened.close()
     sdf = model.grid(settings)
     problems = _ProbedProblems(events, opened, sdf, seed)
-    told = [event.source for event in events if isinstance(event, RigDescribed)]
+    described = [event.source for event in events if isinstance(event, RigDescribed)]
     return Source(
         model.name,
         model.mesh,
@@ -135,18 +131,18 @@ def _of_session(
         model.epsilon,
         problems.steps,
         problems,
-        told[0] if told else file_digest(path),
+        described[0] if described else file_digest(path),
     )
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a file is not some other program's, as its first record tells."""
+    """Whether a file is a recording, by its first record; also if that cannot be read."""
     try:
         with path.open("rb") as file:
             first = BytesIO(file.read(_LONGEST_HEADER))
         records = StreamReader(first, record_size_limit=_LONGEST_HEADER).records
         header = next(iter(records), None)
-    except (McapError, OSError, ValueError):  # what is wrong with it is told when it is read
+    except (McapError, OSError, ValueError):  # reading it reports what is wrong
         return True
     return not isinstance(header, Header) or header.profile == PROFILE
 
@@ -173,10 +169,10 @@ class _ProbedProblems:
         self.steps = tuple(probe.step for probe in self._probes)
 
     def problem(self, step: int) -> RegistrationProblem:
-        news = [probe.new_points for probe in self._probes if probe.step <= step]
+        new = [probe.new_points for probe in self._probes if probe.step <= step]
         return RegistrationProblem(
             self._sdf,
-            reduce(KnownPoints.merged, news, self._of.initial_points),
+            KnownPoints.joined([self._of.initial_points, *new]),
             np.eye(4)[None],
             self._of.workspace,
             self._of.free_resolution,

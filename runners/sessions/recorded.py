@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
-from functools import reduce
 
 from chsel.errors import PointsError, SettingError
 from chsel.problem.input_checks import check_points
@@ -16,15 +15,11 @@ from replay.mcap.reader import read_recording
 
 @dataclass(frozen=True)
 class RecordedSettings:
-    """path: the recording.mcap; it brings its own object, workspace and resolutions.
+    """A recording brings its own object, workspace and resolutions."""
 
-    start_contacts, start_probe: a registration needs so many contacts and this probe index; None:
-    as in the recording.
-    """
-
-    path: str | None = None
-    start_contacts: int | None = None
-    start_probe: int | None = None
+    path: str | None = None  # the recording.mcap
+    start_contacts: int | None = None  # a registration needs so many; None: as in the recording
+    start_probe: int | None = None  # and this index of the probe
 
     def __post_init__(self) -> None:
         if not self.path:
@@ -57,7 +52,7 @@ class RecordedSession:
     def _check(self, path: str) -> None:
         """Before any work; warnings are given when the points become known."""
         new = (probe.new_points for probe in self._probes)
-        every = reduce(KnownPoints.merged, new, self.initial_points)
+        every = KnownPoints.joined([self.initial_points, *new])
         diameter = self.recorded.sdf.diameter
         try:
             check_points(every, diameter, self.free_resolution, self.workspace)

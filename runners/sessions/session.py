@@ -17,7 +17,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def unwatched(stage: str, done: int, total: int) -> None:
-    """The progress that nobody watches."""
+    """The progress where none is shown."""
 
 
 class Session(Protocol):
