@@ -58,7 +58,8 @@ def rows_by_level(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows.assign(faults=levels)
     if len(order) > 1:
         rows = pd.concat([rows, rows.assign(faults=_ALL)])
-    return rows.assign(faults=pd.Categorical(rows[_FAULTS], [*order, _ALL], ordered=True))
+    categories = list(dict.fromkeys([*order, _ALL]))
+    return rows.assign(faults=pd.Categorical(rows[_FAULTS], categories, ordered=True))
 
 
 def shares_held(rows: pd.DataFrame) -> pd.DataFrame:

@@ -91,7 +91,7 @@ class Evaluation:
         seeds = self.experiment.get("seeds")
         if not configurations or not isinstance(seeds, list):
             return sorted(trials_of(self.rows))
-        return [(name, seed) for name in configurations for seed in seeds]
+        return [(name, seed) for name in configurations for seed in seeds if isinstance(seed, int)]
 
     @cached_property
     def planned_methods(self) -> list[str]:
@@ -235,9 +235,14 @@ def _rows(paths: Sequence[Path], name: str) -> pd.DataFrame:
             found = pa.parquet.read_table(path, partitioning=None).replace_schema_metadata()
             if missing := [column for column in _NEEDED[name] if column not in found.column_names]:
                 raise ReportError(f"{path} lacks the column {', '.join(missing)}; {_ACCEPTED}")
-            both = pa.concat_tables([tables[0], found], promote_options="permissive")
-            tables.append(both.select(schema.names).cast(schema))
-        except (pa.ArrowException, OSError) as error:
+            columns = [
+                found[field.name].cast(field.type)
+                if field.name in found.column_names
+                else pa.nulls(len(found), field.type)
+                for field in schema
+            ]
+            tables.append(pa.table(columns, schema=schema))
+        except (pa.ArrowException, KeyError, OSError) as error:  # two columns of a name: KeyError
             text = " ".join(str(error).split())
             raise ReportError(f"{path} cannot be read as a table ({text}); {_ACCEPTED}") from None
         for column in (column for column in _KEYS if column in _NEEDED[name]):

@@ -238,6 +238,7 @@ def test_settings_of_the_sequence_choose_trial_methods_and_steps(
         (["{}/text"], "experiment.json cannot be read"),
         (["{}/damaged"], "results.parquet cannot be read as a table"),
         (["{}/other"], "results.parquet lacks the column"),
+        (["{}/letters"], "results.parquet cannot be read as a table (Failed to parse string"),
         (["{}/good", "sequence.trial=clamp"], "accepted: CONFIGURATION/SEED"),
         (["{}/good", "sequence.view=zz"], "view is 'zz'; accepted: xz, xy, yz"),
         (["{}/good", "sequence.steps=[]"], "steps is empty"),
@@ -253,6 +254,8 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: st
     (tmp_path / "damaged" / "results.parquet").write_bytes(b"PAR1 and no more")
     write_evaluation(tmp_path / "other", None)
     write_table(tmp_path / "other" / "results.parquet", [{"a": 1}], None)
+    letters = [row("can", 0, "chsel", 4, diversity="much")]
+    write_table(write_evaluation(tmp_path / "letters", None) / "results.parquet", letters, None)
     (tmp_path / "empty").mkdir()
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "experiment.json").write_text("{")
