@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +24,6 @@ _ACCEPTED = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class PoseFile:
-    """A pose world_from_object (4, 4), and what else the file says about it."""
-
-    world_from_object: FloatArray
-    about: Mapping[str, Any]
-
-
 def beside(path: str | Path) -> Path:
     """Where the pose of a log or recording is looked for: X.pose.yaml beside X.mcap or folder X."""
     path = Path(path).absolute()
@@ -41,14 +32,11 @@ def beside(path: str | Path) -> Path:
 
 def read_pose(path: str | Path) -> FloatArray:
     """world_from_object (4, 4) of a file. Raises SessionError unless it holds a rigid one."""
-    return read_pose_file(path).world_from_object
-
-
-def read_pose_file(path: str | Path) -> PoseFile:
-    """A pose with all that stands beside it. Raises SessionError unless it is rigid."""
     path = Path(path).expanduser()
-    values = _values(path)
-    rows = values.pop(KEY, None)
+    try:
+        rows = read_yaml(path, _MOST_BYTES).get(KEY)
+    except SessionError as error:
+        raise SessionError(f"pose file {path}: {error}; {_ACCEPTED}") from None
     if not _is_matrix(rows):
         raise SessionError(f"pose file {path} has no {KEY} of 4 x 4 numbers; {_ACCEPTED}")
     try:
@@ -57,7 +45,7 @@ def read_pose_file(path: str | Path) -> PoseFile:
     except PoseError:
         raise SessionError(f"pose file {path}: {KEY} is not rigid; {_ACCEPTED}") from None
     pose.setflags(write=False)
-    return PoseFile(pose, values)
+    return pose
 
 
 def write_pose(
@@ -72,14 +60,6 @@ def write_pose(
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     with whole_file(path) if overwrite else new_file(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
-
-
-def _values(path: Path) -> dict[str, Any]:
-    try:
-        values = read_yaml(path, _MOST_BYTES)
-    except SessionError as error:
-        raise SessionError(f"pose file {path}: {error}; {_ACCEPTED}") from None
-    return {str(key): value for key, value in values.items()}
 
 
 def _is_matrix(rows: Any) -> bool:

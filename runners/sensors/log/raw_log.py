@@ -31,7 +31,6 @@ _BLOCK = 2**22  # bytes
 _DIGEST_SIZE = 16  # bytes
 _MOST_FAULTS = 200  # different texts
 _MOST_LISTED = 60
-_END_OF_TIME = 2**63
 _STATIC = "tf_static"
 
 
@@ -77,24 +76,18 @@ class RawLog:
         ]
 
     def messages(
-        self,
-        topics: Collection[str],
-        *,
-        begin: int | None = None,
-        end: int | None = None,
-        progress: Progress | None = None,
+        self, topics: Collection[str], *, progress: Progress | None = None
     ) -> Iterator[Received]:
         """The messages on topics, in order of log time where the files have an index.
 
-        begin, end: log times in nanoseconds, begin <= t < end. What cannot be read is passed by,
-        and counted in `faults`. Raises SessionError if the log has none of the topics.
+        What cannot be read is skipped, and counted in `faults`. Raises SessionError if the log has
+        none of the topics.
         """
         known = frozenset(topics) & self.topics.keys()
         if not known:
             named = ", ".join(sorted(topics)) or "none"
             raise SessionError(f"log {self.path} has no topic {named}; it has {self.listing()}")
-        wanted = Wanted(known, begin or 0, _END_OF_TIME if end is None else end)
-        return self._received(wanted, progress)
+        return self._received(Wanted(known), progress)
 
     def listing(self) -> str:
         """All topics with their schemas, for messages to the user."""
