@@ -55,94 +55,77 @@ def kernels_in(folder: Path) -> list[Path]:
 
 def test_kernels_are_kept_in_the_named_folder_apart_for_every_cpu(tmp_path: Path) -> None:
     named = tmp_path / "kept" / "here"
-    first, said = result_of(start(COMPUTE, tmp_path, CHSEL_CACHE_DIR=str(named)))
+    names = {"CHSEL_CACHE_DIR": str(named)}
+    first, said = result_of(start(COMPUTE, tmp_path, **names))
     assert str(named) in said
-    assert said.count("compiling the kernels") == 1
+    assert said.count("compiling the kernels") == said.count("CPU, once:") == 1
     made = kernels_in(named)
     assert len(made) > 0
     assert len({path.relative_to(named).parts[0] for path in made}) == 1
-    again, said = result_of(start(COMPUTE, tmp_path, CHSEL_CACHE_DIR=str(named)))
+    again, said = result_of(start(COMPUTE, tmp_path, **names))
     assert (again, said) == (first, "")
     assert kernels_in(named) == made
-    other, said = result_of(
-        start(
-            COMPUTE,
-            tmp_path,
-            CHSEL_CACHE_DIR=str(named),
-            NUMBA_CPU_NAME="generic",
-            NUMBA_CPU_FEATURES="",
-        )
-    )
+    plain = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    other, said = result_of(start(COMPUTE, tmp_path, **names, **plain))
     assert other == first  # to the bit, by code for another CPU
     assert "compiling the kernels" in said
     assert len({path.relative_to(named).parts[0] for path in kernels_in(named)}) == 2
     assert not (tmp_path / "home").exists()
+    more = "from chsel.numerics.elementary import logs, arctangents; ones = np.ones(2)"
+    code = f"{COMPUTE}\n{more}; logs(ones); arctangents(ones, ones)"
+    _, said = result_of(
+        start(code, tmp_path, **names)
+    )  # "once" is not said of those that come later
+    assert said == f"compiling the kernels that are still missing (kept in {named})\n"
 
 
-def test_two_processes_that_start_on_an_empty_folder_both_succeed(tmp_path: Path) -> None:
-    processes = [start(COMPUTE, tmp_path, XDG_CACHE_HOME=str(tmp_path / "xdg")) for _ in range(2)]
-    (one, _), (other, _) = (result_of(process) for process in processes)
-    assert one == other
-    assert len(kernels_in(tmp_path / "xdg" / "chsel" / "kernels")) > 0
-    again, said = result_of(start(COMPUTE, tmp_path, XDG_CACHE_HOME=str(tmp_path / "xdg")))
-    assert (again, said) == (one, "")
-
-
-def test_a_named_folder_that_cannot_be_written_is_named_and_passed_over(tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.write_text("no folder")
-    process = start(COMPUTE, tmp_path, CHSEL_CACHE_DIR=str(file), XDG_CACHE_HOME=str(tmp_path))
-    _, said = result_of(process)
-    assert said.splitlines()[0] == (
-        f"CHSEL_CACHE_DIR is {file}, which cannot be written; accepted: a folder for compiled "
-        "kernels. The default folder is used"
-    )
-    assert (tmp_path / "chsel" / "kernels").is_dir()
-    assert file.read_text() == "no folder"
-
-
-def test_a_named_folder_that_others_can_write_to_is_named_and_passed_over(tmp_path: Path) -> None:
-    open_to_all = tmp_path / "open"
-    open_to_all.mkdir()
-    open_to_all.chmod(0o777)
-    names = {"CHSEL_CACHE_DIR": str(open_to_all), "XDG_CACHE_HOME": str(tmp_path / "xdg")}
-    _, said = result_of(start(COMPUTE, tmp_path, **names))
-    assert said.splitlines()[0] == (
-        f"CHSEL_CACHE_DIR is {open_to_all}, which others can write to, and compiled kernels are "
-        "executed; accepted: a folder that only you can write to (chmod go-w). The default folder "
-        "is used"
-    )
-    assert not kernels_in(open_to_all)
-    assert kernels_in(tmp_path / "xdg")
-
-
-def test_folders_are_private_whatever_the_umask_and_used_again(tmp_path: Path) -> None:
-    """Those that an earlier version left open to a group, too."""
+def test_two_processes_that_start_on_an_empty_folder_share_private_folders(tmp_path: Path) -> None:
+    """Whatever the umask; those that an earlier version left open to a group, too."""
     xdg, temporary = tmp_path / "xdg", tmp_path / "temporary"
     temporary.mkdir()
     names = {"XDG_CACHE_HOME": str(xdg), "TMPDIR": str(temporary)}
-    first, _ = result_of(start(COMPUTE, tmp_path, umask=0o002, **names))
+    processes = [start(COMPUTE, tmp_path, umask=0o002, **names) for _ in range(2)]
+    (one, _), (other, _) = (result_of(process) for process in processes)
+    assert one == other
     place = xdg / "chsel" / "kernels"
     kept = kernels_in(place)
     assert kept
     folders = [xdg, xdg / "chsel", place, *place.iterdir()]
     assert {folder.stat().st_mode & 0o777 for folder in folders} == {0o700}
     place.chmod(0o775)
-    assert result_of(start(COMPUTE, tmp_path, umask=0o002, **names)) == (first, "")
+    assert result_of(start(COMPUTE, tmp_path, umask=0o002, **names)) == (one, "")
     assert place.stat().st_mode & 0o022 == 0
     assert kernels_in(place) == kept
     assert not list(temporary.glob("chsel*"))
 
 
-def test_once_is_said_once_and_not_of_kernels_that_come_later(tmp_path: Path) -> None:
-    names = {"CHSEL_CACHE_DIR": str(tmp_path / "kept")}
+@pytest.mark.parametrize(
+    ("mode", "reason"),
+    [
+        (None, "which cannot be written; accepted: a folder for compiled kernels"),
+        (
+            0o777,
+            "which others can write to, and compiled kernels are executed; accepted: a folder that "
+            "only you can write to (chmod go-w)",
+        ),
+    ],
+    ids=["a file", "open to all"],
+)
+def test_a_named_folder_that_cannot_be_used_is_named_and_passed_over(
+    tmp_path: Path, mode: int | None, reason: str
+) -> None:
+    named = tmp_path / "named"
+    if mode is None:
+        named.write_text("no folder")
+    else:
+        named.mkdir()
+        named.chmod(mode)
+    names = {"CHSEL_CACHE_DIR": str(named), "XDG_CACHE_HOME": str(tmp_path / "xdg")}
     _, said = result_of(start(COMPUTE, tmp_path, **names))
-    assert said.count("CPU, once:") == 1
-    later = "from chsel.numerics.elementary import logs; logs(np.ones(2))"
-    both = f"{COMPUTE}\n{later}\nfrom chsel.numerics.elementary import arctangents\n"
-    both += "arctangents(np.ones(2), np.ones(2))"
-    _, said = result_of(start(both, tmp_path, **names))
-    assert said == f"compiling the kernels that are still missing (kept in {tmp_path / 'kept'})\n"
+    first = f"CHSEL_CACHE_DIR is {named}, {reason}. The default folder is used"
+    assert said.splitlines()[0] == first
+    assert kernels_in(tmp_path / "xdg")
+    assert named.read_text() == "no folder" if mode is None else not kernels_in(named)
 
 
 NAMELESS = """
