@@ -13,11 +13,7 @@ import trimesh
 
 import chsel
 from chsel.methods import build_method, preset_settings
-from chsel.plausible.pose_metrics import pose_errors
-from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.problem.online_registration import pose_problem
 from chsel.problem.poses import apply, axis_angle, compose, inverse
-from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
@@ -78,42 +74,6 @@ def test_odd_points_have_a_defined_result(points: dict[str, Any], preset: str) -
     assert found.object_from_world.shape == (5, 4, 4)
     assert np.isfinite(found.object_from_world).all()
     assert np.isfinite(found.cost).all()
-
-
-@pytest.mark.parametrize(
-    "points",
-    [
-        chsel.KnownPoints(known=[[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]),
-        chsel.KnownPoints(free=np.full((1, 3), 1e6), known=POINT),
-    ],
-)
-@pytest.mark.parametrize("preset", ["default", "paper", "reference"])
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_points_that_are_refused_have_a_defined_result_for_a_method(
-    points: chsel.KnownPoints, preset: str
-) -> None:
-    found = unchecked(points, chsel.Workspace((0, 0, 0), (1, 1, 1)), preset)
-    assert np.isfinite(found.object_from_world).all()
-    assert np.isfinite(found.cost).all()
-
-
-def test_points_far_outside_of_the_workspace_cost_their_distance() -> None:
-    workspace = chsel.Workspace((0, 0, 0), (1, 1, 1))
-    found = unchecked(chsel.KnownPoints(known=[[1e6, 0, 0]]), workspace)
-    assert found.cost[0] == pytest.approx(1e6, rel=1e-4)
-
-
-def unchecked(
-    points: chsel.KnownPoints, workspace: chsel.Workspace, preset: str = "default"
-) -> chsel.Hypotheses:
-    """A registration of points that nobody has checked."""
-    settings = settings_mapping(preset_settings("chsel", preset))
-    settings["descent"] |= QUICK["descent"]
-    settings["emitter"] |= QUICK["emitter"]
-    solver = build_method("chsel", settings)
-    grid = chsel.SdfGrid.from_mesh(BOX, 0.002)
-    key = StreamKey(0, 0)
-    return solver.register(pose_problem(grid, points, workspace, 0.01, key, solver.online, None))
 
 
 def warned(**arguments: Any) -> list[chsel.InputWarning]:
@@ -279,16 +239,6 @@ def test_own_starts_are_used() -> None:
     found = register(surface=SURFACE, initial_set=starts, method="gradient_descent", settings=None)
     assert len(found.cost) == 4
     assert found.duplicate.tolist() == [False, True, True, True]
-
-
-def test_pose_errors_are_distance_and_angle() -> None:
-    shift = compose(
-        axis_angle(np.array([0.0, 1.0, 0.0]), np.array(0.3)), np.array([0.0, 0.03, 0.04])
-    )
-    estimates = np.stack([inverse(POSE), inverse(POSE @ shift)])
-    position, rotation = pose_errors(estimates, POSE, ObjectSymmetry())
-    np.testing.assert_allclose(position, [0.0, 0.05], atol=1e-12)
-    np.testing.assert_allclose(rotation, [0.0, 0.3], atol=1e-12)
 
 
 def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:

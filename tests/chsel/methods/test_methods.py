@@ -132,6 +132,12 @@ def test_odd_points_have_results(name: str, preset: str) -> None:
             assert ((found.cost > -2e-3) & (found.cost <= 1.0)).all()
 
 
+def test_a_point_far_outside_of_the_workspace_costs_its_distance() -> None:
+    method = quick("chsel")
+    found = method.register(posed(method, KnownPoints(known=[[1e6, 0.0, 0.0]])))
+    assert found.cost[0] == pytest.approx(1e6, rel=1e-4)
+
+
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", [name for name in METHODS if name not in BOUNDED])

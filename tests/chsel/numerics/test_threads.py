@@ -5,7 +5,6 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,14 +18,6 @@ from chsel.numerics.threads import require_threads, spread
 from chsel.numerics.threads import threads as use_threads
 
 PATIENCE = 20.0  # seconds until what should have ended long ago counts as stuck
-
-
-@pytest.fixture(params=[1, 2, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
 
 
 def no_scratch() -> None:

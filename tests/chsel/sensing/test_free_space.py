@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -43,14 +41,6 @@ def image() -> tuple[FloatArray, BoolArray]:
     depth[stream.random(depth.shape) < 0.05] = np.inf
     depth[stream.random(depth.shape) < 0.05] = 0.0
     return depth, stream.random(depth.shape) < 0.8
-
-
-@pytest.fixture(params=[1, 2, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
 
 
 def test_the_grid_is_the_lattice_up_to_the_upper_corner() -> None:
