@@ -102,7 +102,7 @@ def _verdicts(path: Path, steps: list[int]) -> Iterator[Verdict]:
 
 
 class UnusableRecording(pytest.Item):
-    """A file that is no recording with results."""
+    """A file without a recorded result."""
 
     def __init__(self, *, reason: str, **more: Any) -> None:
         super().__init__(**more)

@@ -65,7 +65,7 @@ class BackgroundRecorder(Recorder):
     ) -> None:
         """A recorder in front of another one.
 
-        most: events that may wait; whoever records another one then waits for its place. patient:
+        most: events that may wait; the caller who records one more waits for its place. patient:
         False lets `flush` only ask for it. optional: what to do about a recording that is not
         written; where this is given, a RecordingError is a warning that ends with it, and no more
         is recorded.

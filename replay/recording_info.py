@@ -26,29 +26,22 @@ _OF_THE_SESSION = ("runner", "object", "session", "method", "seed", "source", "f
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """What `info` tells of a recording.
-
-    size: of the file, bytes. session: names, seed, configuration and the like, plain values.
-    rig: name and source of the sensors of a robot session, None if it had none.
-    steps: a mapping for each probe, named as the columns of the message `Contents`; points are
-    all known with the probe. outcome: how the session ended, None if that is not told.
-    attachments: bytes by name. messages, message_bytes: by topic; bytes are known where everything
-    was read. checked: whether it was. damage: what is wrong, None if nothing is. digest: of the
-    whole recording, "" if it is of a format before version 3 or has no end.
-    """
+    """What `info` shows of a recording."""
 
     path: Path
-    size: int
-    session: Mapping[str, Any]
+    size: int  # of the file, bytes
+    session: Mapping[str, Any]  # names, seed, configuration and the like, plain values
+    # A mapping for each probe, named as the columns of the message `Contents`; points are all
+    # known with the probe.
     steps: tuple[Mapping[str, Any], ...]
-    outcome: str | None
-    attachments: Mapping[str, int]
-    messages: Mapping[str, int]
-    message_bytes: Mapping[str, int] | None = None
-    checked: bool = False
-    damage: str | None = None
-    rig: Mapping[str, str] | None = None
-    digest: str = ""
+    outcome: str | None  # how the session ended, None if that is unknown
+    attachments: Mapping[str, int]  # bytes by name
+    messages: Mapping[str, int]  # by topic
+    message_bytes: Mapping[str, int] | None = None  # by topic, where everything was read
+    checked: bool = False  # whether everything was read
+    damage: str | None = None  # what is wrong, None if nothing is
+    rig: Mapping[str, str] | None = None  # name and source of a robot session's sensors
+    digest: str = ""  # of the whole recording, "" before format 3 and without an end
 
     @property
     def registrations(self) -> int:
@@ -97,7 +90,7 @@ def recording_info(path: str | Path, *, check: bool = False) -> RecordingInfo:
     path = Path(path).expanduser()
     try:
         indexed = _from_index(McapIndex(path))
-    except RecordingError:  # unfinished or damaged, or no recording: reading it all will tell
+    except RecordingError:  # unfinished or damaged, or no recording: so all of it is read
         return _from_everything(path)
     if not check:
         return indexed
@@ -229,7 +222,7 @@ def _contradiction(indexed: RecordingInfo, checked: RecordingInfo) -> str | None
     for topic, count in indexed.messages.items():
         found = checked.messages.get(topic, 0)
         if count != found:
-            return f"damaged: its index tells of {count} messages on {topic}, there are {found}"
+            return f"damaged: its index has {count} messages on {topic}, there are {found}"
     if indexed.attachments != checked.attachments:
-        return "damaged: its index tells of other attachments than there are"
+        return "damaged: its index has other attachments than there are"
     return None

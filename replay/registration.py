@@ -98,10 +98,10 @@ class Registered:
 
 
 def recorded_method(recording: Recording) -> NamedMethod:
-    """The method of a recording, with its settings; RecordingError if it does not tell them."""
+    """The method of a recording, with its settings; RecordingError if it does not have them."""
     name, config = recording.start.method, recording.start.config.get("method")
     if not isinstance(config, Mapping) or config.get("name") != name:
-        raise RecordingError(f"recording {recording.path} does not tell the settings of {name}")
+        raise RecordingError(f"recording {recording.path} does not have the settings of {name}")
     try:
         settings = {key: value for key, value in config.items() if key != "name"}
         return _named(name, completed(settings, preset_settings(name)))
@@ -113,7 +113,7 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
     """A method by name (None: the recorded one) with changes such as "cost.free_scale=40".
 
     Unchanged settings are those of the recording if it is the recorded method, else those of a
-    preset: the recording's if it tells one, or that of the change "preset=NAME".
+    preset: the recording's if it has one, or that of the change "preset=NAME".
     Raises SettingError for names and values that do not exist.
     """
     pairs = [_pair(change) for change in changes]

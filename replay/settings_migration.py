@@ -27,7 +27,7 @@ LEFT_OUT: Mapping[type, Mapping[str, Any]] = {
 def completed(recorded: Mapping[str, Any], default: Any) -> dict[str, Any]:
     """A recorded mapping of settings with what it leaves out, groups in it included.
 
-    default: settings of the same class, which tell the classes of the groups.
+    default: settings of the same class, which show the classes of the groups.
     """
     groups = {
         name: completed(value, getattr(default, name))

@@ -47,7 +47,7 @@ class CommonCost:
 
 
 def common_cost(recording: Recording) -> CommonCost:
-    """The cost of the recorded method; that of the default preset if the recording tells none."""
+    """The cost of the recorded method; that of the default preset if the recording has none."""
     recorded = recorded_or_none(recording)
     settings = getattr(recorded.method.settings, "cost", None) if recorded else None
     if not isinstance(settings, CostSettings):

@@ -59,7 +59,7 @@ def contenders(
 
 
 def recorded_or_none(recording: Recording) -> NamedMethod | None:
-    """The method of a recording, if it tells one that exists here."""
+    """The method of a recording, if it has one that exists here."""
     try:
         return recorded_method(recording)
     except RecordingError:

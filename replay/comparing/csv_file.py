@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from replay.comparing.columns import COLUMNS
@@ -27,34 +27,23 @@ def write_csv(
     method is not the recorded one) and failure.
     """
     by_label = {method.label: method for method in methods}
-    names = ["step", "label", "method", "changes", "cost", "definition"]
-    names += [column.csv_name for column in COLUMNS]
+    rows = []
+    for outcome in outcomes:
+        method, numbers = by_label.get(outcome.label), outcome.numbers
+        rows.append(
+            {
+                "step": outcome.step,
+                "label": outcome.label,
+                "method": method.named.name if method else outcome.label.split(": ", 1)[-1],
+                "changes": "; ".join(method.changes) if method else "",
+                "cost": cost.name,
+                "definition": definition if "diversity" in numbers else "",
+                **{column.csv_name: numbers.get(column.name) for column in COLUMNS},
+                "bits_as_recorded": {True: "yes", False: "no", None: ""}[outcome.as_recorded],
+                "failure": outcome.failure,
+            }
+        )
     with new_file(path) as beside, beside.open("x", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*names, "bits_as_recorded", "failure"])
-        for outcome in outcomes:
-            writer.writerow(
-                [
-                    outcome.step,
-                    outcome.label,
-                    *_method(outcome, by_label),
-                    cost.name,
-                    definition if "diversity" in outcome.numbers else "",
-                    *(_exact(outcome, column.name) for column in COLUMNS),
-                    {True: "yes", False: "no", None: ""}[outcome.as_recorded],
-                    outcome.failure,
-                ]
-            )
-
-
-def _method(outcome: Outcome, by_label: Mapping[str, Contender]) -> tuple[str, str]:
-    """Name and changes of a method; of the recorded result, what its label says."""
-    method = by_label.get(outcome.label)
-    if method is None:
-        return outcome.label.split(": ", 1)[-1], ""
-    return method.named.name, "; ".join(method.changes)
-
-
-def _exact(outcome: Outcome, name: str) -> str:
-    value = outcome.numbers.get(name)
-    return "" if value is None else repr(value)
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)

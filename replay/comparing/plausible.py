@@ -28,7 +28,7 @@ class PlausibleSets:
     ) -> None:
         require_choice("definition", definition, DEFINITIONS)
         if folder is not None and not folder.is_dir():
-            raise RecordingError(f"{folder} is no folder; accepted: one with plausible sets")
+            raise RecordingError(f"{folder} is not a folder; accepted: one with plausible sets")
         self._folder = folder or recording.path.parent / "plausible"
         self._definition = definition
         self._start = recording.start

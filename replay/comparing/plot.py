@@ -29,7 +29,9 @@ _CLOCKLESS = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}
 def require_picture(path: Path) -> None:
     """Raise SettingError unless a picture can be written under this name."""
     if path.suffix.lower() not in SUFFIXES:
-        raise SettingError(f"{path} is no name of a picture; accepted: *{', *'.join(SUFFIXES)}")
+        raise SettingError(
+            f"{path} is not the name of a picture; accepted: *{', *'.join(SUFFIXES)}"
+        )
 
 
 def write_plot(path: Path, outcomes: Sequence[Outcome], title: str) -> None:

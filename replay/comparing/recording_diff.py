@@ -123,7 +123,7 @@ def _compared_messages(pair: MessagePair, ignored: Ignored) -> list[MessageDiffe
     order = "order: it stands later in the second recording"
     found = [MessageDifference(key=key, field="order", text=order)] if moved else []
     same = first is not None and second is not None and first.data == second.data
-    if same and key.topic in RECORDS:  # else its log time may tell something
+    if same and key.topic in RECORDS:  # else its time stamp may differ from its log time
         return found
     return found + _compared(key, first, second, _comparable_content, ignored)
 

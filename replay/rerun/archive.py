@@ -89,7 +89,7 @@ class ArchiveMap:
 
     def _lay_out(self, frame: Frame, costs: tuple[int, int], colors: tuple[int, int]) -> None:
         """What stays from one snapshot to the next."""
-        # The costs lie under the colours, so that the viewer tells them where the mouse points.
+        # The costs lie under the colours, so that the viewer shows them where the mouse points.
         self._log("cost", _layer(costs, "L", rr.ChannelDatatype.F32, -30.0))
         self._log("colors", _layer(colors, "RGBA", rr.ChannelDatatype.U8, -20.0))
         self._log("axes", texts([]))
@@ -180,7 +180,7 @@ def _bar_edges(width: int) -> tuple[int, int]:
 
 
 def _stretch(archive: ArchiveSnapshot) -> tuple[int, int]:
-    """By how much a cell is drawn wider and higher, so that the map is no thin line."""
+    """By how much a cell is drawn wider and higher, so that the map is not a thin line."""
     width, height = archive.shape[0], _rows(archive)
     return max(1, height // (_FLATTEST * width)), max(1, width // (_FLATTEST * height))
 

@@ -39,7 +39,7 @@ APPLICATION = "chsel comparison"
 _FACES = 24_000  # of all methods' meshes of one colour together
 _FEWEST_FACES = 1_000
 _ALPHA = (26, 10)  # on one scale for all methods, a good set may be on its lowest step alone
-_NOTE = 15.2  # where the legend tells of the scale, in units of its view
+_NOTE = 15.2  # where the legend names the scale, in units of its view
 
 
 def save_comparison(
@@ -130,7 +130,7 @@ class _Comparison:
 
     def add_results(self, problem: RegistrationProblem, found: Mapping[str, Hypotheses]) -> None:
         """The hypotheses of methods, by their labels, for one problem."""
-        with warnings.catch_warnings(action="ignore"):  # whoever registered has been warned
+        with warnings.catch_warnings(action="ignore"):  # those that registered have been warned
             judge = CompiledCost.of(problem, self._cost.settings)
         judged = {label: ranked(hypotheses, judge) for label, hypotheses in found.items()}
         self._lay_out(judged)

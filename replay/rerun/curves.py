@@ -62,7 +62,7 @@ class Curves:
 
     def add_measured(self, name: str, value: float) -> None:
         """One measured number; its name says where it is shown."""
-        if name == "distinct_hypotheses":  # told by the hypotheses themselves
+        if name == "distinct_hypotheses":  # which the hypotheses show
             return
         text = name.replace("_", " ")
         for kind in ("position", "rotation"):

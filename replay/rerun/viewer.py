@@ -191,7 +191,7 @@ def _last_line(output: IO[str]) -> str:
 
 @contextmanager
 def _endings_as_exceptions() -> Iterator[None]:
-    """Let whoever ends this process end what it has started: a signal unwinds the blocks."""
+    """End what this process has started when a signal ends it: a signal unwinds the blocks."""
 
     def leave(number: int, frame: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)

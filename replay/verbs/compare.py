@@ -211,7 +211,7 @@ def _print_bits(console: Console, method: Contender, outcomes: Sequence[Outcome]
     text = f"{method.label} has the recorded settings: "
     if other:
         text += f"{len(other)} of {len(known)} results are not those recorded, at step "
-        text += f"{', '.join(other)} (verify tells where)"
+        text += f"{', '.join(other)} (verify shows where)"
     else:
         text += f"its {len(known)} results are those recorded, to the bit"
     console.print(text, soft_wrap=True)

@@ -56,7 +56,7 @@ def run(given: argparse.Namespace) -> int:
         for item in found.differences:
             console.print(str(item), soft_wrap=True)
     else:
-        _tell_session(console, found)
+        _print_session(console, found)
     return 1
 
 
@@ -74,7 +74,7 @@ def _table(found: RecordingDiff) -> Table:
     return table
 
 
-def _tell_session(console: Console, found: RecordingDiff) -> None:
+def _print_session(console: Console, found: RecordingDiff) -> None:
     """The settings and the environment that differ, beyond the line that was printed first."""
     of_start = [item for item in found.differences[1:] if item.key.topic == "/session"]
     for item in of_start[:_SHOWN]:

@@ -102,7 +102,7 @@ def _facts(info: RecordingInfo) -> Table:
         "source": f"recording {session['source']}" if session["source"] else "",
         "rig": "" if info.rig is None else f"{info.rig['name']}, raw log {info.rig['source']}",
         "true pose": "known" if session["true_pose"] else "unknown",
-        "outcome": info.outcome or "not told: the session did not end",
+        "outcome": info.outcome or "unknown: the session did not end",
         "lost": ", ".join(session["lost"]),
         "size": f"{decimal(info.size)}, of that, uncompressed: {files}",
         "messages": _messages(info),

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> int:
-    """Write the new recording, and tell what was kept and what was lost."""
+    """Write the new recording, and print what was kept and what was lost."""
     path, out = given.file.expanduser(), given.out.expanduser()
     found = recover(path, out)
     console = Console(soft_wrap=True)
@@ -37,11 +37,11 @@ def run(given: argparse.Namespace) -> int:
     images = f", {found.images} images" if found.images else ""
     console.print(f"kept: {kept}{len(found.results)} results{images}")
     console.print(str(out))
-    _tell_losses(console, found)
+    _print_losses(console, found)
     return 0
 
 
-def _tell_losses(console: Console, found: Recovered) -> None:
+def _print_losses(console: Console, found: Recovered) -> None:
     if found.damage is None:
         return
     console.print(f"the file was not whole: it {found.damage}")
@@ -58,8 +58,8 @@ def _tell_losses(console: Console, found: Recovered) -> None:
         spans = [str(a) if a == b else f"{a} to {b}" for a, b in found.lost_probes]
         doubt = "" if found.complete else "at most "
         console.print(f"lost probes: {doubt}those of step {', '.join(spans)}")
-    _tell_steps(console, "lost registration problems", found.lost_problems)
-    _tell_steps(console, "lost results", found.lost_results)
+    _print_steps(console, "lost registration problems", found.lost_problems)
+    _print_steps(console, "lost results", found.lost_results)
     for name in found.remade:
         console.print(f"{name} was lost and is there again, made from the mesh, to the bit")
     for name in found.attachments:
@@ -70,6 +70,6 @@ def _tell_losses(console: Console, found: Recovered) -> None:
         console.print("the session's end is missing: what else was in it cannot be known")
 
 
-def _tell_steps(console: Console, what: str, steps: Sequence[int]) -> None:
+def _print_steps(console: Console, what: str, steps: Sequence[int]) -> None:
     if steps:
         console.print(f"{what}: those of step {', '.join(map(str, steps))}")

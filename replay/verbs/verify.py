@@ -32,7 +32,7 @@ def run(given: argparse.Namespace) -> int:
     with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress:
         task = progress.add_task("verifying", total=len(paths))
         for file in verified_files(paths, given.step, jobs=given.jobs):
-            _tell(console, file)
+            _print(console, file)
             progress.advance(task)
             status = max(status, file.status)
             equal += file.equal
@@ -45,7 +45,7 @@ def run(given: argparse.Namespace) -> int:
     return status
 
 
-def _tell(console: Console, file: FileVerdict) -> None:
+def _print(console: Console, file: FileVerdict) -> None:
     if file.unusable:
         print_error(file.unusable)
         return

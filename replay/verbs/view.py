@@ -43,20 +43,20 @@ def run(given: argparse.Namespace) -> int:
         )
     recording = read_recording(given.file, partial=True)
     _check_step(recording, given.step)
-    said = Console()
+    console = Console()
     if recording.damage is not None:
         warnings = Console(stderr=True)
         what = f"warning: {given.file} is {recording.damage}; what is whole of it is shown"
         warnings.print(what, soft_wrap=True)
     if given.save is not None:
         _draw(recording, given.save, given.step)
-        said.print(str(given.save), soft_wrap=True)
+        console.print(str(given.save), soft_wrap=True)
         return 0
     with tempfile.TemporaryDirectory(prefix="replay-view-") as folder:
         rrd = Path(folder) / "recording.rrd"
         if given.web:  # which takes no order where to stand
             _draw(recording, rrd, given.step)
-            _show_in_browser(rrd, said)
+            _show_in_browser(rrd, console)
         else:
             _draw(recording, rrd)
             with suppress(KeyboardInterrupt), window(rrd, step=given.step) as viewer:
@@ -64,11 +64,11 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def _show_in_browser(rrd: Path, said: Console) -> None:
+def _show_in_browser(rrd: Path, console: Console) -> None:
     """Serve the viewer until Ctrl-C."""
     with suppress(KeyboardInterrupt), web_server(rrd) as (server, address):
-        said.print(address, soft_wrap=True)
-        said.print("Ctrl-C ends it")
+        console.print(address, soft_wrap=True)
+        console.print("Ctrl-C ends it")
         if has_screen():  # else a browser for text might take the terminal over
             webbrowser.open(address)
         server.wait()

@@ -308,7 +308,10 @@ def test_everything_is_saved(path, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--save-plot", "out.jpg"], "out.jpg is no name of a picture; accepted: *.png, *.svg"),
+        (
+            ["--save-plot", "out.jpg"],
+            "out.jpg is not the name of a picture; accepted: *.png, *.svg",
+        ),
         (["--save-plot", "nowhere/out.png"], "folder nowhere does not exist"),
         (["--save-plot", "out.png", "--save-csv", "out.png"], "out.png is named twice"),
         (["--threads", "0"], "--threads is 0; accepted: an integer from 1 to 256"),
@@ -360,7 +363,7 @@ def test_a_recording_that_tells_no_method_is_judged_by_the_default_preset(make_e
     recording = read_recording(write(make_events()))
     cost = common_cost(recording)
     assert (cost.settings, cost.name) == (CostSettings(), "preset default")
-    with pytest.raises(RecordingError, match="does not tell the settings of chsel"):
+    with pytest.raises(RecordingError, match="does not have the settings of chsel"):
         contenders(recording, ["chsel"])
     methods = contenders(recording, ["gradient_descent"], ["descent.iterations=2"])
     found = list(compared(recording, methods, (2,), cost))
@@ -413,4 +416,4 @@ def test_beside_plausible_sets_it_tells_how_far_hypotheses_are_from_them(
     assert main([*arguments, "--definition", "paper", "--each"]) == 0
     assert "PD" not in capsys.readouterr().out
     assert main([*arguments, "--plausible", str(tmp_path / "nowhere")]) == 2
-    assert "nowhere is no folder" in capsys.readouterr().err
+    assert "nowhere is not a folder" in capsys.readouterr().err

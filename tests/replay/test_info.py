@@ -171,7 +171,7 @@ def test_an_index_that_tells_of_other_messages_is_found_out(events, write_steps)
 
     copy = with_summary(write_steps(events), more)
     assert recording_info(copy).damage is None
-    assert "its index tells of 4 messages on /" in recording_info(copy, check=True).damage
+    assert "its index has 4 messages on /" in recording_info(copy, check=True).damage
 
 
 @pytest.mark.parametrize(

@@ -8,95 +8,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from chsel.errors import RecordingError, SettingError
-from chsel.methods import build_method, preset_settings
-from chsel.problem.online_registration import pose_problem
-from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import Hypotheses
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.settings import settings_mapping
-from chsel.problem.streams import StreamKey
 from replay import step_again
 from replay.__main__ import main
 from replay.environment import environment
-from replay.events import Event, HypothesesFound, Probe, ProblemPosed, SessionEnded, SessionStarted
+from replay.events import Event, HypothesesFound, SessionEnded
 from replay.mcap.reader import Recording, read_recording
-from replay.mcap.writer import McapRecorder
-from replay.recorder import ListRecorder
-from replay.registration import NamedMethod, other_method, register_recorded, symmetry_for_errors
+from replay.registration import other_method
 from replay.verification import EQUAL, verify
-
-QUICK = {
-    "descent": {"restarts": 1, "iterations": 10},
-    "emitter": {"iterations": 12},
-    "archive": {"bins": 10},
-    "online": {"hypotheses": 8},
-}
-
-
-def quick_method() -> NamedMethod:
-    settings = settings_mapping(preset_settings("chsel"))
-    settings |= {name: settings[name] | change for name, change in QUICK.items()}
-    return NamedMethod("chsel", settings, build_method("chsel", settings))
-
-
-def session_events(method: NamedMethod) -> list[Event]:
-    """A box touched thrice, registered from the second probe on, snapshots every 4 iterations."""
-    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
-    start = SessionStarted(
-        runner="probe",
-        object="box",
-        session="points",
-        method="chsel",
-        seed=5,
-        config={"method": method.config, "preset": {"name": "default"}},
-        mesh=mesh,
-        sdf=SdfGrid.from_mesh(mesh, 0.01, padding=0.03),
-        workspace=Workspace((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2)),
-        free_resolution=0.02,
-        initial_points=KnownPoints(free=[[0.15, 0.0, 0.0]]),
-        world_from_object=np.eye(4),
-        environment={"python": "2.7"},
-    )
-    recorder, points, previous = ListRecorder(), start.initial_points, None
-    recorder.record(start)
-    for step, contact in enumerate([[0.05, 0.0, 0.01], [0.0, 0.03, 0.0], [0.01, 0.0, 0.02]]):
-        new = KnownPoints(free=2.0 * np.array([contact]), known=[contact], known_sdf=[0.0])
-        points = points.merged(new)
-        recorder.record(Probe(step, "contact", new))
-        if step > 0:
-            key = StreamKey(start.seed, step)
-            online = method.method.online
-            problem = pose_problem(
-                start.sdf, points, start.workspace, start.free_resolution, key, online, previous
-            )
-            posed = ProblemPosed(step, problem)
-            register_recorded(
-                posed,
-                method.method,
-                recorder,
-                start.world_from_object,
-                symmetry_for_errors(start),
-                snapshot_interval=4,
-            )
-            found = [event for event in recorder.events if isinstance(event, HypothesesFound)]
-            previous = found[-1].hypotheses
-    return [*recorder.events, SessionEnded(2, "finished")]
+from tests.tools.small_recordings import registered_session, write_recording
 
 
 def written(events: list[Event], path: Path) -> Recording:
-    recorder = McapRecorder(path)
-    for event in events:
-        recorder.record(event)
-    recorder.close()
+    write_recording(path, events)
     return read_recording(path)
 
 
 @pytest.fixture(scope="module")
 def session() -> list[Event]:
-    return session_events(quick_method())
+    return registered_session("chsel")
 
 
 @pytest.fixture
@@ -114,14 +46,14 @@ def step(recording, tmp_path, monkeypatch):
 
 
 def test_the_recorded_method_gives_the_recorded_bits(recording, step, capsys):
-    assert step("--step", "2") == 0
+    assert step("--step", "1") == 0
     said = capsys.readouterr().out
-    expected = recording.hypotheses(2)
+    expected = recording.hypotheses(1)
     assert f"equal to the recorded result, every bit; digest {expected.digest}" in said
     assert "method and settings are the recorded ones" in said
-    again = read_recording("session_step2_chsel.mcap")
-    assert again.hypotheses(2).digest == expected.digest
-    digests = [[a.digest for a in of.snapshots(2)] for of in (recording, again)]
+    again = read_recording("session_step1_chsel.mcap")
+    assert again.hypotheses(1).digest == expected.digest
+    digests = [[a.digest for a in of.snapshots(1)] for of in (recording, again)]
     assert digests[0] == digests[1]
     assert len(digests[0]) > 2
 
@@ -141,51 +73,51 @@ def test_the_new_recording_holds_the_problem_and_says_where_it_is_from(recording
     }
     assert again.start.config["method"] == recording.start.config["method"]
     assert again.start.environment == environment()
-    assert (again.start.object, again.start.seed) == ("box", 5)
+    assert (again.start.object, again.start.seed) == ("box", 3)
     assert again.start.mesh.vertices.tolist() == recording.start.mesh.vertices.tolist()
     assert again.ended == SessionEnded(1, "finished")
     assert [verdict.outcome for verdict in verify(again)] == [EQUAL]
 
 
 def test_another_method_with_other_settings_is_recorded_as_such(recording, step, capsys):
-    words = ("--step", "2", "--method", "gradient_descent", "cost.free_scale=40", "preset=paper")
+    words = ("--step", "1", "--method", "gradient_descent", "cost.free_scale=40", "preset=paper")
     assert step(*words) == 0
     said = capsys.readouterr().out
     assert "differs from the recorded result, as another method or other settings may" in said
-    again = read_recording("session_step2_gradient_descent.mcap")
+    again = read_recording("session_step1_gradient_descent.mcap")
     assert again.start.method == "gradient_descent"
     assert again.start.config["method"]["name"] == "gradient_descent"
     assert again.start.config["method"]["cost"]["free_scale"] == 40
     assert again.start.config["method"]["descent"]["stop_below"] is None
     assert again.start.config["preset"] == {"name": "paper"}
-    assert again.problem(2).digest == recording.problem(2).digest
-    assert again.hypotheses(2).digest != recording.hypotheses(2).digest
+    assert again.problem(1).digest == recording.problem(1).digest
+    assert again.hypotheses(1).digest != recording.hypotheses(1).digest
     method = other_method(recording, "gradient_descent", words[4:])
-    expected = method.method.register(recording.problem(2))
-    assert again.hypotheses(2).digest == expected.digest
+    expected = method.method.register(recording.problem(1))
+    assert again.hypotheses(1).digest == expected.digest
     assert [verdict.outcome for verdict in verify(again)] == [EQUAL]
 
 
 def test_settings_of_the_recorded_method_can_change_alone(recording, step):
-    assert step("--step", "2", "--method", "emitter.iterations=4", "--snapshot-interval", "0") == 0
-    again = read_recording("session_step2_chsel.mcap")
+    assert step("--step", "1", "--method", "emitter.iterations=4", "--snapshot-interval", "0") == 0
+    again = read_recording("session_step1_chsel.mcap")
     expected = recording.start.config["method"]
     assert again.start.config["method"] == {
         **expected,
         "emitter": {**expected["emitter"], "iterations": 4},
     }
-    assert [archive.iteration for archive in again.snapshots(2)] == [0, 4]
+    assert [archive.iteration for archive in again.snapshots(1)] == [0, 4]
 
 
 def test_a_step_again_can_be_taken_again(recording, step):
-    assert step("--step", "2", "-o", "once.mcap") == 0
-    assert step("--step", "2", "-o", "twice.mcap") == 0
+    assert step("--step", "1", "-o", "once.mcap") == 0
+    assert step("--step", "1", "-o", "twice.mcap") == 0
     assert Path("once.mcap").read_bytes() == Path("twice.mcap").read_bytes()
-    assert main(["step", "once.mcap", "--step", "2", "-o", "of_it.mcap"]) == 0
+    assert main(["step", "once.mcap", "--step", "1", "-o", "of_it.mcap"]) == 0
     of_it = read_recording("of_it.mcap")
     once = hashlib.blake2b(Path("once.mcap").read_bytes(), digest_size=16).hexdigest()
     assert of_it.start.source == once
-    assert of_it.hypotheses(2).digest == recording.hypotheses(2).digest
+    assert of_it.hypotheses(1).digest == recording.hypotheses(1).digest
 
 
 def test_a_result_that_is_not_the_recorded_one_is_told(session, tmp_path, capsys):
@@ -193,19 +125,19 @@ def test_a_result_that_is_not_the_recorded_one_is_told(session, tmp_path, capsys
     index = max(i for i, event in enumerate(events) if isinstance(event, HypothesesFound))
     found: Hypotheses = events[index].hypotheses
     cost = np.nextafter(found.cost, np.inf)
-    events[index] = HypothesesFound(2, dataclasses.replace(found, cost=cost))
+    events[index] = HypothesesFound(1, dataclasses.replace(found, cost=cost))
     path = written(events, tmp_path / "changed.mcap").path
-    assert main(["step", str(path), "--step", "2", "-o", str(tmp_path / "a.mcap")]) == 1
+    assert main(["step", str(path), "--step", "1", "-o", str(tmp_path / "a.mcap")]) == 1
     said = capsys.readouterr().out
     assert "differs from the recorded result, though method and settings are the recorded" in said
     more = ["--method", "emitter.iterations=4"]
-    assert main(["step", str(path), "--step", "2", "-o", str(tmp_path / "b.mcap"), *more]) == 0
+    assert main(["step", str(path), "--step", "1", "-o", str(tmp_path / "b.mcap"), *more]) == 0
 
 
 def test_a_problem_without_a_result_can_be_registered(session, tmp_path, capsys):
-    events = [e for e in session if not (isinstance(e, HypothesesFound) and e.step == 2)]
+    events = [e for e in session if not (isinstance(e, HypothesesFound) and e.step == 1)]
     path = written(events, tmp_path / "lacking.mcap").path
-    assert main(["step", str(path), "--step", "2", "-o", str(tmp_path / "a.mcap")]) == 0
+    assert main(["step", str(path), "--step", "1", "-o", str(tmp_path / "a.mcap")]) == 0
     assert "no result was recorded to compare with" in capsys.readouterr().out
     again = read_recording(tmp_path / "a.mcap")
     assert again.start.config["source"]["hypotheses"] is None
@@ -213,12 +145,12 @@ def test_a_problem_without_a_result_can_be_registered(session, tmp_path, capsys)
 
 def test_nothing_is_overwritten(recording, step, capsys):
     Path("mine.mcap").write_bytes(b"mine")
-    assert step("--step", "2", "-o", "mine.mcap") == 2
+    assert step("--step", "1", "-o", "mine.mcap") == 2
     assert Path("mine.mcap").read_bytes() == b"mine"
     before = recording.path.read_bytes()
-    assert step("--step", "2", "-o", str(recording.path)) == 2
+    assert step("--step", "1", "-o", str(recording.path)) == 2
     assert recording.path.read_bytes() == before
-    assert step("--step", "2", "--save-rerun", "mine.mcap") == 2
+    assert step("--step", "1", "--save-rerun", "mine.mcap") == 2
     assert capsys.readouterr().err.count("exists") == 3
     assert [file.name for file in Path().iterdir()] == ["mine.mcap"]
 
@@ -228,7 +160,7 @@ def test_nothing_is_left_of_a_registration_that_fails(recording, step, monkeypat
         raise SettingError("the object is too small")
 
     monkeypatch.setattr(step_again, "register_recorded", failing)
-    assert step("--step", "2") == 2
+    assert step("--step", "1") == 2
     assert capsys.readouterr().err == "error: the object is too small\n"
     assert not list(Path().iterdir())
 
@@ -236,11 +168,11 @@ def test_nothing_is_left_of_a_registration_that_fails(recording, step, monkeypat
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--step", "0"), "has no registration problem of step 0; accepted: 1, 2"),
-        (("--step", "2", "--method", "a", "b"), "--method names a and b; accepted: one, then"),
-        (("--step", "2", "--method", "chselle"), "chselle"),
-        (("--step", "2", "--method", "emitter.iteration=4"), "emitter.iteration does not exist"),
-        (("--step", "2", "--snapshot-interval", "-1"), "--snapshot-interval is -1; accepted: 0"),
+        (("--step", "2"), "has no registration problem of step 2; accepted: 0, 1"),
+        (("--step", "1", "--method", "a", "b"), "--method names a and b; accepted: one, then"),
+        (("--step", "1", "--method", "chselle"), "chselle"),
+        (("--step", "1", "--method", "emitter.iteration=4"), "emitter.iteration does not exist"),
+        (("--step", "1", "--snapshot-interval", "-1"), "--snapshot-interval is -1; accepted: 0"),
     ],
 )
 def test_what_does_not_exist_is_named(step, capsys, words, message):
@@ -252,7 +184,7 @@ def test_what_does_not_exist_is_named(step, capsys, words, message):
 
 
 def test_it_can_be_drawn_too(step):
-    assert step("--step", "2", "--save-rerun", "view.rrd") == 0
+    assert step("--step", "1", "--save-rerun", "view.rrd") == 0
     assert Path("view.rrd").read_bytes()[:3] == b"RRF"
 
 
