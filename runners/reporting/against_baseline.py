@@ -113,7 +113,7 @@ def _summary(evaluation: Evaluation, styles: Styles, baseline: str, rows: pd.Dat
         "members": lambda of: _percent(of.rows["exact_members"].mean()),
         "distinct [least]": _distinct,
         "misses": _misses,
-        "s, median": lambda of: of.rows["seconds"].median(),
+        "s, median": lambda of: of.rows["seconds"].dropna().median(),
         "s, mean": lambda of: of.rows["seconds"].mean(),
     }
     note = (

@@ -107,7 +107,8 @@ def failures_table(evaluation: Evaluation) -> Table:
         for which, some in seeds.groupby(seeds, sort=False):
             every = len(some) == len(methods) > 1
             names = "all" if every else ", ".join(some.index)
-            lines.append(tuple(map(Cell, (configuration, which, names, steps, why))))
+            texts = map(str, (configuration, which, names, steps, why))
+            lines.append(tuple(map(Cell, texts)))
     rest = len(lines) - _MOST_LISTED
     return Table(
         "What is missing",

@@ -139,7 +139,7 @@ def open_evaluation(folder: Path) -> Evaluation:
     order = ["object", *TRIAL, "method", "step", "draw"]
     rows = _in_order(rows, labels, order)
     iterations = _in_order(iterations, labels, [*order[1:-1], "iteration", "draw"])
-    definition = _definition(folder, experiment, pd.concat([rows, iterations])["definition"])
+    definition = _definition(folder, experiment, [*rows["definition"], *iterations["definition"]])
     return Evaluation(folder, experiment, rows, iterations, gathered, definition)
 
 
@@ -152,7 +152,7 @@ def _in_order(rows: pd.DataFrame, labels: set[str], order: list[str]) -> pd.Data
     return rows.sort_values(order, kind="stable", na_position="first", ignore_index=True)
 
 
-def _definition(folder: Path, experiment: Mapping[str, Any], column: pd.Series) -> str:
+def _definition(folder: Path, experiment: Mapping[str, Any], labels: list[Any]) -> str:
     """The label of the one definition of plausible sets by which all rows were measured.
 
     Rows from before there was a column of it have that of experiment.json. Raises ReportError if
@@ -160,7 +160,7 @@ def _definition(folder: Path, experiment: Mapping[str, Any], column: pd.Series) 
     """
     asked = experiment.get("definition")
     usual = _label(asked) if isinstance(asked, Mapping) else _UNNAMED
-    labels = sorted({str(label) if label else usual for label in column.fillna("")})
+    labels = sorted({usual if pd.isna(label) or not label else label for label in labels})
     if len(labels) > 1:
         raise ReportError(
             f"{folder} has numbers by {len(labels)} definitions of plausible sets, "
@@ -248,5 +248,6 @@ def _rows(paths: Sequence[Path], name: str) -> pd.DataFrame:
         for column in (column for column in _KEYS if column in _NEEDED[name]):
             if found[column].null_count:
                 raise ReportError(f"{path} has a row without {column}; {_ACCEPTED}")
-    rows = pa.concat_tables(tables).to_pandas().replace([math.inf, -math.inf], math.nan)
-    return rows.astype({"step": "Int64"})
+    rows = pa.concat_tables(tables).to_pandas().astype({"step": "Int64"})
+    numbers = rows.select_dtypes("float64")
+    return rows.assign(**numbers.where(numbers.abs() < math.inf))

@@ -59,9 +59,16 @@ def test_arrows_push_free_points_out_occupied_ones_in_and_known_ones_to_the_surf
         occupied: (lambda s: s > -tolerance, lambda s: -tolerance - s),
         known: (lambda s: abs(s) > 0.0, lambda s: -s),
     }
-    for axes, (violated, strength) in pushed.items():
+    for (axes, (violated, strength)), kind in zip(
+        pushed.items(), ("free", "occupied", "known"), strict=True
+    ):
         (arrows,) = (one for one in axes.collections if isinstance(one, Quiver))
         drawn = np.column_stack([arrows.U, arrows.V])
+        written = picture.data.set_index(["x", "z"]).loc[list(zip(arrows.X, arrows.Y, strict=True))]
+        written = written[written["points"] == kind][["push_x", "push_z"]].to_numpy()
+        np.testing.assert_allclose(
+            written / np.hypot(*written.T)[:, None], drawn / np.hypot(*drawn.T)[:, None], atol=1e-9
+        )
         assert len(drawn) > 20
         distances, normals = section_at(recording, arrows.X, arrows.Y, settings.lookup)
         assert violated(distances).all(), axes.get_title()
@@ -103,6 +110,11 @@ def test_a_probing_sequence_shows_poses_in_the_world_and_the_contacts_so_far() -
     picture = picture_of_sequence({"chsel": HAMMER}, styles, steps=shown, view="xz")
     figure = picture.figure
     assert [axes.get_title() for axes in figure.axes] == [f"step {step}" for step in shown]
+    written = picture.data[picture.data["kind"] == "hypothesis"].groupby("step")
+    for step, poses in written:
+        expected = inverse(recording.hypotheses(step).object_from_world)
+        np.testing.assert_array_equal(poses[["x", "y", "z"]], expected[:, :3, 3])
+        np.testing.assert_array_equal(poses[["r00", "r01", "r02"]], expected[:, 0, :3])
     assert figure.axes[0].get_ylabel() == "CHSEL\nz in m"
     for axes, step in zip(figure.axes, shown, strict=True):
         assert axes.get_xlabel() == "x in m"
