@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -22,16 +21,22 @@ from chsel.numerics.threads import require_threads
 from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.settings import build_settings
 from runners.command.program import command, plain
+from runners.evaluation.cluster import ClusterConfig, cluster_config, connected
 from runners.evaluation.configurations import SENSORS, faulty_name
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label
 from runners.evaluation.definition import definition_text
-from runners.evaluation.display import Display
-from runners.evaluation.experiment import join_experiment, read_experiment
-from runners.evaluation.external_results import external_file, external_folders, read_external
-from runners.evaluation.gathering import gather
+from runners.evaluation.display import Display, Progress
+from runners.evaluation.experiment import (
+    add_environments,
+    collect,
+    join_experiment,
+    read_experiment,
+    writing_alone,
+)
+from runners.evaluation.external_results import external_folders, read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
-from runners.evaluation.schedule import Progress, Schedule
+from runners.evaluation.scheduling import Scheduling
 from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
 from runners.evaluation.sensor_logs import check_log, is_missing
 from runners.evaluation.true_poses import true_poses
@@ -39,7 +44,7 @@ from runners.objects.scans import AssetsConfig, scan_file
 from runners.run.scene import PresetName
 from runners.sessions.faults import CLEAN, LEVELS, without_clean_faults
 
-_GATHER = 300.0  # s between tables of what is finished so far
+_COLLECT = 300.0  # s between tables of what is finished so far
 _OF_TRIAL = ("configuration", "logs")
 
 
@@ -83,6 +88,7 @@ class EvaluateConfig:
     plausible: bool
     recordings: bool
     workers: int | None
+    cluster: Any
 
     def __post_init__(self) -> None:
         if self.workers is not None:
@@ -100,7 +106,7 @@ def main(config: DictConfig) -> None:
     if values["steps"] is not None:
         values["steps"] = str(values["steps"])
     checked = build_settings(EvaluateConfig, values, "evaluate")
-    plan = _plan(checked)
+    plan, cluster = _plan(checked), cluster_config(checked.cluster, checked.workers)
     levels = chosen_names("faults", checked.faults, LEVELS)
     clean = {name: one for name, one in plan.configurations.items() if one.faults == CLEAN}
     chosen = chosen_configurations(checked.configurations, clean)
@@ -109,37 +115,43 @@ def main(config: DictConfig) -> None:
     trials = [Trial(seed, name) for seed in seeds for name in configurations]
     _check_faults(plan, levels)
     _check(plan, trials)
-    join_experiment(plan, checked.name, configurations, seeds)
-    failed = evaluate(plan, trials, checked.workers or _cores())
+    display = Display()
+    with writing_alone(plan.folder, display.say):
+        join_experiment(plan, checked.name, configurations, seeds)
+        failed = evaluate(plan, trials, cluster, checked.workers, display)
     if failed and HydraConfig.get().mode is not RunMode.MULTIRUN:  # the other jobs must go on
         sys.exit(1)
 
 
-def evaluate(plan: Plan, trials: list[Trial], workers: int) -> bool:
-    """Run the schedule and write the tables; whether anything failed."""
-    display = Display()
-    gathered = time.monotonic()
+def evaluate(
+    plan: Plan, trials: list[Trial], cluster: ClusterConfig, workers: int | None, display: Display
+) -> bool:
+    """Do all tasks that are not finished, and write the tables; whether anything failed."""
+    collected = time.monotonic()
 
     def show(progress: Progress) -> None:
-        nonlocal gathered
+        nonlocal collected
         display.progress(progress)
-        if time.monotonic() - gathered > _GATHER:
-            gathered = time.monotonic()
-            with suppress(RecordingError):  # of a damaged part: at the end it is told
-                gather(plan.folder)
+        if time.monotonic() - collected > _COLLECT:
+            collected = time.monotonic()
+            with suppress(RecordingError):  # of a damaged part: it is an error at the end
+                collect(plan.folder)
 
-    schedule = Schedule(plan, trials, workers, show)
-    before = schedule.progress
+    scheduling = Scheduling(plan, trials, show)
+    before = scheduling.progress
     display.say(
         f"evaluation in {plan.folder}: {len(trials)} trials, {len(plan.contenders)} methods, "
-        f"{before.total} units, of which {before.finished} are finished"
+        f"{before.total} tasks, of which {before.finished} are finished"
     )
     try:
-        schedule.run()
+        if before.finished < before.total:
+            with connected(cluster, workers, display.say) as connection:
+                scheduling.run(connection)
     finally:
         display.close()
-        display.failures(schedule.progress)
-        results = gather(plan.folder)
+        display.failures(before)
+        add_environments(plan.folder, scheduling.environments)
+        results = collect(plan.folder)
         if sys.exc_info()[0] is KeyboardInterrupt:
             display.say("interrupted: what is finished stays, and the same command goes on")
     display.summary(results, _labels(plan.folder), definition_text(plan.definition))
@@ -207,9 +219,7 @@ def _check(plan: Plan, trials: list[Trial]) -> None:
         if not folder.is_dir():
             raise SettingError(f"outside.{label} is {folder}; accepted: a folder")
         for trial in trials:
-            path = external_file(folder, trial)
-            if path is not None:
-                read_external(plan, trial, path)
+            read_external(plan, trial, label)
 
 
 def _check_sessions(plan: Plan, trials: list[Trial]) -> None:
@@ -230,11 +240,6 @@ def _check_sessions(plan: Plan, trials: list[Trial]) -> None:
 def _labels(folder: Path) -> list[str]:
     experiment = read_experiment(folder)
     return [*experiment["methods"], *experiment["outside"]]
-
-
-def _cores() -> int:
-    """How many processes this one may use at a time."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 if __name__ == "__main__":

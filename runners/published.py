@@ -16,10 +16,9 @@ from omegaconf import DictConfig
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
 from runners.command.program import command, plain
-from runners.evaluation.display import Display
+from runners.evaluation.display import Display, Progress
 from runners.evaluation.plan import Trial
 from runners.evaluation.repeats import repeat_seed, require_repeats
-from runners.evaluation.schedule import Progress
 from runners.evaluation.selection import chosen_seeds
 from runners.evaluation.trial_session import read_told
 from runners.published_package.environment import PackageConfig, interpreter

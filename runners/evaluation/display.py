@@ -1,9 +1,10 @@
-"""What an evaluation says on the terminal."""
+"""What an evaluation shows on the terminal."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from math import degrees
 from pathlib import Path
 from typing import Any
@@ -14,24 +15,37 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn
 from rich.table import Table
 
-from replay.console import Console, Progress, TextColumn
-from runners.evaluation import schedule
+from replay import console
+from runners.evaluation.plan import Task
 from runners.evaluation.true_poses import FoundPose
 
 _SPARSE = 60.0  # s between lines where there is no terminal
-_MOST_SHOWN = 3  # units at work, failures
+_MOST_SHOWN = 3  # tasks at work, failures
+
+
+@dataclass
+class Progress:
+    """How far an evaluation is."""
+
+    total: int  # tasks
+    finished: int = 0  # before it began
+    done: int = 0  # since then
+    running: list[Task] = field(default_factory=list)
+    failed: dict[Task, str] = field(default_factory=dict)  # reasons
+    seconds_left: float | None = None
+    waits_for_workers: bool = False
 
 
 class Display:
     """A bar with what is at work, or a line a minute where there is no terminal; then a table."""
 
     def __init__(self) -> None:
-        self._console = Console()
+        self._console = console.Console()
         terminal = self._console.is_terminal
-        self._bar = Progress(
-            TextColumn("{task.completed}/{task.total} units"),
+        self._bar = console.Progress(
+            console.TextColumn("{task.completed}/{task.total} tasks"),
             BarColumn(bar_width=20),
-            TextColumn("{task.description}"),
+            console.TextColumn("{task.description}"),
             console=self._console,
             transient=True,
             disable=not terminal,
@@ -43,7 +57,7 @@ class Display:
         """A line of its own."""
         self._console.print(text, soft_wrap=True)
 
-    def progress(self, state: schedule.Progress) -> None:
+    def progress(self, state: Progress) -> None:
         """Show how far it is."""
         finished = state.finished + state.done + len(state.failed)
         if self._task is None:
@@ -52,17 +66,17 @@ class Display:
         self._bar.update(self._task, description=_doing(state), completed=finished)
         if not self._console.is_terminal and time.monotonic() - self._said >= _SPARSE:
             self._said = time.monotonic()
-            self.say(f"{finished}/{state.total} units  {_doing(state)}")
+            self.say(f"{finished}/{state.total} tasks  {_doing(state)}")
 
     def close(self) -> None:
         """Give the terminal back."""
         self._bar.stop()
 
-    def failures(self, state: schedule.Progress) -> None:
-        """Which units failed, and why."""
+    def failures(self, state: Progress) -> None:
+        """Which tasks failed, and why."""
         shown = list(state.failed.items())[: 4 * _MOST_SHOWN]
-        for unit, reason in shown:
-            self.say(f"failed: {unit}: {reason}")
+        for task, reason in shown:
+            self.say(f"failed: {task}: {reason}")
         if len(shown) < len(state.failed):
             self.say(f"and {len(state.failed) - len(shown)} more, see the table")
 
@@ -141,8 +155,10 @@ def _median(values: np.ndarray) -> str:
     return f"{median:.0f}" if median >= 100.0 else f"{median:.3g}"
 
 
-def _doing(state: schedule.Progress) -> str:
-    text = ", ".join(str(unit) for unit in state.running[:_MOST_SHOWN])
+def _doing(state: Progress) -> str:
+    if state.waits_for_workers:
+        return "waiting for workers"
+    text = ", ".join(str(task) for task in state.running[:_MOST_SHOWN])
     more = len(state.running) - _MOST_SHOWN
     text += f" and {more} more" if more > 0 else ""
     if state.failed:

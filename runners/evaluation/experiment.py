@@ -1,23 +1,35 @@
-"""experiment.json: what the folder of an evaluation holds, and whether more of it fits."""
+"""The folder of an evaluation: its experiment.json, who may write, and its two tables."""
 
 from __future__ import annotations
 
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import pyarrow as pa
+from filelock import FileLock, Timeout
 
 from chsel.errors import RecordingError, SettingError
 from chsel.problem.settings import settings_mapping
 from replay.environment import environment
-from replay.files import whole_file
-from runners.evaluation.claims import claimed
+from replay.files import WritingError, whole_file
 from runners.evaluation.configurations import SENSORS
+from runners.evaluation.definition import definition_label
 from runners.evaluation.plan import Plan
+from runners.evaluation.table import (
+    ITERATIONS,
+    ITERATIONS_ORDER,
+    RESULTS,
+    RESULTS_ORDER,
+    write_table,
+)
 
 FILE = "experiment.json"
+LOCK = ".lock"
 FORMAT = 1
 _FIXED = (
     "format",
@@ -37,6 +49,49 @@ _BEFORE = {"plausible": True}
 """What keys mean that folders from before there were any lack."""
 
 
+@contextmanager
+def writing_alone(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Keep other runs out of the folder of an evaluation; waits while one of them is at work.
+
+    The operating system lifts the lock of a process that ends. On a file system without locks
+    nobody is kept out: two runs would do the same work there, and write the same whole files.
+    say: shows a line.
+    """
+    lock = FileLock(folder / LOCK)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            say(f"another run is at work in {folder}; this one waits until it ends")
+            lock.acquire()
+    except NotImplementedError:
+        pass
+    except OSError as error:
+        raise WritingError(
+            f"{lock.lock_file} cannot be written ({error.strerror or error}); accepted: an out=DIR "
+            "that can be written"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def collect(folder: Path) -> pa.Table:
+    """Write results and, where iterations are measured, iterations; the former.
+
+    Every part that exists is in them, whoever made it and when.
+    """
+    experiment = read_experiment(folder)
+    definition = definition_label(experiment["definition"])
+    if experiment["iterations"]["every"] is not None:
+        parts = list(_parts(folder, experiment, ".iterations.parquet"))
+        write_table(folder, "iterations", parts, ITERATIONS, ITERATIONS_ORDER, definition)
+    parts = list(_parts(folder, experiment, ".parquet", ".failed.parquet"))
+    return write_table(folder, "results", parts, RESULTS, RESULTS_ORDER, definition)
+
+
 def join_experiment(
     plan: Plan, name: str, configurations: Sequence[str], seeds: Sequence[int]
 ) -> None:
@@ -47,15 +102,22 @@ def join_experiment(
     """
     path = plan.folder / FILE
     ours = _described(plan, name, configurations, seeds)
-    with claimed(plan.folder, "experiment", wait=True):
-        if path.exists():
-            theirs = read_experiment(plan.folder)
-            _check_same(plan.folder, theirs, ours)
-            ours = _united(plan, theirs, ours)
-        elif (plan.folder / "trials").exists():
-            raise SettingError(f"{plan.folder} has trials but no {FILE}; accepted: another out=DIR")
-        with whole_file(path) as beside:
-            beside.write_text(json.dumps(ours, indent=2) + "\n")
+    if path.exists():
+        theirs = read_experiment(plan.folder)
+        _check_same(plan.folder, theirs, ours)
+        ours = _united(plan, theirs, ours)
+    elif (plan.folder / "trials").exists():
+        raise SettingError(f"{plan.folder} has trials but no {FILE}; accepted: another out=DIR")
+    _write(path, ours)
+
+
+def add_environments(folder: Path, environments: Iterable[Mapping[str, str]]) -> None:
+    """Note those of workers which differ from what experiment.json has."""
+    values = read_experiment(folder)
+    others = values["other_environments"]
+    new = [one for one in environments if one not in [values["environment"], *others]]
+    if new:
+        _write(folder / FILE, {**values, "other_environments": [*others, *new]})
 
 
 def read_experiment(folder: Path) -> dict[str, Any]:
@@ -68,6 +130,22 @@ def read_experiment(folder: Path) -> dict[str, Any]:
     if not isinstance(values, Mapping):
         raise RecordingError(f"{path} is not the description of an evaluation")
     return dict(values)
+
+
+def _write(path: Path, values: Mapping[str, Any]) -> None:
+    with whole_file(path) as beside:
+        beside.write_text(json.dumps(values, indent=2) + "\n")
+
+
+def _parts(folder: Path, experiment: Mapping[str, Any], *suffixes: str) -> Iterable[Path]:
+    """Of every trial and label the first file with one of the suffixes."""
+    labels = [*experiment["methods"], *experiment["outside"]]
+    for configuration in experiment["configurations"]:
+        for seed in experiment["seeds"]:
+            trial = folder / "trials" / configuration / f"seed_{seed}"
+            for label in labels:
+                files = (trial / f"{label}{suffix}" for suffix in suffixes)
+                yield from [file for file in files if file.exists()][:1]
 
 
 def _described(

@@ -58,6 +58,18 @@ class ExternalSet:
         return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, poses)
 
 
+@dataclass(frozen=True, eq=False)
+class ExternalResults:
+    """What a folder has about one trial, read where the folder is.
+
+    sets: by step. missing: why another step has none. digest: of the file, see `external_digest`.
+    """
+
+    sets: Mapping[int, ExternalSet]
+    missing: str
+    digest: str
+
+
 def external_folders(given: Mapping[str, Path]) -> dict[str, Path]:
     """Folders by label: those given, and under a label of its own every draw in them."""
     found = dict(given)
@@ -79,18 +91,24 @@ def external_file(folder: Path, trial: Trial) -> Path | None:
     return None
 
 
-def external_digest(path: Path | None) -> str:
-    """Digest of a file; "none" without one."""
+def external_digest(plan: Plan, trial: Trial, label: str) -> str:
+    """Digest of the file of a trial; "none" without one."""
+    path = external_file(plan.outside[label], trial)
     return "none" if path is None else file_digest(path)
 
 
-def read_external(plan: Plan, trial: Trial, path: Path) -> dict[int, ExternalSet]:
-    """The sets of a trial by step.
+def read_external(plan: Plan, trial: Trial, label: str) -> ExternalResults:
+    """The sets of a trial in the folder of a label.
 
     npz: arrays `step_K` (B, 4, 4), world_from_object of step K; where known `cost_K` (B,) and
     `seconds_K`. json: an object with the same names, and lists. Raises ExternalSetError for
     anything else: other names, steps that do not exist, shapes, numbers, rotations.
     """
+    folder, digest = plan.outside[label], external_digest(plan, trial, label)
+    path = external_file(folder, trial)
+    if path is None:
+        wanted = folder / trial.configuration / f"seed_{trial.seed}{SUFFIXES[0]}"
+        return ExternalResults({}, f"there is no {wanted}", digest)
     values = _values(path)
     steps = plan.probes_of(trial.configuration)
     for key in values:
@@ -104,38 +122,27 @@ def read_external(plan: Plan, trial: Trial, path: Path) -> dict[int, ExternalSet
         if f"step_{int(match[2])}" not in values:
             raise ExternalSetError(f"{path} has {key}; accepted: only with step_{int(match[2])}")
     names = [key for key in values if key.startswith("step_")]
-    return {int(name[5:]): _set_of(path, int(name[5:]), values) for name in names}
+    sets = {int(name[5:]): _set_of(path, int(name[5:]), values) for name in names}
+    return ExternalResults(sets, f"{path} has no set of this step", digest)
 
 
-def rank_external(plan: Plan, trial: Trial, label: str) -> None:
-    """Write the part of the table about the sets of a folder, of one trial."""
-    path = external_file(plan.outside[label], trial)
-    about = external_digest(path)
-    sets = {} if path is None else read_external(plan, trial, path)
-    reason = f"{path} has no set of this step"
-    if path is None:
-        reason = f"there is no {_wanted(plan, trial, label)}"
+def external_rows(plan: Plan, trial: Trial, label: str, results: ExternalResults) -> None:
+    """Write the part of the table about external results, of one trial."""
     session = open_recorded(plan, trial)
     result_rows = ResultRows(plan, trial, session, label, PRESET)
     rows: list[Row] = []
     for problem in problems(plan, trial, session):
         members, missing = result_rows.members(problem)
-        given = sets.get(problem.key.step)
+        given = results.sets.get(problem.key.step)
         if given is None:
-            row = result_rows.row(problem, None, members, reason)
+            row = result_rows.row(problem, None, members, results.missing)
         else:
             row = result_rows.row(problem, given.hypotheses(), members, missing)
             row["seconds"] = given.seconds
             if given.cost is None:
                 row |= {"best_cost": None, "mean_cost": None}
         rows.append(row | {"problem_digest": None})  # a problem has an E_0, which is not known
-    write_part(trial.folder(plan) / f"{label}.parquet", rows, RESULTS, about)
-
-
-def _wanted(plan: Plan, trial: Trial, label: str) -> Path:
-    """Where a trial's file is looked for first."""
-    folder = plan.outside[label] / trial.configuration
-    return folder / f"seed_{trial.seed}{SUFFIXES[0]}"
+    write_part(trial.folder(plan) / f"{label}.parquet", rows, RESULTS, results.digest)
 
 
 def _values(path: Path) -> Mapping[str, Any]:

@@ -1,9 +1,9 @@
-"""What an evaluation does, as every process that works on it knows it; and where its files are."""
+"""What an evaluation computes, as every worker knows it, and where its files are."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,20 @@ class Plan:
     def log_folder(self) -> Path:
         """Where CONFIGURATION/seed_K.mcap are, in sessions of sensors."""
         return self.logs if self.logs is not None else self.folder / "logs"
+
+    def moved(self, folder: Path, trial: Trial) -> Plan:
+        """The same for a worker on one trial, which has its files in `folder`.
+
+        Logs that are simulated are files of the evaluation; recorded ones and scans stay where
+        they are.
+        """
+        logs = None if self.logs is None or self.is_simulated_log(trial) else self.logs.absolute()
+        return replace(self, folder=folder, logs=logs, assets=self.assets.absolute())
+
+    def is_simulated_log(self, trial: Trial) -> bool:
+        """Whether the session of a trial comes from a log of the simulated robot."""
+        of = self.configurations[trial.configuration]
+        return self.kind == SENSORS and of.log_folder is None
 
     def leader(self) -> Method | None:
         """The method whose problems all methods get, if these are not their own."""
@@ -173,7 +187,7 @@ class Trial:
 class Task:
     """What one worker does at a time: the session of a trial, or a label's rows about it.
 
-    label: of a contender, or of sets from outside; "" for the session and its plausible sets.
+    label: of a contender, or of external results; "" for the session and its plausible sets.
     """
 
     trial: Trial
@@ -183,16 +197,16 @@ class Task:
         what = self.label or "session"
         return f"{self.trial.configuration}, seed {self.trial.seed}: {what}"
 
-    @property
-    def claim(self) -> str:
-        """The name of the claim on it."""
-        return f"{self.trial.configuration}.{self.trial.seed}.{self.label or 'session'}"
+    def sessions(self, plan: Plan) -> tuple[Trial, ...]:
+        """The trials whose sessions the rows of the label need; with faults also that without."""
+        clean = self.trial.without_faults(plan) if plan.plausible else self.trial
+        return tuple(dict.fromkeys([clean, self.trial]))
 
     def finished(self, plan: Plan) -> Path:
-        """The file that is there once the unit is finished."""
+        """The file that is there once the task is finished."""
         folder = self.trial.folder(plan)
         return folder / (f"{self.label}.parquet" if self.label else "session.json")
 
     def failed(self, plan: Plan) -> Path:
-        """Rows that say how the unit failed, until it is done again."""
+        """Rows that say how the task failed, until it is done again."""
         return self.trial.folder(plan) / f"{self.label}.failed.parquet"

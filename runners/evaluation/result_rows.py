@@ -80,7 +80,8 @@ class ResultRows:
             of_session = self._of_session(problem)
             return load_members(self._plan, self._clean, self._session, of_session), ""
         except EvaluationError as error:
-            return None, f"no plausible set: {one_line(error)}"
+            reason = one_line(error).replace(f"{self._plan.folder}/", "")
+            return None, f"no plausible set: {reason}"
 
     def row(
         self,

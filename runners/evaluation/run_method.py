@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import replace
 
 from chsel.plausible.symmetry import object_symmetry
@@ -16,7 +16,7 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
-from replay.files import file_digest, whole_file
+from replay.files import file_digest
 from replay.mcap.writer import McapRecorder
 from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender
@@ -30,7 +30,7 @@ from runners.run.session_run import SessionRun
 from runners.sessions.recorded import RecordedSession
 
 
-def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str]) -> None:
+def run_method(plan: Plan, trial: Trial, contender: Contender, warm: set[str]) -> None:
     """Write METHOD.mcap, if recordings are wanted, and then the method's part of the table.
 
     warm: labels that have registered in this process before; others do so once untimed, so that
@@ -41,62 +41,60 @@ def register_trial(plan: Plan, trial: Trial, contender: Contender, warm: set[str
     method, leader = contender.method(), plan.leader()
     rows: list[Row] = []
     iterations: list[Row] = []
-    with ExitStack() as stack:
-        recorder: Recorder = NullRecorder()
-        if plan.recordings:
-            beside = stack.enter_context(whole_file(folder / f"{contender.label}.mcap"))
-            recorder = McapRecorder(beside)
-        recorder.record(_started(plan, trial, contender, session))
-        by_step = _ByStep(recorder)
-        run = SessionRun(
-            session,
-            session.online(
-                (leader or method).online,
-                repeat_seed(trial.seed, contender.draw),
-                only=chosen if leader is None else None,
-            ),
-            method,
-            by_step,
-            symmetry=object_symmetry(session.recorded.mesh),
-            recording=RecordingConfig(snapshot_interval=plan.every or 0),
-            show=lambda *_: None,
-        )
+    recorder: Recorder = NullRecorder()
+    if plan.recordings:
+        recorder = McapRecorder(folder / f"{contender.label}.mcap")
+    recorder.record(_started(plan, trial, contender, session))
+    by_step = _ByStep(recorder)
+    run = SessionRun(
+        session,
+        session.online(
+            (leader or method).online,
+            repeat_seed(trial.seed, contender.draw),
+            only=chosen if leader is None else None,
+        ),
+        method,
+        by_step,
+        symmetry=object_symmetry(session.recorded.mesh),
+        recording=RecordingConfig(snapshot_interval=plan.every or 0),
+        show=lambda *_: None,
+    )
 
-        def register(problem: RegistrationProblem) -> Hypotheses:
-            if contender.label not in warm:
-                warm.add(contender.label)
-                with suppress(Exception):  # it fails again when it is recorded
-                    method.register(problem)
-            return run.register(problem)
+    def register(problem: RegistrationProblem) -> Hypotheses:
+        if contender.label not in warm:
+            warm.add(contender.label)
+            with suppress(Exception):  # it fails again when it is recorded
+                method.register(problem)
+        return run.register(problem)
 
-        def register_and_lead(problem: RegistrationProblem) -> Hypotheses:
-            """The leader's result, which the next problem follows from."""
-            assert leader is not None
-            if problem.key.step in chosen:
-                try:
-                    register(problem)
-                except Exception as error:
-                    run.failed(problem.key.step, error)
-            return leader.register(problem)
+    def register_and_lead(problem: RegistrationProblem) -> Hypotheses:
+        """The leader's result, which the next problem follows from."""
+        assert leader is not None
+        if problem.key.step in chosen:
+            try:
+                register(problem)
+            except Exception as error:
+                run.failed(problem.key.step, error)
+        return leader.register(problem)
 
-        steps = run.steps(register, Exception) if leader is None else run.steps(register_and_lead)
-        result_rows = ResultRows(plan, trial, session, contender.label, contender.preset, method)
-        for step, _ in steps:
-            problem = step.problem
-            if problem is None or step.step not in chosen:
-                continue
-            found = None if run.registered is None else run.registered.hypotheses
-            members, missing = result_rows.members(problem)
-            row = result_rows.row(problem, found, members, run.failure or missing)
-            if run.registered is not None:
-                row["seconds"] = run.registered.total_seconds
-            rows.append(row)
-            if found is not None and members is not None and plan.every is not None:
-                taken = by_step.snapshots
-                iterations += result_rows.iterations(problem, taken, method.settings, members)
-        recorder.record(Logged(run.step, "info", "session finished"))
-        recorder.record(SessionEnded(run.step, "finished"))
-        recorder.close()
+    steps = run.steps(register, Exception) if leader is None else run.steps(register_and_lead)
+    result_rows = ResultRows(plan, trial, session, contender.label, contender.preset, method)
+    for step, _ in steps:
+        problem = step.problem
+        if problem is None or step.step not in chosen:
+            continue
+        found = None if run.registered is None else run.registered.hypotheses
+        members, missing = result_rows.members(problem)
+        row = result_rows.row(problem, found, members, run.failure or missing)
+        if run.registered is not None:
+            row["seconds"] = run.registered.total_seconds
+        rows.append(row)
+        if found is not None and members is not None and plan.every is not None:
+            taken = by_step.snapshots
+            iterations += result_rows.iterations(problem, taken, method.settings, members)
+    recorder.record(Logged(run.step, "info", "session finished"))
+    recorder.record(SessionEnded(run.step, "finished"))
+    recorder.close()
     if plan.every is not None:
         write_part(folder / f"{contender.label}.iterations.parquet", iterations, ITERATIONS)
     write_part(folder / f"{contender.label}.parquet", rows, RESULTS)

@@ -68,11 +68,11 @@ RESULTS_ORDER = ("object", "configuration", "seed", "method", "step")
 ITERATIONS_ORDER = ("configuration", "seed", "method", "step", "iteration")
 
 
-def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, about: str = "") -> None:
-    """Write a finished part of a table. about: kept with it, see `about_part`."""
+def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, source: str = "") -> None:
+    """Write a finished part of a table. source: kept with it, see `part_source`."""
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=schema)
     with whole_file(path) as beside:
-        pa.parquet.write_table(table.replace_schema_metadata({"about": about}), beside)
+        pa.parquet.write_table(table.replace_schema_metadata({"about": source}), beside)
 
 
 def read_part(path: Path, schema: pa.Schema, definition: str) -> pa.Table:
@@ -112,7 +112,7 @@ def is_part(path: Path) -> bool:
     return True
 
 
-def about_part(path: Path) -> str:
+def part_source(path: Path) -> str:
     """What was kept with a part; empty if there is no such part."""
     try:
         metadata = pa.parquet.read_schema(path).metadata or {}

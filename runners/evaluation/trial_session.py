@@ -19,11 +19,10 @@ from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.environment import environment
 from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
-from replay.files import WritingError, whole_file
+from replay.files import WritingError
 from replay.mcap.writer import McapRecorder
-from runners.evaluation.claims import claimed
 from runners.evaluation.configurations import SENSORS
-from runners.evaluation.plan import Plan, Task, Trial
+from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.sensor_logs import ensure_log
 from runners.evaluation.true_poses import find_truth, known_at_the_end
 from runners.objects.loader import check_size, load_object
@@ -32,6 +31,8 @@ from runners.sessions.recorded import RecordedSession, RecordedSettings
 
 METHOD = "none"
 """The method that the recording of a session alone names."""
+SESSION_FILES = ("session.mcap", "session.json", "plausible/*")
+"""Patterns of the files in the folder of a trial that are about its session."""
 TRUTH = "truth"
 """Key of the configuration under which stands how a true pose was found."""
 
@@ -111,18 +112,12 @@ class TrialSession:
 def make_session(plan: Plan, trial: Trial) -> None:
     """Probe, and make the plausible sets of all steps at which methods will register.
 
-    Those of a session with faults are the sets of the one without; it is made first. Raises
-    ClaimedError while another process makes it.
+    Those of a session with faults are the sets of the one without.
     """
     folder, clean = trial.folder(plan), trial.without_faults(plan)
-    if clean != trial and plan.plausible:
-        with claimed(plan.folder, Task(clean).claim):
-            if not has_session(plan, clean):
-                make_session(plan, clean)
     begun = time.perf_counter()
     if not (folder / "session.mcap").exists():
-        with whole_file(folder / "session.mcap") as beside:
-            record_session(plan, trial, McapRecorder(beside))
+        record_session(plan, trial, McapRecorder(folder / "session.mcap"))
     probed = time.perf_counter()
     session = open_recorded(plan, trial)
     settings = plausible_settings_of(plan, session)
@@ -141,8 +136,7 @@ def make_session(plan: Plan, trial: Trial) -> None:
     told = {"steps": steps, "no_plausible_set": failures, "seconds": seconds}
     if TRUTH in session.recorded.config:
         told[TRUTH] = session.recorded.config[TRUTH]
-    with whole_file(folder / "session.json") as beside:
-        beside.write_text(json.dumps(told, indent=2) + "\n")
+    (folder / "session.json").write_text(json.dumps(told, indent=2) + "\n")
 
 
 def read_session(plan: Plan, trial: Trial) -> TrialSession:

@@ -11,6 +11,10 @@ from dataclasses import dataclass
 
 import pytest
 
+from runners.evaluation.external_results import read_external
+from runners.evaluation.plan import Plan, Task
+from runners.evaluation.tasks import input_files, run_task, store_files
+
 
 @dataclass(frozen=True)
 class Done:
@@ -34,3 +38,11 @@ def run(program: Callable[[], None], *arguments: str, columns: int = 160) -> Don
         except SystemExit as end:
             status = int(end.code or 0)
     return Done(status, out.getvalue(), errors.getvalue())
+
+
+def do_task(plan: Plan, task: Task) -> str:
+    """Do a task of an evaluation in this process; the reason why it failed, "" if it did not."""
+    external = read_external(plan, task.trial, task.label) if task.label in plan.outside else None
+    outcome = run_task(plan.moved(plan.folder, task.trial), task, input_files(plan, task), external)
+    store_files(plan, task, outcome.files)
+    return outcome.failure

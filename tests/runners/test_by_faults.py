@@ -11,18 +11,16 @@ import pytest
 from chsel.errors import SettingError
 from runners import evaluate, report
 from runners.evaluation.configurations import configurations_of, with_faults
-from runners.evaluation.experiment import join_experiment
-from runners.evaluation.gathering import gather
+from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.selection import chosen_names
 from runners.evaluation.table import RESULTS, read_part, write_part
-from runners.evaluation.work import do_unit
 from runners.reporting.by_faults import picture_of_shares, shares_held, tables_by_faults
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_style import method_styles
 from runners.reporting.statistics import shares
 from runners.sessions.faults import LEVELS
-from tests.runners.in_process import run
+from tests.runners.in_process import do_task, run
 from tests.runners.made_up_evaluations import row, write_evaluation
 from tests.runners.test_evaluation import TRIAL, plan_in
 from tests.runners.test_report import page_of
@@ -57,9 +55,9 @@ def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(
 ) -> None:
     plan = plan_in(tmp_path / "out", steps="5", plausible=False)
     join_experiment(plan, "test", [FAULTY.configuration], [0])
-    for unit in (Task(FAULTY), Task(FAULTY, "icp")):
-        assert do_unit(plan, unit, set()).kind == "done"
-    (found,) = gather(plan.folder).to_pylist()
+    for task in (Task(FAULTY), Task(FAULTY, "icp")):
+        assert do_task(plan, task) == ""
+    (found,) = collect(plan.folder).to_pylist()
     assert (found["status"], found["members"], found["diversity"]) == ("ok", None, None)
     assert found["nearest_hypothesis"] > 0.0
     assert found["truth_held"] is None  # ICP has no set

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
+from subprocess import PIPE
 
+import psutil
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
@@ -19,7 +23,6 @@ from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, verify
 from runners import evaluate, plausible, probe
 from runners.command.choices import CONF
-from runners.evaluation.claims import ClaimedError, claimed
 from runners.evaluation.plan import Plan, Trial
 from tests.runners.in_process import Done, run
 from tests.runners.test_plausible import rows
@@ -52,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("evaluate") / "out"
     done = evaluated(folder, METHODS)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "1 trials, 2 methods, 3 units, of which 0 are finished" in done.stdout
+    assert "1 trials, 2 methods, 3 tasks, of which 0 are finished" in done.stdout
     assert re.search(r"plausible sets: default~\w{8}, cost by means over points, ", done.stdout)
     return folder
 
@@ -74,7 +77,7 @@ def test_every_experiment_can_be_planned(
 ) -> None:
     planned: list[tuple[Plan, list[Trial]]] = []
 
-    def instead(plan: Plan, trials: list[Trial], workers: int) -> bool:
+    def instead(plan: Plan, trials: list[Trial], *_: object) -> bool:
         planned.append((plan, trials))
         return False
 
@@ -157,11 +160,11 @@ def test_registrations_are_those_of_runners_probe(folder: Path, tmp_path: Path) 
 def test_what_is_finished_is_not_done_again(folder: Path) -> None:
     before = stamps(folder)
     again = evaluated(folder, METHODS)
-    assert "3 units, of which 3 are finished" in again.stdout
+    assert "3 tasks, of which 3 are finished" in again.stdout
     assert stamps(folder) == before
     more = evaluated(folder, "methods=[icp,svgd]", "settings.svgd.iterations=5")
     assert (more.returncode, more.stderr) == (0, "")
-    assert "3 units, of which 2 are finished" in more.stdout
+    assert "3 tasks, of which 2 are finished" in more.stdout
     after = stamps(folder)
     assert {name: after[name] for name in before} == before
     new = {Path(name).name for name in after if name not in before}
@@ -201,6 +204,10 @@ def stamps(folder: Path) -> dict[str, int]:
         (["session.noise=-1"], "noise is -1"),
         (["metrics.method=fast"], "method is 'fast'"),
         (["workers=0"], "workers is 0"),
+        (["workers=2", "cluster.scheduler=tcp://127.0.0.1:1"], "workers is 2, which is of this"),
+        (["cluster=slurm", "cluster.jobs=0"], "jobs is 0"),
+        (["cluster=slurm", "cluster.directives=a"], "directives is 'a'; accepted: a list"),
+        (["cluster.shceduler=a"], "did you mean scheduler?"),
         (["workers=10000"], "workers is 10000; accepted: an integer from 1 to 256"),
         (["experiment=smok"], "did you mean smoke?"),
         (["objects=ycb"], "objects is 'ycb'; accepted: models, scans"),
@@ -241,42 +248,42 @@ def test_jobs_of_a_sweep_share_a_folder(tmp_path: Path) -> None:
 def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_path: Path) -> None:
     slow = ("settings.chsel.emitter.iterations=1000000", "methods=chsel", "workers=1")
     command = [sys.executable, "-m", "runners.evaluate", *SMALL, f"out={tmp_path}", *slow]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        wait_until_claimed(tmp_path, "mustard.0.chsel", process)
-        process.send_signal(signal.SIGINT)
-        out, _ = process.communicate(timeout=60)
-    assert process.returncode == 130
+
+    def started() -> subprocess.Popen[str]:
+        """The command, at work on the method; in a process group of its own, as in a shell."""
+        scratch = Path(tempfile.mkdtemp(dir=tmp_path))
+        environment = {**os.environ, "TMPDIR": str(scratch)}
+        process = subprocess.Popen(
+            command, stdout=PIPE, stderr=PIPE, text=True, env=environment, start_new_session=True
+        )
+        latest = time.monotonic() + 300.0
+        while not list(scratch.rglob("task-*/trials/*/*/chsel.mcap")):
+            assert process.poll() is None
+            assert time.monotonic() < latest
+            time.sleep(0.1)
+        return process
+
+    with started() as process:
+        workers = children(process.pid)
+        os.killpg(process.pid, signal.SIGINT)
+        out, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "")
     assert "interrupted: what is finished stays" in out
     assert table(tmp_path) == []
     told = json.loads((tmp_path / "experiment.json").read_text())
     assert told["commands"][0].startswith("python -m runners.evaluate session=kinematic")
-    kept = {name: time for name, time in stamps(tmp_path).items() if "/." not in name}
+    kept = stamps(tmp_path)
     assert len(kept) == 4  # the session's recording, what it tells, two plausible sets
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        wait_until_claimed(tmp_path, "mustard.0.chsel", process)
+    with started() as process:
+        workers += children(process.pid)
         process.kill()
         out, _ = process.communicate(timeout=60)
-    assert "2 units, of which 1 are finished" in out
-    left = time.monotonic() + 30.0
-    while is_claimed(tmp_path, "mustard.0.chsel"):
-        assert time.monotonic() < left
-        time.sleep(0.1)
-    after = stamps(tmp_path)
-    assert {name: after[name] for name in kept} == kept
-    assert not (tmp_path / TRIAL / "chsel.parquet").exists()
+    assert "2 tasks, of which 1 are finished" in out
+    gone, alive = psutil.wait_procs(workers, timeout=30.0)
+    assert len(gone) >= 2
+    assert alive == []
+    assert stamps(tmp_path) == kept
 
 
-def wait_until_claimed(folder: Path, name: str, process: subprocess.Popen[str]) -> None:
-    latest = time.monotonic() + 300.0
-    while not (folder / TRIAL / "session.json").exists() or not is_claimed(folder, name):
-        assert process.poll() is None
-        assert time.monotonic() < latest
-        time.sleep(0.1)
-
-
-def is_claimed(folder: Path, name: str) -> bool:
-    try:
-        with claimed(folder, name):
-            return False
-    except ClaimedError:
-        return True
+def children(process: int) -> list[psutil.Process]:
+    return psutil.Process(process).children(recursive=True)

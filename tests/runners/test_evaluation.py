@@ -1,17 +1,23 @@
-"""The parts of an evaluation: units, their failures, sets from outside, iterations."""
+"""The tasks of an evaluation: their failures, external results, iterations."""
 
 from __future__ import annotations
 
+import errno
 import json
-from collections.abc import Callable
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from filelock import FileLock, Timeout
 
 from chsel.errors import ChselError, RecordingError
 from chsel.methods.icp import Icp
@@ -27,20 +33,21 @@ from replay.events import Measured
 from replay.files import WritingError, whole_file
 from replay.mcap.reader import read_recording
 from replay.verification import EQUAL, NO_RESULT, verify
-from runners.evaluation import run_method, work
-from runners.evaluation.claims import claimed
+from runners.evaluation import run_method, scheduling
+from runners.evaluation.cluster import Connection, LocalConfig, connected
 from runners.evaluation.configurations import configurations_of
 from runners.evaluation.contenders import Contender, chosen_contenders
-from runners.evaluation.experiment import join_experiment
+from runners.evaluation.display import Progress
+from runners.evaluation.experiment import collect, join_experiment, writing_alone
 from runners.evaluation.external_results import ExternalSetError, read_external
-from runners.evaluation.gathering import gather
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
-from runners.evaluation.schedule import Schedule
+from runners.evaluation.scheduling import Scheduling, is_finished
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
+from runners.evaluation.tasks import Outcome, input_files, run_on_worker, run_task
 from runners.evaluation.trial_session import open_recorded, problems
-from runners.evaluation.work import do_unit
 from runners.sessions.probing import ProbingSettings
+from tests.runners.in_process import do_task
 
 TRIAL = Trial(0, "mustard")
 FAST = {"chsel": {"descent": {"restarts": 1}, "emitter": {"iterations": 20}}}
@@ -73,7 +80,7 @@ def plan_in(folder: Path, methods: Any = ("icp",), **changes: Any) -> Plan:
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A trial's folder with its session and plausible sets."""
     plan = plan_in(tmp_path_factory.mktemp("session"))
-    assert do_unit(plan, Task(TRIAL), set()).kind == "done"
+    assert do_task(plan, Task(TRIAL)) == ""
     return TRIAL.folder(plan)
 
 
@@ -97,7 +104,7 @@ def make_plan(session: Path, tmp_path: Path) -> MakePlan:
 
 
 def results(plan: Plan) -> list[dict[str, Any]]:
-    return gather(plan.folder).to_pylist()
+    return collect(plan.folder).to_pylist()
 
 
 @pytest.mark.parametrize(
@@ -140,48 +147,65 @@ def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry() -> N
     assert marked.settings["cost"]["lookup"] == "nearest"
 
 
-DYING = """
-import os, signal
-from pathlib import Path
-from runners.evaluation import work
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Connection]:
+    """A cluster of one worker."""
+    with connected(LocalConfig("local", None, None), 1, print) as cluster:
+        yield cluster
 
-real = work.do_unit
 
-def do_unit(plan, unit, warm):
-    mark = Path(plan.folder) / f"tried_{unit.label}"
-    if unit.label == "always" or unit.label == "once" and not mark.exists():
+def finished(plan: Plan, cluster: Connection) -> Progress:
+    """Do all tasks of the trial."""
+    tasks = Scheduling(plan, [TRIAL], lambda _: None)
+    tasks.run(cluster)
+    return tasks.progress
+
+
+def _dies(plan: Plan, task: Task, files: Any, external: Any) -> Outcome:
+    """Kills its worker, always or once, by the label of the task."""
+    mark = plan.folder / "tried"
+    if task.label == "always" or (task.label == "once" and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return real(plan, unit, warm)
-
-def job(connection, plan):
-    work.do_unit = do_unit
-    work.work(connection, plan)
-"""
+    return run_on_worker(plan, task, files, external)
 
 
-def test_a_worker_that_dies_once_costs_nothing_and_twice_its_unit_alone(
-    make_plan: MakePlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_worker_that_dies_once_costs_nothing_and_twice_its_task_alone(
+    make_plan: MakePlan, cluster: Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "dying_worker.py").write_text(DYING)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    from dying_worker import job
-
-    entries = [{"name": "icp", "label": label} for label in ("always", "once", "fine")]
-    plan = make_plan(entries)
-    schedule = Schedule(plan, [TRIAL], 1, lambda _: None, job)
-    progress = schedule.run()
-    assert {unit.label for unit in progress.failed} == {"always"}
+    monkeypatch.setattr(scheduling, "run_on_worker", _dies)
+    plan = make_plan([{"name": "icp", "label": label} for label in ("always", "once", "fine")])
+    progress = finished(plan, cluster)
+    assert {task.label for task in progress.failed} == {"always"}
     assert (progress.finished, progress.done) == (1, 2)
     status = {row["method"]: row["status"] for row in results(plan)}
     assert status["once"] == status["fine"] == "ok"
-    assert status["always"].startswith("failed: its process died 2 times, SIGKILL")
+    assert status["always"].startswith("failed: its worker died 2 times, as of a lack of memory")
     failed = [row for row in results(plan) if row["method"] == "always"]
     assert [row["step"] for row in failed] == [4, 5]
     assert {row["diversity"] for row in failed} == {None}
-    assert do_unit(plan, Task(TRIAL, "always"), set()).kind == "done"
+    monkeypatch.undo()
+    assert finished(plan, cluster).done == 1  # the same command tries again
     assert {row["status"] for row in results(plan)} == {"ok"}
     assert not list(TRIAL.folder(plan).glob("*failed*"))
+
+
+def _raises(*_: Any) -> None:
+    raise ModuleNotFoundError("No module named 'runners'")
+
+
+def test_workers_that_cannot_run_tasks_end_the_evaluation(
+    make_plan: MakePlan, cluster: Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scheduling, "run_on_worker", _raises)
+    with pytest.raises(ChselError, match=r"a worker cannot run .* No module named 'runners'"):
+        finished(make_plan(), cluster)
+
+
+def test_workers_of_several_threads_are_refused(make_plan: MakePlan) -> None:
+    client = SimpleNamespace(nthreads=lambda: {"tcp://a": 1, "tcp://b": 4}, as_current=nullcontext)
+    with pytest.raises(ChselError, match="a worker has 4 threads; accepted: one"):
+        finished(make_plan(), Connection(client))
 
 
 class _FailsAtFour(Icp):
@@ -196,7 +220,7 @@ def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(
 ) -> None:
     plan = make_plan()
     monkeypatch.setattr(Contender, "method", lambda self: _FailsAtFour())
-    assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "done"
+    assert do_task(plan, Task(TRIAL, "icp")) == ""
     first, second = results(plan)
     assert first["status"] == "failed: nothing to see"
     assert first["members"] > 0
@@ -206,36 +230,64 @@ def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(
     assert [verdict.outcome for verdict in verdicts] == [NO_RESULT, EQUAL]
 
 
-def test_a_session_that_fails_fails_its_methods_and_no_others(tmp_path: Path) -> None:
+def test_a_session_that_fails_fails_its_methods_and_no_others(
+    tmp_path: Path, cluster: Connection
+) -> None:
     plan = plan_in(tmp_path, objects="scans", assets=tmp_path / "nowhere")
     join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
-    progress = Schedule(plan, [TRIAL], 1, lambda _: None).run()
-    assert {unit.label for unit in progress.failed} == {"", "icp"}
+    assert {task.label for task in finished(plan, cluster).failed} == {"", "icp"}
     (row,) = results(plan)
     assert row["step"] is None
     assert row["status"].startswith("failed: session: ")
 
 
-def test_a_unit_that_another_run_has_claimed_is_left_to_it(make_plan: MakePlan) -> None:
+def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path: Path) -> None:
+    said: list[str] = []
+    lock = FileLock(tmp_path / ".lock")
+    lock.acquire()
+
+    def end_the_first(line: str) -> None:
+        said.append(line)
+        lock.release()
+
+    with writing_alone(tmp_path, end_the_first):
+        assert said == [f"another run is at work in {tmp_path}; this one waits until it ends"]
+        with pytest.raises(Timeout):
+            lock.acquire(timeout=0)
+
+
+@pytest.mark.parametrize("name", ["session.json", "icp.parquet"])
+def test_a_damaged_file_is_made_again(make_plan: MakePlan, cluster: Connection, name: str) -> None:
     plan = make_plan()
-    with claimed(plan.folder, "mustard.0.icp"):
-        assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "elsewhere"
-    assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "done"
+    finished(plan, cluster)
+    before = results(plan)
+    path = TRIAL.folder(plan) / name
+    start = path.read_bytes()[:20]
+    path.unlink()  # other tests share the file
+    path.write_bytes(start)
+    progress = finished(plan, cluster)
+    assert (progress.finished, progress.done, progress.failed) == (1, 1, {})
+    after = results(plan)
+    for row in before + after:
+        row.pop("seconds")
+    assert after == before
 
 
-def test_what_cannot_be_written_stops_everything_and_leaves_no_file(
-    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
+def test_a_disk_that_cannot_be_written_stops_everything(
+    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     def full(table: Any, path: Path) -> None:
         path.write_bytes(b"half")
-        raise OSError(28, "No space left on device")
+        raise OSError(number, os.strerror(number))
 
-    plan = make_plan()
+    plan, task = make_plan(), Task(TRIAL, "icp")
     monkeypatch.setattr(pa.parquet, "write_table", full)
-    outcome = do_unit(plan, Task(TRIAL, "icp"), set())
-    assert outcome.kind == "stop"
-    assert "icp.parquet cannot be written (No space left on device)" in outcome.reason
-    assert not [path for path in TRIAL.folder(plan).iterdir() if "parquet" in path.name]
+    outcome = run_task(plan, task, input_files(plan, task))
+    assert outcome.stops
+    assert f"icp.parquet cannot be written ({os.strerror(number)})" in outcome.failure
+    assert str(TRIAL.folder(plan)) in outcome.failure  # not the worker's own folder
+    assert not list(TRIAL.folder(plan).glob("icp*"))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device here")
@@ -255,7 +307,7 @@ def _record_on_full_disk(path: Path) -> None:
         raise RecordingError(f"{path} cannot be written ({error.strerror})") from None
 
 
-def test_what_cannot_be_recorded_is_a_failure_of_its_unit_alone(
+def test_what_cannot_be_recorded_is_a_failure_of_its_task_alone(
     make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(self: Any, event: Any) -> None:
@@ -263,19 +315,7 @@ def test_what_cannot_be_recorded_is_a_failure_of_its_unit_alone(
 
     plan = make_plan()
     monkeypatch.setattr(run_method.McapRecorder, "record", refused)
-    outcome = do_unit(plan, Task(TRIAL, "icp"), set())
-    assert (outcome.kind, outcome.reason) == ("failed", "not finite")
-
-
-def test_what_a_dead_process_left_half_written_is_removed(make_plan: MakePlan) -> None:
-    plan = make_plan(["icp", "svgd"])
-    folder = TRIAL.folder(plan)
-    left, other = folder / ".icp.mcap.01234567", folder / ".svgd.mcap.01234567"
-    for path in (left, other):
-        path.write_text("half")
-    assert do_unit(plan, Task(TRIAL, "icp"), set()).kind == "done"
-    assert not left.exists()
-    assert other.exists()
+    assert do_task(plan, Task(TRIAL, "icp")) == "not finite"
 
 
 def _half_written(path: Path) -> None:
@@ -296,26 +336,9 @@ def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("name", ["session.json", "icp.parquet"])
-def test_a_damaged_file_is_made_again(make_plan: MakePlan, name: str) -> None:
-    plan = make_plan()
-    Schedule(plan, [TRIAL], 1, lambda _: None).run()
-    before = results(plan)
-    path = TRIAL.folder(plan) / name
-    start = path.read_bytes()[:20]
-    path.unlink()  # other tests share the file
-    path.write_bytes(start)
-    progress = Schedule(plan, [TRIAL], 1, lambda _: None).run()
-    assert (progress.finished, progress.done, progress.failed) == (1, 1, {})
-    after = results(plan)
-    for row in before + after:
-        row.pop("seconds")
-    assert after == before
-
-
 def test_errors_are_modulo_symmetries_at_the_centre(make_plan: MakePlan) -> None:
     plan = make_plan()
-    Schedule(plan, [TRIAL], 1, lambda _: None).run()
+    assert do_task(plan, Task(TRIAL, "icp")) == ""
     recording = read_recording(TRIAL.folder(plan) / "icp.mcap")
     truth, symmetry = recording.start.world_from_object, object_symmetry(recording.start.mesh)
     assert truth is not None
@@ -349,7 +372,7 @@ def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Pat
     listed = {"step_5": shifted.tolist(), "cost_5": list(range(len(shifted)))[::-1]}
     (folders["text"] / "mustard" / "seed_0.json").write_text(json.dumps(listed))
     for label in ("icp", *folders):
-        assert do_unit(plan, Task(TRIAL, label), set()).kind == "done"
+        assert do_task(plan, Task(TRIAL, label)) == ""
     by = {(row["method"], row["step"]): row for row in results(plan)}
     for step in (4, 5):
         own = by["perfect", step]
@@ -365,11 +388,11 @@ def test_sets_from_outside_rank_as_methods_do(make_plan: MakePlan, tmp_path: Pat
     assert by["text", 5]["best_cost"] == 0.0
     assert by["text", 5]["diversity"] > 1e4
     assert by["text", 5]["exact_members"] == 0.0
-    unit = Task(TRIAL, "text")
-    assert work.is_finished(plan, unit)
+    task = Task(TRIAL, "text")
+    assert is_finished(plan, task)
     listed["step_4"] = sets["step_4"].tolist()
     (folders["text"] / "mustard" / "seed_0.json").write_text(json.dumps(listed))
-    assert not work.is_finished(plan, unit)
+    assert not is_finished(plan, task)
 
 
 def step_of(plan: Plan, points_digest: str) -> int:
@@ -402,16 +425,16 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 def test_a_set_from_outside_that_is_wrong_is_told(
     tmp_path: Path, values: dict[str, Any], message: str
 ) -> None:
-    path = tmp_path / "seed_0.npz"
-    np.savez(path, **values)
+    (tmp_path / "mustard").mkdir()
+    np.savez(tmp_path / "mustard" / "seed_0.npz", **values)
     with pytest.raises(ExternalSetError, match=message):
-        read_external(plan_in(tmp_path), TRIAL, path)
+        read_external(plan_in(tmp_path, outside={"mine": tmp_path}), TRIAL, "mine")
 
 
 def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None:
     plan = make_plan(["chsel", "chsel_cma_me"], starts="gradient_descent", every=5)
     for label in plan.contenders:
-        assert do_unit(plan, Task(TRIAL, label), set()).kind == "done"
+        assert do_task(plan, Task(TRIAL, label)) == ""
     rows = results(plan)
     starts = {(row["step"], row["problem_digest"]) for row in rows}
     assert len(starts) == 2  # one a step, whatever the method
@@ -443,8 +466,8 @@ def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without
         return np.array([problem.key.step == 5])
 
     monkeypatch.setattr(Icp, "holds", holds, raising=False)
-    for unit in (Task(faulty), Task(faulty, "icp"), Task(TRIAL, "icp")):
-        assert do_unit(plan, unit, set()).kind == "done"
+    for task in (Task(faulty), Task(faulty, "icp"), Task(TRIAL, "icp")):
+        assert do_task(plan, task) == ""
     assert not (faulty.folder(plan) / "plausible").exists()
     clean, noisy = results(plan)
     assert [one["faults"] for one in (clean, noisy)] == ["clean", "noise_3mm"]

@@ -18,8 +18,8 @@ from runners.evaluation.plan import Task
 from runners.evaluation.repeats import MOST_REPEATS, repeat_seed
 from runners.evaluation.result_rows import ResultRows
 from runners.evaluation.trial_session import open_recorded, problems
-from runners.evaluation.work import do_unit
 from runners.sessions.recorded import RecordedSession
+from tests.runners.in_process import do_task
 from tests.runners.test_evaluation import TRIAL, plan_in
 
 EPSILON = 0.0003  # metres, that of the mustard bottle
@@ -40,7 +40,7 @@ class Scene:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     plan = plan_in(tmp_path_factory.mktemp("session"))
-    assert do_unit(plan, Task(TRIAL), set()).kind == "done"
+    assert do_task(plan, Task(TRIAL)) == ""
     session = open_recorded(plan, TRIAL)
     truth = session.world_from_object
     assert truth is not None

@@ -33,9 +33,8 @@ from runners.evaluation.sensor_logs import (
 )
 from runners.evaluation.trial_session import open_recorded
 from runners.evaluation.true_poses import FoundPose, true_poses
-from runners.evaluation.work import do_unit
 from runners.sensors.pose_file import beside, read_pose, write_pose
-from tests.runners.in_process import run
+from tests.runners.in_process import do_task, run
 from tests.runners.test_evaluation import plan_in
 
 CABINET = ["cabinet_drill", "cabinet_drill_opposite", "cabinet_mustard", "cabinet_mustard_sideways"]
@@ -190,8 +189,7 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
     )
     monkeypatch.setattr(sensor_logs, "RobotSettings", lambda: small)
     plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
-    outcome = do_unit(plan, Task(trial), set())
-    assert (outcome.kind, outcome.reason) == ("done", "")
+    assert do_task(plan, Task(trial)) == ""
     log = trial.log(plan)
     assert {file.name for file in log.parent.iterdir()} == {"seed_0.mcap", f"seed_0{TRUTH}"}
     truth = read_pose(log.with_name(f"seed_0{TRUTH}"))
@@ -210,7 +208,7 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
     session = open_recorded(plan, trial)
     assert session.start == (1, 0)
     elsewhere = replace(plan, folder=tmp_path / "again", logs=log.parents[1])
-    assert do_unit(elsewhere, Task(trial), set()).kind == "done"
+    assert do_task(elsewhere, Task(trial)) == ""
     first, second = (trial.folder(one) / "session.mcap" for one in (plan, elsewhere))
     assert first.read_bytes() == second.read_bytes()
     log.with_name(f"seed_0{TRUTH}").unlink()

@@ -1,0 +1,161 @@
+"""Evaluations on workers in other folders: a scheduler started by hand, and jobs of SLURM."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+import pytest
+
+from chsel.errors import SettingError
+from runners.evaluation import cluster
+from runners.evaluation.cluster import LocalConfig, SlurmConfig, connected, slurm_cluster
+from tests.runners.test_evaluate import METHODS, evaluated
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SBATCH = """#!/usr/bin/env bash
+cp "${*: -1}" "$(dirname "$0")/job"
+setsid bash "$(dirname "$0")/job" >/dev/null 2>&1 &
+echo "Submitted batch job $!"
+"""
+SCANCEL = """#!/usr/bin/env bash
+kill -- "-$1"
+"""
+SLURM = SlurmConfig(
+    kind="slurm",
+    jobs=2,
+    processes=8,
+    memory="16GB",
+    walltime="2:30:00",
+    queue="fast",
+    account="robots",
+    interface="lo",
+    directives=["--constraint=avx2"],
+    prologue=["module load python"],
+    python="/opt/python",
+    log_directory=None,
+    dashboard=None,
+)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """The table of an evaluation by workers of this machine."""
+    folder = tmp_path_factory.mktemp("here")
+    assert evaluated(folder, METHODS).returncode == 0
+    return results(folder)
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[str]:
+    """The address of a scheduler with two workers, each in a folder of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    file = tmp_path / "scheduler.json"
+    where = ["--scheduler-file", str(file)]
+    with ExitStack() as stack:
+
+        def start(name: str, *arguments: str) -> None:
+            (tmp_path / name).mkdir()
+            process = subprocess.Popen(
+                [sys.executable, "-m", f"distributed.cli.dask_{arguments[0]}", *arguments[1:]],
+                cwd=tmp_path / name,
+                env=environment,
+                stderr=subprocess.DEVNULL,
+            )
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+
+        start("s", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", *where)
+        for name in ("a", "b"):
+            start(name, "worker", "--nthreads", "1", "--local-directory", ".", *where)
+        while not file.exists():
+            time.sleep(0.05)
+        yield json.loads(file.read_text())["address"]
+
+
+def results(folder: Path) -> list[dict[str, Any]]:
+    """The rows but for the time that they took."""
+    rows = pyarrow.parquet.read_table(folder / "results.parquet").to_pylist()
+    return [{**row, "seconds": None} for row in rows]
+
+
+def test_workers_in_other_folders_give_the_same_table(
+    here: list[dict[str, Any]], scheduler: str, tmp_path: Path
+) -> None:
+    done = evaluated(tmp_path / "out", METHODS, "workers=null", f"cluster.scheduler={scheduler}")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"workers of the Dask scheduler at {scheduler}" in done.stdout
+    assert results(tmp_path / "out") == here
+    for name in ("a", "b"):
+        assert not list((tmp_path / name).rglob("task-*")), "workers leave nothing behind"
+
+
+def test_jobs_of_slurm_give_the_same_table(
+    here: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SLURM is two scripts here, of which the first starts the job on this machine."""
+    for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
+    words = ("workers=null", "cluster=slurm", "cluster.interface=lo")
+    done = evaluated(tmp_path / "out", METHODS, *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert results(tmp_path / "out") == here
+
+
+def test_a_job_of_slurm_asks_for_what_is_configured() -> None:
+    with slurm_cluster(SLURM) as jobs:
+        script = jobs.job_script()
+    for line in (
+        "#SBATCH -p fast",
+        "#SBATCH -A robots",
+        "#SBATCH -n 1",
+        "#SBATCH --cpus-per-task=8",
+        "#SBATCH --mem=15G",  # 16 GB in units of 2^30 bytes
+        "#SBATCH -t 2:30:00",
+        "#SBATCH --constraint=avx2",
+        "export NUMBA_NUM_THREADS=1",
+        "module load python",
+    ):
+        assert line in script.splitlines()
+    worker = script.splitlines()[-1]
+    assert worker.startswith("/opt/python -m distributed.cli.dask_worker tcp://127.0.0.1:")
+    assert "--nthreads 1 " in worker
+    assert "--nworkers 8 " in worker
+    assert "--preload runners.evaluation.tasks --interface lo" in worker
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "ftp://a:1"])
+def test_a_scheduler_that_is_not_there_is_one_line(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_CONNECT", 0.5)
+    config = LocalConfig("local", address, None)
+    with (
+        pytest.raises(SettingError, match=r"cluster\.scheduler is .*; accepted: the address of"),
+        connected(config, None, print),
+    ):
+        pass
+
+
+def test_the_address_of_a_dashboard_is_told_where_there_is_one(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with connected(LocalConfig("local", None, True), 1, print) as connection:
+        assert connection.client.nthreads()
+    shown = capsys.readouterr().out
+    if importlib.util.find_spec("bokeh") is None:
+        assert shown == "no dashboard: it needs bokeh, which is not installed\n"
+    else:
+        assert shown.startswith("dashboard: http://127.0.0.1:")
