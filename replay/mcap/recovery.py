@@ -41,33 +41,24 @@ _OF_POINTS = ("/points/free", "/points/occupied", "/points/known", "/known_point
 
 @dataclass
 class Recovered:
-    """What a recovery found.
+    """What a recovery kept and what is lost."""
 
-    damage: why the file cannot be read as it is; None if it can, and nothing is lost. probes,
-    problems, results: steps of those kept. images: how many are. damages: bytes that cannot be
-    believed. messages: how many are known to be missing. events: lost for other reasons than
-    missing bytes. complete: whether the recording's own list of contents was there, so that all
-    losses are known. lost_probes: first and last of steps in a row; without the list, those that
-    may be lost. lost_problems, lost_results: steps of registrations; without the list, those known
-    to be lost. attachments: names of those lost. remade: of those that were made again, to the bit.
-    ended: outcome, where the recording told it.
-    """
-
-    damage: str | None = None
-    damages: list[Damage] = field(default_factory=list)
-    probes: list[int] = field(default_factory=list)
-    problems: list[int] = field(default_factory=list)
-    results: list[int] = field(default_factory=list)
-    images: int = 0
-    messages: int = 0
-    events: list[str] = field(default_factory=list)
-    complete: bool = False
+    damage: str | None = None  # why the file cannot be read as it is; None if it can
+    damages: list[Damage] = field(default_factory=list)  # bytes that cannot be believed
+    probes: list[int] = field(default_factory=list)  # steps of those kept
+    problems: list[int] = field(default_factory=list)  # likewise
+    results: list[int] = field(default_factory=list)  # likewise
+    images: int = 0  # how many are kept
+    ended: str | None = None  # outcome, if the end of the session is kept
+    messages: int = 0  # how many are known to be missing
+    events: list[str] = field(default_factory=list)  # lost for other reasons than missing bytes
+    complete: bool = False  # whether the list of contents was there, so that all losses are known
     lost_probes: list[tuple[int, int]] = field(default_factory=list)
-    lost_problems: list[int] = field(default_factory=list)
-    lost_results: list[int] = field(default_factory=list)
-    attachments: list[str] = field(default_factory=list)
-    remade: list[str] = field(default_factory=list)
-    ended: str | None = None
+    """First and last of steps in a row; without the list of contents, those that may be lost."""
+    lost_problems: list[int] = field(default_factory=list)  # steps; without the list, those known
+    lost_results: list[int] = field(default_factory=list)  # likewise
+    attachments: list[str] = field(default_factory=list)  # names of those lost
+    remade: list[str] = field(default_factory=list)  # of those that were made again, to the bit
 
     @property
     def nothing_lost(self) -> bool:
