@@ -7,14 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chsel.errors import RecordingError
+from chsel.errors import RecordingError, SessionError
+from chsel.problem.file_checks import refuse_special_file
 from replay.mcap.damaged import recover_hint
 from replay.mcap.encoding import decode
-from replay.mcap.file import StoredMessage
-from replay.mcap.index import McapIndex
+from replay.mcap.file import LIMITS, StoredMessage
 from replay.mcap.plain_config import config_from_json
 from replay.mcap.schemas import FORMAT_VERSION, MESSAGES
 from replay.mcap.texts import check_name
+from replay.raw.log_info import is_other_programs
+from replay.raw.raw_file import RawFile, unwatched
+from replay.raw.raw_reading import Wanted
 from replay.standard_json import standard
 
 # What reads everything takes seconds to import, so that it is imported where everything is read.
@@ -88,9 +91,10 @@ def recording_info(path: str | Path, *, check: bool = False) -> RecordingInfo:
     has no index, all is read that is whole. Raises RecordingError if nothing can be read.
     """
     path = Path(path).expanduser()
+    refuse_special_file(f"recording {path}", path, RecordingError)
     try:
-        indexed = _from_index(McapIndex(path))
-    except RecordingError:  # unfinished or damaged, or no recording: so all of it is read
+        indexed = _from_index(path)
+    except (RecordingError, SessionError):  # reading it all shows what is wrong
         return _from_everything(path)
     if not check:
         return indexed
@@ -105,29 +109,48 @@ def recording_info(path: str | Path, *, check: bool = False) -> RecordingInfo:
 def recording_digest(path: Path) -> str | None:
     """The digest of a finished recording, from its end; None if there is none."""
     try:
-        contents = McapIndex(path).message("/contents")
-    except RecordingError:
+        found = _by_index(RawFile(path, LIMITS), "/contents")
+    except (RecordingError, SessionError):
         return None
-    return None if contents is None else decode("Contents", contents)["digest"] or None
+    return decode("Contents", found["/contents"])["digest"] or None if found else None
 
 
-def _from_index(index: McapIndex) -> RecordingInfo:
-    session, last = index.message("/session"), index.message("/contents")
-    if session is None or last is None:
-        raise RecordingError(f"recording {index.path} has no session or no contents")
-    contents = decode("Contents", last)
-    ended, rig = index.message("/session_ended"), index.message("/rig")
+def _from_index(path: Path) -> RecordingInfo:
+    file = RawFile(path, LIMITS)
+    found = _by_index(file, "/session", "/contents", "/session_ended", "/rig")
+    if is_other_programs(path) or not found.keys() >= {"/session", "/contents"}:
+        raise RecordingError(f"recording {path} has no session or no contents")
+    contents, ended, rig = found["/contents"], found.get("/session_ended"), found.get("/rig")
+    channels, rows = file.channels.by_id, decode("Contents", contents)
     return RecordingInfo(
-        index.path,
-        index.size,
-        _session(index.path, session),
-        _rows(contents),
+        path,
+        file.size,
+        _session(path, found["/session"]),
+        _rows(rows),
         None if ended is None else decode("SessionEnded", ended)["outcome"],
-        index.attachments,
-        index.messages,
-        rig=None if rig is None else _rig(index.path, decode("Rig", rig)),
-        digest=contents["digest"],
+        file.attachments,
+        {channels[number].topic: count for number, count in (file.counts or {}).items()},
+        rig=None if rig is None else _rig(path, decode("Rig", rig)),
+        digest=rows["digest"],
     )
+
+
+def _by_index(file: RawFile, *topics: str) -> dict[str, bytes]:
+    """The one message on each topic that has one; the middle of a large file is not read.
+
+    Raises RecordingError if the file has no index, if what is read is damaged, and if a topic has
+    more messages than one or others than the index says.
+    """
+    faults = [] if file.is_indexed else [f"its index cannot be used: {file.index_fault}"]
+    messages = file.messages(Wanted(frozenset(topics)), faults.append, unwatched)
+    found = {} if faults else {message.channel.topic: message.data for message in messages}
+    for number, count in (file.counts or {}).items():
+        topic = file.channels.by_id[number].topic
+        if topic in topics and count != (topic in found):
+            faults.append(f"it has not {count} messages on {topic}")
+    if faults:
+        raise RecordingError(f"recording {file.path}: {faults[0]}")
+    return found
 
 
 def _from_everything(path: Path) -> RecordingInfo:

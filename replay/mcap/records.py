@@ -20,6 +20,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, NamedTuple
 
 from mcap.opcode import Opcode
@@ -85,6 +86,7 @@ class Records:
 
     def __init__(self, file: IO[bytes], limits: Limits) -> None:
         self.size = file.seek(0, 2)
+        self.name = Path(getattr(file, "name", "")).name
         self._file, self._limits = file, limits
         self._header = len(MCAP0_MAGIC)  # where it is
         self._unpackable = limits.size + limits.ratio * self.size  # bytes that are left

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
-from mcap.records import Channel, ChunkIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
 from replay.mcap.record_bytes import MALFORMED, reason_of
-from replay.mcap.records import Records
+from replay.mcap.records import Limits, Records
 from replay.mcap.summary import summary
 from replay.raw.channels import Channels
 from replay.raw.raw_reading import LIMITS, ChunkPlace, Fault, RawMessage, RawReading, Wanted
@@ -24,11 +24,13 @@ _COMPARED = 64  # chunks that are looked at before an index is believed
 class RawFile:
     """Reads one file; no length in it is believed. Raises SessionError if it is not MCAP."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, limits: Limits = LIMITS) -> None:
         self.path = path
+        self._limits = limits
         self.channels = Channels()  # complete where there is an index
         self.counts: dict[int, int] | None = None  # of messages by channel, as the index says
         self.times: tuple[int, int] | None = None  # first and last log time, likewise
+        self.attachments: dict[str, int] = {}  # bytes of each by name, likewise
         self.is_indexed = False  # if so, messages come in order of log time, else in the file's
         self.index_fault = ""  # what is wrong with the index; "" also where there is none
         self.remarks: list[str] = []
@@ -51,7 +53,8 @@ class RawFile:
         """
         try:
             with self.path.open("rb") as file:
-                reading = RawReading(file, self.channels, wanted, fault, self.remarks, progress)
+                records = Records(file, self._limits)
+                reading = RawReading(records, self.channels, wanted, fault, self.remarks, progress)
                 if self.is_indexed:
                     yield from reading.ordered(self._chunks, MOST_HELD // at_once)
                 else:
@@ -63,7 +66,8 @@ class RawFile:
         """All messages in the order of the file, whether or not an index says where they are."""
         channels = Channels()
         with self.path.open("rb") as file:
-            reading = RawReading(file, channels, Wanted(), fault, self.remarks, _unwatched)
+            records = Records(file, self._limits)
+            reading = RawReading(records, channels, Wanted(), fault, self.remarks, unwatched)
             yield from reading.as_written()
         for number, channel in channels.by_id.items():
             self.channels.by_id.setdefault(number, channel)
@@ -77,7 +81,8 @@ class RawFile:
                 chosen.append(chunk)
                 seen |= chunk.channels
         with self.path.open("rb") as file:
-            reading = RawReading(file, self.channels, Wanted(), fault, self.remarks, _unwatched)
+            records = Records(file, self._limits)
+            reading = RawReading(records, self.channels, Wanted(), fault, self.remarks, unwatched)
             yield from reading.ordered(chosen, MOST_HELD)
 
     def spans(self) -> dict[int, tuple[int, int]]:
@@ -112,12 +117,14 @@ class RawFile:
         """What the summary says, None if there is none; any of MALFORMED if it contradicts."""
         statistics, is_empty = None, True
         alike: dict[frozenset[int], frozenset[int]] = {}
-        for part in summary(file, checked=False):
+        for part in summary(file, checked=self._limits.checked):
             is_empty = False
             if isinstance(part, Schema | Channel):
                 channels.describe(part)
             elif isinstance(part, Statistics):
                 statistics = part
+            elif isinstance(part, AttachmentIndex):
+                self.attachments[part.name] = part.data_size
             elif isinstance(part, ChunkIndex):
                 chunks.append(self._chunk_place(part, alike))
         if is_empty:
@@ -133,7 +140,7 @@ class RawFile:
             raise ValueError("its index contradicts itself")
         if any(number not in channels.by_id for number, count in counts.items() if count):
             raise ValueError("its index lacks channels")
-        some, records = chunks[:: max(len(chunks) // _COMPARED, 1)], Records(file, LIMITS)
+        some, records = chunks[:: max(len(chunks) // _COMPARED, 1)], Records(file, self._limits)
         missing = sum(chunk.head(records) is None for chunk in some)
         if 2 * missing > len(some):  # an index of old
             raise ValueError("its index is another file's")
@@ -151,5 +158,5 @@ class RawFile:
         return ChunkPlace(first, start, last, length, alike.setdefault(channels, channels))
 
 
-def _unwatched(done: int) -> None:
+def unwatched(done: int) -> None:
     """Nobody is shown how far reading is."""

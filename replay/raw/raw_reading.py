@@ -5,8 +5,6 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import IO
 
 from mcap.opcode import Opcode
 
@@ -75,7 +73,7 @@ class RawReading:
 
     def __init__(
         self,
-        file: IO[bytes],
+        records: Records,
         channels: Channels,
         wanted: Wanted,
         fault: Fault,
@@ -83,7 +81,7 @@ class RawReading:
         progress: Callable[[int], None],
     ) -> None:
         """fault: called with each damage. remarks: are added to. progress: with bytes done."""
-        self._records, self._name = Records(file, LIMITS), Path(file.name).name
+        self._records, self._name = records, records.name
         self._channels, self._wanted = channels, wanted
         self._fault, self._remarks, self._progress = fault, remarks, progress
 

@@ -13,16 +13,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, ChunkIndex, Footer, Header, Statistics
+from mcap.records import ChunkIndex, Footer, Statistics
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from chsel.errors import RecordingError
 from replay.__main__ import main
 from replay.events import Event, HypothesesFound, Probe, ProblemPosed
-from replay.mcap.index import McapIndex
 from replay.mcap.writer import McapRecorder
 from replay.recording_info import recording_info
 
@@ -167,7 +165,8 @@ def test_an_index_that_tells_of_other_messages_is_found_out(events, write_steps)
         if not isinstance(record, Statistics):
             return record
         counts = {n: count + (count == 3) for n, count in record.channel_message_counts.items()}
-        return dataclasses.replace(record, channel_message_counts=counts)
+        count = sum(counts.values())
+        return dataclasses.replace(record, message_count=count, channel_message_counts=counts)
 
     copy = with_summary(write_steps(events), more)
     assert recording_info(copy).damage is None
@@ -175,27 +174,21 @@ def test_an_index_that_tells_of_other_messages_is_found_out(events, write_steps)
 
 
 @pytest.mark.parametrize(
-    ("of", "lie", "message"),
+    ("of", "lie"),
     [
-        (ChunkIndex, {"chunk_start_offset": 2**63}, "has a damaged chunk"),
-        (ChunkIndex, {"chunk_start_offset": 2**40}, "has a damaged chunk"),
-        (ChunkIndex, {"chunk_length": 2**63 - 10**6}, "has a damaged chunk"),
-        (ChunkIndex, {"chunk_start_offset": 8}, "has a damaged chunk"),
-        (ChunkIndex, {"chunk_length": 3}, "has a damaged chunk"),
-        (ChunkIndex, {"message_index_offsets": {}}, "has 0 messages on /session"),
-        (ChunkIndex, {"message_index_offsets": {999: 0}}, "has a damaged chunk"),
-        (Statistics, {"channel_message_counts": {}}, "its statistics are missing"),
-        (Statistics, {"channel_message_counts": {999: 1}}, "name channels that do not exist"),
-        (Statistics, {"channel_message_counts": {1: 2}}, "has 1 messages on /session"),
+        (ChunkIndex, {"chunk_start_offset": 2**63}),
+        (ChunkIndex, {"chunk_length": 2**63 - 10**6}),
+        (ChunkIndex, {"chunk_start_offset": 8}),
+        (ChunkIndex, {"chunk_length": 3}),
+        (ChunkIndex, {"message_index_offsets": {2: 0}}),
+        (Statistics, {"channel_message_counts": {}}),
+        (Statistics, {"message_count": 1, "channel_message_counts": {999: 1}}),
+        (Statistics, {"message_count": 2, "channel_message_counts": {1: 2}}),
     ],
 )
-def test_an_index_that_leads_astray_is_left_for_the_file_itself(
-    events, write_steps, of, lie, message
-):
+def test_an_index_that_leads_astray_is_left_for_the_file_itself(events, write_steps, of, lie):
     path = write_steps(events)
     copy = with_summary(path, lambda r: dataclasses.replace(r, **lie) if isinstance(r, of) else r)
-    with pytest.raises(RecordingError, match=message):
-        McapIndex(copy).message("/session")
     info = recording_info(copy)
     assert info.checked
     assert info.damage is None
@@ -210,8 +203,6 @@ def test_another_programs_index_is_not_used(tmp_path):
         channel = writer.register_channel("/session", "json", 0)
         writer.add_message(channel, 0, b"{}", 0)
         writer.finish()
-    with pytest.raises(RecordingError, match="its header is not that of profile chsel"):
-        McapIndex(path)
     with pytest.raises(RecordingError, match="is another program's"):
         recording_info(path)
 
@@ -232,27 +223,6 @@ def test_a_problem_without_a_result_counts_as_no_registration(events, write, cap
     assert recording_info(path).registrations == 1
     assert main(["info", str(path)]) == 0
     assert "no result" in capsys.readouterr().out
-
-
-def test_a_chunk_that_lies_about_its_size_is_not_unpacked(tmp_path):
-    zeros = bytes(2000)
-    packed = zstandard.ZstdCompressor().compress(zeros)
-    records = RecordBuilder()
-    Header("chsel", "").write(records)
-    Chunk("zstd", packed, 0, 0, zlib.crc32(zeros), 2**40).write(records)
-    data = MCAP0_MAGIC + records.end()
-    start = data.index(packed) - 53
-    assert data[start] == 6  # the chunk's opcode
-    Channel(1, "/session", "protobuf", {}, 0).write(records)
-    Statistics(0, 1, {1: 1}, 1, 1, 0, 0, 0, 0).write(records)
-    ChunkIndex(len(data) - start, start, "zstd", len(packed), 0, 0, {1: 0}, 0, 2**40).write(records)
-    summary = records.end()
-    crc = zlib.crc32(struct.pack("<BQQQ", 2, 20, len(data), 0), zlib.crc32(summary))
-    Footer(len(data), 0, crc).write(records)
-    path = tmp_path / "bomb.mcap"
-    path.write_bytes(data + summary + records.end() + MCAP0_MAGIC)
-    with pytest.raises(RecordingError, match=f"a chunk claims {2**40} bytes"):
-        McapIndex(path).message("/session")
 
 
 def test_json_is_standard_and_a_list_of_several(events, write, tmp_path, capsys):

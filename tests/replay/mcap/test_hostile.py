@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zstandard
 from mcap.opcode import Opcode
 
 from chsel.cost.cost_settings import CostSettings
@@ -383,17 +382,3 @@ def test_bombs_take_little_memory(
     ):
         assert any(message in error for error in errors), message
     assert int(grown) < 150  # MB
-
-
-def test_a_frame_that_lies_about_its_size_is_not_unpacked(
-    tmp_path: Path, write: Callable[[list[Event]], Path], events: list[Event]
-) -> None:
-    path = write(events)
-    everything = split(path.read_bytes()[8:-8])
-    data = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(2**24))
-    head = bytes(16) + (2**24).to_bytes(8, "little") + bytes(4)
-    chunk = head + b"\4\0\0\0zstd" + len(data).to_bytes(8, "little") + data
-    everything.insert(2, (Opcode.CHUNK, chunk))
-    path.write_bytes(file_of(everything))
-    with pytest.raises(RecordingError, match="is damaged before byte"):
-        read_recording(path)

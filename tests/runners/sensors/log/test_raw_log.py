@@ -1,6 +1,5 @@
 """Logs as files and folders: in order, within bounds, and what is left of damaged ones."""
 
-import dataclasses
 import hashlib
 import shutil
 import struct
@@ -15,7 +14,7 @@ from mcap.writer import CompressionType
 
 from chsel.errors import SessionError
 from replay.files import file_digest
-from replay.raw import raw_file, raw_reading
+from replay.raw import raw_file
 from replay.raw.channels import Channel
 from replay.raw.raw_reading import RawMessage
 from runners.sensors.log.log_files import merged, most_at_once
@@ -215,24 +214,6 @@ def test_a_cut_file_gives_what_is_before_the_cut(tmp_path: Path, part: float) ->
     assert left == whole[: len(left)]
     assert any("without its index" in text for text in log.warnings)
     assert log.faults
-
-
-def test_a_file_of_false_chunks_is_not_searched_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = write_ros2(tmp_path / "log.mcap", ros2_sent(4), chunk_size=1500)
-    data = data[: summary_start(data) - 13]
-    heads, count, each = [], 3000, 53
-    for index in range(count):  # each of them seems to reach up to the end of the file
-        rest = each * (count - index) - 9
-        head = struct.pack("<BQQQQII", 6, rest, 0, 0, 10, 0, 4) + b"zstd"
-        heads.append(head + struct.pack("<Q", rest - 44))
-    (tmp_path / "log.mcap").write_bytes(data + b"\0" + b"".join(heads))
-    few = dataclasses.replace(raw_reading.LIMITS, size=2**20)
-    monkeypatch.setattr(raw_reading, "LIMITS", few)
-    log = RawLog(tmp_path / "log.mcap")
-    assert 10 < log.faults.total() < count / 2
-    assert list(log.messages(log.topics))
 
 
 def rosbag(folder: Path, metadata: str | None = None) -> None:
