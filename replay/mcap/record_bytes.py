@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -34,21 +34,39 @@ MALFORMED = (
 
 HEAD = struct.Struct("<BQ")  # of every record: opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHUNK_INDEX = struct.Struct("<QQQQI")  # times, start, length, size of the entries
+_ENTRY = struct.Struct("<HQ")  # channel, and where its messages are listed
 _TYPES: dict[int, Any] = {
     Opcode.HEADER: records.Header,
     Opcode.FOOTER: records.Footer,
     Opcode.SCHEMA: records.Schema,
     Opcode.CHANNEL: records.Channel,
     Opcode.CHUNK: records.Chunk,
-    Opcode.CHUNK_INDEX: records.ChunkIndex,
     Opcode.ATTACHMENT: records.Attachment,
     Opcode.ATTACHMENT_INDEX: records.AttachmentIndex,
     Opcode.STATISTICS: records.Statistics,
 }
 
 
+class ChunkIndex(NamedTuple):
+    """Where a chunk is, and the times and channels of its messages."""
+
+    first: int  # log time, nanoseconds
+    last: int
+    start: int  # in the file, bytes
+    length: int  # of the whole record
+    channels: frozenset[int]  # by id; none if they are not known
+
+
 def parsed(opcode: int, body: bytes) -> Any:
-    """A record of mcap's type; any of MALFORMED if its fields do not fit into its bytes."""
+    """A record of mcap's type; any of MALFORMED if its fields do not fit into its bytes.
+
+    That of a chunk in an index is our own: mcap reads those of a large log six times as slowly.
+    """
+    if opcode == Opcode.CHUNK_INDEX:
+        first, last, start, length, size = _CHUNK_INDEX.unpack_from(body)
+        entries = _ENTRY.iter_unpack(body[_CHUNK_INDEX.size :][:size])
+        return ChunkIndex(first, last, start, length, frozenset(number for number, _ in entries))
     return _TYPES[opcode].read(ReadDataStream(_Exact(body)))  # type: ignore[arg-type]
 
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import SessionError
-from replay.mcap.record_bytes import MALFORMED, reason_of
+from replay.mcap.record_bytes import MALFORMED, ChunkIndex, reason_of
 from replay.mcap.records import Limits, Records
 from replay.mcap.summary import summary
 from replay.raw.channels import Channels
@@ -150,12 +150,10 @@ class RawFile:
         self, index: ChunkIndex, alike: dict[frozenset[int], frozenset[int]]
     ) -> ChunkPlace:
         """alike: sets of channels that were met, so that many equal ones take little memory."""
-        start, length = index.chunk_start_offset, index.chunk_length
-        if start + length > self.size:
+        if index.start + index.length > self.size:
             raise ValueError("a chunk in the index lies outside of the file")
-        channels = frozenset(index.message_index_offsets)
-        first, last = index.message_start_time, index.message_end_time
-        return ChunkPlace(first, start, last, length, alike.setdefault(channels, channels))
+        channels = alike.setdefault(index.channels, index.channels)
+        return ChunkPlace(index.first, index.start, index.last, index.length, channels)
 
 
 def unwatched(done: int) -> None:
