@@ -101,7 +101,7 @@ class EvaluateConfig:
 
 @command("evaluate")
 def main(config: DictConfig) -> None:
-    """Do what is not done yet, and gather all that is there."""
+    """Do what is not done yet, and collect all that is there."""
     values = plain(config)
     if values["steps"] is not None:
         values["steps"] = str(values["steps"])

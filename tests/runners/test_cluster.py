@@ -77,7 +77,9 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         start("s", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", *where)
         for name in ("a", "b"):
             start(name, "worker", "--nthreads", "1", "--local-directory", ".", *where)
+        latest = time.monotonic() + 120.0
         while not file.exists():
+            assert time.monotonic() < latest
             time.sleep(0.05)
         yield json.loads(file.read_text())["address"]
 
