@@ -29,7 +29,7 @@ def completeness(subject: Subject) -> Section:
         objects_table(evaluation.rows),
         failures_table(evaluation),
     )
-    return Section("there", "What was run", text, tables=tables)
+    return Section("what-was-run", "What was run", text, tables=tables)
 
 
 def completeness_table(evaluation: Evaluation, styles: Styles) -> Table:

@@ -27,8 +27,8 @@ FORMATS = ("png", "svg", "pdf")
 _DPI = 120
 _TITLE = 0.35  # inches that a figure is taller with a title
 _COLORS = 256  # of a small PNG file
-# What a file would say of when and with what it was made.
-_UNSAID: dict[str, Any] = {
+# Metadata that is left out: when and with what a file was made.
+_NO_CLOCKS: dict[str, Any] = {
     "png": {"Software": None},
     "svg": {"Date": None, "Creator": None},
     "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
@@ -98,7 +98,7 @@ def set_title(figure: Figure, title: str) -> None:
 def file_content(figure: Figure, kind: str = "png") -> bytes:
     """A file of one of the FORMATS, without anything that tells when and with what it was made."""
     stream = io.BytesIO()
-    figure.savefig(stream, format=kind, dpi=_DPI, metadata=_UNSAID[kind])
+    figure.savefig(stream, format=kind, dpi=_DPI, metadata=_NO_CLOCKS[kind])
     return stream.getvalue()
 
 
