@@ -375,7 +375,7 @@ def other_setting(rig: Rig, random: Random) -> Rig:
             after = number if name in ("unit", "edge", "rate") else str(random.choice(_TEXTS))
         case (float(), float()):
             after = (0.1, number)
-        case tuple():
+        case tuple() if name != "workspace":
             after = ()
         case _:
             return rig
