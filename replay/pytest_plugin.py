@@ -74,19 +74,18 @@ class StoredReplay(pytest.File):
         except ChselError as error:
             reason = str(error)
         if reason:
-            yield UnusableRecording.from_parent(self, name="recording", reason=reason)
+            yield ReplayedItem.from_parent(self, name="recording", failure=reason)
             return
         for step in steps:
             name = f"step {step}, {recording.start.method}"
-            yield ReplayedStep.from_parent(self, name=name, step=step)
+            yield ReplayedItem.from_parent(self, name=name, step=step)
 
     def verdict(self, step: int) -> Verdict:
-        """The verdict on a step; others that were selected are come to on the way."""
+        """The verdict on a step; those on other selected steps come before it."""
         if self._coming is None:
             items = (item for item in self.session.items if item.parent is self)
-            self._coming = _verdicts(
-                self.path, [i.step for i in items if isinstance(i, ReplayedStep)]
-            )
+            steps = [item.step for item in items if isinstance(item, ReplayedItem)]
+            self._coming = _verdicts(self.path, steps)
         while step not in self._verdicts:
             verdict = next(self._coming)
             self._verdicts[verdict.step] = verdict
@@ -94,45 +93,30 @@ class StoredReplay(pytest.File):
 
 
 def _verdicts(path: Path, steps: list[int]) -> Iterator[Verdict]:
-    """Verdicts on steps of a file that is read now, and given up with the last."""
+    """Verdicts on steps of a file that is read now, and released with the last."""
     from replay.mcap.reader import read_recording
     from replay.verification import verify
 
     yield from verify(read_recording(path), steps)
 
 
-class UnusableRecording(pytest.Item):
-    """A file without a recorded result."""
-
-    def __init__(self, *, reason: str, **more: Any) -> None:
-        super().__init__(**more)
-        self._reason = reason
-
-    def runtest(self) -> None:
-        """Fail with the reason."""
-        from replay.console import printable
-
-        pytest.fail(printable(self._reason), pytrace=False)
-
-    def reportinfo(self) -> tuple[Path, None, str]:
-        """Where it is."""
-        return self.path, None, f"{self.path.name}: {self.name}"
-
-
-class ReplayedStep(pytest.Item):
-    """One registration, run again."""
+class ReplayedItem(pytest.Item):
+    """One registration, run again; or a file that cannot be, with the reason."""
 
     parent: StoredReplay
 
-    def __init__(self, *, step: int, **more: Any) -> None:
+    def __init__(self, *, step: int = -1, failure: str = "", **more: Any) -> None:
         super().__init__(**more)
         self.step = step
+        self._failure = failure
 
     def runtest(self) -> None:
-        """Fail with the report unless every bit is equal."""
+        """Fail with the reason, or with the report unless every bit is equal."""
         from replay.console import printable
         from replay.verification import EQUAL
 
+        if self._failure:
+            pytest.fail(printable(self._failure), pytrace=False)
         verdict = self.parent.verdict(self.step)
         if verdict.outcome != EQUAL:
             pytest.fail(f"{printable(str(self.path))}: {verdict.report()}", pytrace=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
 
@@ -16,6 +16,7 @@ from replay.files import require_new, sync_file, sync_folder
 
 _END = b"RRF2FOOT"  # near the end of every finished .rrd file
 _END_SIZE = 64  # bytes
+_FLUSH_SECONDS = 10.0
 _MOMENT = 2.0  # seconds in which any disk writes something of what waits
 
 
@@ -43,9 +44,18 @@ def new_file_stream(path: Path, application: str) -> Iterator[rr.RecordingStream
         stream = new_stream(application, file.sink)
         try:
             yield stream
-        finally:
+        except BaseException:
             stream.disconnect()
-        file.finish()
+            raise
+        try:
+            with suppress(RuntimeError):  # a writer that has failed, which shows in the file
+                stream.flush(timeout_sec=_FLUSH_SECONDS)
+            file.check(grown=True)
+            stream.disconnect()
+            file.finish()
+        except RecordingError:
+            abandon(stream)
+            raise
     except BaseException:
         path.unlink(missing_ok=True)
         raise
