@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 
 from chsel.errors import RecordingError, SettingError
 from chsel.problem.points import KnownPoints
@@ -66,7 +65,7 @@ def test_a_points_session_on_exported_points_has_the_recorded_problems(
 ):
     path = exported(recording, tmp_path, "points", file_format)
     workspace = tuple(zip(*recording.start.workspace.bounds.tolist(), strict=True))
-    large: Any = SimpleNamespace(mesh=trimesh.creation.box((3.0, 3.0, 3.0)))
+    large: Any = SimpleNamespace(diameter=5.0)
     session = PointsSession(PointsSettings(str(path), workspace), large)
     assert session.workspace == recording.start.workspace
     points, steps = KnownPoints(), []
