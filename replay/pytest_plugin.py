@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:  # a run of pytest without recordings loads nothing of this package
-    from replay.verification import Verdict
+    from replay.comparing.verification import Verdict
 
 _SUFFIX = ".mcap"
 
@@ -94,8 +94,8 @@ class StoredReplay(pytest.File):
 
 def _verdicts(path: Path, steps: list[int]) -> Iterator[Verdict]:
     """Verdicts on steps of a file that is read now, and released with the last."""
+    from replay.comparing.verification import verify
     from replay.mcap.reader import read_recording
-    from replay.verification import verify
 
     yield from verify(read_recording(path), steps)
 
@@ -112,8 +112,8 @@ class ReplayedItem(pytest.Item):
 
     def runtest(self) -> None:
         """Fail with the reason, or with the report unless every bit is equal."""
+        from replay.comparing.verification import EQUAL
         from replay.console import printable
-        from replay.verification import EQUAL
 
         if self._failure:
             pytest.fail(printable(self._failure), pytrace=False)

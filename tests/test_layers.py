@@ -23,15 +23,42 @@ FORBIDDEN = {
     "runners": set(),
 }
 MAY_IMPORT = {
-    "numerics": set(),
-    "problem": {"numerics"},
-    "cost": {"numerics", "problem"},
-    "qd": {"numerics", "problem", "cost"},
-    "methods": {"numerics", "problem", "cost", "qd"},
-    "plausible": {"numerics", "problem", "cost"},
-    "sensing": {"numerics", "problem"},
+    "chsel": {
+        "numerics": set(),
+        "problem": {"numerics"},
+        "cost": {"numerics", "problem"},
+        "qd": {"numerics", "problem", "cost"},
+        "methods": {"numerics", "problem", "cost", "qd"},
+        "plausible": {"numerics", "problem", "cost"},
+        "sensing": {"numerics", "problem"},
+    },
+    "replay": {
+        "mcap": set(),
+        "raw": {"mcap"},
+        "comparing": {"mcap"},
+        "rerun": {"mcap", "comparing"},
+        "verbs": {"mcap", "raw", "comparing", "rerun"},
+    },
+    "runners": {
+        "objects": set(),
+        "sensors": set(),
+        "sessions": {"objects", "sensors"},
+        "simulated_robot": {"sensors", "sessions"},
+        "command": {"sensors", "sessions"},
+        "run": {"sensors", "sessions"},
+        "evaluation": {"objects", "sensors", "sessions", "simulated_robot", "command", "run"},
+        "published_package": {"sessions", "evaluation"},
+        "reporting": {"objects", "sessions", "evaluation"},
+        "benchmarks": {"objects", "run", "published_package"},
+    },
 }
-"""Folders of chsel. Each may import chsel.errors, too, and no other file of chsel itself."""
+"""Folders of a package, and those of the same package that each may import."""
+LOWEST = {
+    "chsel": {"errors"},
+    "replay": {"events", "files"},
+    "runners": set(),
+}
+"""Files of a package itself, below all its folders; its other files are above them."""
 BUILT_OF = {"chsel": {"gradient_descent", "anchored"}}
 """Methods, each a file or a folder of chsel/methods, and those that are parts of them."""
 EVERY_METHOD = {"method"}  # the protocol that they implement
@@ -66,10 +93,10 @@ def import_graph(root: Path, package: str = "chsel") -> dict[str, set[str]]:
     return graph
 
 
-def unplaced(root: Path) -> set[str]:
-    """Folders of chsel that MAY_IMPORT leaves out."""
-    folders = {path.parent.relative_to(root / "chsel") for path in root.glob("chsel/**/*.py")}
-    return {folder.parts[0] for folder in folders if folder.parts} - set(MAY_IMPORT)
+def unplaced(root: Path, package: str = "chsel") -> set[str]:
+    """Folders of a package that MAY_IMPORT leaves out."""
+    folders = {path.parent.relative_to(root / package) for path in root.glob(f"{package}/**/*.py")}
+    return {folder.parts[0] for folder in folders if folder.parts} - set(MAY_IMPORT[package])
 
 
 def forbidden_imports(graph: dict[str, set[str]]) -> list[str]:
@@ -78,22 +105,25 @@ def forbidden_imports(graph: dict[str, set[str]]) -> list[str]:
         f"{module} imports {end}"
         for module, ends in graph.items()
         for end in sorted(ends)
-        if not _may_import(module.split(".")[1:], end.split(".")[1:])
+        if not _may_import(module.split("."), end.split("."))
     ]
 
 
 def _may_import(module: list[str], end: list[str]) -> bool:
-    """Whether a module may import another; both are paths inside chsel."""
-    if end == ["errors"]:
+    """Whether a module may import another one of its package; both are paths of names."""
+    package, *place = module
+    folders, lowest = MAY_IMPORT[package], LOWEST[package]
+    if len(end) == 2 and end[1] in lowest:
         return True
-    folder, of_folder = module[:1], end[:1]
-    if not folder or folder[0] not in MAY_IMPORT:  # a file of chsel itself, above all folders
-        return folder != ["errors"]
-    if not of_folder or of_folder[0] not in MAY_IMPORT:
+    if not place or place[0] not in folders:  # a file of the package itself
+        return not place or place[0] not in lowest
+    folder, of_folder = place[0], "".join(end[1:2])
+    if of_folder not in folders:
         return False
     if of_folder != folder:
-        return of_folder[0] in MAY_IMPORT[folder[0]]
-    return folder != ["methods"] or _method_may_import("".join(module[1:2]), "".join(end[1:2]))
+        return of_folder in folders[folder]
+    inside_methods = (package, folder) == ("chsel", "methods")
+    return not inside_methods or _method_may_import("".join(place[1:2]), "".join(end[2:3]))
 
 
 def _method_may_import(name: str, other: str) -> bool:
@@ -115,9 +145,9 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
     ]
 
 
-def repeated(root: Path) -> set[str]:
-    """File names and class names that stand in the package chsel twice."""
-    files = [file for file in (root / "chsel").rglob("*.py") if file.name != "__init__.py"]
+def repeated(root: Path, package: str = "chsel") -> set[str]:
+    """File names and class names that stand in a package twice."""
+    files = [file for file in (root / package).rglob("*.py") if file.name != "__init__.py"]
     nodes = (node for file in files for node in ast.walk(ast.parse(file.read_text())))
     classes = [node.name for node in nodes if isinstance(node, ast.ClassDef)]
     counts = Counter([file.name for file in files]) + Counter(classes)
@@ -135,7 +165,8 @@ def test_a_package_imports_only_what_it_may(package: str) -> None:
 def test_the_page_for_maintainers_has_these_rules() -> None:
     for header, rules in {
         "package | never imports": FORBIDDEN,
-        "folder of `chsel` | may import": MAY_IMPORT,
+        **{f"folder of `{package}` | may import": MAY_IMPORT[package] for package in MAY_IMPORT},
+        "package | files below all its folders": LOWEST,
         "method | is built of": BUILT_OF,
     }.items():
         _, _, rest = PAGE.read_text().partition(f"| {header} |\n|---|---|\n")
@@ -143,13 +174,16 @@ def test_the_page_for_maintainers_has_these_rules() -> None:
         assert {name: set(others) for name, *others in rows} == rules
 
 
-def test_every_folder_of_chsel_has_its_layer() -> None:
-    assert unplaced(REPOSITORY) == set()
-    assert all((REPOSITORY / "chsel" / folder).is_dir() for folder in MAY_IMPORT)
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_every_folder_has_its_layer(package: str) -> None:
+    assert unplaced(REPOSITORY, package) == set()
+    assert all((REPOSITORY / package / folder).is_dir() for folder in MAY_IMPORT[package])
+    assert all((REPOSITORY / package / f"{file}.py").is_file() for file in LOWEST[package])
 
 
-def test_no_folder_of_chsel_imports_one_above_it() -> None:
-    graph = import_graph(REPOSITORY)
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_no_folder_imports_one_above_it(package: str) -> None:
+    graph = import_graph(REPOSITORY, package)
     assert len(graph) > 30
     assert forbidden_imports(graph) == []
 
@@ -159,8 +193,9 @@ def test_no_circle_of_imports(package: str) -> None:
     assert circles(import_graph(REPOSITORY, package)) == []
 
 
-def test_no_name_of_a_file_or_class_of_chsel_means_two_things() -> None:
-    assert repeated(REPOSITORY) == set()
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_no_name_of_a_file_or_class_means_two_things(package: str) -> None:
+    assert repeated(REPOSITORY, package) == set()
 
 
 PLANTED = {

@@ -28,6 +28,8 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import Hypotheses
+from replay.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
+from replay.colors import OBJECT as OBJECT_COLOR
 from replay.events import Event, HypothesesFound, Probe, SessionStarted
 from replay.lost_attachment import is_lost
 from replay.mcap.foxglove_messages import (
@@ -39,8 +41,6 @@ from replay.mcap.foxglove_messages import (
     serialized,
     stamp,
 )
-from replay.rerun.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
-from replay.rerun.colors import OBJECT as OBJECT_COLOR
 
 if TYPE_CHECKING:
     import trimesh

@@ -10,8 +10,8 @@ import rerun as rr
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
+from replay.colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
 from replay.rerun.clock import ITERATION, PROBE, REGISTRATION
-from replay.rerun.colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
 from replay.rerun.hypotheses import shown_hypotheses
 from replay.rerun.plane import Frame, Label, color_array, lines, on_screen, texts, ticks
 

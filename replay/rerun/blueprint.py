@@ -14,9 +14,9 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
 from chsel.problem.poses import apply, inverse
 from chsel.problem.registration_problem import Hypotheses
+from replay.colors import BACKGROUND, GRID
 from replay.events import SessionStarted
 from replay.rerun.clock import PROBE, REGISTRATION, TIMELINES
-from replay.rerun.colors import BACKGROUND, GRID
 from replay.rerun.curves import SEARCH_FRAME, SPREADS
 from replay.rerun.hypotheses import shown_hypotheses
 from replay.rerun.legend import LEGEND_FRAME

@@ -10,9 +10,9 @@ import rerun as rr
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import spread
 from chsel.problem.registration_problem import Hypotheses
+from replay.colors import CURVES, SERIES, CostScale, Rgb, number
 from replay.events import Traced
 from replay.rerun.clock import ITERATION
-from replay.rerun.colors import CURVES, SERIES, CostScale, Rgb, number
 from replay.rerun.plane import Frame, Label, lines, texts, ticks
 
 SEARCH_FRAME = Frame(1.5, 1.0)

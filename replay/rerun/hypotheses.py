@@ -10,7 +10,7 @@ import rerun as rr
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses
-from replay.rerun.colors import CostScale, cost_colors
+from replay.colors import CostScale, cost_colors
 from replay.rerun.meshes import DISPLAY_FACES, HIDDEN, coarsened, display_mesh, mesh_poses
 
 if TYPE_CHECKING:

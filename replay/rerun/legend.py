@@ -7,7 +7,7 @@ import rerun as rr
 
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import Hypotheses
-from replay.rerun.colors import (
+from replay.colors import (
     CONTACT,
     FREE,
     GRIPPER,

@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 
 from chsel.numerics.arrays import FloatArray
+from replay.colors import HAND
 from replay.events import Probe
-from replay.rerun.colors import HAND
 
 if TYPE_CHECKING:
     import trimesh

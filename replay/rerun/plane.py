@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from replay.rerun.colors import FRAME, TEXT, Rgb
+from replay.colors import FRAME, TEXT, Rgb
 
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 Label = tuple[float, float, str]

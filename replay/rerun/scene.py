@@ -9,8 +9,7 @@ import rerun as rr
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
-from replay.events import Probe
-from replay.rerun.colors import (
+from replay.colors import (
     CONTACT,
     FRAME,
     FREE,
@@ -22,6 +21,7 @@ from replay.rerun.colors import (
     PAST,
     Rgb,
 )
+from replay.events import Probe
 from replay.rerun.meshes import display_mesh
 from replay.rerun.plane import color_array, on_screen
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import rerun as rr
 
+from replay.colors import BACKGROUND, CAMERA, CONTACT
 from replay.events import SensorImage
-from replay.rerun.colors import BACKGROUND, CAMERA, CONTACT
 from replay.rerun.plane import Frame, lines, texts
 
 DEFORMATION = "deformation"

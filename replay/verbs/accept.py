@@ -12,11 +12,11 @@ from pathlib import Path
 from rich.table import Table
 
 from chsel.errors import RecordingError
-from replay.accept import ResultChange, result_changes, write_accepted
+from replay.comparing.acceptance import ResultChange, result_changes, write_accepted
+from replay.comparing.verification import EQUAL, recordings_in
 from replay.console import Console, plain_table
 from replay.files import sync_folder
 from replay.mcap.reader import read_recording
-from replay.verification import EQUAL, recordings_in
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -113,7 +113,7 @@ def run(given: argparse.Namespace) -> int:
         title = f"{start.object}, {start.session} session, seed {start.seed}, costs of all by "
         write_plot(given.save_plot, outcomes, title + cost.name)
     if given.save_rerun is not None:
-        from replay.rerun.comparison import save_comparison
+        from replay.rerun.comparison_view import save_comparison
 
         save_comparison(given.save_rerun, recording, _results(recording, outcomes))
     for path in outputs:

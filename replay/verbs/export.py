@@ -11,8 +11,8 @@ from rich.filesize import decimal
 from chsel.errors import SettingError
 from replay.arguments import STEPS_HELP, path_argument
 from replay.console import Console
-from replay.export import FORMATS, write_export
-from replay.export_content import EXPORTS, exported_archive
+from replay.content.export_content import EXPORTS, exported_archive
+from replay.content.export_files import FORMATS, write_export
 from replay.mcap.reader import read_recording
 
 

@@ -18,9 +18,9 @@ from rich.table import Table
 
 from chsel.errors import RecordingError, SessionError
 from replay.console import Console, plain_table, print_error
+from replay.content.recording_info import RecordingInfo, recording_info
 from replay.raw.log_display import fact_table, log_overview, show_log
 from replay.raw.log_info import LogInfo, is_other_programs, log_info
-from replay.recording_info import RecordingInfo, recording_info
 
 _IN_FULL = 3  # files; of more, each is a line
 _EITHER_END = 5  # steps that are shown of many

@@ -18,12 +18,12 @@ from chsel.errors import SettingError
 from chsel.methods import METHODS
 from replay.arguments import path_argument
 from replay.comparing.comparison import common_cost, numbers_under, recorded_label
+from replay.comparing.step_again import StepAgain, register_step_again
 from replay.console import Console, plain_table
 from replay.files import require_new
 from replay.mcap.reader import Recording, read_recording
 from replay.registration import other_method
-from replay.rerun.recorder import draw_recording
-from replay.step_again import StepAgain, register_step_again
+from replay.rerun.rerun_recorder import draw_recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

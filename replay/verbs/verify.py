@@ -9,8 +9,14 @@ import argparse
 import time
 
 from chsel.numerics.threads import require_threads
+from replay.comparing.verification import (
+    DIFFERS,
+    NO_RESULT,
+    FileVerdict,
+    recordings_in,
+    verified_files,
+)
 from replay.console import Console, Progress, print_error
-from replay.verification import DIFFERS, NO_RESULT, FileVerdict, recordings_in, verified_files
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

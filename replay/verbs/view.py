@@ -13,7 +13,7 @@ from replay.arguments import path_argument
 from replay.console import Console
 from replay.files import require_new
 from replay.mcap.reader import Recording, read_recording
-from replay.rerun.recorder import draw_recording
+from replay.rerun.rerun_recorder import draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
 
 _STEP_HELP = (

@@ -12,9 +12,9 @@ from typing import Self
 
 from chsel.errors import RecordingError
 from chsel.methods.method import Method
+from replay.content.recording_info import recording_digest
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.files import WritingError
-from replay.recording_info import recording_digest
 from replay.registration import symmetry_for_errors
 from runners.run.display import Display
 from runners.run.recording import open_recorder, write_in_run_folder

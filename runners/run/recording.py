@@ -71,7 +71,7 @@ def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
         recorders.append(BackgroundRecorder(McapRecorder(folder / "recording.mcap")))
     if config.rerun or config.live:
         os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
-        from replay.rerun.recorder import RerunRecorder
+        from replay.rerun.rerun_recorder import RerunRecorder
 
         path = folder / "recording.rrd" if config.rerun else None
         pictures = RerunRecorder(path, live=config.live)

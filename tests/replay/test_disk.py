@@ -16,7 +16,7 @@ from chsel.problem import online_registration as online
 from replay.__main__ import main
 from replay.files import WritingError, new_file, whole_file
 from replay.mcap.writer import McapRecorder
-from replay.rerun.recorder import RerunRecorder
+from replay.rerun.rerun_recorder import RerunRecorder
 from runners.benchmarks import report
 from runners.run.recording import write_in_run_folder
 from tests.runners.in_process import run

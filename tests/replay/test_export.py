@@ -14,10 +14,10 @@ import pytest
 from chsel.errors import RecordingError, SettingError
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
-from replay import export
 from replay.__main__ import main
+from replay.content import export_files as export
+from replay.content.export_content import EXPORTS, exported_archive
 from replay.events import HypothesesFound, Probe, SnapshotTaken
-from replay.export_content import EXPORTS, exported_archive
 from replay.mcap.reader import read_recording
 from runners.sessions.points import PointsSession, PointsSettings
 

@@ -8,9 +8,9 @@ import pytest
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
+from replay.comparing.verification import verify
 from replay.events import Event
 from replay.mcap.reader import read_recording
-from replay.verification import verify
 from tests.replay.conftest import same_bits
 from tests.tools.fuzz_recordings import Original, main, originals, run_case
 from tests.tools.fuzzing import Tally, peak_memory, quiet

@@ -20,9 +20,9 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from chsel.errors import RecordingError
 from replay.__main__ import main
+from replay.content.recording_info import recording_info
 from replay.events import Event, HypothesesFound, Probe, ProblemPosed
 from replay.mcap.writer import McapRecorder
-from replay.recording_info import recording_info
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 ROW = r"(?m)^ +(\d+) +\d+ +\d+ +\d+ +\d+ "  # of the table of steps

@@ -15,7 +15,7 @@ from chsel.problem.poses import axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.accept import best_pose_moves
+from replay.comparing.acceptance import best_pose_moves
 from replay.comparing.comparison import numbers_under
 from replay.events import Measured, ProblemPosed, SessionStarted
 from replay.recorder import ListRecorder

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from replay.__main__ import main
-from replay.accept import write_accepted
+from replay.comparing.acceptance import write_accepted
 from replay.events import RigDescribed, SensorImage
 from replay.mcap.reader import read_recording
 from tests.replay.conftest import same_bits

@@ -11,13 +11,13 @@ import pytest
 
 from chsel.errors import RecordingError, SettingError
 from chsel.problem.registration_problem import Hypotheses
-from replay import step_again
 from replay.__main__ import main
+from replay.comparing import step_again
+from replay.comparing.verification import EQUAL, verify
 from replay.environment import environment
 from replay.events import Event, HypothesesFound, SessionEnded
 from replay.mcap.reader import Recording, read_recording
 from replay.registration import other_method
-from replay.verification import EQUAL, verify
 from tests.tools.small_recordings import registered_session, write_recording
 
 

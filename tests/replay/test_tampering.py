@@ -15,14 +15,14 @@ from mcap.opcode import Opcode
 from chsel.errors import RecordingError
 from replay.__main__ import main
 from replay.comparing.results import is_close
+from replay.comparing.verification import DIFFERS, EQUAL, verify
+from replay.content.recording_info import recording_digest, recording_info
 from replay.events import Event
 from replay.mcap.encoding import decode, encode
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover
 from replay.mcap.schemas import RECORDS
-from replay.recording_info import recording_digest, recording_info
-from replay.verification import DIFFERS, EQUAL, verify
 from tests.tools.mutations import (
     changed_messages,
     file_of,

@@ -13,10 +13,10 @@ import pytest
 
 from chsel.problem.registration_problem import Hypotheses
 from replay.__main__ import main
+from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verified_files, verify
 from replay.events import Event, HypothesesFound, Measured, Probe, SessionStarted, Traced
 from replay.mcap.reader import read_recording
 from replay.registration import recorded_method
-from replay.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, verified_files, verify
 from tests.tools.small_recordings import measured_again
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"

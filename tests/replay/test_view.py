@@ -27,7 +27,7 @@ from replay import __main__
 from replay.events import Event, SessionStarted, Timed
 from replay.mcap.reader import read_recording
 from replay.rerun import viewer as rerun_viewer
-from replay.rerun.recorder import RerunRecorder, draw_recording
+from replay.rerun.rerun_recorder import RerunRecorder, draw_recording
 from replay.rerun.viewer import web_server
 from tests.tools.rrd_rows import opens_at
 

@@ -16,7 +16,7 @@ from chsel.errors import RecordingError
 from replay.__main__ import main as replay_main
 from replay.mcap.reader import Recording, read_recording
 from replay.recorder import BackgroundRecorder
-from replay.rerun.recorder import RerunRecorder
+from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.stream import RrdFile
 from runners.run.recording import RecordingConfig, open_recorder
 from tests.tools.kill_sessions import points_session, reported_probes

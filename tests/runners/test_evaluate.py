@@ -19,8 +19,8 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 
+from replay.comparing.verification import EQUAL, verify
 from replay.mcap.reader import read_recording
-from replay.verification import EQUAL, verify
 from runners import evaluate, plausible, probe
 from runners.command.choices import CONF
 from runners.evaluation.plan import Plan, Trial

@@ -29,10 +29,10 @@ from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.problem.poses import axis_angle
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.settings import settings_mapping
+from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.events import Measured
 from replay.files import WritingError, whole_file
 from replay.mcap.reader import read_recording
-from replay.verification import EQUAL, NO_RESULT, verify
 from runners.evaluation import run_method, scheduling
 from runners.evaluation.cluster import Connection, LocalConfig, connected
 from runners.evaluation.configurations import configurations_of

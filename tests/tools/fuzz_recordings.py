@@ -19,11 +19,11 @@ import numpy as np
 
 from chsel.errors import ChselError, RecordingError
 from replay.comparing.recording_diff import recording_diff
+from replay.comparing.verification import DIFFERS, EQUAL, Verdict, verify
+from replay.content.recording_info import recording_info
 from replay.events import Event, HypothesesFound, ProblemPosed, SessionStarted
 from replay.mcap.reader import Recording, read_recording
-from replay.recording_info import recording_info
 from replay.registration import recorded_method
-from replay.verification import DIFFERS, EQUAL, Verdict, verify
 from tests.replay.conftest import same_bits
 from tests.tools.fuzzing import Tally, WrongOutcome, run_cases
 from tests.tools.mutations import LAYERS, Random, file_of, meaning, split

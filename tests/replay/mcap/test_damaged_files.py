@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
 from chsel.errors import RecordingError, SessionError
+from replay.content.recording_info import recording_info
 from replay.events import Event, Logged, Probe, ProblemPosed, SessionEnded
 from replay.mcap.contents import Contents
 from replay.mcap.file import LIMITS
@@ -25,7 +26,6 @@ from replay.mcap.recovery import recover, tells_loss
 from replay.raw.log_info import log_info
 from replay.raw.raw_file import RawFile
 from replay.raw.raw_reading import RawMessage, Wanted
-from replay.recording_info import recording_info
 from tests.replay.conftest import example_events, same_bits
 from tests.runners.sensors.small_logs import ros2_sent, write_ros2
 from tests.tools.fuzzing import peak_memory

@@ -11,11 +11,11 @@ import pytest
 
 from chsel.errors import RecordingError
 from replay.__main__ import main
+from replay.comparing.verification import EQUAL, verify
 from replay.events import Event, HypothesesFound, SessionStarted
 from replay.lost_attachment import is_lost
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import Recovered, recover
-from replay.verification import EQUAL, verify
 from tests.replay.conftest import same_bits
 from tests.tools.small_recordings import registered_session, write_recording
 

@@ -14,6 +14,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
 from replay.__main__ import main
+from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.events import (
     Event,
     HypothesesFound,
@@ -29,7 +30,6 @@ from replay.mcap.reader import read_recording
 from replay.mcap.records import ENDS_EARLY, NO_RECORD
 from replay.mcap.recovery import Recovered, recover, tells_loss
 from replay.mcap.writer import McapRecorder
-from replay.verification import EQUAL, NO_RESULT, verify
 from tests.tools.kill_sessions import PROBES, quick_session
 from tests.tools.mutations import joined, packed, split, unpacked
 

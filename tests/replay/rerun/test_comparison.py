@@ -16,12 +16,12 @@ from chsel.errors import RecordingError
 from chsel.plausible.pose_metrics import spread
 from chsel.problem.poses import compose, inverse
 from chsel.problem.registration_problem import Hypotheses
+from replay.colors import cost_colors, number
 from replay.comparing.comparison import common_cost, numbers_under
 from replay.events import Event
 from replay.mcap.reader import Recording, read_recording
-from replay.rerun.colors import cost_colors, number
-from replay.rerun.comparison import ranked, save_comparison
 from replay.rerun.comparison_layout import CURVES, entity_names
+from replay.rerun.comparison_view import ranked, save_comparison
 from replay.rerun.hypotheses import LEVELS
 from tests.tools.rrd_rows import Row, read, shown_at
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from replay.rerun.colors import CostScale, cost_colors, number
+from replay.colors import CostScale, cost_colors, number
 from replay.rerun.hypotheses import LEVELS, cost_levels
 from replay.rerun.meshes import coarsened
 from replay.rerun.plane import Frame, ticks

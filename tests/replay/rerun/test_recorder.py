@@ -42,7 +42,7 @@ from replay.events import (
 from replay.recorder import BackgroundRecorder
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.hypotheses import LEVELS, MOST
-from replay.rerun.recorder import RerunRecorder
+from replay.rerun.rerun_recorder import RerunRecorder
 from tests.tools.rrd_rows import (
     Row,
     at_probe,

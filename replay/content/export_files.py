@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chsel.errors import RecordingError, require_choice
+from replay.content.standard_json import standard
 from replay.files import new_file
 from replay.mcap.reader import Recording
-from replay.standard_json import standard
 
 FORMATS = ("npz", "csv", "json")
 

@@ -17,6 +17,7 @@ from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.comparing.plausible import PlausibleSets
 from replay.comparing.results import ResultDifferences, has_measured, recorded_registrations
+from replay.comparing.verification import Verdict
 from replay.environment import environment, environment_differences
 from replay.events import (
     HypothesesFound,
@@ -41,7 +42,6 @@ from replay.registration import (
     snapshot_interval,
     symmetry_for_errors,
 )
-from replay.verification import Verdict
 
 _RESULTS = (SnapshotTaken, Traced, HypothesesFound, Measured, Timed)
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import chosen_steps
+from replay.content.export_files import Exported, require_any
 from replay.events import SensorImage
-from replay.export import Exported, require_any
 from replay.mcap.contents import Contents
 from replay.mcap.event_messages import step_numbers
 from replay.mcap.foxglove_messages import POINT_CLASSES

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from chsel.errors import RecordingError, SessionError
 from chsel.problem.file_checks import refuse_special_file
+from replay.content.standard_json import standard
 from replay.mcap.damaged import recover_hint
 from replay.mcap.encoding import decode
 from replay.mcap.file import LIMITS, StoredMessage
@@ -18,7 +19,6 @@ from replay.mcap.texts import check_name
 from replay.raw.log_info import is_other_programs
 from replay.raw.raw_file import RawFile, unwatched
 from replay.raw.raw_reading import Wanted
-from replay.standard_json import standard
 
 # What reads everything takes seconds to import, so that it is imported where everything is read.
 if TYPE_CHECKING:

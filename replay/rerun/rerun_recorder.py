@@ -15,6 +15,7 @@ import rerun as rr
 from chsel.errors import RecordingError
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay import events
+from replay.colors import number
 from replay.events import Recorder
 from replay.files import require_new
 from replay.mcap.event_messages import step_numbers
@@ -23,7 +24,6 @@ from replay.mcap.schemas import NUMBERS
 from replay.rerun.archive import ArchiveMap, map_frame
 from replay.rerun.blueprint import USUAL_ARCHIVE, Bounds, bounds_in_sight, session_blueprint
 from replay.rerun.clock import Clock
-from replay.rerun.colors import number
 from replay.rerun.curves import Curves, SearchPlot
 from replay.rerun.hypotheses import HypothesisMeshes
 from replay.rerun.legend import Legend

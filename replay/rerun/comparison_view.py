@@ -15,12 +15,12 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
 from chsel.plausible.pose_metrics import spread
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from replay.colors import SERIES, CostScale, Rgb, number
 from replay.comparing.comparison import CommonCost, common_cost, numbers_under
 from replay.events import Probe, ProblemPosed
 from replay.mcap.reader import Recording
 from replay.rerun.blueprint import bounds_in_sight
 from replay.rerun.clock import PROBE, REGISTRATION
-from replay.rerun.colors import SERIES, CostScale, Rgb, number
 from replay.rerun.comparison_layout import (
     CURVES,
     SUMMARY_FRAME,
