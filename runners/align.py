@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+import trimesh
 from omegaconf import DictConfig
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -23,15 +26,21 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.console import Console
-from runners.align_view import save_view
-from runners.alignment_fit import Fit, fit_of
+from replay.rerun.blueprint import at_last_probe, scene_view
+from replay.rerun.clock import PROBE
+from replay.rerun.meshes import display_mesh
+from replay.rerun.scene import Scene
+from replay.rerun.stream import new_file_stream
 from runners.command.program import command, plain
 from runners.objects.scans import AssetsConfig
+from runners.sensors.alignment_fit import Fit, fit_of
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
 from runners.sessions.problem_source import Source, open_source
 
 Triple = tuple[float, float, float]
 _VIEW = ".pose.rrd"
+_APPLICATION = "chsel alignment"
+_GUESS_COLOR = (240, 140, 40, 60)
 
 
 @dataclass(frozen=True)
@@ -215,6 +224,30 @@ def _about(
         "source": source.digest,
         "sdf": source.problems.problem(source.steps[-1]).sdf.digest,
     }
+
+
+def save_view(
+    path: Path,
+    mesh: trimesh.Trimesh,
+    problem: RegistrationProblem,
+    guess: FloatArray,
+    found: FloatArray,
+) -> None:
+    """Write a new .rrd with the known points and the mesh at both poses (4, 4), world_from_object.
+
+    Raises RecordingError if the file exists or cannot be written.
+    """
+    with new_file_stream(path, _APPLICATION) as stream:
+        stream.set_time(PROBE, sequence=problem.key.step)
+        view = scene_view(
+            problem.workspace, name="The object where it was found; orange: the guess"
+        )
+        stream.send_blueprint(at_last_probe(rrb.Vertical(view)))
+        scene = Scene(stream)
+        scene.set_up(mesh, problem.workspace, found)
+        pose = rr.Transform3D(translation=guess[:3, 3], mat3x3=guess[:3, :3])
+        stream.log("scene/guess", display_mesh(mesh, _GUESS_COLOR), pose, static=True)
+        scene.add_points(problem.points, new=False)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from chsel.errors import require_choice, require_positive
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
 from replay.console import Console
-from runners.benchmarks import report
+from runners.benchmarks import benchmark_tables as report
 from runners.benchmarks.comparison import WHAT, compare
 from runners.benchmarks.measures import MEASURES
 from runners.benchmarks.plot import picture_of_benchmark

@@ -20,12 +20,11 @@ from chsel.methods import METHODS
 from chsel.numerics.threads import require_threads
 from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.settings import build_settings
+from replay.console import Console
 from runners.command.program import command, plain
 from runners.evaluation.cluster import ClusterConfig, cluster_config, connected
-from runners.evaluation.configurations import SENSORS, faulty_name
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label
 from runners.evaluation.definition import definition_text
-from runners.evaluation.display import Display, Progress
 from runners.evaluation.experiment import (
     add_environments,
     collect,
@@ -36,9 +35,11 @@ from runners.evaluation.experiment import (
 from runners.evaluation.external_results import external_folders, read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
+from runners.evaluation.progress_display import Progress, ProgressDisplay
 from runners.evaluation.scheduling import Scheduling
 from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
 from runners.evaluation.sensor_logs import check_log, is_missing
+from runners.evaluation.trial_configurations import SENSORS, faulty_name
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
 from runners.run.scene import PresetName
@@ -115,7 +116,7 @@ def main(config: DictConfig) -> None:
     trials = [Trial(seed, name) for seed in seeds for name in configurations]
     _check_faults(plan, levels)
     _check(plan, trials)
-    display = Display()
+    display = ProgressDisplay()
     with writing_alone(plan.folder, display.say):
         join_experiment(plan, checked.name, configurations, seeds)
         failed = evaluate(plan, trials, cluster, checked.workers, display)
@@ -124,7 +125,11 @@ def main(config: DictConfig) -> None:
 
 
 def evaluate(
-    plan: Plan, trials: list[Trial], cluster: ClusterConfig, workers: int | None, display: Display
+    plan: Plan,
+    trials: list[Trial],
+    cluster: ClusterConfig,
+    workers: int | None,
+    display: ProgressDisplay,
 ) -> bool:
     """Do all tasks that are not finished, and write the tables; whether anything failed."""
     collected = time.monotonic()
@@ -155,10 +160,24 @@ def evaluate(
         if sys.exc_info()[0] is KeyboardInterrupt:
             display.say("interrupted: what is finished stays, and the same command goes on")
     display.summary(results, _labels(plan.folder), definition_text(plan.definition))
-    display.faults(plan.folder)
+    _print_by_faults(plan.folder)
     display.true_poses(true_poses(plan.folder, read_experiment(plan.folder)))
     display.written(plan.folder, results)
     return any(text.startswith("failed") for text in results["status"].to_pylist())
+
+
+def _print_by_faults(folder: Path) -> None:
+    """By level of faults: whether sets hold the truth, and how far hypotheses are from it."""
+    # Pandas and matplotlib take a second to import, which an evaluation starts without.
+    from runners.reporting.by_faults import tables_by_faults
+    from runners.reporting.evaluation_folder import open_evaluation
+    from runners.reporting.method_style import method_styles
+    from runners.reporting.tables import print_table
+
+    evaluation = open_evaluation(folder)
+    styles = method_styles(evaluation.methods)
+    for table in tables_by_faults(evaluation.rows, styles):
+        print_table(Console(), table)
 
 
 def _plan(config: EvaluateConfig) -> Plan:

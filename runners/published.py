@@ -16,15 +16,15 @@ from omegaconf import DictConfig
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
 from runners.command.program import command, plain
-from runners.evaluation.display import Display, Progress
 from runners.evaluation.plan import Trial
+from runners.evaluation.progress_display import Progress, ProgressDisplay
 from runners.evaluation.repeats import repeat_seed, require_repeats
 from runners.evaluation.selection import chosen_seeds
 from runners.evaluation.trial_session import read_told
 from runners.published_package.environment import PackageConfig, interpreter
 from runners.published_package.files import PackageFiles
+from runners.published_package.package_session import PackageSession
 from runners.published_package.process import PublishedPackage
-from runners.published_package.session import PackageSession
 
 _SEED = re.compile(r"seed_(\d{1,19})")
 
@@ -57,7 +57,7 @@ def main(config: DictConfig) -> None:
     """Register what is not registered yet."""
     checked = build_settings(PublishedConfig, plain(config), "published")
     trials = found_trials(checked)
-    display = Display()
+    display = ProgressDisplay()
     with PublishedPackage(interpreter(checked.package, display.say)) as package:
         files = [
             PackageFiles(checked.folder, trial, draw, session, steps, package.versions)
@@ -78,7 +78,9 @@ def main(config: DictConfig) -> None:
         sys.exit(1)
 
 
-def register(files: Sequence[PackageFiles], package: PublishedPackage, display: Display) -> None:
+def register(
+    files: Sequence[PackageFiles], package: PublishedPackage, display: ProgressDisplay
+) -> None:
     """Write all files that are not there yet, and show how far it is."""
     open_files = [one for one in files if one.finished() is None]
     progress = Progress(len(files), finished=len(files) - len(open_files))

@@ -20,7 +20,10 @@ from replay.files import WritingError, whole_file
 from runners.command.program import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
-from runners.simulated_robot.configurations import CabinetConfiguration, find_cabinet_configuration
+from runners.simulated_robot.robot_configurations import (
+    CabinetConfiguration,
+    find_cabinet_configuration,
+)
 from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
 

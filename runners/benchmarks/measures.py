@@ -23,9 +23,9 @@ from chsel.problem.settings import in_preset
 from chsel.problem.streams import StreamKey
 from runners.benchmarks.depth_images import depth_images
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
-from runners.benchmarks.plausible import plausible_sets
+from runners.benchmarks.plausible_sets import plausible_sets
 from runners.benchmarks.problems import PROBLEMS, PosedProblem, Problem, pose
-from runners.benchmarks.recorded import recorded_registrations
+from runners.benchmarks.recording_cost import recorded_registrations
 from runners.benchmarks.registrations import PRESETS, Scope, StageTimer, register
 from runners.benchmarks.timing import Row, in_turn, milliseconds
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from runners.benchmarks.report import number
+from runners.benchmarks.benchmark_tables import number
 from runners.reporting.figures import Picture, new_figure, positive_scale
 
 Values = Mapping[str, Any]

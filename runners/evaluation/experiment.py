@@ -17,7 +17,6 @@ from chsel.errors import RecordingError, SettingError
 from chsel.problem.settings import settings_mapping
 from replay.environment import environment
 from replay.files import WritingError, whole_file
-from runners.evaluation.configurations import SENSORS
 from runners.evaluation.definition import definition_label
 from runners.evaluation.plan import Plan
 from runners.evaluation.table import (
@@ -27,6 +26,7 @@ from runners.evaluation.table import (
     RESULTS_ORDER,
     write_table,
 )
+from runners.evaluation.trial_configurations import SENSORS
 
 FILE = "experiment.json"
 LOCK = ".lock"

@@ -15,7 +15,10 @@ from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.settings import build_settings
 from replay.arguments import chosen_steps
-from runners.evaluation.configurations import (
+from runners.evaluation.contenders import Contender
+from runners.evaluation.definition import definition_label, definition_settings
+from runners.evaluation.metrics import MetricsConfig
+from runners.evaluation.trial_configurations import (
     MOST_PROBES,
     SENSORS,
     TrialConfiguration,
@@ -24,9 +27,6 @@ from runners.evaluation.configurations import (
     recorded_object,
     with_faults,
 )
-from runners.evaluation.contenders import Contender
-from runners.evaluation.definition import definition_label, definition_settings
-from runners.evaluation.metrics import MetricsConfig
 from runners.objects.loader import ObjectConfig
 from runners.sessions import session_settings
 from runners.sessions.faults import CLEAN, LEVELS, level_name

@@ -8,9 +8,9 @@ from typing import Any
 
 from chsel.errors import ChselError
 from runners.evaluation.cluster import Connection
-from runners.evaluation.display import Progress
 from runners.evaluation.external_results import PRESET, external_digest, read_external
 from runners.evaluation.plan import Plan, Task, Trial
+from runners.evaluation.progress_display import Progress
 from runners.evaluation.table import RESULTS, Row, is_part, part_source, write_part
 from runners.evaluation.tasks import Outcome, input_files, run_on_worker, store_files
 from runners.evaluation.trial_session import has_session, read_session

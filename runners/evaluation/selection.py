@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from chsel.errors import SettingError
-from runners.evaluation.configurations import TrialConfiguration
+from runners.evaluation.trial_configurations import TrialConfiguration
 
 MOST_SEEDS = 100_000
 SEED_LIMIT = 2**63  # a column of the table holds them

@@ -21,9 +21,9 @@ from replay.environment import environment
 from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
 from replay.files import WritingError
 from replay.mcap.writer import McapRecorder
-from runners.evaluation.configurations import SENSORS
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.sensor_logs import ensure_log
+from runners.evaluation.trial_configurations import SENSORS
 from runners.evaluation.true_poses import find_truth, known_at_the_end
 from runners.objects.loader import check_size, load_object
 from runners.sessions import open_session

@@ -24,9 +24,9 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.events import Event, Probe
-from runners.alignment_fit import fit_of
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.sensor_logs import guessed_pose, twin_truth
+from runners.sensors.alignment_fit import fit_of
 from runners.sessions.session import Session
 
 

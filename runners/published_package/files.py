@@ -15,7 +15,7 @@ from replay.files import file_digest, whole_file
 from runners.evaluation.external_results import REPEAT_FOLDER
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.repeats import repeat_label
-from runners.published_package.session import PackageSet
+from runners.published_package.package_session import PackageSet
 
 
 @dataclass(frozen=True)

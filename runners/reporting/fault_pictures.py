@@ -29,7 +29,7 @@ from chsel.problem.settings import build_settings
 from chsel.problem.trust import trust_in
 from replay.console import Console, print_error
 from replay.events import Probe
-from runners.evaluation.configurations import object_values
+from runners.evaluation.trial_configurations import object_values
 from runners.objects.loader import ObjectConfig, load_object
 from runners.reporting.figures import FORMATS, Picture, drawing, new_figure, write_picture
 from runners.reporting.silhouette import (

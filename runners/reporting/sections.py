@@ -15,7 +15,7 @@ from runners.reporting.over_iterations import over_iterations
 from runners.reporting.probing_sequence import probing_sequence
 from runners.reporting.registration_times import registration_times
 from runners.reporting.section import Section, Subject
-from runners.reporting.true_poses import true_poses
+from runners.reporting.true_pose_table import true_poses
 
 SECTIONS: tuple[Callable[[Subject], Section | None], ...] = (
     completeness,

@@ -19,7 +19,7 @@ from runners.objects.scans import AssetsConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.session_report import Report
 from runners.sessions import open_session, session_settings
-from runners.sessions.depth_frame import DepthFrameSession
+from runners.sessions.depth_frame_session import DepthFrameSession
 from runners.sessions.faults import without_clean_faults
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession

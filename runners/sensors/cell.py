@@ -69,7 +69,7 @@ class FreeMap:
 
 
 @dataclass(frozen=True)
-class Cell:
+class RobotCell:
     """The frames, the free space, and what holds for all sensors."""
 
     world: str  # the frame of all known points

@@ -8,7 +8,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
 from chsel.sensing.regions import main_regions, point_regions
-from runners.sensors.cell import Cell
+from runners.sensors.cell import RobotCell
 from runners.sensors.log.messages import CloudMessage
 from runners.sensors.rig import CloudRig
 from runners.sensors.session_report import Counts
@@ -19,7 +19,7 @@ FARTHEST = 100.0  # m: no robot that probes an object measures rays of this leng
 class Clouds:
     """The points of one topic."""
 
-    def __init__(self, rig: CloudRig, cell: Cell, resolution: float) -> None:
+    def __init__(self, rig: CloudRig, cell: RobotCell, resolution: float) -> None:
         """resolution: metres; of surface points one a voxel of this side is kept."""
         self._rig, self._cell = rig, cell
         self._lattice = Lattice(cell.free.workspace.lower, resolution)

@@ -10,7 +10,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.sensing.contact_patch import contact_subset, share
-from runners.sensors.cell import Cell
+from runners.sensors.cell import RobotCell
 from runners.sensors.depth_camera import View
 from runners.sensors.pad import Imprint, Pad
 from runners.sensors.rig import Rig
@@ -34,7 +34,7 @@ class PushEnd:
 class PushWatch:
     """Keeps of every pad the image in which the hand was furthest."""
 
-    def __init__(self, frame: str, cell: Cell) -> None:
+    def __init__(self, frame: str, cell: RobotCell) -> None:
         """frame: of the hand, z pointing forward."""
         self._frame, self._cell = frame, cell
         self._furthest: dict[str, tuple[float, FloatArray, Pad, View]] = {}
@@ -82,7 +82,7 @@ class Contacts:
 class ContactFinder:
     """Picks a probe's contacts, by the rig's rule and its annotations (CHSEL, Sec. V-B)."""
 
-    def __init__(self, rig: Rig, pads: Mapping[str, Pad], cell: Cell, seed: int) -> None:
+    def __init__(self, rig: Rig, pads: Mapping[str, Pad], cell: RobotCell, seed: int) -> None:
         self._rig, self._pads, self._cell, self._seed = rig, pads, cell, seed
 
     def felt(

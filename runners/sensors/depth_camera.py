@@ -11,7 +11,7 @@ from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges, valid_pix
 from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.regions import depth_regions, speckle_free
 from replay.events import SensorImage
-from runners.sensors.cell import Cell
+from runners.sensors.cell import RobotCell
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, CameraRig, GateRig
 from runners.sensors.session_report import Counts
@@ -32,7 +32,7 @@ class View:
 class DepthSource:
     """The images of one camera."""
 
-    def __init__(self, rig: CameraRig | BubbleRig, camera: PinholeCamera, cell: Cell) -> None:
+    def __init__(self, rig: CameraRig | BubbleRig, camera: PinholeCamera, cell: RobotCell) -> None:
         self.rig, self.camera, self.cell = rig, camera, cell
 
     def view(self, time: int, message: ImageMessage, counts: Counts) -> View | None:
@@ -116,7 +116,7 @@ def mark_rays(
 class DepthCamera:
     """Marks what it sees through (CHSEL, Sec. V-B: rays to 95 % of the depth)."""
 
-    def __init__(self, rig: CameraRig, camera: PinholeCamera, cell: Cell) -> None:
+    def __init__(self, rig: CameraRig, camera: PinholeCamera, cell: RobotCell) -> None:
         self._rig, self._cell = rig, cell
         self._source = DepthSource(rig, camera, cell)
         free = cell.free

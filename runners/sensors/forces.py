@@ -13,7 +13,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse, rotated
 from chsel.sensing.force_contact import contact_ahead, contact_on_axis
-from runners.sensors.cell import Cell
+from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import Contacts
 from runners.sensors.hand import HandModel
 from runners.sensors.log.messages import WrenchMessage
@@ -43,7 +43,7 @@ class Forces:
         self,
         rig: ForceRig,
         hand: tuple[HandRig, HandModel, JointHistory],
-        cell: Cell,
+        cell: RobotCell,
         resolution: float,
     ) -> None:
         """resolution: metres; of the contacts of a probe one a voxel of this side is kept."""

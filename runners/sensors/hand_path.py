@@ -11,7 +11,7 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse
 from chsel.sensing.swept import between, interior_lattice
-from runners.sensors.cell import Cell
+from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import PushEnd
 from runners.sensors.hand import HandModel
 from runners.sensors.log.motion import JointHistory
@@ -36,7 +36,7 @@ class HandPath:
     """Where the hand was, probe by probe, and the free space that follows."""
 
     def __init__(
-        self, rig: HandRig, model: HandModel, joints: JointHistory, times: IntArray, cell: Cell
+        self, rig: HandRig, model: HandModel, joints: JointHistory, times: IntArray, cell: RobotCell
     ) -> None:
         """times (T,): of all transforms, nanoseconds, ascending."""
         self._rig, self._model, self._joints, self._times = rig, model, joints, times

@@ -15,7 +15,7 @@ from chsel.sensing.contact_patch import contact_mask, deformation, smooth
 from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from chsel.sensing.regions import depth_regions, main_regions, small_regions
 from replay.events import SensorImage
-from runners.sensors.cell import Cell
+from runners.sensors.cell import RobotCell
 from runners.sensors.depth_camera import DepthSource, View, intrinsics_of, metres, recorded
 from runners.sensors.log.images import read_image
 from runners.sensors.log.messages import ImageMessage
@@ -104,7 +104,7 @@ class Pad:
         contact: ContactRig,
         camera: PinholeCamera,
         reference: FloatArray,
-        cell: Cell,
+        cell: RobotCell,
         *,
         inside: bool,
     ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
 from replay.events import Logged, Probe, RigDescribed, SensorImage
-from runners.sensors.cell import Cell
+from runners.sensors.cell import RobotCell
 from runners.sensors.clouds import Clouds
 from runners.sensors.contacts import ContactFinder, Contacts, PushWatch
 from runners.sensors.depth_camera import DepthCamera
@@ -36,7 +36,7 @@ class SecondPass:
         self,
         rig: Rig,
         first_pass: FirstPass,
-        cell: Cell,
+        cell: RobotCell,
         report: Report,
         hand: HandModel | None,
         *,

@@ -11,7 +11,7 @@ import trimesh
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
-from runners.sessions import hand
+from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import find_configuration
 from runners.sessions.faults import probed_mesh
 from runners.sessions.placement import laid_down

@@ -16,7 +16,7 @@ from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import Presets
 from chsel.problem.streams import Purpose, StreamKey
 from replay.events import Probe
-from runners.sessions import hand
+from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import WORKSPACE, Configuration
 from runners.sessions.faults import Faults, FaultSettings, probed_mesh
 from runners.sessions.free_space import box_shell, floor_slab, swept_voxels

@@ -11,7 +11,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
 from replay.events import Logged, RigDescribed
 from runners.objects.loader import ObjectModel
-from runners.sensors.cell import Cell, FreeMap
+from runners.sensors.cell import FreeMap, RobotCell
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.first_pass import read_first_pass
 from runners.sensors.hand import HandModel
@@ -22,7 +22,7 @@ from runners.sensors.pose_file import beside, read_pose
 from runners.sensors.rig import Rig
 from runners.sensors.second_pass import SecondPass
 from runners.sensors.session_report import LogWarnings, Report
-from runners.sessions.depth_frame import DepthFrameSession
+from runners.sessions.depth_frame_session import DepthFrameSession
 from runners.sessions.free_space import box_shell
 from runners.sessions.session import Progress, Session, SessionEvent, unwatched
 
@@ -126,7 +126,7 @@ class SensorsSession:
         """The probes of the log, in their order; its images are read as they go."""
         rig, first_pass, warnings = self._rig, self._first_pass, LogWarnings(self._opening)
         self.report.by_probe.clear()
-        cell = Cell(
+        cell = RobotCell(
             rig.world,
             first_pass.tree,
             rig.clock.gap,

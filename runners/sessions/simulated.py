@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
-from runners.sessions import hand
+from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import Configuration, find_configuration
 from runners.sessions.faults import probed_mesh
 from runners.sessions.physics_engine import connect, silent

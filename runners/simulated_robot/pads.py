@@ -11,7 +11,7 @@ from chsel.problem.poses import apply, inverse
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import ContactRig
 from runners.simulated_robot import wrist
-from runners.simulated_robot.scene import Scene
+from runners.simulated_robot.physics_scene import PhysicsScene
 from runners.simulated_robot.settings import RenderedCamera
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 
@@ -91,7 +91,7 @@ class Pads:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: PhysicsScene,
         camera: RenderedCamera,
         mesh: trimesh.Trimesh,
         world_from_object: FloatArray,

@@ -13,7 +13,7 @@ from runners.simulated_robot import cabinet, ros_messages, wrist
 from runners.simulated_robot.log_writer import LogWriter
 from runners.simulated_robot.noise import bubble_depth, stereo_depth
 from runners.simulated_robot.pads import Pads
-from runners.simulated_robot.scene import Scene
+from runners.simulated_robot.physics_scene import PhysicsScene
 from runners.simulated_robot.settings import RobotSettings
 
 WORLD = "world"
@@ -38,7 +38,7 @@ class Recorder:
     """Writes the robot's streams. `tick` is one moment of the clock, the wrist at some place."""
 
     def __init__(
-        self, log: LogWriter, scene: Scene, pads: Pads, settings: RobotSettings, seed: int
+        self, log: LogWriter, scene: PhysicsScene, pads: Pads, settings: RobotSettings, seed: int
     ) -> None:
         self._log = log
         self._scene = scene

@@ -15,11 +15,11 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey, normals
 from replay.files import whole_file
 from runners.simulated_robot import wrist
-from runners.simulated_robot.configurations import REST, CabinetConfiguration, stood_on_shelf
 from runners.simulated_robot.log_writer import LogWriter
 from runners.simulated_robot.pads import Pads
+from runners.simulated_robot.physics_scene import PhysicsScene
 from runners.simulated_robot.recorder import TICK, Recorder
-from runners.simulated_robot.scene import Scene
+from runners.simulated_robot.robot_configurations import REST, CabinetConfiguration, stood_on_shelf
 from runners.simulated_robot.settings import RobotSettings
 
 HOME = (0.48, 0.0, 0.433)  # m: where the wrist is before and after all probes
@@ -71,7 +71,7 @@ def simulate_log(
     world_from_object = stood_on_shelf(mesh, configuration)
     pushes = []
     with (
-        closing(Scene(mesh, world_from_object)) as scene,
+        closing(PhysicsScene(mesh, world_from_object)) as scene,
         whole_file(path) as beside,
         LogWriter(beside) as log,
     ):
@@ -99,7 +99,7 @@ class _Robot:
     """Moves the wrist on straight lines, tick by tick."""
 
     def __init__(
-        self, scene: Scene, pads: Pads, recorder: Recorder, settings: RobotSettings
+        self, scene: PhysicsScene, pads: Pads, recorder: Recorder, settings: RobotSettings
     ) -> None:
         self._scene = scene
         self._pads = pads

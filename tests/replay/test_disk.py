@@ -17,7 +17,7 @@ from replay.__main__ import main
 from replay.files import WritingError, new_file, whole_file
 from replay.mcap.writer import McapRecorder
 from replay.rerun.rerun_recorder import RerunRecorder
-from runners.benchmarks import report
+from runners.benchmarks import benchmark_tables as report
 from runners.run.recording import write_in_run_folder
 from tests.runners.in_process import run
 

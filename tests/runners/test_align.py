@@ -21,7 +21,7 @@ from runners import align, plausible, probe
 from runners.evaluation import true_poses
 from runners.objects.models import MODELS
 from runners.sensors.pose_file import beside, read_pose
-from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS
+from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 from tests.runners.in_process import Done, run
 

@@ -18,13 +18,13 @@ from matplotlib.container import BarContainer
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from runners import benchmark
+from runners.benchmarks.benchmark_tables import number, ratios
 from runners.benchmarks.comparison import BenchmarkError, require_equal
 from runners.benchmarks.measures import methods
-from runners.benchmarks.plausible import plausible_sets
+from runners.benchmarks.plausible_sets import plausible_sets
 from runners.benchmarks.plot import picture_of_benchmark
 from runners.benchmarks.problems import PROBLEMS, WORKSPACE, PosedProblem, Problem, drill, pose
 from runners.benchmarks.registrations import PRESETS, Scope, Steps
-from runners.benchmarks.report import number, ratios
 from runners.benchmarks.timing import Row, in_turn
 from runners.published_package.environment import PackageError
 from runners.published_package.problem_file import load_problem

@@ -10,11 +10,11 @@ import pytest
 
 from chsel.errors import SettingError
 from runners import evaluate, report
-from runners.evaluation.configurations import configurations_of, with_faults
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.selection import chosen_names
 from runners.evaluation.table import RESULTS, read_part, write_part
+from runners.evaluation.trial_configurations import configurations_of, with_faults
 from runners.reporting.by_faults import picture_of_shares, shares_held, tables_by_faults
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_style import method_styles

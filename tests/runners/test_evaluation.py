@@ -35,16 +35,16 @@ from replay.files import WritingError, whole_file
 from replay.mcap.reader import read_recording
 from runners.evaluation import run_method, scheduling
 from runners.evaluation.cluster import Connection, LocalConfig, connected
-from runners.evaluation.configurations import configurations_of
 from runners.evaluation.contenders import Contender, chosen_contenders
-from runners.evaluation.display import Progress
 from runners.evaluation.experiment import collect, join_experiment, writing_alone
 from runners.evaluation.external_results import ExternalSetError, read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
+from runners.evaluation.progress_display import Progress
 from runners.evaluation.scheduling import Scheduling, is_finished
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
 from runners.evaluation.tasks import Outcome, input_files, run_on_worker, run_task
+from runners.evaluation.trial_configurations import configurations_of
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.sessions.probing import ProbingSettings
 from tests.runners.in_process import do_task

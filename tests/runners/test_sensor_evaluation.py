@@ -19,9 +19,8 @@ from replay.events import RigDescribed
 from replay.mcap.reader import read_recording
 from runners import evaluate
 from runners.command.choices import CONF
-from runners.evaluation.configurations import configurations_of
-from runners.evaluation.display import Display
 from runners.evaluation.plan import Plan, Task, Trial
+from runners.evaluation.progress_display import ProgressDisplay
 from runners.evaluation.selection import chosen_configurations
 from runners.evaluation.sensor_logs import (
     TRUTH,
@@ -31,6 +30,7 @@ from runners.evaluation.sensor_logs import (
     guessed_pose,
     is_missing,
 )
+from runners.evaluation.trial_configurations import configurations_of
 from runners.evaluation.trial_session import open_recorded
 from runners.evaluation.true_poses import FoundPose, true_poses
 from runners.sensors.pose_file import beside, read_pose, write_pose
@@ -142,12 +142,12 @@ def test_a_pose_set_by_hand_is_near_the_truth_but_not_it() -> None:
 
 
 def test_how_far_true_poses_are_off_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    Display().true_poses([])
+    ProgressDisplay().true_poses([])
     assert capsys.readouterr().out == ""
     near = FoundPose("cabinet_drill", 0, 0.001, 0.1, 0.0004, 0, 0.01, 0.1, 0.002, np.deg2rad(1.0))
     far = replace(near, mean_distance=0.0006, violations=3, position_error=0.006)
     own = replace(near, mean_distance=0.0002, position_error=None, rotation_error=None)
-    Display().true_poses([near, far, own])
+    ProgressDisplay().true_poses([near, far, own])
     told = capsys.readouterr().out
     assert "sought in 3 trials: mean |SDF| of contacts 0.40 mm, 3 free points inside" in told
     assert "simulated truth of 2, modulo symmetries: 4.0 mm in the mean" in told

@@ -17,12 +17,12 @@ from runners.objects.models import MODELS
 from runners.sensors.rig import Rig
 from runners.simulate_rig import SimulateRigConfig
 from runners.simulated_robot import wrist
-from runners.simulated_robot.configurations import (
+from runners.simulated_robot.recorder import WORLD, WRIST
+from runners.simulated_robot.robot_configurations import (
     CABINET_CONFIGURATIONS,
     CABINET_WORKSPACE,
     stood_on_shelf,
 )
-from runners.simulated_robot.recorder import WORLD, WRIST
 from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 from tests.runners.in_process import run

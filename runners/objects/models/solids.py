@@ -12,7 +12,7 @@ MILLIMETRE = 1e-3
 AXES = "xyz"
 
 
-class Section(NamedTuple):
+class CrossSection(NamedTuple):
     """A superellipse |u/a|^power + |v/b|^power = 1 across a loft's axis; lengths in millimetres.
 
     `u` and `v` are its centre, `width` (2a) and `height` (2b) its full extents. A power of 2 is an
@@ -28,7 +28,7 @@ class Section(NamedTuple):
     power: float = 2.0
 
 
-def _ring(section: Section, segments: int) -> np.ndarray:
+def _ring(section: CrossSection, segments: int) -> np.ndarray:
     angle = 2 * np.pi * np.arange(segments) / segments
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (segments, 2)
     unit = np.sign(unit) * np.abs(unit) ** (2 / section.power)
@@ -38,7 +38,9 @@ def _ring(section: Section, segments: int) -> np.ndarray:
     return ring
 
 
-def loft(sections: Sequence[Section], *, axis: str = "z", segments: int = 32) -> trimesh.Trimesh:
+def loft(
+    sections: Sequence[CrossSection], *, axis: str = "z", segments: int = 32
+) -> trimesh.Trimesh:
     """The closed solid through `sections`, which are in rising order of `at` along `axis`; mm."""
     rings = [_ring(section, segments) for section in sections]
     ends = [rings[0].mean(axis=0), rings[-1].mean(axis=0)]

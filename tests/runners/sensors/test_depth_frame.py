@@ -25,7 +25,7 @@ from runners.sensors import depth_frame_points as module
 from runners.sensors.depth_frame import DepthFrame, read_depth_frame
 from runners.sensors.depth_frame_points import depth_frame_points, one_per_voxel
 from runners.sensors.rig import GateRig, Rig
-from runners.sessions.depth_frame import DepthFrameSession
+from runners.sessions.depth_frame_session import DepthFrameSession
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 WIDTH, HEIGHT = 80, 60

@@ -11,7 +11,7 @@ from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.objects.models import MODELS
-from runners.sessions import hand
+from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.free_space import box_shell
 from runners.sessions.kinematic import KinematicEngine, open_kinematic

@@ -575,7 +575,7 @@ def test_damaged_logs_give_points_or_one_clear_error(
 
 def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    from runners.simulated_robot.configurations import find_cabinet_configuration
+    from runners.simulated_robot.robot_configurations import find_cabinet_configuration
     from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
     from runners.simulated_robot.simulation import simulate_log
 

@@ -9,7 +9,7 @@ from chsel.errors import SessionError
 from chsel.problem.poses import apply, inverse
 from runners.objects.models import MODELS
 from runners.simulated_robot import wrist
-from runners.simulated_robot.configurations import (
+from runners.simulated_robot.robot_configurations import (
     CABINET_CONFIGURATIONS,
     REST,
     SHELF,

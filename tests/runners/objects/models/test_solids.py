@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runners.objects.models.solids import Section, cut, loft, placed, united
+from runners.objects.models.solids import CrossSection, cut, loft, placed, united
 
-BAR = [Section(0, 1, 2, 4, 6, 40), Section(10, 1, 2, 4, 6, 40)]
+BAR = [CrossSection(0, 1, 2, 4, 6, 40), CrossSection(10, 1, 2, 4, 6, 40)]
 
 
 @pytest.mark.parametrize(
@@ -26,12 +26,12 @@ def test_a_loft_lies_along_its_axis_and_points_outwards(axis: str, bounds: list)
 
 
 def test_a_loft_of_ellipses_has_the_volume_of_a_frustum() -> None:
-    frustum = loft([Section(0, 0, 0, 8, 4), Section(3, 0, 0, 4, 2)], segments=256)
+    frustum = loft([CrossSection(0, 0, 0, 8, 4), CrossSection(3, 0, 0, 4, 2)], segments=256)
     assert frustum.volume == pytest.approx(np.pi * 3 / 3 * (4 * 2 + 2 * 1 + 4), rel=1e-3)
 
 
 def test_a_power_of_one_gives_a_rhombus() -> None:
-    prism = loft([Section(0, 0, 0, 2, 2, 1), Section(1, 0, 0, 2, 2, 1)])
+    prism = loft([CrossSection(0, 0, 0, 2, 2, 1), CrossSection(1, 0, 0, 2, 2, 1)])
     assert prism.volume == pytest.approx(2)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 import pytest
 
-from runners.evaluation.display import Display
+from runners.evaluation.progress_display import ProgressDisplay
 from runners.evaluation.table import RESULTS
 from tests.runners.made_up_evaluations import row
 
@@ -21,7 +21,7 @@ def test_the_summary_is_medians_by_object_in_mm2_and_milliseconds(
     rows += [row("box", 1, "icp", 4) | {"status": "failed: no reason"}]
     rows += [row("can", 0, "svgd", 4, diversity=7.0)]
     table = pa.Table.from_pylist(rows, schema=RESULTS)
-    Display().summary(table, ["icp", "svgd", "cvo"], "wide_sums, by sums")
+    ProgressDisplay().summary(table, ["icp", "svgd", "cvo"], "wide_sums, by sums")
     told = capsys.readouterr().out.splitlines()
     assert "PD in mm²" in told[0]
     cells = [line.split() for line in told]

@@ -15,7 +15,7 @@ from runners.command.choices import CONF
 from runners.objects.loader import ObjectConfig
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.faults import CLEAN, LEVELS
-from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS
+from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
 
 SENSORS = "sensors"
 MOST_PROBES = 1_000

@@ -36,7 +36,7 @@ class Progress:
     waits_for_workers: bool = False
 
 
-class Display:
+class ProgressDisplay:
     """A bar with what is at work, or a line a minute where there is no terminal; then a table."""
 
     def __init__(self) -> None:
@@ -105,19 +105,6 @@ class Display:
         self.say("medians over all steps of all trials: PD in mm² by object, ms a registration")
         self._console.print(table)
         self._console.print(f"plausible sets: {definition}", markup=False)
-
-    def faults(self, folder: Path) -> None:
-        """By level of faults: whether sets hold the truth, and how far hypotheses are from it."""
-        # Pandas and matplotlib take a second to import, which an evaluation starts without.
-        from runners.reporting.by_faults import tables_by_faults
-        from runners.reporting.evaluation_folder import open_evaluation
-        from runners.reporting.method_style import method_styles
-        from runners.reporting.tables import print_table
-
-        evaluation = open_evaluation(folder)
-        styles = method_styles(evaluation.methods)
-        for table in tables_by_faults(evaluation.rows, styles):
-            print_table(self._console, table)
 
     def true_poses(self, found: Sequence[FoundPose]) -> None:
         """How far the true poses that were sought are from guesses, and from a simulated truth."""

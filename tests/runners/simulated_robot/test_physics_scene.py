@@ -15,8 +15,12 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 from runners.objects.models import MODELS
 from runners.simulated_robot import cabinet, wrist
-from runners.simulated_robot.configurations import CABINET_CONFIGURATIONS, REST, stood_on_shelf
-from runners.simulated_robot.scene import NEAR, Scene
+from runners.simulated_robot.physics_scene import NEAR, PhysicsScene
+from runners.simulated_robot.robot_configurations import (
+    CABINET_CONFIGURATIONS,
+    REST,
+    stood_on_shelf,
+)
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RenderedCamera
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
@@ -28,8 +32,8 @@ EXACT = 2e-5  # m
 
 
 @pytest.fixture(scope="module")
-def scene() -> Iterator[Scene]:
-    with closing(Scene(MESH, POSE)) as scene:
+def scene() -> Iterator[PhysicsScene]:
+    with closing(PhysicsScene(MESH, POSE)) as scene:
         yield scene
 
 
@@ -56,19 +60,19 @@ def agreement(seen: FloatArray, exact: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("hand", [False, True])
-def test_the_outer_camera_sees_exact_depths(scene: Scene, hand: bool) -> None:
+def test_the_outer_camera_sees_exact_depths(scene: PhysicsScene, hand: bool) -> None:
     camera, pose = CameraSettings(width=160).pinhole, cabinet.world_from_camera()
     seen = scene.depth(camera, pose, HAND if hand else None)
     assert agreement(seen, cast(solid(hand), camera, pose)) > 0.998
 
 
-def test_the_hand_hides_what_is_behind_it(scene: Scene) -> None:
+def test_the_hand_hides_what_is_behind_it(scene: PhysicsScene) -> None:
     camera, pose = CameraSettings(width=160).pinhole, cabinet.world_from_camera()
     nearer = scene.depth(camera, pose, HAND) < scene.depth(camera, pose) - 0.01
     assert 0.02 < nearer.mean() < 0.5
 
 
-def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene: Scene) -> None:
+def test_a_bubble_camera_sees_the_object_but_not_its_own_housing(scene: PhysicsScene) -> None:
     camera = BubbleSettings(width=112).pinhole
     pose = HAND @ wrist.wrist_from_bubble_camera("right")
     seen = scene.depth(camera, pose)
@@ -86,7 +90,7 @@ def test_the_object_is_seen_but_in_part() -> None:
     assert 0.1 < hidden.sum() / alone.sum() < 0.9
 
 
-def test_clearance_is_the_distance_to_what_is_nearest(scene: Scene) -> None:
+def test_clearance_is_the_distance_to_what_is_nearest(scene: PhysicsScene) -> None:
     side = apply(wrist.world_from_wrist(np.zeros(3)), wrist.rigid_mesh().vertices)[:, 1].max()
     for gap in (0.010, 0.003, -0.002):
         beside_wall = np.array([0.75, 0.22 - gap - side, 0.45])
@@ -95,7 +99,7 @@ def test_clearance_is_the_distance_to_what_is_nearest(scene: Scene) -> None:
     assert scene.clearance(wrist.world_from_wrist(np.array([0.2, 0.0, 0.9]))) == NEAR
 
 
-def test_the_hand_feels_the_object_too(scene: Scene) -> None:
+def test_the_hand_feels_the_object_too(scene: PhysicsScene) -> None:
     front = apply(wrist.world_from_wrist(np.zeros(3)), wrist.rigid_mesh().vertices)[:, 0].max()
     surface = apply(POSE, MESH.vertices)
     pose = wrist.world_from_wrist(np.array([surface[:, 0].min() - front + 0.01, 0.0, 0.46]))
@@ -104,11 +108,11 @@ def test_the_hand_feels_the_object_too(scene: Scene) -> None:
     assert 0.01 - 1e-4 < scene.clearance(pose) <= NEAR
 
 
-def test_no_corner_of_the_hand_touches_at_rest(scene: Scene) -> None:
+def test_no_corner_of_the_hand_touches_at_rest(scene: PhysicsScene) -> None:
     assert scene.clearance(wrist.world_from_wrist(np.array(REST))) == NEAR
 
 
 def test_a_missing_engine_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(SessionError, match="PyBullet is not installed"):
-        Scene(MESH, POSE)
+        PhysicsScene(MESH, POSE)

@@ -22,7 +22,7 @@ NEAR = 0.02  # m: how far around the hand contacts are looked for
 _AWAY = compose(np.eye(3), np.array([0.0, 0.0, -100.0]))  # the hand, where no camera sees it
 
 
-class Scene:
+class PhysicsScene:
     """An object at its pose in the cabinet, and the hand, which goes wherever it is put."""
 
     def __init__(self, mesh: trimesh.Trimesh, world_from_object: FloatArray) -> None:
