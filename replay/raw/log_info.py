@@ -73,7 +73,7 @@ class LogInfo:
         if self.damage is not None:
             return f"damaged or unfinished: {self.damage}; what is whole was counted"
         if self.checked:
-            return "everything was read, all checksums are right"
+            return "all messages were read, the checksums of their chunks are right"
         return (
             "counts are those of its index, frames those of some chunks (--check reads everything)"
         )

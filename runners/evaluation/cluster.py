@@ -35,7 +35,7 @@ class LocalConfig:
 
     kind: str
     scheduler: str | None  # address of a running Dask scheduler; None: workers of our own
-    dashboard: bool | None  # None: where bokeh is installed, which draws it
+    dashboard: bool  # whether workers of our own have one
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class SlurmConfig:
     prologue: Any  # a list of lines of the shell before a worker starts
     python: str | None  # on the nodes; None: this one
     log_directory: str | None  # of the jobs' output
-    dashboard: bool | None
+    dashboard: bool
 
     def __post_init__(self) -> None:
         require_positive("jobs", self.jobs)
@@ -112,23 +112,21 @@ def connected(
                 say(f"workers of the Dask scheduler at {config.scheduler}")
                 yield Connection(client)
             return
-        wants_dashboard = config.dashboard is not False and _has_bokeh()
+        dashboard = _DASHBOARD if config.dashboard else None
         if isinstance(config, SlurmConfig):
-            started, size = slurm_cluster(config), {"jobs": config.jobs}
+            started, size = slurm_cluster(config, dashboard), {"jobs": config.jobs}
         else:
             size = {"n": workers or _cores()}
-            started = _local_cluster(size["n"])
+            started = _local_cluster(size["n"], dashboard)
         with started as cluster, Client(cluster, set_as_default=False) as client:
             restore = partial(cluster.scale, **size)
             restore()
-            if wants_dashboard:
+            if dashboard:
                 say(f"dashboard: {cluster.dashboard_link}")
-            elif config.dashboard:
-                say("no dashboard: it needs bokeh, which is not installed")
             yield Connection(client, restore)
 
 
-def slurm_cluster(config: SlurmConfig) -> Any:
+def slurm_cluster(config: SlurmConfig, dashboard: str | None = None) -> Any:
     """A cluster whose workers are in jobs; it has none until it is scaled."""
     from dask_jobqueue import SLURMCluster
 
@@ -143,13 +141,13 @@ def slurm_cluster(config: SlurmConfig) -> Any:
         job_extra_directives=list(config.directives),
         job_script_prologue=["export NUMBA_NUM_THREADS=1", *config.prologue],
         log_directory=config.log_directory,
-        scheduler_options={"dashboard_address": _DASHBOARD},
+        scheduler_options={"dashboard_address": dashboard},
         worker_extra_args=["--preload", _PRELOAD],
         python=config.python or sys.executable,
     )
 
 
-def _local_cluster(workers: int) -> Any:
+def _local_cluster(workers: int, dashboard: str | None) -> Any:
     """Processes of one thread and no limit of memory each, for this machine alone."""
     from distributed import LocalCluster
 
@@ -158,7 +156,7 @@ def _local_cluster(workers: int) -> Any:
         threads_per_worker=1,
         memory_limit=0,
         host=_LOOPBACK,
-        dashboard_address=_DASHBOARD,
+        dashboard_address=dashboard,
         silence_logs=logging.CRITICAL,
         preload=[_PRELOAD],
         env={"NUMBA_NUM_THREADS": "1"},  # Dask sets those of OpenMP, MKL and OpenBLAS
@@ -178,10 +176,6 @@ def _client_of(address: str) -> Iterator[Any]:
         ) from error
     with client:
         yield client
-
-
-def _has_bokeh() -> bool:
-    return importlib.util.find_spec("bokeh") is not None
 
 
 def _cores() -> int:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -15,6 +15,7 @@ from typing import Any
 
 import pyarrow.parquet
 import pytest
+import requests
 
 from chsel.errors import SettingError
 from runners.evaluation import cluster
@@ -43,7 +44,7 @@ SLURM = SlurmConfig(
     prologue=["module load python"],
     python="/opt/python",
     log_directory=None,
-    dashboard=None,
+    dashboard=False,
 )
 
 
@@ -143,7 +144,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "_CONNECT", 0.5)
-    config = LocalConfig("local", address, None)
+    config = LocalConfig("local", address, False)
     with (
         pytest.raises(SettingError, match=r"cluster\.scheduler is .*; accepted: the address of"),
         connected(config, None, print),
@@ -151,13 +152,15 @@ def test_a_scheduler_that_is_not_there_is_one_line(
         pass
 
 
-def test_the_address_of_a_dashboard_is_told_where_there_is_one(
-    capsys: pytest.CaptureFixture[str],
+@pytest.mark.parametrize(
+    ("dashboard", "shown"), [(True, r"dashboard: http://127\.0\.0\.1:\d+/status\n"), (False, "")]
+)
+def test_the_address_of_the_dashboard_is_printed(
+    dashboard: bool, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with connected(LocalConfig("local", None, True), 1, print) as connection:
+    with connected(LocalConfig("local", None, dashboard), 1, print) as connection:
         assert connection.client.nthreads()
-    shown = capsys.readouterr().out
-    if importlib.util.find_spec("bokeh") is None:
-        assert shown == "no dashboard: it needs bokeh, which is not installed\n"
-    else:
-        assert shown.startswith("dashboard: http://127.0.0.1:")
+        printed = capsys.readouterr().out
+        assert re.fullmatch(shown, printed)
+        if dashboard:
+            assert requests.get(printed.split()[1], timeout=30).status_code == 200
