@@ -20,7 +20,7 @@ PLUGINS = {
     "submitit_local": "hydra_submitit_launcher",
     "submitit_slurm": "hydra_submitit_launcher",
 }
-SMALL = ("session=kinematic", "configuration=mustard", "method=icp", "recording=mcap")
+SMALL = ("object=mustard", "session=kinematic", "method=icp", "recording=mcap")
 # What submitit asks of SLURM, by a cluster of one machine that starts every job at once.
 CLUSTER = {
     "sbatch": """#!/usr/bin/env bash
@@ -98,7 +98,7 @@ def test_every_job_of_a_sweep_records_its_session(launcher: str, tmp_path: Path)
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_a_mistake_in_a_job_is_an_error_of_the_sweep(launcher: str, tmp_path: Path) -> None:
     needs(launcher)
-    done = sweep(launcher, tmp_path, "method.iterations=0")
+    done = sweep(launcher, tmp_path, "method.iterations=-1")
     assert done.returncode == 2, done.stderr
-    assert re.match(r"error: .*iterations is 0; accepted", done.stderr.splitlines()[-1])
+    assert re.match(r"error: .*iterations is -1; accepted", done.stderr.splitlines()[-1])
     assert "Traceback" not in done.stderr
