@@ -58,9 +58,9 @@ class LogInfo:
     @property
     def damage(self) -> str | None:
         """What is wrong, in a line; None if nothing is."""
-        told = [text if count == 1 else f"{text} ({count} times)" for text, count in self._worst()]
-        more = len(self.faults) - len(told)
-        return "; ".join(told + [f"{more} other faults"] * (more > 0)) or None
+        shown = [text if count == 1 else f"{text} ({count} times)" for text, count in self._worst()]
+        more = len(self.faults) - len(shown)
+        return "; ".join(shown + [f"{more} other faults"] * (more > 0)) or None
 
     @property
     def count(self) -> int:
@@ -200,11 +200,13 @@ class _Gathered:
         return min(seen.first for seen in all_seen), max(seen.last for seen in all_seen)
 
     def compare(self, file: RawFile) -> None:
-        """A fault for every topic of which the index tells another number of messages."""
-        for channel, (told, _) in _indexed(file).items():
+        """A fault for every topic of which the index has another number of messages."""
+        for channel, (indexed, _) in _indexed(file).items():
             count = self._seen[channel].count if channel in self._seen else 0
-            if told != count:
-                self.fault(f"its index has {told} messages on {channel.topic}, there are {count}")
+            if indexed != count:
+                self.fault(
+                    f"its index has {indexed} messages on {channel.topic}, there are {count}"
+                )
 
     def topics(self, file: RawFile, *, counted: bool) -> Iterator[TopicInfo]:
         """What is known of each topic. counted: by the messages read, not by the index."""

@@ -40,8 +40,8 @@ class Contender:
     @property
     def config(self) -> dict[str, Any]:
         """As experiment.json has it."""
-        told = {"name": self.name, "preset": self.preset, "settings": dict(self.settings)}
-        return told | ({"draw": self.draw} if self.draw else {})
+        content = {"name": self.name, "preset": self.preset, "settings": dict(self.settings)}
+        return content | ({"draw": self.draw} if self.draw else {})
 
 
 @dataclass(frozen=True)

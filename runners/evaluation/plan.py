@@ -47,8 +47,8 @@ class Plan:
     from whose results they follow, so that all register the same problems. every: iterations
     between measures of the search; None: at its end alone. recordings: whether to write
     METHOD.mcap. outside: folders of hypothesis sets by label. logs: a folder of raw logs, for
-    sessions of sensors; None: those of the twin, in the evaluation's folder. truth: how the true
-    pose of such a session is sought.
+    sessions of sensors; None: those of the simulated robot, in the evaluation's
+    folder. truth: how the true pose of such a session is sought.
     """
 
     folder: Path

@@ -1,4 +1,4 @@
-"""The raw log of a trial: where it is, how the twin makes it, and about where its object is."""
+"""The raw log of a trial: where it is, how it is simulated, and about where its object is."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def check_log(plan: Plan, trial: Trial) -> None:
 
 
 def ensure_log(plan: Plan, trial: Trial) -> Path:
-    """The log of a trial; one of the twin's configurations is simulated if it is missing."""
+    """The log of a trial; it is simulated if it is missing and a simulated robot's."""
     log = trial.log(plan)
     if not is_missing(plan, trial):
         return log
@@ -61,17 +61,18 @@ def is_missing(plan: Plan, trial: Trial) -> bool:
 def guessed_pose(log: Path) -> FloatArray:
     """world_from_object (4, 4) about where a log's object is.
 
-    That of the pose file beside it; of the twin its truth, as roughly as a person sets a pose.
+    That of the pose file beside it; of a simulated robot its truth, as roughly as a person
+    sets a pose.
     """
     if beside(log).exists():
         return read_pose(beside(log))
-    truth = twin_truth(log)
+    truth = simulated_truth(log)
     if truth is None:
         raise SettingError(f"there is no {beside(log)}; accepted: a pose that runners.align finds")
     return as_set_by_hand(truth)
 
 
-def twin_truth(log: Path) -> FloatArray | None:
+def simulated_truth(log: Path) -> FloatArray | None:
     """world_from_object (4, 4) of a simulated log, to which results are compared; else None."""
     path = _truth_path(log)
     return read_pose(path) if path.exists() else None

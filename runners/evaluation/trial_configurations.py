@@ -1,4 +1,4 @@
-"""The configurations of an evaluation: simulated ones, the twin's, or folders of recorded logs."""
+"""Configurations of an evaluation: of simulated sessions or robots, or folders of logs."""
 
 from __future__ import annotations
 
@@ -47,29 +47,29 @@ class TrialConfiguration:
 def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialConfiguration]:
     """All configurations of a kind of session, by name.
 
-    Those of sessions of sensors are the folders in `logs`, and the twin's where there are no
-    others. Raises SettingError for a folder that does not exist or does not name its object.
+    Those of sessions of sensors are the folders in `logs`, and the simulated robot's where there
+    are no others. Raises SettingError for a folder that does not exist or does not name its object.
     """
     if kind != SENSORS:
         return {
             name: TrialConfiguration(name, one.object, len(one.grid))
             for name, one in CONFIGURATIONS.items()
         }
-    twin = {
+    simulated = {
         name: TrialConfiguration(name, one.object, len(one.grid))
         for name, one in CABINET_CONFIGURATIONS.items()
     }
     if logs is None:
-        return twin
+        return simulated
     if not logs.is_dir():
         raise SettingError(
             f"session.logs is {logs}; accepted: a folder with CONFIGURATION/seed_0.mcap and "
-            f"CONFIGURATION/{OBJECT_FILE}, or an empty one for logs of the twin"
+            f"CONFIGURATION/{OBJECT_FILE}, or an empty one for logs of the simulated robot"
         )
     there = {path.name: path for path in sorted(logs.iterdir()) if path.is_dir()}
-    if set(there) <= set(twin):
-        return twin
-    return {name: twin.get(name) or _recorded(name, path) for name, path in there.items()}
+    if set(there) <= set(simulated):
+        return simulated
+    return {name: simulated.get(name) or _recorded(name, path) for name, path in there.items()}
 
 
 def with_faults(

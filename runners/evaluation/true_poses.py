@@ -25,7 +25,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.events import Event, Probe
 from runners.evaluation.plan import Plan, Trial
-from runners.evaluation.sensor_logs import guessed_pose, twin_truth
+from runners.evaluation.sensor_logs import guessed_pose, simulated_truth
 from runners.sensors.alignment_fit import fit_of
 from runners.sessions.session import Session
 
@@ -56,18 +56,20 @@ def known_at_the_end(
 def find_truth(
     plan: Plan, problem: RegistrationProblem, mesh: trimesh.Trimesh, log: Path
 ) -> tuple[FloatArray, dict[str, Any]]:
-    """T* as world_from_object (4, 4), and what is to be told about it, plain values.
+    """T* as world_from_object (4, 4), and what the table says of it, plain values.
 
     Of the problem of a trial's last step: the pose of least evaluation cost near the guess that
     belongs to the log. mesh: of the object, m. Distances are in metres and radians, modulo the
     object's symmetries, at its centre.
     """
-    guess, truth = guessed_pose(log), twin_truth(log)
+    guess, truth = guessed_pose(log), simulated_truth(log)
     found = find_true_pose(problem, guess, plan.truth)
-    return found.world_from_object, _told(plan, problem, object_symmetry(mesh), found, guess, truth)
+    return found.world_from_object, _record(
+        plan, problem, object_symmetry(mesh), found, guess, truth
+    )
 
 
-def _told(
+def _record(
     plan: Plan,
     problem: RegistrationProblem,
     symmetry: ObjectSymmetry,
@@ -76,7 +78,7 @@ def _told(
     truth: FloatArray | None,
 ) -> dict[str, Any]:
     fit = fit_of(problem, found.world_from_object, found.cost, plan.truth.cost)
-    told: dict[str, Any] = {
+    record: dict[str, Any] = {
         "cost": found.cost,
         "mean_distance": fit.mean_distance,
         "violations": fit.violations,
@@ -85,9 +87,9 @@ def _told(
         "from_guess": _between(found.world_from_object, guess, symmetry),
     }
     if truth is not None:
-        told["simulated"] = truth.tolist()
-        told["from_simulated"] = _between(found.world_from_object, truth, symmetry)
-    return told
+        record["simulated"] = truth.tolist()
+        record["from_simulated"] = _between(found.world_from_object, truth, symmetry)
+    return record
 
 
 def _between(one: FloatArray, other: FloatArray, symmetry: ObjectSymmetry) -> dict[str, float]:
@@ -129,15 +131,15 @@ def true_poses(folder: Path, experiment: Mapping[str, Any]) -> list[FoundPose]:
 
 
 def _found(configuration: str, seed: int, session: Mapping[str, Any]) -> FoundPose:
-    told = session["truth"]
-    guess, truth = told["from_guess"], told.get("from_simulated") or {}
+    record = session["truth"]
+    guess, truth = record["from_guess"], record.get("from_simulated") or {}
     return FoundPose(
         configuration,
         seed,
-        float(told["cost"]),
-        float(told["guess_cost"]),
-        float(told["mean_distance"]),
-        int(told["violations"]),
+        float(record["cost"]),
+        float(record["guess_cost"]),
+        float(record["mean_distance"]),
+        int(record["violations"]),
         float(guess["position"]),
         float(guess["rotation"]),
         truth.get("position"),

@@ -42,7 +42,7 @@ POSE = compose(rotation_vector(np.array([0.31, -0.4, 1.1])), np.array([0.913, -0
 
 
 def sensors_plan(folder: Path, **changes: Any) -> Plan:
-    """A plan of sessions of the twin's rig."""
+    """A plan of sessions of the simulated robot's rig."""
     rig = yaml.safe_load((CONF / "session" / "rig" / "cabinet.yaml").read_text())
     session = {"kind": "sensors", "rig": rig, "start_contacts": 1, "start_probe": 0}
     truth = TruePoseSettings(reach=0.02, spacing=0.01, rotations=200, angle=0.05, passes=2)
@@ -58,7 +58,7 @@ def own_logs(folder: Path, **objects: dict[str, Any]) -> Path:
     return folder
 
 
-def test_configurations_are_the_twins_unless_there_are_logs_of_ones_own(tmp_path: Path) -> None:
+def test_configurations_are_simulated_unless_there_are_logs_of_ones_own(tmp_path: Path) -> None:
     assert list(configurations_of("sensors")) == CABINET
     assert [one.probes for one in configurations_of("sensors").values()] == [6, 6, 6, 6]
     (tmp_path / "cabinet_drill").mkdir()
@@ -112,7 +112,7 @@ def test_a_folder_of_logs_must_name_its_object(
         configurations_of("sensors", tmp_path / "none")
 
 
-def test_logs_of_ones_own_need_a_guess_and_the_twins_are_made(tmp_path: Path) -> None:
+def test_logs_of_ones_own_need_a_guess_and_simulated_ones_are_made(tmp_path: Path) -> None:
     logs = own_logs(tmp_path / "logs", shelf={"name": "mustard"})
     plan, trial = sensors_plan(tmp_path, logs=logs), Trial(0, "shelf")
     assert not is_missing(plan, trial)
@@ -125,10 +125,10 @@ def test_logs_of_ones_own_need_a_guess_and_the_twins_are_made(tmp_path: Path) ->
     np.testing.assert_allclose(guessed_pose(trial.log(plan)), POSE, atol=1e-12)
     (logs / "shelf" / "seed_1").mkdir()
     assert Trial(1, "shelf").log(plan) == logs / "shelf" / "seed_1"
-    twin = sensors_plan(tmp_path)
-    assert is_missing(twin, Trial(0, "cabinet_drill"))
-    check_log(twin, Trial(0, "cabinet_drill"))
-    assert trial.log(twin) == twin.folder / "logs" / "shelf" / "seed_0.mcap"
+    simulated = sensors_plan(tmp_path)
+    assert is_missing(simulated, Trial(0, "cabinet_drill"))
+    check_log(simulated, Trial(0, "cabinet_drill"))
+    assert trial.log(simulated) == simulated.folder / "logs" / "shelf" / "seed_0.mcap"
 
 
 def test_a_pose_set_by_hand_is_near_the_truth_but_not_it() -> None:

@@ -1,4 +1,4 @@
-"""Logs of the twin, read with other people's readers: is what they say where the object is?"""
+"""Simulated logs, read by other packages: is what they hold where the object is?"""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _read(path: Path, truth: SimulatedLog) -> Log:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    path = tmp_path_factory.mktemp("twin") / "small.mcap"
+    path = tmp_path_factory.mktemp("simulated") / "small.mcap"
     return _read(path, simulate_log(path, CONFIGURATION, MESH, SEED, SMALL))
 
 
