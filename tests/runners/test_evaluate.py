@@ -37,6 +37,7 @@ SMALL = (
     "definition.grid.rotations=300",
     "definition.grid.upright=4",
     "metrics.points=50",
+    "cluster.dashboard=false",
 )
 METHODS = "methods=[chsel,icp]"
 DEFINITION_OF = {

@@ -150,7 +150,7 @@ def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry() -> N
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Connection]:
     """A cluster of one worker."""
-    with connected(LocalConfig("local", None, None), 1, print) as cluster:
+    with connected(LocalConfig("local", None, False), 1, print) as cluster:
         yield cluster
 
 
