@@ -25,7 +25,7 @@ _DASK = {
 }
 _PRELOAD = "runners.evaluation.tasks"
 _LOOPBACK = "127.0.0.1"
-_DASHBOARD = f"{_LOOPBACK}:0"  # any free port, for this machine alone
+_LOCAL_PORT = f"{_LOOPBACK}:0"  # any free port, for this machine alone
 _CONNECT = 30.0  # s
 
 
@@ -112,21 +112,20 @@ def connected(
                 say(f"workers of the Dask scheduler at {config.scheduler}")
                 yield Connection(client)
             return
-        dashboard = _DASHBOARD if config.dashboard else None
         if isinstance(config, SlurmConfig):
-            started, size = slurm_cluster(config, dashboard), {"jobs": config.jobs}
+            started, size = slurm_cluster(config), {"jobs": config.jobs}
         else:
             size = {"n": workers or _cores()}
-            started = _local_cluster(size["n"], dashboard)
+            started = _local_cluster(size["n"], dashboard=config.dashboard)
         with started as cluster, Client(cluster, set_as_default=False) as client:
             restore = partial(cluster.scale, **size)
             restore()
-            if dashboard:
+            if config.dashboard:
                 say(f"dashboard: {cluster.dashboard_link}")
             yield Connection(client, restore)
 
 
-def slurm_cluster(config: SlurmConfig, dashboard: str | None = None) -> Any:
+def slurm_cluster(config: SlurmConfig) -> Any:
     """A cluster whose workers are in jobs; it has none until it is scaled."""
     from dask_jobqueue import SLURMCluster
 
@@ -141,13 +140,13 @@ def slurm_cluster(config: SlurmConfig, dashboard: str | None = None) -> Any:
         job_extra_directives=list(config.directives),
         job_script_prologue=["export NUMBA_NUM_THREADS=1", *config.prologue],
         log_directory=config.log_directory,
-        scheduler_options={"dashboard_address": dashboard},
+        scheduler_options={"dashboard_address": _LOCAL_PORT, "dashboard": config.dashboard},
         worker_extra_args=["--preload", _PRELOAD],
         python=config.python or sys.executable,
     )
 
 
-def _local_cluster(workers: int, dashboard: str | None) -> Any:
+def _local_cluster(workers: int, *, dashboard: bool) -> Any:
     """Processes of one thread and no limit of memory each, for this machine alone."""
     from distributed import LocalCluster
 
@@ -156,7 +155,8 @@ def _local_cluster(workers: int, dashboard: str | None) -> Any:
         threads_per_worker=1,
         memory_limit=0,
         host=_LOOPBACK,
-        dashboard_address=dashboard,
+        dashboard_address=_LOCAL_PORT,
+        scheduler_kwargs={"dashboard": dashboard},
         silence_logs=logging.CRITICAL,
         preload=[_PRELOAD],
         env={"NUMBA_NUM_THREADS": "1"},  # Dask sets those of OpenMP, MKL and OpenBLAS

@@ -160,6 +160,9 @@ def test_the_address_of_the_dashboard_is_printed(
 ) -> None:
     with connected(LocalConfig("local", None, dashboard), 1, print) as connection:
         assert connection.client.nthreads()
+        served = connection.client.cluster.scheduler_info["services"]["dashboard"]
+        assert served != 8787, "Dask's own port is for other clusters, and for all machines"
+        assert connection.client.cluster.dashboard_link.startswith("http://127.0.0.1:")
         printed = capsys.readouterr().out
         assert re.fullmatch(shown, printed)
         if dashboard:
