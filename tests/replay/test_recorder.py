@@ -19,7 +19,7 @@ from replay.recorder import BackgroundRecorder, TeeRecorder
 
 
 class Gate:
-    """Notes what it gets once its gate is open; fails at the events that it is told of."""
+    """Notes what it gets once its gate is open; fails at the events that `fails_at` names."""
 
     def __init__(self, *fails_at: object, is_open: bool = True) -> None:
         self.calls: list[object] = []

@@ -45,7 +45,7 @@ def frame_name(name: str, *, needed: bool = False) -> str:
     if needed and not name:
         raise UnusableMessage("a transform lacks the name of a frame")
     if len(name) > LONGEST_NAME or one_line(name) != name:
-        raise UnusableMessage("the name of a frame is no name on one line")
+        raise UnusableMessage("the name of a frame is too long or is not one line of text")
     return name
 
 
