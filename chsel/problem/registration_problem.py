@@ -130,6 +130,9 @@ class Hypotheses:
     cell: IntArray  # (B,): the archive cell that a pose came from, -1 for none
     elites: FloatArray  # (L, 4, 4): object_from_world of all solutions, from which E_l follows
     archive: ArchiveSnapshot | None = None  # the last one, if the method keeps an archive
+    # (C, 4, 4): poses that the points allow, before B of them were chosen; none if the method does
+    # not say. Decisions on the next probe weigh them up; they are not part of the digest.
+    candidates: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
     trust: Trust | None = None  # of `chsel.register`; methods leave it out, see `chsel.trust_in`
 
     @property

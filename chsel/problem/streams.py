@@ -36,6 +36,8 @@ class Purpose(IntEnum):
     ANCHORS = 15
     WALKS = 16
     FAULTS = 17
+    PRIOR_BELIEF = 18
+    POLICY = 19
 
 
 @dataclass(frozen=True)

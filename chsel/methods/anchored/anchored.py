@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -331,7 +332,8 @@ class Search:
         hypotheses = space.poses(vectors[chosen])
         energies = self.energy.of(hypotheses)
         last = archive.snapshot(0, 0)
-        return ranked(hypotheses.matrices, energies, cells, elites.matrices, last)
+        found = ranked(hypotheses.matrices, energies, cells, elites.matrices, last)
+        return replace(found, candidates=poses.matrices)
 
     def _show(self, stage: str, candidates: RatedPoses) -> None:
         vectors = self._space.encode(candidates.poses)

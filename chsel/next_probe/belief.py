@@ -1,0 +1,62 @@
+"""What a registration leaves plausible, as poses with weights; and before any registration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from chsel.next_probe.decision_problem import Belief
+from chsel.problem.outline import signed_distances
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import CheckedSettings, at_most, positive
+from chsel.problem.streams import Purpose, StreamKey, uniforms
+from chsel.problem.subset import evenly_spaced
+from chsel.problem.surface import object_centre
+
+MOST_POSES = 2000
+_DRAWN = 1000  # poses before any registration, of which those that free space allows are kept
+_MOST_FREE = 2000  # free points that are compared with them
+
+
+@dataclass(frozen=True)
+class BeliefSettings(CheckedSettings):
+    """Which poses a decision weighs up."""
+
+    poses: Annotated[int, positive, at_most(MOST_POSES)] = 100  # K, at most
+
+
+def belief_after(hypotheses: Hypotheses, settings: BeliefSettings) -> Belief:
+    """The candidates of a registration, or its hypotheses if it has none; all weigh the same."""
+    poses = hypotheses.candidates
+    if len(poses) == 0:
+        poses = hypotheses.object_from_world[~hypotheses.duplicate]
+    poses = poses[evenly_spaced(len(poses), settings.poses)]
+    return Belief(poses, np.full(len(poses), 1.0 / len(poses)))
+
+
+def belief_before(
+    sdf: SdfGrid,
+    points: KnownPoints,
+    workspace: Workspace,
+    key: StreamKey,
+    settings: BeliefSettings,
+) -> Belief:
+    """Poses with the object's centre in the workspace, turned any way, that free points allow.
+
+    The first of those drawn that free space does not enter by more than its grid's resolution; if
+    they are too few, those that it enters least.
+    """
+    stream = key.stream(Purpose.PRIOR_BELIEF)
+    rotation = random_rotations(stream, _DRAWN)  # world_from_object
+    centre = uniforms(stream, workspace.lower, workspace.upper, (_DRAWN, 3))
+    offset = rotated(rotation, object_centre(sdf))
+    poses = Poses.of(inverse(compose(rotation, centre - offset)))
+    free = points.free[evenly_spaced(len(points.free), _MOST_FREE)]
+    depth = -signed_distances(sdf, poses, free).min(axis=1, initial=np.inf)
+    order = np.argsort(np.maximum(depth, sdf.resolution), kind="stable")[: settings.poses]
+    return Belief(poses.matrices[order], np.full(len(order), 1.0 / len(order)))

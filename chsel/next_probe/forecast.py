@@ -1,0 +1,165 @@
+"""What each action would show if the belief is right, and how much would be known after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from chsel.next_probe.decision_problem import DecisionProblem
+from chsel.next_probe.first_contact import FirstContacts, first_contacts
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.compiler import compiled
+from chsel.numerics.elementary import exp, log
+from chsel.numerics.threads import spread
+from chsel.problem.outline import in_order
+from chsel.problem.poses import Poses
+from chsel.problem.subset import surface_descriptors
+
+_FARTHEST = 60.0  # exponents beyond count as zero
+_UNLIKE = 0.01  # overlap of a hit with a miss: a sensor may err
+
+
+class _Gains(NamedTuple):
+    """What the kernel fills, for A actions."""
+
+    information: FloatArray  # (A,), nats
+    expected_spread: FloatArray  # (A,), metres
+    surviving: FloatArray  # (A,): expected weight of the poses that the outcome does not rule out
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Forecasts of all A actions of a decision, by its belief of K poses.
+
+    noise: standard deviation of a contact's place from where it is forecast, metres.
+    """
+
+    problem: DecisionProblem
+    noise: float
+
+    @cached_property
+    def first(self) -> FirstContacts:
+        """Where each action meets the object, by pose."""
+        of = self.problem
+        return first_contacts(of.sdf, of.belief, of.actions, of.hand)
+
+    @property
+    def hit(self) -> BoolArray:
+        """Whether an action meets the object (K, A), by pose."""
+        return self.first.travel < inf
+
+    @cached_property
+    def hit_chance(self) -> FloatArray:
+        """That the hand meets the object (A,)."""
+        return self._chance(self.hit)
+
+    @cached_property
+    def blocked_chance(self) -> FloatArray:
+        """That the object is in the way to the start (A,)."""
+        return self._chance(self.first.travel < 0.0)
+
+    @cached_property
+    def distances(self) -> FloatArray:
+        """How far the surface in one pose is from that in another (K, K), metres.
+
+        Root mean square difference of distances from 64 places on surfaces of the belief.
+        """
+        poses = Poses.of(self.problem.belief.object_from_world)
+        descriptors = surface_descriptors(self.problem.sdf, poses)
+        apart: FloatArray = np.empty((len(poses), len(poses)))
+        distances_between(np.ascontiguousarray(descriptors.T), apart)
+        return apart
+
+    @cached_property
+    def spread(self) -> float:
+        """Mean distance of two surfaces drawn from the belief, metres."""
+        weights = self.problem.belief.weights
+        return float(in_order(weights * in_order(weights * self.distances)))
+
+    @cached_property
+    def gains(self) -> _Gains:
+        """What is gained by each action."""
+        count = len(self.problem.actions)
+        gains = _Gains(np.zeros(count), np.full(count, self.spread), np.ones(count))
+        weights, distances = np.array(self.problem.belief.weights), self.distances
+        contacts = self.first  # before threads begin, which must not wait for each other
+        size = len(weights)
+
+        def run(first: int, last: int, scratch: Any) -> None:
+            overlap(contacts, weights, distances, self.noise, gains, scratch, (first, last))
+
+        spread(run, count, lambda: np.empty((4, size)), least=20)
+        return gains
+
+    def _chance(self, flags: BoolArray) -> FloatArray:
+        """Weight (A,) of the poses with a flag, of flags (K, A)."""
+        return in_order(np.where(flags, self.problem.belief.weights[:, None], 0.0).T)
+
+
+@compiled
+def distances_between(descriptors: Any, apart: Any) -> None:
+    """Fill apart (K, K) with root mean square differences of descriptors (D, K)."""
+    size, count = descriptors.shape
+    for i in range(count):
+        row = apart[i]
+        for j in range(count):
+            row[j] = 0.0
+        for d in range(size):
+            values, value = descriptors[d], descriptors[d, i]
+            for j in range(count):
+                row[j] += (values[j] - value) * (values[j] - value)
+        for j in range(count):
+            row[j] = np.sqrt(row[j] / size)
+
+
+@compiled
+def overlap(
+    first: Any, weights: Any, distances: Any, noise: Any, gains: Any, scratch: Any, some: Any
+) -> None:
+    """Fill `gains` of some actions (first, last) from how alike their outcomes are.
+
+    Outcomes of two poses overlap by the Bhattacharyya coefficient of Gaussians around their
+    contacts, B = exp(-d^2 / 8 noise^2); by 1 if both miss, and hardly if one does. A pose survives
+    another's outcome with likelihood B^2. Information is the pairwise bound of Kolchinsky and
+    Tracey (Entropy, 2017), - sum_i w_i ln sum_j w_j B_ij.
+    """
+    count = len(weights)
+    scale = 1.0 / (8.0 * noise * noise)
+    alike, alive, far = scratch[0], scratch[1], scratch[2]
+    for a in range(some[0], some[1]):
+        for i in range(count):
+            alike[i], alive[i], far[i] = weights[i], weights[i], 0.0
+        for i in range(count):
+            hit = first.travel[i, a] < np.inf
+            for j in range(i + 1, count):
+                b = 1.0
+                if hit != (first.travel[j, a] < np.inf):
+                    b = _UNLIKE
+                elif hit:
+                    x = first.contact[i, a, 0] - first.contact[j, a, 0]
+                    y = first.contact[i, a, 1] - first.contact[j, a, 1]
+                    z = first.contact[i, a, 2] - first.contact[j, a, 2]
+                    exponent = scale * (x * x + y * y + z * z)
+                    if exponent > _FARTHEST:
+                        continue
+                    b = exp(-exponent)
+                g = b * b
+                alike[i] += weights[j] * b
+                alike[j] += weights[i] * b
+                alive[i] += weights[j] * g
+                alive[j] += weights[i] * g
+                far[i] += weights[j] * g * distances[i, j]
+                far[j] += weights[i] * g * distances[i, j]
+        information, left, surviving = 0.0, 0.0, 0.0
+        for i in range(count):
+            if weights[i] > 0.0:
+                information -= weights[i] * log(alike[i])
+                left += weights[i] * far[i] / alive[i]
+                surviving += weights[i] * alive[i]
+        gains.information[a] = max(information, 0.0)
+        gains.expected_spread[a] = left
+        gains.surviving[a] = surviving

@@ -1,0 +1,1 @@
+"""Which action to take next: a file for each policy."""

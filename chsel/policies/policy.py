@@ -1,0 +1,108 @@
+"""What every policy offers, and the part of it that those of this package share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf
+from typing import Annotated, Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from chsel.next_probe.action_lattice import ActionSettings
+from chsel.next_probe.belief import BeliefSettings
+from chsel.next_probe.decision_problem import Decision, DecisionProblem
+from chsel.next_probe.forecast import Forecast
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
+
+MOST_PROBES = 100_000
+
+
+class Policy(Protocol):
+    """A pure function of a decision problem and of its settings."""
+
+    settings: Any
+    """A frozen dataclass, `PolicySettings` or one derived from it."""
+
+    def decide(self, problem: DecisionProblem) -> Decision:
+        """Scores and forecasts of all actions, and which of them to take, if any."""
+
+
+@dataclass(frozen=True)
+class StopSettings(CheckedSettings):
+    """When no further probe is made. 0 switches a rule off."""
+
+    spread: Annotated[float, not_negative] = 0.010  # of the belief, at most, metres
+    gain: Annotated[float, not_negative] = 0.0005  # promised by the best action, at least, metres
+
+
+@dataclass(frozen=True)
+class PolicySettings(CheckedSettings):
+    """What all policies share."""
+
+    probes: Annotated[int, positive, at_most(MOST_PROBES)] = 30  # the budget of a session
+    # Standard deviation of a contact's place from where a pose of the belief has it, metres.
+    noise: Annotated[float, positive] = 0.005
+    # Actions to whose starts the object is in the way with a larger chance are not taken.
+    blocked: Annotated[float, not_negative, at_most(1.0)] = 0.05
+    stop: StopSettings = field(default_factory=StopSettings)
+    actions: ActionSettings = field(default_factory=ActionSettings)
+    belief: BeliefSettings = field(default_factory=BeliefSettings)
+
+
+Settings = TypeVar("Settings", bound=PolicySettings)
+
+
+class ConfiguredPolicy(Generic[Settings]):
+    """Base of policies that rate every action; `settings_class` makes the default settings.
+
+    A rating is a gain, not negative, or with `is_gain` False any number that orders the actions.
+    Gains are divided by the seconds that actions take, where these are known.
+    """
+
+    settings_class: type[Settings]
+    is_gain = True
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        self.settings = settings or self.settings_class()
+
+    def rate(self, problem: DecisionProblem, forecast: Forecast) -> FloatArray:
+        """A rating (A,) of all actions of a problem: the higher the better."""
+        raise NotImplementedError
+
+    def decide(self, problem: DecisionProblem) -> Decision:
+        """The available action of the highest rating, the first of several, or why to stop."""
+        forecast = Forecast(problem, self.settings.noise)
+        rating = self.rate(problem, forecast)
+        if self.is_gain and problem.actions.seconds is not None:
+            rating = rating / problem.actions.seconds
+        feasible = problem.available & (forecast.blocked_chance <= self.settings.blocked)
+        stop = self._stop(problem, forecast, feasible)
+        score = np.where(feasible, rating, -inf)
+        chosen = -1 if stop else int(np.argmax(score))
+        contacts = np.zeros((0, 3))
+        if chosen >= 0:
+            met = forecast.hit[:, chosen, None]
+            contacts = np.where(met, forecast.first.contact[:, chosen], np.nan)
+        return Decision(
+            chosen,
+            stop,
+            forecast.spread,
+            score,
+            forecast.hit_chance,
+            forecast.blocked_chance,
+            forecast.gains.expected_spread,
+            contacts,
+        )
+
+    def _stop(self, problem: DecisionProblem, forecast: Forecast, feasible: BoolArray) -> str:
+        """Why no probe is made, "" if one is."""
+        settings = self.settings
+        if problem.key.step >= settings.probes:
+            return "budget"
+        if forecast.spread <= settings.stop.spread:
+            return "spread"
+        if not feasible.any():
+            return "actions"
+        promised = forecast.spread - float(forecast.gains.expected_spread[feasible].min())
+        return "gain" if promised < settings.stop.gain else ""
