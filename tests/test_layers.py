@@ -31,6 +31,8 @@ MAY_IMPORT = {
         "methods": {"numerics", "problem", "cost", "qd"},
         "plausible": {"numerics", "problem", "cost"},
         "sensing": {"numerics", "problem"},
+        "next_probe": {"numerics", "problem"},
+        "policies": {"numerics", "problem", "next_probe"},
     },
     "replay": {
         "mcap": set(),

@@ -1,1 +1,5 @@
 """Which action to take next: a file for each policy."""
+
+from chsel.policies.policy_registry import POLICIES, build_policy, policy_settings
+
+__all__ = ["POLICIES", "build_policy", "policy_settings"]

@@ -6,16 +6,26 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from chsel.errors import require_choice, require_instance
+from chsel.policies.expected_loss import ExpectedLoss, ExpectedLossSettings
 from chsel.policies.grid import Grid, GridSettings
+from chsel.policies.hit_chance import HitChance, HitChanceSettings
+from chsel.policies.hypothesis_pruning import HypothesisPruning, HypothesisPruningSettings
 from chsel.policies.information import Information, InformationSettings
+from chsel.policies.nearest_mean import NearestMean, NearestMeanSettings
 from chsel.policies.policy import Policy
+from chsel.policies.random import RandomAction, RandomSettings
 from chsel.problem.settings import changed_settings
 
 GROUP = "chsel.policies"
 
 _OURS: dict[str, tuple[Callable[[Any], Policy], Any]] = {
     "grid": (Grid, GridSettings()),
+    "random": (RandomAction, RandomSettings()),
+    "nearest_mean": (NearestMean, NearestMeanSettings()),
+    "hit_chance": (HitChance, HitChanceSettings()),
+    "hypothesis_pruning": (HypothesisPruning, HypothesisPruningSettings()),
     "information": (Information, InformationSettings()),
+    "expected_loss": (ExpectedLoss, ExpectedLossSettings()),
 }
 POLICIES = tuple(_OURS)
 

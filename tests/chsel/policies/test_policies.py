@@ -1,0 +1,104 @@
+"""What each policy prefers, where the answer can be told without it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from chsel.errors import SettingError
+from chsel.next_probe.decision_problem import Actions
+from chsel.policies import POLICIES, build_policy
+from tests.chsel.next_probe.decisions import along_x, at, ball_problem
+
+# Two places of the ball, apart in y and in depth; of the third action both are in the way, at
+# different depths, the fourth misses both.
+TWO = at((0.0, -0.03, 0.0), (0.15, 0.03, 0.0))
+PLACES = [(-0.06, 0.0), (0.06, 0.0), (0.0, 0.0), (0.25, 0.25)]
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_only_actions_that_can_be_taken_are_chosen(name: str) -> None:
+    available = np.array([False, True, False, True])
+    decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES), available=available))
+    assert decision.chosen in (1, 3)
+    assert np.isneginf(decision.score).tolist() == [True, False, True, False]
+    nothing = ball_problem(TWO, along_x(PLACES), available=np.zeros(4, dtype=bool))
+    assert build_policy(name).decide(nothing).chosen == -1
+    assert build_policy(name).decide(nothing).stop == "actions"
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_a_decision_is_a_function_of_its_problem(name: str) -> None:
+    problem = ball_problem(TWO, along_x(PLACES))
+    policy = build_policy(name)
+    first = policy.decide(problem)
+    policy.decide(ball_problem(TWO[::-1], along_x(PLACES[::-1]), step=1))
+    assert policy.decide(problem).digest == first.digest
+    assert build_policy(name).decide(ball_problem(TWO, along_x(PLACES))).digest == first.digest
+
+
+@pytest.mark.parametrize(
+    ("name", "best"),
+    [("hit_chance", 2), ("nearest_mean", 2), ("grid", 0)],
+)
+def test_the_action_between_two_places(name: str, best: int) -> None:
+    decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES)))
+    assert decision.chosen == best
+
+
+@pytest.mark.parametrize(
+    ("name", "certain"),
+    [
+        ("information", np.log(2.0)),
+        ("expected_loss", None),  # all of the spread
+        ("hypothesis_pruning", 0.5),
+    ],
+)
+def test_what_tells_two_poses_apart_is_worth_most(name: str, certain: float | None) -> None:
+    decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES)))
+    certain = decision.spread if certain is None else certain
+    assert decision.score[:3] == pytest.approx([certain] * 3, rel=0.06)
+    assert decision.score[3] == pytest.approx(0.0, abs=1e-12)
+    agreed = build_policy(name).decide(ball_problem(TWO[[0, 0]], along_x(PLACES)))
+    assert agreed.score == pytest.approx(np.zeros(4), abs=1e-12)
+
+
+def test_the_nearest_way_ends_where_the_action_ends() -> None:
+    policy = build_policy("nearest_mean")
+    problem = ball_problem(at((0.2, 0.0, 0.0)), along_x([(0.0, 0.0), (0.05, 0.0)]))
+    assert policy.decide(problem).score == pytest.approx([0.0, -0.05], abs=3e-3)
+    short = ball_problem(at((0.2, 0.0, 0.0)), along_x([(0.0, 0.0), (0.05, 0.0)], length=0.2))
+    assert policy.decide(short).score == pytest.approx([-0.3, -np.hypot(0.3, 0.05)], abs=3e-3)
+
+
+def test_random_takes_every_available_action_as_often() -> None:
+    policy = build_policy("random", {"probes": 1000, "stop": {"gain": 0.0}})
+    available = np.array([True, False, True, True])
+    problem = ball_problem(TWO, along_x(PLACES), available=available)
+    keys = [replace(problem.key, step=step) for step in range(600)]
+    counts = np.bincount(
+        [policy.decide(replace(problem, key=key)).chosen for key in keys], minlength=4
+    )
+    assert counts[1] == 0
+    assert counts[[0, 2, 3]].min() > 150
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in POLICIES if n not in ("grid", "random", "nearest_mean")]
+)
+def test_gains_are_a_second(name: str) -> None:
+    actions = along_x(PLACES)
+    seconds = np.array([1.0, 2.0, 4.0, 1.0])
+    timed = Actions(actions.world_from_hand, actions.length, seconds)
+    usual = build_policy(name).decide(ball_problem(TWO, actions))
+    decision = build_policy(name).decide(ball_problem(TWO, timed))
+    assert np.array_equal(decision.score, usual.score / seconds)
+
+
+def test_names_and_settings_that_do_not_exist_are_refused() -> None:
+    with pytest.raises(SettingError, match="policy is 'greedy'; accepted: grid, random"):
+        build_policy("greedy")
+    with pytest.raises(SettingError, match=r"policy.prob does not exist; did you mean probes"):
+        build_policy("random", {"prob": 3})
