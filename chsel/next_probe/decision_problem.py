@@ -12,8 +12,10 @@ from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray, digest, frozen
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import check_rigid
-from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_grid import FARTHEST, SdfGrid
 from chsel.problem.streams import StreamKey
+
+MOST_ACTIONS = 20_000  # that are compared in one decision
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,9 @@ class Actions:
     def __post_init__(self) -> None:
         poses = frozen("actions", self.world_from_hand, (None, 4, 4), error=PoseError)
         check_rigid("actions", poses)
+        _check_near("actions", poses)
+        if len(poses) > MOST_ACTIONS:
+            raise SettingError(f"there are {len(poses)} actions; accepted: at most {MOST_ACTIONS}")
         object.__setattr__(self, "world_from_hand", poses)
         for name in ("length", "seconds"):
             value = getattr(self, name)
@@ -57,6 +62,7 @@ class Belief:
     def __post_init__(self) -> None:
         poses = frozen("belief", self.object_from_world, (None, 4, 4), error=PoseError)
         check_rigid("belief", poses)
+        _check_near("belief", poses)
         if len(poses) == 0:
             raise PoseError("the belief has no poses; accepted: at least one")
         weights = frozen("weights", self.weights, (len(poses),), error=SettingError)
@@ -134,3 +140,12 @@ class Decision:
         arrays = self.score, self.hit_chance, self.blocked_chance, self.expected_spread
         numbers = np.array([float(self.chosen), float(STOPS.index(self.stop)), self.spread])
         return digest(numbers, *arrays, self.contacts)
+
+
+def _check_near(name: str, transforms: FloatArray) -> None:
+    """Raise PoseError unless transforms (B, 4, 4) move by at most FARTHEST along each axis."""
+    far = np.abs(transforms[:, :3, 3]).max(axis=1) > FARTHEST
+    if far.any():
+        raise PoseError(
+            f"{name}[{int(np.argmax(far))}] is beyond {FARTHEST:g} m; accepted: places within"
+        )

@@ -18,6 +18,7 @@ from chsel.problem.surface import surface_points
 
 POINTS = 1200  # on the object's surface
 _CELL = 0.005  # metres: of two points that a hand sees in one cell, the nearer counts
+_MOST_CELLS = 400  # along a side of what a hand sees: cells of an object above 2 m are larger
 
 
 class FirstContacts(NamedTuple):
@@ -59,7 +60,9 @@ def first_contacts(
     count, front = len(poses), hand.front
     travel = np.full((count, len(actions)), np.inf)
     contact = np.zeros((count, len(actions), 3))
-    size = int(2.0 * _radius(points) / _CELL) + 3
+    width = 2.0 * _radius(points)
+    cell = max(_CELL, width / _MOST_CELLS)
+    size = int(width / cell) + 3
     groups = list(_groups(actions))
 
     def scratch() -> _View:
@@ -72,7 +75,7 @@ def first_contacts(
 
     def run(first: int, last: int, view: _View) -> None:
         for moves in groups:
-            meet(points, poses, moves, front, view, _CELL, (travel, contact), (first, last))
+            meet(points, poses, moves, front, view, cell, (travel, contact), (first, last))
 
     spread(run, count, scratch, least=10)
     return FirstContacts(travel, contact)
@@ -140,7 +143,7 @@ def meet(
 
 
 @inner
-def _look(points, pose, turn, view, cell):
+def _look(points: Any, pose: Any, turn: Any, view: Any, cell: Any) -> Any:
     """Turn the object into the axes of the hand, and order what is seen of it by rows of x.
 
     Returns the x of the first row's edge.
