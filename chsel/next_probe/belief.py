@@ -8,7 +8,8 @@ from typing import Annotated
 import numpy as np
 
 from chsel.next_probe.decision_problem import Belief
-from chsel.problem.outline import signed_distances
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.outline import outline_in_world, signed_distances
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
 from chsel.problem.registration_problem import Hypotheses
@@ -28,6 +29,8 @@ class BeliefSettings(CheckedSettings):
     """Which poses a decision weighs up."""
 
     poses: Annotated[int, positive, at_most(MOST_POSES)] = 100  # K, at most
+    # Height in the world of the floor that the object lies on, metres; None: it may be anywhere.
+    floor: float | None = 0.0
 
 
 def belief_after(hypotheses: Hypotheses, settings: BeliefSettings) -> Belief:
@@ -54,9 +57,18 @@ def belief_before(
     stream = key.stream(Purpose.PRIOR_BELIEF)
     rotation = random_rotations(stream, _DRAWN)  # world_from_object
     centre = uniforms(stream, workspace.lower, workspace.upper, (_DRAWN, 3))
-    offset = rotated(rotation, object_centre(sdf))
-    poses = Poses.of(inverse(compose(rotation, centre - offset)))
+    position = centre - rotated(rotation, object_centre(sdf))
+    poses = Poses.of(inverse(compose(rotation, position)))
+    if settings.floor is not None:
+        position[:, 2] -= heights(sdf, poses, settings.floor)
+        poses = Poses.of(inverse(compose(rotation, position)))
     free = points.free[evenly_spaced(len(points.free), _MOST_FREE)]
     depth = -signed_distances(sdf, poses, free).min(axis=1, initial=np.inf)
     order = np.argsort(np.maximum(depth, sdf.resolution), kind="stable")[: settings.poses]
     return Belief(poses.matrices[order], np.full(len(order), 1.0 / len(order)))
+
+
+def heights(sdf: SdfGrid, poses: Poses, floor: float) -> FloatArray:
+    """How far the object's lowest point is above the floor (B,) in each pose, metres."""
+    lowest: FloatArray = outline_in_world(sdf, poses)[..., 2].min(axis=1) - floor
+    return lowest

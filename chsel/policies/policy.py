@@ -12,6 +12,7 @@ from chsel.next_probe.action_lattice import ActionSettings
 from chsel.next_probe.belief import BeliefSettings
 from chsel.next_probe.decision_problem import Decision, DecisionProblem
 from chsel.next_probe.forecast import Forecast
+from chsel.next_probe.surprise import SurpriseSettings
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
 
@@ -48,6 +49,7 @@ class PolicySettings(CheckedSettings):
     stop: StopSettings = field(default_factory=StopSettings)
     actions: ActionSettings = field(default_factory=ActionSettings)
     belief: BeliefSettings = field(default_factory=BeliefSettings)
+    surprise: SurpriseSettings = field(default_factory=SurpriseSettings)
 
 
 Settings = TypeVar("Settings", bound=PolicySettings)

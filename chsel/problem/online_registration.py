@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
@@ -67,7 +67,7 @@ def pose_problem(
         initial_set = first_initial_set(workspace, points, key, settings)
         low_cost_set = np.zeros((0, 4, 4))
     else:
-        initial_set = previous.object_from_world
+        initial_set = previous.object_from_world[: settings.hypotheses]
         if settings.update == "noise":
             initial_set = updated_initial_set(previous, key, settings)
         low_cost_set = _low_cost_set(previous, settings)
@@ -185,6 +185,7 @@ class OnlineRegistration:
         self.sdf, self._workspace, self._free_resolution = sdf, workspace, free_resolution
         self._settings, self._seed = settings, seed
         self._start, self._only = start, only
+        self._larger = 1
         self.points = GrowingPoints(points or KnownPoints())
         self.previous = previous
 
@@ -234,10 +235,14 @@ class OnlineRegistration:
             self._workspace,
             self._free_resolution,
             StreamKey(self._seed, step),
-            self._settings,
+            replace(self._settings, hypotheses=self._larger * self._settings.hypotheses),
             self.previous,
         )
 
+    def start_afresh(self, larger: int = 1) -> None:
+        """Let the next problem be a first one, with so many times the hypotheses."""
+        self.previous, self._larger = None, larger
+
     def remember(self, hypotheses: Hypotheses) -> None:
         """Let the next problem follow from this result."""
-        self.previous = hypotheses
+        self.previous, self._larger = hypotheses, 1

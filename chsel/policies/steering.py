@@ -1,0 +1,90 @@
+"""Decision after decision: what a session does next, and how far it was surprised."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from chsel.next_probe.belief import belief_after, belief_before
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
+from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.surprise import surprise
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.policies.policy import Policy
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
+
+
+class Choice(NamedTuple):
+    """A decision with what determines it."""
+
+    problem: DecisionProblem
+    decision: Decision
+
+
+class Steering:
+    """Chooses the actions of one session, by what its registrations find.
+
+    last: the decision made last, None before the first. surprise: of the last outcome, nats.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        sdf: SdfGrid,
+        workspace: Workspace,
+        free_resolution: float,
+        actions: Actions,
+        hand: HandShape,
+        *,
+        seed: int = 0,
+    ) -> None:
+        """free_resolution: voxel side of free space, metres. seed: of the random streams."""
+        self.policy, self.actions, self.hand = policy, actions, hand
+        self._sdf, self._workspace, self._free_resolution = sdf, workspace, free_resolution
+        self._seed = seed
+        self.last: Choice | None = None
+        self.surprise = 0.0
+
+    def decide(
+        self, done: int, points: KnownPoints, hypotheses: Hypotheses | None, available: BoolArray
+    ) -> Choice:
+        """What to do after so many probes, by the last result; None before there was one.
+
+        points: all that are known. available (A,): the actions that can be taken now.
+        """
+        key = StreamKey(self._seed, done)
+        problem = DecisionProblem(
+            self._sdf,
+            points,
+            self._workspace,
+            self._free_resolution,
+            self.belief(points, hypotheses, key),
+            self.actions,
+            available,
+            self.hand,
+            key,
+        )
+        self.last = Choice(problem, self.policy.decide(problem))
+        return self.last
+
+    def belief(self, points: KnownPoints, hypotheses: Hypotheses | None, key: StreamKey) -> Belief:
+        """The poses that a decision weighs up."""
+        settings = self.policy.settings.belief
+        if hypotheses is None or len(hypotheses.cost) == 0:
+            return belief_before(self._sdf, points, self._workspace, key, settings)
+        return belief_after(hypotheses, settings)
+
+    def felt(self, contacts: FloatArray) -> bool:
+        """Take note of the outcome of the chosen action; whether it starts registration afresh.
+
+        contacts (C, 3): where the hand has met the object, the first one first; world frame.
+        """
+        assert self.last is not None
+        contact = np.asarray(contacts[0]) if len(contacts) else None
+        settings = self.policy.settings
+        self.surprise = surprise(*self.last, settings.noise, contact)
+        return bool(self.surprise > settings.surprise.limit)
