@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ class FirstContacts(NamedTuple):
     contact: FloatArray  # (K, A, 3): that place on the object, world frame; 0 where there is none
 
 
-class _Moves(NamedTuple):
+class Moves(NamedTuple):
     """Actions of one orientation of the hand."""
 
     rotation: FloatArray  # (9,): hand_from_world, row by row
@@ -55,7 +56,7 @@ def first_contacts(
     one of them, the way to the first contact is negative: it would have met it on its way to the
     start. Longer ways than an action's are inf.
     """
-    points = sdf.derived("touched", lambda: _touched(sdf))
+    points = touched_points(sdf)
     poses = np.array(Poses.of(belief.object_from_world).numbers)
     count, front = len(poses), hand.front
     travel = np.full((count, len(actions)), np.inf)
@@ -63,7 +64,7 @@ def first_contacts(
     width = 2.0 * _radius(points)
     cell = max(_CELL, width / _MOST_CELLS)
     size = int(width / cell) + 3
-    groups = list(_groups(actions))
+    groups = list(moves_by_orientation(actions))
 
     def scratch() -> _View:
         return _View(
@@ -81,9 +82,10 @@ def first_contacts(
     return FirstContacts(travel, contact)
 
 
-def _touched(sdf: SdfGrid) -> FloatArray:
-    """Points (N, 3) on the object's surface, in its frame."""
-    return surface_points(sdf, POINTS, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
+def touched_points(sdf: SdfGrid) -> FloatArray:
+    """Points (N, 3) on the object's surface, in its frame, that a hand can touch."""
+    stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
+    return sdf.derived("touched", lambda: surface_points(sdf, POINTS, stream))
 
 
 def _radius(points: FloatArray) -> float:
@@ -92,7 +94,7 @@ def _radius(points: FloatArray) -> float:
     return float(np.sqrt(((points - middle) ** 2).sum(axis=1).max()))
 
 
-def _groups(actions: Actions) -> Any:
+def moves_by_orientation(actions: Actions) -> Iterator[Moves]:
     """The actions by the orientation of the hand, in the order of their first ones."""
     rotations = actions.world_from_hand[:, :3, :3]
     left = np.ones(len(actions), dtype=bool)
@@ -105,7 +107,7 @@ def _groups(actions: Actions) -> Any:
         position = actions.world_from_hand[which, :3, 3]
         starts = position[:, 0, None] * turn[:, 0]
         starts = starts + position[:, 1, None] * turn[:, 1] + position[:, 2, None] * turn[:, 2]
-        yield _Moves(np.ascontiguousarray(turn).reshape(-1), starts, actions.length[which], which)
+        yield Moves(np.ascontiguousarray(turn).reshape(-1), starts, actions.length[which], which)
 
 
 @compiled

@@ -14,6 +14,7 @@ from chsel.policies.information import Information, InformationSettings
 from chsel.policies.nearest_mean import NearestMean, NearestMeanSettings
 from chsel.policies.policy import Policy
 from chsel.policies.random import RandomAction, RandomSettings
+from chsel.policies.voxel_entropy import VoxelEntropy, VoxelEntropySettings
 from chsel.problem.settings import changed_settings
 
 GROUP = "chsel.policies"
@@ -23,6 +24,7 @@ _OURS: dict[str, tuple[Callable[[Any], Policy], Any]] = {
     "random": (RandomAction, RandomSettings()),
     "nearest_mean": (NearestMean, NearestMeanSettings()),
     "hit_chance": (HitChance, HitChanceSettings()),
+    "voxel_entropy": (VoxelEntropy, VoxelEntropySettings()),
     "hypothesis_pruning": (HypothesisPruning, HypothesisPruningSettings()),
     "information": (Information, InformationSettings()),
     "expected_loss": (ExpectedLoss, ExpectedLossSettings()),
