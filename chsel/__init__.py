@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from chsel.cost.cost_settings import CostSettings
     from chsel.cost.torch_cost import RelaxedCost
     from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
+    from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
+    from chsel.next_probe.hand_shape import HandShape
+    from chsel.policies import build_policy
+    from chsel.policies.steering import Steering
     from chsel.problem.mesh import load_mesh
     from chsel.problem.online_registration import OnlineRegistration
     from chsel.problem.points import KnownPoints, Workspace
@@ -34,10 +38,15 @@ if TYPE_CHECKING:
     from chsel.problem.trust import trust_in
 
 __all__ = [
+    "Actions",
     "ArchiveSnapshot",
+    "Belief",
     "ChselError",
     "CompiledCost",
     "CostSettings",
+    "Decision",
+    "DecisionProblem",
+    "HandShape",
     "Hypotheses",
     "InputWarning",
     "KnownPoints",
@@ -47,18 +56,25 @@ __all__ = [
     "RegistrationProblem",
     "RelaxedCost",
     "SdfGrid",
+    "Steering",
     "Trust",
     "Workspace",
+    "build_policy",
     "load_mesh",
     "register",
     "trust_in",
 ]
 
 _PLACES = {
+    "Actions": "next_probe.decision_problem",
     "ArchiveSnapshot": "problem.registration_problem",
+    "Belief": "next_probe.decision_problem",
     "ChselError": "errors",
     "CompiledCost": "cost.compiled_cost",
     "CostSettings": "cost.cost_settings",
+    "Decision": "next_probe.decision_problem",
+    "DecisionProblem": "next_probe.decision_problem",
+    "HandShape": "next_probe.hand_shape",
     "Hypotheses": "problem.registration_problem",
     "InputWarning": "errors",
     "KnownPoints": "problem.points",
@@ -68,8 +84,10 @@ _PLACES = {
     "RegistrationProblem": "problem.registration_problem",
     "RelaxedCost": "cost.torch_cost",
     "SdfGrid": "problem.sdf_grid",
+    "Steering": "policies.steering",
     "Trust": "problem.registration_problem",
     "Workspace": "problem.points",
+    "build_policy": "policies",
     "load_mesh": "problem.mesh",
     "register": "api",
     "trust_in": "problem.trust",

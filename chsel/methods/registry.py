@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from collections.abc import Callable
 from typing import Any
 
-from chsel.errors import SettingError, require_choice, require_instance
+from chsel.errors import require_choice
 from chsel.methods.anchored.anchored import Anchored
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.chsel import Chsel, ChselSettings
@@ -23,69 +20,11 @@ from chsel.methods.medial_constraint import (
 )
 from chsel.methods.method import Method
 from chsel.methods.svgd import Svgd, SvgdSettings
+from chsel.problem.named_choices import NamedChoices
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
-from chsel.problem.settings import PRESETS, changed_settings, in_preset
+from chsel.problem.settings import PRESETS, in_preset
 from chsel.problem.trust import SENSOR_NOISE, has_pose, trust_in
-
-GROUP = "chsel.methods"
-_IMPLEMENTED = "docs/writing_a_method.md"
-
-
-def installed_names() -> tuple[str, ...]:
-    """The names that installed packages give to methods."""
-    return tuple(sorted(_offers()))
-
-
-def offering_packages(name: str) -> tuple[str, ...]:
-    """The packages that offer a method of that name."""
-    return tuple(point.dist.name if point.dist else "unknown" for point in _offers().get(name, ()))
-
-
-@cache
-def installed_method(name: str) -> tuple[Callable[[Any], Method], Any]:
-    """What makes an installed method of its settings, and its settings by default.
-
-    Raises SettingError for one that cannot be imported, is not a method, or has two packages.
-    """
-    point, *others = _offers()[name]
-    package = offering_packages(name)
-    if others:
-        raise SettingError(f"method {name} is of {' and '.join(package)}; accepted: one of them")
-    who = f"method {name} of package {package[0]}"
-    try:
-        offered = point.load()
-        default = offered()
-    except Exception as error:  # whatever somebody else's code raises
-        reason = f"{type(error).__name__}: {error}"
-        raise SettingError(
-            f"{who} cannot be loaded: {reason}; accepted: a class as in {_IMPLEMENTED}"
-        ) from error
-    if lacks := _lacks(default):
-        raise SettingError(f"{who} has {lacks}; see {_IMPLEMENTED}")
-    return offered, default.settings
-
-
-def _lacks(method: Any) -> str | None:
-    """What an object lacks to be a method, and what is accepted."""
-    settings = getattr(method, "settings", None)
-    if not dataclasses.is_dataclass(settings):
-        return f"settings {settings!r}; accepted: a frozen dataclass"
-    if not isinstance(getattr(method, "online", None), OnlineSettings):
-        return "no `online`; accepted: a property that returns OnlineSettings"
-    if not callable(getattr(method, "register", None)):
-        return "no `register`; accepted: register(problem, observer=None)"
-    return None
-
-
-@cache
-def _offers() -> dict[str, list[EntryPoint]]:
-    """All entry points of the group, by their names."""
-    offers: dict[str, list[EntryPoint]] = {}
-    for point in entry_points(group=GROUP):
-        offers.setdefault(point.name, []).append(point)
-    return offers
-
 
 _OURS: dict[str, tuple[Callable[[Any], Method], Any]] = {
     "chsel": (Chsel, ChselSettings()),
@@ -100,12 +39,26 @@ _OURS: dict[str, tuple[Callable[[Any], Method], Any]] = {
     "anchored": (Anchored, AnchoredSettings()),
 }
 OURS = tuple(_OURS)
-METHODS = (*OURS, *(name for name in installed_names() if name not in OURS))
+
+
+def _lacks(method: Any) -> str | None:
+    """What an object with settings lacks to be a method, and what is accepted."""
+    if not isinstance(getattr(method, "online", None), OnlineSettings):
+        return "no `online`; accepted: a property that returns OnlineSettings"
+    if not callable(getattr(method, "register", None)):
+        return "no `register`; accepted: register(problem, observer=None)"
+    return None
+
+
+_CHOICES = NamedChoices[Method](
+    "method", "chsel.methods", "docs/writing_a_method.md", _OURS, _lacks
+)
+METHODS = _CHOICES.names
 
 
 def preset_settings(name: str, preset: str = "default") -> Any:
     """The settings of a method by name in a preset, one of PRESETS."""
-    make, default = _entry(name)
+    make, default = _CHOICES.entry(name)
     require_choice("preset", preset, PRESETS)
     own = getattr(make, "preset", None)  # of an installed method
     return own(preset) if own else in_preset(default, preset)
@@ -118,17 +71,7 @@ def build_method(name: str, settings: Any = None) -> Method:
     SettingError for names and values that do not exist, and for a name of ours that an installed
     package gives to a method, too.
     """
-    make, _ = _entry(name)
-    if name in OURS and (offering := offering_packages(name)):
-        raise SettingError(f"method {name} is of package {offering[0]}, too; accepted: one of them")
-    default = preset_settings(name)
-    kind = type(default)
-    if settings is None:
-        settings = default
-    elif isinstance(settings, Mapping):
-        settings = changed_settings(default, settings, "method")
-    require_instance("settings", settings, kind, f"a mapping, or a {kind.__name__}")
-    return make(settings)
+    return _CHOICES.build(name, settings, preset_settings(name))
 
 
 def noise_of(method: Method) -> float | None:
@@ -142,9 +85,3 @@ def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypothese
     if not has_pose(hypotheses):
         return None
     return trust_in(problem, hypotheses, noise_of(method) or SENSOR_NOISE)
-
-
-def _entry(name: str) -> tuple[Callable[[Any], Method], Any]:
-    """What makes a method of its settings, and its settings by default."""
-    require_choice("method", name, METHODS)
-    return _OURS[name] if name in OURS else installed_method(name)

@@ -11,7 +11,7 @@ import pytest
 
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import SettingError
-from chsel.methods import METHODS, OURS, build_method, preset_settings
+from chsel.methods import OURS, build_method, preset_settings
 from chsel.methods.anchored.anchor_sampling import AnchoredStarts, AnchorSettings
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.methods.cvo.cvo import CvoSettings
@@ -20,6 +20,7 @@ from chsel.methods.icp import Icp, IcpSettings
 from chsel.methods.medial_constraint.cma_es import CmaEsSettings
 from chsel.methods.medial_constraint.medial_cost import MedialCostSettings
 from chsel.methods.svgd import SvgdSettings
+from chsel.problem.named_choices import NamedChoices
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.settings import PRESETS, settings_mapping
 from chsel.qd.selection import OutputSettings
@@ -206,10 +207,9 @@ def test_an_installed_class_may_give_the_settings_of_each_preset(
         def preset(name: str) -> IcpSettings:
             return IcpSettings(iterations=PRESETS.index(name) + 7)
 
-    monkeypatch.setattr("chsel.methods.registry.METHODS", (*METHODS, "theirs"))
-    monkeypatch.setattr(
-        "chsel.methods.registry.installed_method", lambda _: (Theirs, IcpSettings())
-    )
+    theirs = {"theirs": (Theirs, IcpSettings())}
+    choices = NamedChoices("method", "chsel.methods", "", theirs, lambda _: None)
+    monkeypatch.setattr("chsel.methods.registry._CHOICES", choices)
     assert [preset_settings("theirs", name).iterations for name in PRESETS] == [7, 8, 9]
     changed = build_method("theirs", {"redraw": "registration"}).settings
     assert changed == IcpSettings(iterations=7, redraw="registration")
