@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from chsel.next_probe.decision_problem import Actions, Decision, DecisionProblem
+from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
@@ -56,6 +58,20 @@ class RigDescribed:
     source: str  # digest of the raw log, which is not part of the recording
     # The solid parts of the hand in its own frame, that of `Probe.gripper_path`, where known.
     hand: trimesh.Trimesh | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ActionsOffered:
+    """The probes that a steered session offers, before the first; once.
+
+    A session is steered if its configuration has a group `policy`.
+    """
+
+    topic: ClassVar[str] = "/actions"
+
+    step: int  # -1: before all steps
+    actions: Actions
+    hand: HandShape  # that takes them
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +171,19 @@ class Measured:
     values: Mapping[str, float]
 
 
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """Which probe a steered session takes next, or why none; it follows the results of its step."""
+
+    topic: ClassVar[str] = "/decision"
+
+    step: int  # of the last probe, -1 before the first; that taken is of the next step
+    problem: DecisionProblem
+    decision: Decision
+    # Of the outcome of the last probe under the decision before, nats; 0 for the first decision.
+    surprise: float
+
+
 @dataclass(frozen=True)
 class Timed:
     """Wall-clock seconds by stage. With it no two recordings are equal to the byte."""
@@ -191,6 +220,7 @@ class SessionEnded:
 Event = (
     SessionStarted
     | RigDescribed
+    | ActionsOffered
     | SensorImage
     | Probe
     | ProblemPosed
@@ -198,6 +228,7 @@ Event = (
     | Traced
     | HypothesesFound
     | Measured
+    | Decided
     | Timed
     | Logged
     | SessionEnded

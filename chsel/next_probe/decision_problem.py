@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from chsel.errors import PoseError, SettingError, require_positive
+from chsel.errors import PoseError, SettingError, require_choice, require_positive
 from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray, digest, frozen
 from chsel.problem.points import KnownPoints, Workspace
@@ -133,6 +133,9 @@ class Decision:
     # Of the chosen action: where the hand meets the object in the poses of the belief (K, 3), world
     # frame; NaN where it does not.
     contacts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def __post_init__(self) -> None:
+        require_choice("stop", self.stop, STOPS)
 
     @cached_property
     def digest(self) -> str:

@@ -15,6 +15,8 @@ from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProb
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.events import (
+    ActionsOffered,
+    Decided,
     Event,
     ProblemPosed,
     RigDescribed,
@@ -23,9 +25,10 @@ from replay.events import (
     SnapshotTaken,
 )
 from replay.lost_attachment import LostAttachment
+from replay.mcap.decision_messages import decision_values, offered_from, offered_values
 from replay.mcap.encoding import shared_arguments, shared_values
 from replay.mcap.plain_config import config_from_json, config_to_json
-from replay.mcap.schemas import FORMAT_VERSION, RECORDS
+from replay.mcap.schemas import FORMAT_VERSION, RECORDS, UNSTEERED_VERSION
 from replay.mcap.sensor_messages import image_values, rig_from, rig_values
 from replay.mcap.validation import check_digest
 
@@ -47,8 +50,12 @@ def event_values(event: Event) -> dict[str, Any]:
             return archive_values(event.step, event.archive)
         case RigDescribed():
             return rig_values(event)
+        case ActionsOffered():
+            return offered_values(event)
         case SensorImage():
             return image_values(event)
+        case Decided():
+            return decision_values(event)
         case _:
             return shared_values(RECORDS[event.topic], event)
 
@@ -56,7 +63,21 @@ def event_values(event: Event) -> dict[str, Any]:
 def event_from(topic: str, values: Mapping[str, Any]) -> Event:
     """The event of a message that is all of it."""
     kind = EVENTS[topic]
-    return rig_from(values) if kind is RigDescribed else kind(**shared_arguments(kind, values))
+    if kind is RigDescribed:
+        return rig_from(values)
+    if kind is ActionsOffered:
+        return offered_from(values)
+    return kind(**shared_arguments(kind, values))
+
+
+def is_steered(start: SessionStarted) -> bool:
+    """Whether a policy decides on the probes of a session, and its decisions are recorded."""
+    return "policy" in start.config
+
+
+def version_of(start: SessionStarted) -> int:
+    """The version of the format in which a session is written: the first that has its topics."""
+    return FORMAT_VERSION if is_steered(start) else UNSTEERED_VERSION
 
 
 def step_numbers(event: Event) -> dict[str, float]:
@@ -75,7 +96,7 @@ def _session_values(event: SessionStarted) -> dict[str, Any]:
     mesh: Any = event.mesh
     lost = [part.name for part in (event.mesh, event.sdf) if isinstance(part, LostAttachment)]
     return shared_values("Session", event) | {
-        "format_version": FORMAT_VERSION,
+        "format_version": version_of(event),
         "config": config_to_json(event.config),
         "workspace": event.workspace.bounds,
         "mesh_digest": mesh.digest if isinstance(mesh, LostAttachment) else mesh_digest(mesh),

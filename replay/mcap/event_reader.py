@@ -14,6 +14,7 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from replay.events import (
+    ActionsOffered,
     Event,
     HypothesesFound,
     Logged,
@@ -26,6 +27,7 @@ from replay.events import (
 from replay.lost_attachment import LostAttachment
 from replay.mcap.attachments import MESH, SDF_GRID, attached
 from replay.mcap.contents import Contents
+from replay.mcap.decision_messages import RecordedDecision, decision_from
 from replay.mcap.encoding import check_message, decode, message_class, shared_arguments
 from replay.mcap.event_messages import (
     archive_from,
@@ -79,7 +81,7 @@ class RecordedProblem:
         return problem
 
 
-Entry = Event | RecordedProblem | ImagePlace
+Entry = Event | RecordedProblem | RecordedDecision | ImagePlace
 """An event, or what is kept of one that takes more than its message to make."""
 
 
@@ -106,6 +108,7 @@ class EventReader:
         self._counts = {"free": 0, "occupied": 0, "known": 0}
         self._last_snapshot: ArchiveSnapshot | None = None
         self._last_elites: FloatArray | None = None
+        self._offered: ActionsOffered | None = None
 
     def take(self, message: StoredMessage) -> None:
         """Read one message. Raises RecordingError if it is malformed or out of place."""
@@ -151,7 +154,7 @@ class EventReader:
         self._order.take(entry.topic, entry.step)
         if isinstance(entry, RecordedProblem):
             self.contents.pose(entry.step)
-        elif not isinstance(entry, ImagePlace):
+        elif not isinstance(entry, RecordedDecision | ImagePlace):
             self.contents.take(entry)
         self.entries.append(entry)
 
@@ -176,8 +179,13 @@ class EventReader:
                 return SnapshotTaken(values["step"], self._last_snapshot)
             case "/hypotheses":
                 return self._hypotheses(values)
+            case "/decision":
+                return decision_from(values, self._offered)
             case _:
-                return event_from(topic, values)
+                event = event_from(topic, values)
+                if isinstance(event, ActionsOffered):
+                    self._offered = event
+                return event
 
     def _close(self, values: dict[str, Any]) -> SessionStarted | Probe:
         """The event that was open, now that its points are there."""

@@ -9,10 +9,18 @@ from chsel.errors import ChselError, RecordingError
 from chsel.problem.defaults import object_grid
 from chsel.problem.points import GrowingPoints
 from chsel.problem.sdf_grid import SdfGrid
-from replay.events import HypothesesFound, Probe, ProblemPosed, SensorImage, SessionStarted
+from replay.events import (
+    Event,
+    HypothesesFound,
+    Probe,
+    ProblemPosed,
+    SensorImage,
+    SessionStarted,
+)
 from replay.lost_attachment import LostAttachment
 from replay.mcap.attachments import MESH, SDF_GRID, attached
 from replay.mcap.contents import Row, rows
+from replay.mcap.decision_messages import RecordedDecision
 from replay.mcap.encoding import decode
 from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
 from replay.mcap.plain_config import config_from_json
@@ -57,11 +65,17 @@ class GapReader(EventReader):
                 self._points.add(entry.new_points)
         return news
 
-    def completed(self, entry: RecordedProblem) -> ProblemPosed:
-        """The whole problem; RecordingError if points or elites of lost messages are missing."""
+    def completed(self, entry: Event | RecordedProblem | RecordedDecision) -> Event:
+        """With its whole problem; RecordingError if something of lost messages is missing."""
+        if not isinstance(entry, RecordedProblem | RecordedDecision):
+            return entry
         assert self.start is not None
         assert self._points is not None
-        return ProblemPosed(entry.step, entry.completed(self.start.sdf, self._points.all()))
+        points = self._points.all()
+        if isinstance(entry, RecordedProblem):
+            return ProblemPosed(entry.step, entry.completed(self.start.sdf, points))
+        assert self._offered is not None  # as the decision was read
+        return entry.completed(self.start, self._offered, points)
 
     def _append(self, entry: Entry) -> None:
         self.entries.append(entry)

@@ -6,11 +6,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 from chsel.errors import ChselError, RecordingError
 from chsel.problem.points import GrowingPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.events import (
+    ActionsOffered,
+    Decided,
     Event,
     HypothesesFound,
     Probe,
@@ -23,6 +26,7 @@ from replay.events import (
     Timed,
 )
 from replay.mcap.damaged import DamagedRecordingError
+from replay.mcap.decision_messages import RecordedDecision
 from replay.mcap.encoding import decode
 from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
 from replay.mcap.file import McapFile, StoredMessage
@@ -31,6 +35,8 @@ from replay.mcap.schemas import RECORDS, SEALED_SINCE, STEP_TIME
 from replay.mcap.sensor_messages import ImagePlace, image_from
 from replay.mcap.texts import one_line
 
+Placed = TypeVar("Placed", RecordedProblem, RecordedDecision)
+
 
 class Recording:
     """What a session left behind.
@@ -38,8 +44,9 @@ class Recording:
     path: of the file. damage: what cut reading short, None if the file is whole. start: how the
     session began. ended: how it ended, None if it did not. probes: in their order. steps: those
     with a registration problem. rig: of a recorded robot session, else None. image_steps: those
-    with images of sensors. version: of its format. digest: of its last seal, "" before version 3.
-    attachments: bytes of each, by name.
+    with images of sensors. offered: the actions of a steered session, else None. decision_steps:
+    those that a decision follows, -1 for that before the first probe. version: of its format.
+    digest: of its last seal, "" before version 3. attachments: bytes of each, by name.
     """
 
     def __init__(
@@ -67,6 +74,9 @@ class Recording:
         self.rig = next((entry for entry in entries if isinstance(entry, RigDescribed)), None)
         seen = (entry.step for entry in entries if isinstance(entry, ImagePlace))
         self.image_steps = tuple(dict.fromkeys(seen))
+        self.offered = next((entry for entry in entries if isinstance(entry, ActionsOffered)), None)
+        decisions = (entry.step for entry in entries if isinstance(entry, RecordedDecision))
+        self.decision_steps = tuple(decisions)
         self._entries = entries
 
     def events(self, *, images: bool = True) -> Iterator[Event]:
@@ -81,6 +91,8 @@ class Recording:
                 points.add(entry.new_points)
             if isinstance(entry, RecordedProblem):
                 yield ProblemPosed(entry.step, self._completed(entry, points))
+            elif isinstance(entry, RecordedDecision):
+                yield self._decided(entry, points)
             elif not isinstance(entry, ImagePlace):
                 yield entry
             elif images:
@@ -95,14 +107,14 @@ class Recording:
     def problem(self, step: int) -> RegistrationProblem:
         """The registration problem of a step, from the file alone; its digest is checked."""
         self._check_step(step, self.steps, "registration problem")
-        points = GrowingPoints(self.start.initial_points)
-        for entry in self._entries:
-            if isinstance(entry, Probe):
-                points.add(entry.new_points)
-            if isinstance(entry, RecordedProblem) and entry.step == step:
-                break
-        assert isinstance(entry, RecordedProblem)
+        entry, points = self._found(RecordedProblem, step)
         return self._completed(entry, points)
+
+    def decision(self, step: int) -> Decided:
+        """The decision that follows a step, with its problem, whose digest is checked."""
+        self._check_step(step, self.decision_steps, "decision")
+        entry, points = self._found(RecordedDecision, step)
+        return self._decided(entry, points)
 
     def checked_steps(self, steps: Sequence[int] | None) -> tuple[int, ...]:
         """Steps with a registration problem, in order; None means all. RecordingError if not."""
@@ -170,6 +182,22 @@ class Recording:
         if found is None or found.step != place.step:
             raise RecordingError(f"recording {self.path} has changed while it was read")
         return found
+
+    def _found(self, kind: type[Placed], step: int) -> tuple[Placed, GrowingPoints]:
+        """An entry of a step that is there, and all points before it."""
+        points = GrowingPoints(self.start.initial_points)
+        for entry in self._entries:
+            if isinstance(entry, Probe):
+                points.add(entry.new_points)
+            if isinstance(entry, kind) and entry.step == step:
+                break
+        assert isinstance(entry, kind)
+        return entry, points
+
+    def _decided(self, entry: RecordedDecision, points: GrowingPoints) -> Decided:
+        assert self.offered is not None  # as the decision was read
+        with _blaming(self.path):
+            return entry.completed(self.start, self.offered, points.all())
 
     def _completed(self, entry: RecordedProblem, points: GrowingPoints) -> RegistrationProblem:
         with _blaming(self.path):

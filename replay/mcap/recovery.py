@@ -192,7 +192,7 @@ class _Recovery:
         if isinstance(entry, _OF_REGISTRATION) and step in self._lost_steps:
             return  # with its problem
         try:
-            event = reader.completed(entry) if isinstance(entry, RecordedProblem) else entry
+            event = reader.completed(entry)
             self._order.take(event.topic, event.step)
         except WRONG as error:
             what, reason = f"{type(entry).__name__} of step {step}", one_line(str(error))

@@ -9,19 +9,24 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from chsel.next_probe.decision_problem import STOPS
 from replay.mcap.validation import (
     Check,
     ascending_costs,
     between,
+    chances,
     check_archive,
+    check_decision,
     check_hand,
     check_hypotheses,
     check_trace,
+    distribution,
     finite,
     intrinsics,
     not_empty,
     one_of,
     plain_texts,
+    positive,
     rigid,
     sensor_name,
     session_end,
@@ -30,11 +35,14 @@ from replay.mcap.validation import (
     voxel_side,
 )
 
-FORMAT_VERSION = 3
-"""That of new recordings. A reader refuses newer ones, so any change of meaning needs a new number.
+FORMAT_VERSION = 4
+"""The newest. A reader refuses newer ones, so any change of meaning needs a new number.
 
-Version 2 added a rig and images of its sensors, version 3 seals.
+Version 2 added a rig and images of its sensors, version 3 seals, version 4 decisions.
 """
+
+UNSTEERED_VERSION = 3
+"""That of new recordings without decisions, which have nothing of a later version."""
 
 SEALED_SINCE = 3
 """From this version on, seals cover every record, and measured values are those of the results."""
@@ -172,6 +180,35 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "intrinsics": ("f8[4]", intrinsics),  # fx, fy, cx, cy, pixels
         "world_from_camera": ("f8[4,4]", rigid),
     },
+    "Actions": {
+        "step": "sint32",
+        "world_from_hand": ("f8[A,4,4]", rigid),
+        "length": ("f8[A]", positive),
+        "seconds": ("f8[A]?", positive),
+        "hand_vertices": "f8[V,3]",
+        "hand_faces": "i4[F,3]",
+        "digest": "string",  # of both
+    },
+    # Grid, points, workspace, actions and hand of the problem are those of the messages before.
+    "Decision": {
+        "step": "sint32",
+        "poses": ("f8[K,4,4]", not_empty, rigid),  # of the belief, object_from_world
+        "weights": ("f8[K]", distribution),
+        "available": "b1[A]",
+        "key_seed": "uint64",
+        "key_step": "uint32",
+        "problem_digest": "string",
+        "chosen": "sint32",
+        "stop": ("string", one_of(*STOPS)),
+        "spread": ("double", between(0.0, 1e6, "m")),
+        "score": "f8[A]",
+        "hit_chance": ("f8[A]", chances),
+        "blocked_chance": ("f8[A]", chances),
+        "expected_spread": ("f8[A]", finite),
+        "contacts": "f8[N,3]",
+        "digest": "string",  # of chosen to contacts
+        "surprise": ("double", finite),
+    },
     # The last message: a row for each probe, so that a large file tells at once what is in it.
     "Contents": {
         "step": "i8[S]",
@@ -218,6 +255,8 @@ RECORDS: Mapping[str, str] = {
     "/rig": "Rig",
     "/sensor_image": "SensorImage",
     "/seal": "Seal",
+    "/actions": "Actions",
+    "/decision": "Decision",
 }
 """Topics that carry messages of the table."""
 
@@ -225,12 +264,20 @@ NUMBERS = ("/measured", "/timed")
 """Topics whose numbers are about a step: rows of exported metrics, and curves in Rerun."""
 
 TOGETHER: Mapping[str, Callable[[Mapping[str, Any]], None]] = {
+    "Actions": check_hand,
     "ArchiveSnapshot": check_archive,
+    "Decision": check_decision,
     "Hypotheses": check_hypotheses,
     "Rig": check_hand,
     "Trace": check_trace,
 }
 """What the values of a message must be together; raises RecordingError."""
 
-SINCE_VERSION: Mapping[str, int] = {"/rig": 2, "/sensor_image": 2, "/seal": SEALED_SINCE}
+SINCE_VERSION: Mapping[str, int] = {
+    "/rig": 2,
+    "/sensor_image": 2,
+    "/seal": SEALED_SINCE,
+    "/actions": 4,
+    "/decision": 4,
+}
 """Topics that a recording of a lower version does not have."""

@@ -16,7 +16,7 @@ from replay.files import sync_folder
 from replay.mcap.attachments import MEDIA_TYPES
 from replay.mcap.encoding import descriptor_set, encode, message_class
 from replay.mcap.foxglove_messages import FOXGLOVE
-from replay.mcap.schemas import BEFORE_ALL_STEPS, PROFILE, RECORDS, STEP_TIME
+from replay.mcap.schemas import BEFORE_ALL_STEPS, PROFILE, RECORDS, SINCE_VERSION, STEP_TIME
 from replay.mcap.seal import CONTENTS, SEAL, Chain
 
 _CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
@@ -25,7 +25,7 @@ _LIBRARY = "chsel-replay"  # without versions of packages, which stand in the se
 
 
 class SealedFile:
-    """Writes messages to a new file, with a description of every topic, used or not.
+    """Writes messages to a new file, with a description of every topic of its format.
 
     All is done within `writing`. Raises RecordingError if the file exists or cannot be written.
     """
@@ -48,7 +48,21 @@ class SealedFile:
                 enable_data_crcs=True,
             )
             self._writer.start(profile=PROFILE, library=_LIBRARY)
-            self._describe()
+
+    def describe(self, version: int) -> None:
+        """Describe all topics of a version of the format, used or not; before anything else."""
+        topics: dict[str, Any] = {topic: message_class(name) for topic, name in RECORDS.items()}
+        schemas: dict[str, int] = {}
+        for topic, kind in {**topics, **FOXGLOVE}.items():
+            if SINCE_VERSION.get(topic, 0) > version:
+                continue
+            name = kind.DESCRIPTOR.full_name
+            if name not in schemas:
+                schemas[name] = self._describe_schema(kind)
+            number = self._writer.register_channel(topic, "protobuf", schemas[name])
+            self._channels[topic] = number
+            self.chain.describe(Channel(number, topic, "protobuf", {}, schemas[name]))
+        self._describe_schema(message_class("SdfGrid"))  # the file describes its attachment too
 
     def attach(self, name: str, data: bytes) -> None:
         """Write an attachment."""
@@ -119,18 +133,6 @@ class SealedFile:
     def _next_time(self, step: int) -> int:
         """Log time of the next message."""
         return (step - BEFORE_ALL_STEPS) * STEP_TIME + self._count
-
-    def _describe(self) -> None:
-        topics: dict[str, Any] = {topic: message_class(name) for topic, name in RECORDS.items()}
-        schemas: dict[str, int] = {}
-        for topic, kind in {**topics, **FOXGLOVE}.items():
-            name = kind.DESCRIPTOR.full_name
-            if name not in schemas:
-                schemas[name] = self._describe_schema(kind)
-            number = self._writer.register_channel(topic, "protobuf", schemas[name])
-            self._channels[topic] = number
-            self.chain.describe(Channel(number, topic, "protobuf", {}, schemas[name]))
-        self._describe_schema(message_class("SdfGrid"))  # the file describes its attachment too
 
     def _describe_schema(self, kind: Any) -> int:
         name, described = kind.DESCRIPTOR.full_name, descriptor_set(kind)

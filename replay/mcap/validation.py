@@ -24,6 +24,7 @@ RECOVERED = "recovered: "
 _ENDS = ("finished", "interrupted")
 _FAILED = "failed: "
 _LONGEST_FOCUS = 1e6  # pixels
+_ROUNDING = 1e-6  # of a sum of weights
 _BEFORE_ALL_STEPS = -1
 
 
@@ -86,6 +87,26 @@ def finite(field: str, value: Any) -> None:
         raise RecordingError(f"{field} has a number that is not finite; accepted: finite numbers")
 
 
+def positive(field: str, value: np.ndarray) -> None:
+    """Finite numbers above 0."""
+    finite(field, value)
+    if not (value > 0.0).all():
+        raise RecordingError(f"{field} has {value.min():g}; accepted: above 0")
+
+
+def chances(field: str, value: np.ndarray) -> None:
+    """Numbers from 0 to 1, but for rounding."""
+    if not ((value >= 0.0) & (value <= 1.0 + _ROUNDING)).all():
+        raise RecordingError(f"{field} has a number that is no chance; accepted: 0 to 1")
+
+
+def distribution(field: str, value: np.ndarray) -> None:
+    """Weights (K,), of sum 1 but for rounding."""
+    chances(field, value)
+    if abs(float(value.sum()) - 1.0) > _ROUNDING:
+        raise RecordingError(f"{field} have the sum {value.sum():g}; accepted: 1")
+
+
 def not_empty(field: str, value: np.ndarray) -> None:
     """An array of at least one row."""
     if len(value) == 0:
@@ -137,13 +158,31 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
         raise RecordingError("the mesh has a face that is no triangle of its vertices")
 
 
-def check_hand(rig: Mapping[str, Any]) -> None:
-    """Raise RecordingError unless the hand of a message `Rig` is a mesh, or absent."""
-    vertices, faces = rig["hand_vertices"], rig["hand_faces"]
+def check_hand(values: Mapping[str, Any]) -> None:
+    """Raise RecordingError unless the hand of a message is a mesh, or absent."""
+    vertices, faces = values["hand_vertices"], values["hand_faces"]
     if (vertices is None) is not (faces is None):
         raise RecordingError("the hand lacks its vertices or its faces; accepted: both or none")
     if vertices is not None:
         check_mesh(vertices, faces)
+
+
+def check_decision(made: Mapping[str, Any]) -> None:
+    """Raise RecordingError unless choice, scores and contacts of a message `Decision` agree."""
+    chosen, score, contacts = made["chosen"], made["score"], made["contacts"]
+    if not -1 <= chosen < len(score):
+        raise RecordingError(f"chosen is {chosen}; accepted: -1 to {len(score) - 1}")
+    if (chosen < 0) is not bool(made["stop"]):
+        raise RecordingError(f"action {chosen} is chosen with the stop {made['stop']!r}")
+    if not (score < math.inf).all():
+        raise RecordingError("score has NaN or inf; accepted: finite numbers, or -inf")
+    if chosen >= 0 and not (made["available"][chosen] and np.isfinite(score[chosen])):
+        raise RecordingError(f"action {chosen} is chosen, which cannot be taken")
+    if len(contacts) not in (0, len(made["weights"])):
+        counts = f"{len(contacts)} contacts for {len(made['weights'])} poses"
+        raise RecordingError(f"it has {counts}; accepted: one for each, or none")
+    if not (np.isfinite(contacts).all(axis=1) | np.isnan(contacts).all(axis=1)).all():
+        raise RecordingError("a contact is not finite; accepted: finite numbers, or NaN alone")
 
 
 def check_trace(trace: Mapping[str, Any]) -> None:
@@ -212,14 +251,17 @@ class EventOrder:
     """Follows the events of one session: steps ascend, and a step has one problem, one result.
 
     step: of the last event, -1 before all steps. has_rig: whether a rig was described.
+    has_actions: whether actions were offered.
     """
 
     def __init__(self) -> None:
         self.step = _BEFORE_ALL_STEPS
         self.has_rig = False
+        self.has_actions = False
         self._probe = _BEFORE_ALL_STEPS  # the step of the last probe
         self._posed = _BEFORE_ALL_STEPS  # the step of the last problem
         self._registering = False  # a problem is posed and has no result yet
+        self._decided = _BEFORE_ALL_STEPS - 1  # the step of the last decision
         self._ended = False
 
     def take(self, topic: str, step: int) -> None:
@@ -249,9 +291,20 @@ class EventOrder:
                     raise RecordingError(
                         f"an image of step {step} does not precede the probe of its step"
                     )
+            case "/actions":
+                if self.has_actions or step != _BEFORE_ALL_STEPS:
+                    raise RecordingError(
+                        f"actions are offered in step {step}; accepted: once, before all steps"
+                    )
+                self.has_actions = True
+            case "/decision":
+                self._check_decision(step)
+                self._decided = step
             case "/problem":
                 if step <= self._posed:
                     raise RecordingError(f"step {step} has a second registration problem")
+                if step == self._decided:
+                    raise RecordingError(f"the registration of step {step} follows its decision")
                 self._posed, self._registering = step, True
             case "/archive" | "/trace" | "/hypotheses":
                 if not self._registering or step != self._posed:
@@ -259,3 +312,14 @@ class EventOrder:
                 self._registering = topic != "/hypotheses"
             case "/session_ended":
                 self._ended = True
+
+    def _check_decision(self, step: int) -> None:
+        """Raise RecordingError unless a decision can be made now."""
+        if not self.has_actions:
+            raise RecordingError(f"a decision of step {step} has no actions before it")
+        if step != self._probe:
+            raise RecordingError(f"a decision of step {step} follows probe {self._probe}")
+        if step == self._decided:
+            raise RecordingError(f"step {step} has a second decision")
+        if self._registering:
+            raise RecordingError(f"a decision of step {step} stands within a registration")

@@ -9,9 +9,13 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import RecordingError
+from chsel.next_probe.decision_problem import DecisionProblem
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import GrowingPoints, KnownPoints
+from chsel.problem.registration_problem import RegistrationProblem
 from replay.events import (
+    ActionsOffered,
+    Decided,
     Event,
     HypothesesFound,
     Logged,
@@ -26,7 +30,13 @@ from replay.lost_attachment import is_lost
 from replay.mcap.attachments import MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
 from replay.mcap.contents import Contents
 from replay.mcap.encoding import check_message, encode
-from replay.mcap.event_messages import archive_values, event_values, shared_values
+from replay.mcap.event_messages import (
+    archive_values,
+    event_values,
+    is_steered,
+    shared_values,
+    version_of,
+)
 from replay.mcap.foxglove_messages import CLOUDS, POINT_CLASSES, log_line, point_cloud
 from replay.mcap.schemas import RECORDS
 from replay.mcap.seal import CONTENTS
@@ -50,7 +60,8 @@ class McapRecorder(Recorder):
         self._order = EventOrder()
         self._views = Views()
         self._points: GrowingPoints | None = None  # all that is known, once a session has started
-        self._sdf_digest = ""
+        self._start: SessionStarted | None = None
+        self._offered: ActionsOffered | None = None
         self._last_snapshot = b""
         self._last_elites: FloatArray | None = None
 
@@ -75,7 +86,7 @@ class McapRecorder(Recorder):
             self._write(event)
             for topic, make in self._views.after(event):
                 self._file.add(topic, event.step, make)
-            if isinstance(event, SessionStarted | RigDescribed):
+            if isinstance(event, SessionStarted | RigDescribed | ActionsOffered):
                 self._file.end_chunk()  # so that it is read, or lost, apart from what follows
         self._contents.take(event)
 
@@ -109,6 +120,10 @@ class McapRecorder(Recorder):
                 self._write_points(event.step, event.new_points)
             case ProblemPosed():
                 self._write_problem(event)
+            case ActionsOffered():
+                self._write_actions(event)
+            case Decided():
+                self._write_decision(event)
             case SnapshotTaken():
                 values = event_values(event)
                 self._last_snapshot = self._record(event.topic, event.step, values)
@@ -122,11 +137,12 @@ class McapRecorder(Recorder):
     def _write_session(self, event: SessionStarted) -> None:
         values = event_values(event)
         check_message("Session", values)
+        self._file.describe(version_of(event))
         if not is_lost(event.mesh):
             self._file.attach(MESH, mesh_to_ply(event.mesh))
         if not is_lost(event.sdf):
             self._file.attach(SDF_GRID, sdf_to_bytes(event.sdf))
-        self._sdf_digest = event.sdf.digest
+        self._start = event
         self._record(event.topic, event.step, values)
         for topic in STARTING_EMPTY:
             self._file.add(topic, event.step, empty_cloud)
@@ -148,9 +164,7 @@ class McapRecorder(Recorder):
 
     def _write_problem(self, event: ProblemPosed) -> None:
         problem = event.problem
-        assert self._points is not None
-        known = self._points.all()
-        if problem.points.digest != known.digest or problem.sdf.digest != self._sdf_digest:
+        if not self._is_given(problem):
             raise RecordingError(
                 f"the problem of step {event.step} has points or an SDF grid that the events "
                 "before it do not give"
@@ -159,6 +173,41 @@ class McapRecorder(Recorder):
         if self._last_elites is not None and _same(problem.low_cost_set, self._last_elites):
             values["low_cost_set"] = None
         self._record(event.topic, event.step, values)
+
+    def _write_actions(self, event: ActionsOffered) -> None:
+        assert self._start is not None
+        if not is_steered(self._start):
+            raise RecordingError(
+                "the session offers actions but has no policy; accepted: a configuration with a "
+                "group policy"
+            )
+        self._record(event.topic, event.step, event_values(event))
+        self._offered = event
+
+    def _write_decision(self, event: Decided) -> None:
+        problem, start, offered = event.problem, self._start, self._offered
+        assert start is not None
+        assert offered is not None
+        if not (
+            self._is_given(problem)
+            and (problem.workspace, problem.free_resolution)
+            == (start.workspace, start.free_resolution)
+            and problem.actions.digest == offered.actions.digest
+            and problem.hand.digest == offered.hand.digest
+        ):
+            raise RecordingError(
+                f"the problem of the decision of step {event.step} has points, a grid, a "
+                "workspace, actions or a hand that the events before it do not give"
+            )
+        self._record(event.topic, event.step, event_values(event))
+
+    def _is_given(self, problem: RegistrationProblem | DecisionProblem) -> bool:
+        """Whether points and grid of a problem are those of the events before."""
+        assert self._points is not None
+        assert self._start is not None
+        known = self._points.all()
+        same_points = problem.points.digest == known.digest
+        return same_points and problem.sdf.digest == self._start.sdf.digest
 
     def _write_hypotheses(self, event: HypothesesFound) -> None:
         found = event.hypotheses

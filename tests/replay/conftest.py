@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 import trimesh
 
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
+from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import digest
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import GrowingPoints, KnownPoints, Workspace
 from chsel.problem.poses import compose, random_rotations
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.events import (
+    ActionsOffered,
+    Decided,
     Event,
     HypothesesFound,
     Logged,
@@ -136,6 +140,55 @@ def with_sensors(events: list[Event], *, height: int = 5, width: int = 7) -> lis
     return made
 
 
+def with_decisions(events: list[Event], *, actions: int = 4, poses: int = 3) -> list[Event]:
+    """The same session steered: actions are offered, and a decision follows each step's results."""
+    random = np.random.default_rng(13)
+    starting = sum(isinstance(event, SessionStarted | RigDescribed) for event in events)
+    start = events[0]
+    start = dataclasses.replace(start, config={**start.config, "policy": {"name": "dice"}})
+    hand = HandShape.of(trimesh.creation.icosphere(subdivisions=1, radius=0.05))
+    length = random.uniform(0.1, 0.5, actions)
+    offered = Actions(_poses(random, actions), length, length + 1.0)
+    points, probed = GrowingPoints(start.initial_points), -1
+    made: list[Event] = [start, *events[1:starting], ActionsOffered(-1, offered, hand)]
+
+    def decided(*, stop: str = "") -> Decided:
+        belief = Belief(_poses(random, poses), np.full(poses, 1.0 / poses))
+        available = np.arange(actions) != probed
+        chosen = -1 if stop else (probed + 1) % actions
+        contacts = random.normal(size=(poses, 3))
+        contacts[0] = np.nan
+        decision = Decision(
+            chosen,
+            stop,
+            random.uniform(),
+            np.where(available, random.normal(size=actions), -np.inf),
+            *random.uniform(size=(3, actions)),
+            contacts=np.zeros((0, 3)) if stop else contacts,
+        )
+        problem = DecisionProblem(
+            start.sdf,
+            points.all(),
+            start.workspace,
+            start.free_resolution,
+            belief,
+            offered,
+            available,
+            hand,
+            StreamKey(start.seed, probed + 1),
+        )
+        return Decided(probed, problem, decision, random.uniform(0.0, 9.0))
+
+    for event in events[starting:]:
+        if event.step > probed or isinstance(event, SessionEnded):
+            made.append(decided(stop="spread" if isinstance(event, SessionEnded) else ""))
+            probed = event.step
+        if isinstance(event, Probe):
+            points.add(event.new_points)
+        made.append(event)
+    return made
+
+
 def same_bits(a: Any, b: Any) -> bool:
     """Whether two values are equal down to the types and bytes of their arrays."""
     if isinstance(a, trimesh.Trimesh):
@@ -143,6 +196,8 @@ def same_bits(a: Any, b: Any) -> bool:
             (a.vertices.view(np.ndarray), a.faces.view(np.ndarray)),
             (b.vertices.view(np.ndarray), b.faces.view(np.ndarray)),
         )
+    if isinstance(a, HandShape) and isinstance(b, HandShape):
+        return same_bits((a.vertices, a.faces), (b.vertices, b.faces))
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
     if type(a) is not type(b):
@@ -230,10 +285,19 @@ def sensor_events() -> list[Event]:
     return with_sensors(example_events())
 
 
-@pytest.fixture(params=["full", "bare", "start alone", "sensors"])
+@pytest.fixture
+def steered_events() -> list[Event]:
+    return with_decisions(example_events())
+
+
+@pytest.fixture(params=["full", "bare", "start alone", "sensors", "steered", "steered sensors"])
 def any_events(request: pytest.FixtureRequest) -> list[Event]:
     if request.param == "bare":
         return bare_events()
+    if request.param == "steered":
+        return with_decisions(example_events())
+    if request.param == "steered sensors":
+        return with_decisions(with_sensors(example_events(steps=2)))
     if request.param == "sensors":
         return with_sensors(example_events(steps=2))
     return example_events() if request.param == "full" else example_events()[:1]

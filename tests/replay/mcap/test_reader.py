@@ -295,7 +295,7 @@ def test_another_format_version_is_named_before_all_else(events, write):
         session.ClearField("workspace")
         return session.SerializeToString()
 
-    with pytest.raises(RecordingError, match="newer version: format 4; this one reads up to 3"):
+    with pytest.raises(RecordingError, match="newer version: format 5; this one reads up to 4"):
         read_recording(rewritten(write(events), newer))
 
 
