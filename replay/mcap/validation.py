@@ -169,7 +169,11 @@ def check_hand(values: Mapping[str, Any]) -> None:
 
 def check_decision(made: Mapping[str, Any]) -> None:
     """Raise RecordingError unless choice, scores and contacts of a message `Decision` agree."""
+    from chsel.next_probe.belief import MOST_POSES
+
     chosen, score, contacts = made["chosen"], made["score"], made["contacts"]
+    if len(made["weights"]) > MOST_POSES:
+        raise RecordingError(f"it has {len(made['weights'])} poses; accepted: at most {MOST_POSES}")
     if not -1 <= chosen < len(score):
         raise RecordingError(f"chosen is {chosen}; accepted: -1 to {len(score) - 1}")
     if (chosen < 0) is not bool(made["stop"]):
