@@ -1,4 +1,4 @@
-"""Colours of the Rerun recording: costs on a perceptual map, and one colour per kind of thing."""
+"""Colours of the Rerun recording: costs and scores on maps, and one colour per kind of thing."""
 
 from __future__ import annotations
 
@@ -28,6 +28,9 @@ GRIPPER: Rgb = (255, 255, 255)
 HAND: Rgb = (150, 190, 230)
 CAMERA: Rgb = (90, 210, 190)
 PAST: Rgb = (140, 146, 156)
+CHOSEN: Rgb = (255, 250, 225)
+FORECAST: Rgb = (255, 170, 190)
+UNAVAILABLE: Rgb = (104, 108, 120)
 
 CURVES: dict[str, Rgb] = {
     "lowest": (253, 220, 60),
@@ -60,6 +63,11 @@ _VIRIDIS = np.array(
         (181, 222, 43),
         (253, 231, 37),
     ],
+    dtype=np.float64,
+)
+# From brown over orange to pale yellow, as costs of hypotheses have the other map.
+_EMBERS = np.array(
+    [(92, 44, 28), (160, 70, 20), (226, 110, 20), (255, 170, 60), (255, 240, 190)],
     dtype=np.float64,
 )
 _PLACES = 1024  # of the map, of which no two neighbours differ by more than one level of a colour
@@ -101,6 +109,27 @@ class CostScale:
         return float(start * (self.high / start) ** fraction)
 
 
+@dataclass(frozen=True)
+class ScoreScale:
+    """Linear scale from the lowest score (0, dark) to the highest (1, bright)."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, score: FloatArray) -> ScoreScale:
+        """The scale of scores (A,); finite ones count, of none at all the scale is 0 to 0."""
+        finite = score[np.isfinite(score)]
+        return cls(float(finite.min()), float(finite.max())) if len(finite) else cls(0.0, 0.0)
+
+    def fraction(self, score: FloatArray) -> FloatArray:
+        """Place of each finite score on the scale, in [0, 1]; 1 where all are equal."""
+        half = 0.5 * self.high - 0.5 * self.low  # the whole may be too large for a number
+        if not half > 0.0:
+            return np.ones(len(score))
+        return np.clip((0.5 * score - 0.5 * self.low) / half, 0.0, 1.0)
+
+
 def cost_colors(fraction: ArrayLike) -> ColorArray:
     """Colours (..., 3) of places on a cost scale (...): bright where the cost is low."""
     place = np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0) * (_PLACES - 1)
@@ -108,12 +137,22 @@ def cost_colors(fraction: ArrayLike) -> ColorArray:
     return colors
 
 
+def score_colors(fraction: ArrayLike) -> ColorArray:
+    """Colours (..., 3) of places on a scale of scores (...): bright where the score is high."""
+    return _between(_EMBERS, np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0))
+
+
 @cache
 def _color_map() -> ColorArray:
     """The colours (_PLACES, 3) of a cost scale, from its lowest cost to its highest."""
-    place = np.linspace(len(_VIRIDIS) - 1, 0.0, _PLACES)
-    steps = np.arange(len(_VIRIDIS))
-    channels = [np.interp(place, steps, _VIRIDIS[:, channel]) for channel in range(3)]
+    return _between(_VIRIDIS, np.linspace(1.0, 0.0, _PLACES))
+
+
+def _between(colors: FloatArray, fraction: FloatArray) -> ColorArray:
+    """Colours (..., 3) at places (...) in [0, 1] along a row of colours (N, 3)."""
+    place = (len(colors) - 1) * fraction
+    steps = np.arange(len(colors))
+    channels = [np.interp(place, steps, colors[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
 

@@ -18,6 +18,7 @@ from replay.colors import BACKGROUND, GRID
 from replay.events import SessionStarted
 from replay.rerun.clock import PROBE, REGISTRATION, TIMELINES
 from replay.rerun.curves import SEARCH_FRAME, SPREADS
+from replay.rerun.decisions import DECISION_CURVES
 from replay.rerun.hypotheses import shown_hypotheses
 from replay.rerun.legend import LEGEND_FRAME
 from replay.rerun.plane import Frame
@@ -46,25 +47,28 @@ def session_blueprint(
     in_sight: Bounds | None = None,
     archive: Frame | None = USUAL_ARCHIVE,
     timed: bool = False,
+    steered: bool = False,
     sensors: Sequence[SensorPicture] = (),
     follow: bool = False,
 ) -> rrb.Blueprint:
     """Scene, archive and text above, curves below.
 
     in_sight: see `scene_view`. archive: size of the heat map in cells; None for a method without
-    an archive. timed: whether there are wall-clock times to show. sensors: of a robot session,
-    their pictures beside all. follow: show the last probe, otherwise the first registration, which
-    must be there then.
+    an archive. timed: whether there are wall-clock times to show. steered: whether there are
+    decisions to show. sensors: of a robot session, their pictures beside all. follow: show the last
+    probe, otherwise the first registration, which must be there then.
     """
     view = scene_view(workspace, in_sight=in_sight)
-    scene = rrb.Vertical(view, legend_view(), row_shares=[9, 1])
+    strips = [legend_view(), *([legend_view("score_legend", "Scores")] if steered else [])]
+    scene = rrb.Vertical(view, *strips, row_shares=[9, *(1 for _ in strips)])
     upper: list[rrb.View | rrb.Container] = [scene, _text_views()]
     shares = [10.0, 4.0]
     if archive is not None:
         upper.insert(1, archive_view(archive))
         shares = [9.5, 6.5, 4.5]
     above = rrb.Horizontal(*upper, column_shares=shares)
-    below = rrb.Horizontal(*_curve_views(pose_known=pose_known, timed=timed))
+    curves = _curve_views(pose_known=pose_known, timed=timed)
+    below = rrb.Horizontal(*(_steered_views(curves) if steered else curves))
     views: rrb.Container = rrb.Vertical(above, below, row_shares=[65, 35])
     if sensors:
         columns = 1 if len(sensors) <= _IN_A_COLUMN else 2
@@ -144,9 +148,9 @@ def _sensor_views(sensors: Sequence[SensorPicture], columns: int) -> rrb.Contain
     return rrb.Grid(*views, grid_columns=columns)
 
 
-def legend_view(root: str = "legend") -> rrb.Spatial2DView:
+def legend_view(root: str = "legend", name: str = "Legend") -> rrb.Spatial2DView:
     """What the colours of the scene mean."""
-    return plane_view(root, "Legend", LEGEND_FRAME, (0.0, 0.0, 0.0, 0.0), titlebar=False)
+    return plane_view(root, name, LEGEND_FRAME, (0.0, 0.0, 0.0, 0.0), titlebar=False)
 
 
 def _curve_views(*, pose_known: bool, timed: bool) -> list[rrb.View | rrb.Container]:
@@ -172,6 +176,17 @@ def _curve_views(*, pose_known: bool, timed: bool) -> list[rrb.View | rrb.Contai
         )
     )
     return views
+
+
+def _steered_views(views: list[rrb.View | rrb.Container]) -> list[rrb.View | rrb.Container]:
+    """The curves of decisions ahead of the others, whose plot of the search is behind costs."""
+    spread, hit, surprise = (
+        curves_view(f"decision/{kind}", name, legend=kind == "spread")
+        for kind, name in DECISION_CURVES.items()
+    )
+    costs, search, *others = views
+    of_costs = rrb.Tabs(*costs.contents, search) if isinstance(costs, rrb.Tabs) else costs
+    return [spread, rrb.Vertical(hit, surprise), *others, of_costs]
 
 
 def _text_views() -> rrb.Container:

@@ -14,6 +14,8 @@ from replay.events import Probe
 if TYPE_CHECKING:
     import trimesh
 
+    from chsel.next_probe.hand_shape import HandShape
+
 DISPLAY_FACES = 6000
 """Meshes with more faces are coarsened for display."""
 HIDDEN = np.zeros((1, 4, 4))
@@ -68,6 +70,13 @@ def coarsened(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
         coarse = trimesh.Trimesh(np.stack(centres, axis=1), group[faces][kept], process=False)
         cell *= 1.2
     return coarse
+
+
+def hand_mesh(hand: HandShape) -> trimesh.Trimesh:
+    """The mesh of the hand that takes actions, in its frame."""
+    import trimesh
+
+    return trimesh.Trimesh(hand.vertices, hand.faces, process=False)
 
 
 class HandMesh:

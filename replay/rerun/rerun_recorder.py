@@ -25,9 +25,10 @@ from replay.rerun.archive import ArchiveMap, map_frame
 from replay.rerun.blueprint import USUAL_ARCHIVE, Bounds, bounds_in_sight, session_blueprint
 from replay.rerun.clock import Clock
 from replay.rerun.curves import Curves, SearchPlot
+from replay.rerun.decisions import Decisions
 from replay.rerun.hypotheses import HypothesisMeshes
 from replay.rerun.legend import Legend
-from replay.rerun.meshes import HandMesh, bare_mesh
+from replay.rerun.meshes import HandMesh, bare_mesh, hand_mesh
 from replay.rerun.plane import Frame
 from replay.rerun.scene import Scene
 from replay.rerun.sensors import SensorImages
@@ -67,6 +68,7 @@ class RerunRecorder(Recorder):
         self._archive = ArchiveMap(self._stream)
         self._curves = Curves(self._stream)
         self._search = SearchPlot(self._stream)
+        self._decisions = Decisions(self._stream)
         self._started: events.SessionStarted | None = None
         self._early: list[events.Probe | events.Logged] = []  # before the first registration
         self._follow = live or follow
@@ -80,9 +82,8 @@ class RerunRecorder(Recorder):
         """Draw one event."""
         if self._closed:
             return
-        self._clock.set_probe(
-            max(getattr(event, "step", 0), 0)
-        )  # what precedes all is of the first
+        first = -1 if isinstance(event, events.ActionsOffered | events.Decided) else 0
+        self._clock.set_probe(max(getattr(event, "step", 0), first))  # all else is of a probe
         self._draw(event)
         if isinstance(event, events.Probe | events.Logged) and not self._clock.registering:
             self._early.append(event)
@@ -163,6 +164,13 @@ class RerunRecorder(Recorder):
             self._hand.set_up(event.hand)
 
     @_draw.register
+    def _(self, event: events.ActionsOffered) -> None:
+        self._meshes.hide()  # before the first probe, too
+        self._hand.set_up(hand_mesh(event.hand))
+        self._decisions.set_up(event.actions)
+        self._lay_out()
+
+    @_draw.register
     def _(self, event: events.SensorImage) -> None:
         self._clock.tick()
         if self._sensors.add(event):
@@ -172,6 +180,7 @@ class RerunRecorder(Recorder):
     def _(self, event: events.Probe) -> None:
         self._sensors.end_step()
         self._legend.add_kinds(event.new_points)
+        self._decisions.add_probe(event)
         self._draw_probe(event)
 
     @_draw.register
@@ -203,6 +212,12 @@ class RerunRecorder(Recorder):
         self._curves.add_hypotheses(event.hypotheses)
         self._search.draw(event.step)
         self._log_result(event.hypotheses)
+
+    @_draw.register
+    def _(self, event: events.Decided) -> None:
+        self._clock.tick()
+        self._decisions.draw(event)
+        self._clock.tick()  # what it led to is of a later moment
 
     @_draw.register
     def _(self, event: events.Timed) -> None:
@@ -262,6 +277,7 @@ class RerunRecorder(Recorder):
                 pose_known=self._started.world_from_object is not None,
                 archive=self._archive_frame,
                 timed=self._timed,
+                steered=self._decisions.offered,
                 sensors=[*self._sensors.pictures.values()],
                 follow=self._follow or not self._clock.registering,
             )

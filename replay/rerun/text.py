@@ -28,6 +28,8 @@ def session_markdown(started: SessionStarted) -> str:
         "seed": started.seed,
         "true pose": "known" if started.world_from_object is not None else "unknown",
     }
+    if policy := _find(started.config, "policy"):
+        rows["policy"] = policy
     if started.source:
         rows["problems of"] = f"recording {started.source}"
     lines = [f"| {name} | **{_literal(text)}** |" for name, text in rows.items()]
