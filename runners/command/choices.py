@@ -18,7 +18,7 @@ from chsel.problem.settings import PRESETS, in_preset, settings_mapping
 from runners.command.arguments import hydra_arguments
 from runners.sensors.rig import Rig
 from runners.sessions.faults import CLEAN, LEVELS
-from runners.sessions.probing import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 NESTED_GROUPS = (

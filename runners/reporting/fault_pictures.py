@@ -44,7 +44,7 @@ from runners.reporting.silhouette import (
 from runners.sessions import open_session
 from runners.sessions.configurations import find_configuration
 from runners.sessions.faults import LEVELS, probed_mesh
-from runners.sessions.probing import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings
 
 _ONE_KIND = ("noise_3mm", "quantised_5mm", "foreign_10", "free_wrong", "camera_5mm", "mesh_2pct")
 KINDS = ("clean", *_ONE_KIND, "mixed")

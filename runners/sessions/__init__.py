@@ -10,7 +10,7 @@ from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
 from runners.sessions.configurations import find_configuration
 from runners.sessions.points import PointsSession, PointsSettings
-from runners.sessions.probing import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 from runners.sessions.sensors import SensorsSettings, open_sensors
 from runners.sessions.session import Progress, Session, unwatched

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import igl
 import numpy as np
@@ -11,11 +11,14 @@ import trimesh
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
-from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import find_configuration
 from runners.sessions.faults import probed_mesh
+from runners.sessions.gripper import START, Touch
+from runners.sessions.panda_hand import panda_hand
 from runners.sessions.placement import laid_down
-from runners.sessions.probing import START, ProbingSession, ProbingSettings, Touch
+from runners.sessions.probing import ProbingSession
+from runners.sessions.probing_hand import ProbingHand, turned_from_forward
+from runners.sessions.probing_settings import ProbingSettings
 
 SPACING = 0.001  # m: of the points on the hand that can touch
 PATCH = 0.010  # m: side of the patches of these points that are passed over as one
@@ -31,20 +34,25 @@ def open_kinematic(
     """
     configuration = find_configuration(configuration_name)
     probed = probed_mesh(mesh, settings.faults)
-    engine = KinematicEngine(probed, laid_down(mesh, configuration), settings)
-    return ProbingSession(engine, mesh, configuration, settings, seed)
+    hand = panda_hand()
+    engine = KinematicEngine(probed, laid_down(mesh, configuration), settings, hand)
+    return ProbingSession(engine, mesh, configuration, settings, seed, hand)
 
 
 class KinematicEngine:
     """The hand follows its targets until a point of its surface meets the object, and waits."""
 
     def __init__(
-        self, mesh: trimesh.Trimesh, world_from_object: FloatArray, settings: ProbingSettings
+        self,
+        mesh: trimesh.Trimesh,
+        world_from_object: FloatArray,
+        settings: ProbingSettings,
+        hand: ProbingHand,
     ) -> None:
         """mesh: metres, in its frame, fixed at world_from_object (4, 4)."""
         self.world_from_object = world_from_object
         self._object = _Surface(mesh, world_from_object)
-        self._patches = _patches()
+        self._patches = self._forward = _patches(hand)
         self._position = np.array(START)
         self._force = settings.max_force
         # No point of a patch is nearer to the object than this; kept true as the hand moves.
@@ -70,6 +78,16 @@ class KinematicEngine:
                     return self._touch(points, motion, length)
         self._position = target
         return Touch(target)
+
+    def place(self, pose: FloatArray) -> bool:
+        """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
+        turn, position = turned_from_forward(pose[:3, :3]), pose[:3, 3]
+        self._patches, self._position = self._forward.turned(turn), position
+        patches = self._patches
+        self._clearance = self._object.distance(patches.centres + position) - patches.radii
+        close = np.isin(patches.labels, np.flatnonzero(self._clearance <= 0.0))
+        close[0] = True  # far from its surface, all or nothing is in the object
+        return not (self._object.closest(patches.points[close] + position)[0] < 0.0).any()
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -108,9 +126,13 @@ class _Patches:
     centres: FloatArray
     radii: FloatArray
 
+    def turned(self, turn: FloatArray) -> _Patches:
+        """The patches of a hand that is turned by (3, 3) about its origin."""
+        return replace(self, points=self.points @ turn.T, centres=self.centres @ turn.T)
 
-@cache
-def _patches() -> _Patches:
+
+@lru_cache(maxsize=2)
+def _patches(hand: ProbingHand) -> _Patches:
     points = hand.surface_points(SPACING)
     _, labels = np.unique(np.rint(points / PATCH), axis=0, return_inverse=True)
     count = np.bincount(labels)

@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import compose
+from runners.sessions.probing_hand import ROTATION, ProbingHand
 
 if TYPE_CHECKING:
     import trimesh
-
-# World axes of the hand's axes: the fingers (hand z) point along world x, and the wide side of
-# the hand (hand y) lies along world y.
-ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 # Rings (z, half width along x, half width along y) in metres, in the hand frame. The real hand is
 # flat where these solids bulge by a few millimetres, so that they meet a flat object at one point.
@@ -49,40 +45,10 @@ _CORNERS = 36  # of a ring
 _ROUNDNESS = 2.5  # exponent of a ring's superellipse: 2 is an ellipse, infinity is a rectangle
 
 
-def world_from_gripper(positions: FloatArray) -> FloatArray:
-    """Poses (..., 4, 4) of the hand at positions (..., 3); its orientation never changes."""
-    return compose(np.broadcast_to(ROTATION, (*positions.shape[:-1], 3, 3)), positions)
-
-
 @cache
-def solids() -> tuple[trimesh.Trimesh, ...]:
-    """Palm and closed fingers, convex, their axes those of the world, origin at the hand's."""
-    return tuple(_solid(rings) for rings in (_PALM, _FINGERS))
-
-
-@cache
-def surface_points(spacing: float) -> FloatArray:
-    """Points (S, 3) that cover the surface about `spacing` apart, all corners among them."""
-    import trimesh
-
-    points = []
-    for solid, other in zip(solids(), reversed(solids()), strict=True):
-        fine, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, spacing)
-        _, kept = np.unique(np.rint(fine / spacing), axis=0, return_index=True)
-        covering = np.concatenate([solid.vertices, fine[kept]])
-        points.append(covering[_depth(other, covering) < 0.0])
-    return np.concatenate(points)
-
-
-@cache
-def interior_points(spacing: float, depth: float) -> FloatArray:
-    """Nodes (M, 3) of a lattice through the origin that lie deeper than `depth` in a solid."""
-    bounds = np.array([solid.bounds for solid in solids()])
-    first = np.floor(bounds[:, 0].min(axis=0) / spacing)
-    last = np.ceil(bounds[:, 1].max(axis=0) / spacing)
-    axes = [np.arange(low, high + 1) * spacing for low, high in zip(first, last, strict=True)]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return nodes[np.max([_depth(solid, nodes) for solid in solids()], axis=0) > depth]
+def panda_hand() -> ProbingHand:
+    """Palm and closed fingers."""
+    return ProbingHand([_solid(rings) for rings in (_PALM, _FINGERS)])
 
 
 def _solid(rings: tuple[tuple[float, float, float], ...]) -> trimesh.Trimesh:
@@ -99,11 +65,3 @@ def _ring(z: float, half_x: float, half_y: float) -> FloatArray:
     angle = 2.0 * np.pi * np.arange(_CORNERS) / _CORNERS
     x, y = (np.sign(w) * np.abs(w) ** (2.0 / _ROUNDNESS) for w in (np.cos(angle), np.sin(angle)))
     return np.stack([half_x * x, half_y * y, np.full(_CORNERS, z)], axis=1)
-
-
-def _depth(solid: trimesh.Trimesh, points: FloatArray) -> FloatArray:
-    """Distance (N,) from points (N, 3) to the surface of a convex solid, negative outside."""
-    depth = np.full(len(points), np.inf)
-    for normal, corner in zip(solid.face_normals, solid.triangles[:, 0], strict=True):
-        np.minimum(depth, (corner - points) @ normal, out=depth)
-    return depth

@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from chsel.numerics.arrays import FloatArray
+from chsel.errors import SessionError
+from chsel.next_probe.action_lattice import ActionSettings
+from chsel.next_probe.decision_problem import Actions
+from chsel.next_probe.hand_shape import HandShape
+from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 
@@ -43,3 +47,32 @@ class Session(Protocol):
 
     def close(self) -> None:
         """Let go of engines and files."""
+
+
+class Steerable(Session, Protocol):
+    """A session whose probes can be chosen, one after the other, in place of `probes`."""
+
+    hand: HandShape
+    """The hand in its own frame, where it probes along z."""
+
+    def offer(self, settings: ActionSettings) -> Actions:
+        """The probes that can be chosen from; once, before the first. SettingError for none."""
+
+    def available(self) -> BoolArray:
+        """Which of them (A,) can be taken now."""
+
+    def take(self, step: int, action: int) -> Iterator[SessionEvent]:
+        """Do the probe `step` as an action (its index) says; the last event is its Probe.
+
+        Raises SessionError for an action that cannot be taken.
+        """
+
+
+def require_available(action: int, available: BoolArray) -> None:
+    """Raise SessionError unless an action is one of those offered and available (A,)."""
+    if not 0 <= action < len(available):
+        raise SessionError(
+            f"action {action} does not exist; accepted: 0 to {len(available) - 1}, as offered"
+        )
+    if not available[action]:
+        raise SessionError(f"action {action} was taken before; accepted: those available")

@@ -14,12 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
-from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import Configuration, find_configuration
 from runners.sessions.faults import probed_mesh
+from runners.sessions.gripper import START, Touch
+from runners.sessions.panda_hand import panda_hand
 from runners.sessions.physics_engine import connect, silent
 from runners.sessions.placement import centre_of_mass, laid_down, lowest
-from runners.sessions.probing import START, ProbingSession, ProbingSettings, Touch
+from runners.sessions.probing import ProbingSession
+from runners.sessions.probing_hand import ProbingHand, turned_from_forward
+from runners.sessions.probing_settings import ProbingSettings
 
 TIME_STEP = 1.0 / 240.0  # s
 GRAVITY = -10.0  # m/s^2
@@ -44,15 +47,20 @@ def open_simulated(
     Raises SessionError for an unknown configuration, or where PyBullet is not installed.
     """
     configuration = find_configuration(configuration_name)
-    engine = PyBulletEngine(mesh, configuration, settings)
-    return ProbingSession(engine, mesh, configuration, settings, seed)
+    hand = panda_hand()
+    engine = PyBulletEngine(mesh, configuration, settings, hand)
+    return ProbingSession(engine, mesh, configuration, settings, seed, hand)
 
 
 class PyBulletEngine:
     """The hand is drawn along by a fixed constraint of limited force, and cannot turn."""
 
     def __init__(
-        self, mesh: trimesh.Trimesh, configuration: Configuration, settings: ProbingSettings
+        self,
+        mesh: trimesh.Trimesh,
+        configuration: Configuration,
+        settings: ProbingSettings,
+        hand: ProbingHand,
     ) -> None:
         """Settle the object of a configuration, fix it, and put the hand at its start."""
         self._max_force = settings.max_force
@@ -66,7 +74,7 @@ class PyBulletEngine:
                 file = _collision_file(self._world, probed, Path(folder), settings.collision_mesh)
                 concave = settings.collision_mesh == "visual"
                 self._object = _fixed_object(self._world, file, self.world_from_object, concave)
-                self._hand = _hand(self._world, Path(folder))
+                self._hand = _hand(self._world, hand, Path(folder))
         except BaseException:
             self.close()
             raise
@@ -94,6 +102,17 @@ class PyBulletEngine:
         # As the hand presses on, the engine's contact wanders over the faces that touch by some
         # millimetres; where the touch began is known best.
         return Touch(position, force, self._began.contact, self._began.normal)
+
+    def place(self, pose: FloatArray) -> bool:
+        """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
+        world, position = self._world, pose[:3, 3].tolist()
+        quaternion = Rotation.from_matrix(turned_from_forward(pose[:3, :3])).as_quat().tolist()
+        world.resetBasePositionAndOrientation(self._hand, position, quaternion)
+        world.changeConstraint(self._holder, position, quaternion, maxForce=self._max_force)
+        self._readings.clear()
+        self._began = None
+        near = world.getClosestPoints(self._hand, self._object, 0.0)
+        return not any(record[_DISTANCE] < 0.0 for record in near)
 
     def close(self) -> None:
         """Disconnect from the engine."""
@@ -123,7 +142,7 @@ class _Reading:
 
 
 # Where a contact record of PyBullet has what; B is the object.
-_POINT_ON_B, _NORMAL_ON_B, _FORCE = 6, 7, 9
+_POINT_ON_B, _NORMAL_ON_B, _DISTANCE, _FORCE = 6, 7, 8, 9
 
 
 def _new_world() -> Any:
@@ -188,9 +207,9 @@ def _fixed_object(world: Any, file: Path, world_from_object: FloatArray, concave
     return body
 
 
-def _hand(world: Any, folder: Path) -> int:
+def _hand(world: Any, hand: ProbingHand, folder: Path) -> int:
     """The hand at its start. Without inertia the engine leaves its orientation alone."""
-    _write_obj(folder / "hand.obj", list(hand.solids()))
+    _write_obj(folder / "hand.obj", list(hand.solids))
     shape = world.createCollisionShape(world.GEOM_MESH, fileName=str(folder / "hand.obj"))
     body: int = world.createMultiBody(HAND_MASS, shape, basePosition=START)
     world.changeDynamics(

@@ -14,7 +14,7 @@ import yaml
 from chsel.methods import OURS, preset_settings
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem.settings import in_preset
-from runners.sessions.probing import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings
 from tests.docs.page import DOCS
 
 ORDER = ("paper", "reference", "default")

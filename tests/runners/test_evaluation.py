@@ -46,7 +46,7 @@ from runners.evaluation.selection import chosen_configurations, chosen_seeds
 from runners.evaluation.tasks import Outcome, input_files, run_on_worker, run_task
 from runners.evaluation.trial_configurations import configurations_of
 from runners.evaluation.trial_session import open_recorded, problems
-from runners.sessions.probing import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings
 from tests.runners.in_process import do_task
 
 TRIAL = Trial(0, "mustard")

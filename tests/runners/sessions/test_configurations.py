@@ -17,7 +17,8 @@ from runners.sessions.configurations import (
     fitting_configurations,
 )
 from runners.sessions.placement import laid_down, lowest, roll_to_rest
-from runners.sessions.probing import ProbingSettings, choose_workspace
+from runners.sessions.probing import choose_workspace
+from runners.sessions.probing_settings import ProbingSettings
 
 PI = np.pi
 PAPER, REFERENCE = (in_preset(ProbingSettings(), name) for name in ("paper", "reference"))

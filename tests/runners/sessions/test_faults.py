@@ -25,7 +25,8 @@ from runners.sessions.faults import (
     without_clean_faults,
 )
 from runners.sessions.kinematic import open_kinematic
-from runners.sessions.probing import ProbingSession, ProbingSettings
+from runners.sessions.probing import ProbingSession
+from runners.sessions.probing_settings import ProbingSettings
 
 RADIUS, SIDE = 0.1, 0.02
 CENTRE = np.array([0.3, 0.0, 0.2])

@@ -11,11 +11,14 @@ from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.objects.models import MODELS
-from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.free_space import box_shell
+from runners.sessions.gripper import START, X_REST
 from runners.sessions.kinematic import KinematicEngine, open_kinematic
-from runners.sessions.probing import START, X_REST, ProbingSession, ProbingSettings
+from runners.sessions.panda_hand import panda_hand
+from runners.sessions.probing import ProbingSession
+from runners.sessions.probing_hand import ROTATION
+from runners.sessions.probing_settings import ProbingSettings
 
 DEFAULT = ProbingSettings()
 TIP = 0.1123  # m: from the hand's origin to the end of its fingers
@@ -37,16 +40,16 @@ def drill() -> tuple[trimesh.Trimesh, ProbingSession, list[Probe]]:
 
 
 def test_the_hand_has_the_outer_size_of_a_franka_hand() -> None:
-    bounds = np.array([solid.bounds for solid in hand.solids()])
+    bounds = np.array([solid.bounds for solid in panda_hand().solids])
     lower, upper = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     np.testing.assert_allclose(lower, [-0.026, -0.102, -0.0316], atol=1e-6)
     np.testing.assert_allclose(upper, [TIP, 0.102, 0.0316], atol=1e-6)
-    assert all(solid.is_convex and solid.is_watertight for solid in hand.solids())
+    assert all(solid.is_convex and solid.is_watertight for solid in panda_hand().solids)
 
 
 def test_interior_points_are_as_deep_as_asked_for() -> None:
-    points = hand.interior_points(0.005, 0.010)
-    depth = -np.min([mesh_sdf(solid, points)[0] for solid in hand.solids()], axis=0)
+    points = panda_hand().interior_points(0.005, 0.010)
+    depth = -np.min([mesh_sdf(solid, points)[0] for solid in panda_hand().solids], axis=0)
     assert depth.min() > 0.010
     assert len(points) > 1000
 
@@ -55,7 +58,7 @@ def test_a_wall_stops_the_finger_tip_to_a_micrometre_and_lets_it_go() -> None:
     wall = trimesh.creation.box((0.1, 2.0, 2.0))
     pose = np.eye(4)
     pose[0, 3] = 0.15
-    engine = KinematicEngine(wall, pose, DEFAULT)
+    engine = KinematicEngine(wall, pose, DEFAULT, panda_hand())
     for step in range(60):
         touch = engine.advance(np.array([X_REST + 0.002 * step, 0.0, 0.2]))
     assert touch.position[0] == pytest.approx(0.1 - TIP, abs=2e-6)
@@ -71,7 +74,7 @@ def test_a_ball_is_met_where_two_round_bodies_touch() -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
     pose = np.eye(4)
     pose[:3, 3] = [0.3, 0.0, 0.2]
-    engine = KinematicEngine(ball, pose, DEFAULT)
+    engine = KinematicEngine(ball, pose, DEFAULT, panda_hand())
     position = np.array(START)
     while (touch := engine.advance(position)).contact is None:
         position = position + np.array([0.002, 0.0, 0.0])
@@ -97,7 +100,7 @@ def test_the_hand_is_never_in_the_object(
 ) -> None:
     mesh, session, probes = drill
     assert session.world_from_object is not None
-    surface = hand.surface_points(0.004)
+    surface = panda_hand().surface_points(0.004)
     for probe in probes[:8]:
         ends = probe.gripper_path[:, :3, 3]
         furthest = ends[np.argmax(ends[:, 0])]
@@ -131,7 +134,7 @@ def test_each_probe_returns_before_the_object_at_its_place_in_the_grid(
         assert (y_end, z_end) == pytest.approx((y, z), abs=5e-3)
         assert probe.outcome == ("contact" if len(probe.contacts) else "free")
         np.testing.assert_array_equal(probe.new_points.contacts, probe.contacts)
-        np.testing.assert_array_equal(probe.gripper_path[0, :3, :3], hand.ROTATION)
+        np.testing.assert_array_equal(probe.gripper_path[0, :3, :3], ROTATION)
 
 
 def test_a_seed_fixes_every_bit_and_another_one_does_not() -> None:

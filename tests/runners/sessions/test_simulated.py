@@ -14,11 +14,11 @@ from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
 from runners.objects.models import MODELS
-from runners.sessions import panda_hand as hand
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.kinematic import open_kinematic
+from runners.sessions.panda_hand import panda_hand
 from runners.sessions.placement import laid_down, lowest
-from runners.sessions.probing import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.simulated import open_simulated
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
@@ -29,7 +29,7 @@ PRESSED = 0.0005  # m: how far 30 N press the hand into the object before the en
 
 DIGESTS = """
 from runners.objects.models import MODELS
-from runners.sessions.probing import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.simulated import open_simulated
 session = open_simulated(MODELS["spam_can"]().apply_scale(2.5), "can", ProbingSettings(), 5)
 print(session.world_from_object.tobytes().hex(), session.initial_points.digest)
@@ -81,7 +81,7 @@ def test_contacts_agree_with_plain_geometry_to_3_mm(pair: _Pair) -> None:
 def _touching(pair: _Pair, probe: Probe, near: FloatArray) -> FloatArray:
     """Where on the object (N, 3) the hand of a probe, at its furthest, all but touches it."""
     ends = probe.gripper_path[:, :3, 3]
-    surface = hand.surface_points(0.001) + ends[np.argmax(ends[:, 0])]
+    surface = panda_hand().surface_points(0.001) + ends[np.argmax(ends[:, 0])]
     surface = surface[_distances(near, surface) < 0.02]
     points = apply(inverse(pair.world_from_object), surface)
     distance, normal = mesh_sdf(pair.mesh, points)

@@ -1,0 +1,90 @@
+"""The solid parts of a hand that probes in simulated sessions: where it touches, what it sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from chsel.next_probe.hand_shape import HandShape
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.poses import compose
+
+if TYPE_CHECKING:
+    import trimesh
+
+# World axes of the hand's axes when it probes along world x: hand z is world x, and the wide side
+# of the hand (hand y) lies along world y.
+ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+_FLUSH = 1e-9  # m: of two solids that share a face
+
+
+class ProbingHand:
+    """Convex solids that may overlap, origin at the hand's; points on them and in them.
+
+    All are in the axes of a world in which the hand probes along x: turned by ROTATION against the
+    hand's own.
+    """
+
+    def __init__(self, solids: Sequence[trimesh.Trimesh]) -> None:
+        self.solids = tuple(solids)
+        self._surfaces: dict[float, FloatArray] = {}
+
+    @cached_property
+    def shape(self) -> HandShape:
+        """All solids in the hand's own frame, where it probes along z."""
+        import trimesh
+
+        joined: Any = trimesh.util.concatenate(list(self.solids))
+        return HandShape(np.asarray(joined.vertices) @ ROTATION, joined.faces)
+
+    def surface_points(self, spacing: float) -> FloatArray:
+        """Points (S, 3) that cover the surface about `spacing` apart, all corners among them."""
+        if spacing not in self._surfaces:
+            parts = [self._covering(index, spacing) for index in range(len(self.solids))]
+            self._surfaces[spacing] = np.concatenate(parts)
+        return self._surfaces[spacing]
+
+    def interior_points(self, spacing: float, depth: float) -> FloatArray:
+        """Nodes (M, 3) of a lattice through the origin that lie deeper than `depth` in a solid."""
+        bounds = np.array([solid.bounds for solid in self.solids])
+        first = np.floor(bounds[:, 0].min(axis=0) / spacing)
+        last = np.ceil(bounds[:, 1].max(axis=0) / spacing)
+        axes = [np.arange(low, high + 1) * spacing for low, high in zip(first, last, strict=True)]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        return nodes[np.max([_depth(solid, nodes) for solid in self.solids], axis=0) > depth]
+
+    def _covering(self, index: int, spacing: float) -> FloatArray:
+        """Points on one solid that are in no other; of faces that two share, those of the first."""
+        import trimesh
+
+        solid = self.solids[index]
+        fine, _ = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, spacing)
+        _, kept = np.unique(np.rint(fine / spacing), axis=0, return_index=True)
+        points = np.concatenate([solid.vertices, fine[kept]])
+        for other, beside in enumerate(self.solids):
+            if other != index:
+                margin = _FLUSH if other > index else -_FLUSH
+                points = points[_depth(beside, points) < margin]
+        return points
+
+
+def turned_from_forward(rotation: FloatArray) -> FloatArray:
+    """The turn (3, 3), in the world, from probing along x to a rotation (3, 3) world_from_hand."""
+    return rotation @ ROTATION.T
+
+
+def world_from_gripper(positions: FloatArray, rotation: FloatArray = ROTATION) -> FloatArray:
+    """Poses (..., 4, 4) of a hand at positions (..., 3), turned by a rotation (3, 3)."""
+    return compose(np.broadcast_to(rotation, (*positions.shape[:-1], 3, 3)), positions)
+
+
+def _depth(solid: trimesh.Trimesh, points: FloatArray) -> FloatArray:
+    """Distance (N,) from points (N, 3) to the surface of a convex solid, negative outside."""
+    depth = np.full(len(points), np.inf)
+    for normal, corner in zip(solid.face_normals, solid.triangles[:, 0], strict=True):
+        np.minimum(depth, (corner - points) @ normal, out=depth)
+    return depth

@@ -1,0 +1,151 @@
+"""Probes in any direction, in both engines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+
+import numpy as np
+import pytest
+import trimesh
+
+from chsel.errors import SessionError
+from chsel.next_probe.action_lattice import ActionSettings
+from chsel.next_probe.decision_problem import Actions, Belief
+from chsel.next_probe.first_contact import first_contacts
+from chsel.problem.poses import apply, inverse
+from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
+from replay.events import Probe
+from runners.objects.models import MODELS
+from runners.sessions.gripper import START, X_REST, Touch
+from runners.sessions.kinematic import open_kinematic
+from runners.sessions.probing import ProbingSession
+from runners.sessions.probing_settings import ProbingSettings
+
+Opener = Callable[..., ProbingSession]
+
+
+def open_pybullet(*arguments: object) -> ProbingSession:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+    from runners.sessions.simulated import open_simulated
+
+    return open_simulated(*arguments)  # type: ignore[arg-type]
+
+
+@pytest.fixture(params=[open_kinematic, open_pybullet])
+def session(request: pytest.FixtureRequest) -> Iterator[ProbingSession]:
+    opened = request.param(_mustard(), "mustard", ProbingSettings(), 0)
+    yield opened
+    opened.close()
+
+
+def _mustard() -> trimesh.Trimesh:
+    return MODELS["mustard"]().apply_scale(2.5)
+
+
+def _taken(session: ProbingSession, actions: Actions, count: int) -> list[tuple[int, Probe]]:
+    """Some of the actions, from all directions, in that order."""
+    chosen = np.linspace(0, len(actions) - 1, count).astype(int).tolist()
+    return [(a, next(iter(session.take(step, a)))) for step, a in enumerate(chosen)]
+
+
+def test_a_probe_goes_straight_along_the_hand_and_meets_what_is_forecast(
+    session: ProbingSession,
+) -> None:
+    mesh, actions = _mustard(), session.offer(ActionSettings())
+    taken = _taken(session, actions, 9)
+    assert session.world_from_object is not None
+    object_from_world = inverse(session.world_from_object)
+    belief = Belief(object_from_world[None], np.ones(1))
+    sdf = SdfGrid.from_mesh(mesh, 0.005, padding=0.02)
+    first = first_contacts(sdf, belief, actions, session.hand)
+    agreed, late, off = 0, [], []
+    for step, (action, probe) in enumerate(taken):
+        start, path = actions.world_from_hand[action], probe.gripper_path
+        assert probe.step == step
+        np.testing.assert_array_equal(
+            path[:, :3, :3], np.broadcast_to(start[:3, :3], path[:, :3, :3].shape)
+        )
+        way = path[:, :3, 3] - start[:3, 3]
+        along = way @ start[:3, 2]
+        assert np.abs(way - along[:, None] * start[:3, 2]).max() < 0.005
+        assert np.abs(way[-1]).max() < 1e-3
+        lowest = (session.hand.vertices @ start[2, :3]).min() + path[:, 2, 3].min()
+        assert lowest > 0.003
+        hit = probe.outcome == "contact"
+        forecast = bool(np.isfinite(first.travel[0, action]))
+        agreed += hit == forecast
+        if hit and forecast:
+            late.append(abs(along.max() - first.travel[0, action]))
+            away = probe.contacts[:, None] - first.contact[0, action]
+            off.append(np.sqrt((away**2).sum(axis=2)).min())
+        on_object = mesh_sdf(mesh, apply(object_from_world, probe.contacts))[0]
+        assert np.abs(on_object).max(initial=0.0) < 0.001
+        if not hit:
+            assert along.max() == pytest.approx(actions.length[action], abs=0.005)
+        free = mesh_sdf(mesh, apply(object_from_world, probe.new_points.free))[0]
+        assert free.min() > -(0.5 * np.sqrt(3.0) * 0.025 - 0.010)
+    assert agreed >= 8  # of 9; the object is points some millimetres apart in a forecast
+    assert len(off) >= 3
+    assert np.median(late) < 0.006
+    assert np.median(off) < 0.015
+
+
+def test_an_action_is_taken_once(session: ProbingSession) -> None:
+    actions = session.offer(ActionSettings(choice="forward", spacing=0.2))
+    assert session.available().all()
+    next(iter(session.take(0, 2)))
+    assert np.flatnonzero(~session.available()).tolist() == [2]
+    with pytest.raises(SessionError, match="action 2 was taken before"):
+        next(iter(session.take(1, 2)))
+    with pytest.raises(SessionError, match=f"accepted: 0 to {len(actions) - 1}"):
+        next(iter(session.take(1, len(actions))))
+
+
+def test_the_grid_as_actions_has_the_outcomes_of_the_grid() -> None:
+    paper = open_kinematic(_mustard(), "mustard", ProbingSettings(), 0)
+    grid = list(islice(paper.probes(), 5))
+    session = open_kinematic(_mustard(), "mustard", ProbingSettings(), 0)
+    actions = session.offer(ActionSettings(choice="configuration"))
+    assert len(actions) == session.count
+    np.testing.assert_allclose(actions.length, 0.3)
+    for step, before in enumerate(grid):
+        probe = next(iter(session.take(step, step)))
+        assert probe.outcome == before.outcome
+        assert probe.gripper_path[0, 0, 3] == X_REST
+        if len(before.contacts):
+            away = probe.contacts[:, None] - before.contacts
+            assert np.sqrt((away**2).sum(axis=2)).min() < 0.005
+
+
+def test_a_hand_that_would_start_in_the_object_comes_from_behind(session: ProbingSession) -> None:
+    assert session.world_from_object is not None
+    centre = apply(session.world_from_object, _mustard().center_mass[None])[0]
+    actions = session.offer(ActionSettings())
+    poses = np.array(actions.world_from_hand[:1])
+    poses[0, :3, 3] = centre
+    object.__setattr__(actions, "world_from_hand", poses)
+    probe = next(iter(session.take(0, 0)))
+    assert probe.outcome == "contact"
+    back = (centre - probe.gripper_path[0, :3, 3]) @ poses[0, :3, 2]
+    assert back == pytest.approx(round(back / 0.05) * 0.05)
+    assert back > 0.1
+
+
+def test_an_object_without_end_is_an_error() -> None:
+    class Solid:
+        world_from_object = np.eye(4)
+
+        def place(self, pose: np.ndarray) -> bool:
+            return False
+
+        def advance(self, target: np.ndarray) -> Touch:
+            return Touch(np.array(START))
+
+        def close(self) -> None:
+            pass
+
+    from runners.sessions.gripper import Gripper
+
+    with pytest.raises(SessionError, match="the object is at the start of a probe"):
+        Gripper(Solid(), ProbingSettings(), 0).probe_along(np.eye(4), 0.3)
