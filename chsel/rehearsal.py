@@ -9,9 +9,14 @@ from typing import Any
 import numpy as np
 
 from chsel.methods.method import Method
+from chsel.next_probe.decision_problem import Actions
+from chsel.next_probe.hand_shape import HandShape
 from chsel.plausible.pose_metrics import result_numbers
+from chsel.policies.policy import Policy, StopSettings
+from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import compose
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.trust import trust_in
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
@@ -53,6 +58,23 @@ def warm_up_sensing() -> None:
     grid.scaled_images(depth, camera, np.eye(4), mask)
     grid.along_rays(np.zeros(3), np.ones((1, 3)))
     grid.at(np.zeros((1, 3)))
+
+
+def warm_up_policy(policy: Policy) -> None:
+    """Compile the kernels that decisions by `policy` need, or load them. See `warm_up`."""
+    corners = np.array([[0.0, 0.0, 0.01], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [-0.01, -0.01, 0.0]])
+    hand = HandShape(corners, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    starts = np.array([[0.0, 0.0, -0.05], [0.01, 0.0, -0.05]])
+    actions = Actions(compose(np.eye(3)[None].repeat(2, axis=0), starts), np.full(2, 0.1))
+    try:
+        settings = dataclasses.replace(_brief(policy.settings), stop=StopSettings(0.0, 0.0))
+        policy = type(policy)(settings)  # type: ignore[call-arg]
+        steering = Steering(policy, _ball(), _WORKSPACE, 0.02, actions, hand)
+        points = KnownPoints(free=np.full((1, 3), 0.05))
+        steering.decide(0, points, None, np.ones(2, dtype=bool))
+        steering.felt(np.zeros((1, 3)))
+    except Exception:  # as above
+        return
 
 
 def _register_twice(method: Method) -> None:

@@ -39,7 +39,8 @@ def main(config: DictConfig) -> None:
             with reading_bar() as bar:
                 scene = open_scene(checked, bar.show)
             stack.callback(scene.session.close)
-            kernels.rehearse(method, sensing=checked.session["kind"] == "sensors")
+            policy = None if scene.steering is None else scene.steering.policy
+            kernels.rehearse(method, policy, sensing=checked.session["kind"] == "sensors")
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name, scene)

@@ -43,7 +43,7 @@ class PolicySettings(CheckedSettings):
 
     probes: Annotated[int, positive, at_most(MOST_PROBES)] = 30  # the budget of a session
     # Standard deviation of a contact's place from where a pose of the belief has it, metres.
-    noise: Annotated[float, positive] = 0.005
+    noise: Annotated[float, positive] = 0.002
     # Actions to whose starts the object is in the way with a larger chance are not taken.
     blocked: Annotated[float, not_negative, at_most(1.0)] = 0.05
     stop: StopSettings = field(default_factory=StopSettings)

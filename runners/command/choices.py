@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from chsel.errors import SettingError
 from chsel.methods import METHODS, preset_settings
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
+from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
 from runners.command.arguments import hydra_arguments
 from runners.sensors.rig import Rig
@@ -35,7 +36,7 @@ def prepared(config_name: str, words: list[str]) -> list[str]:
 
 
 def store_choices() -> None:
-    """Offer preset/PRESET, method/METHOD, definition/NAME, simulated sessions and their faults.
+    """Offer presets, methods, policies, definitions, simulated sessions and their faults, by name.
 
     session/presets/rig/default has all keys of a rig, so that each can be changed by its name.
     """
@@ -43,6 +44,9 @@ def store_choices() -> None:
         _store("preset", preset, {"name": preset})
     for method in METHODS:
         _store_with_presets("method", method, partial(preset_settings, method), {"name": method})
+    for policy in POLICIES:
+        with suppress(SettingError):  # of an installed policy; who chooses it gets the message
+            _store("policy", policy, {"name": policy, **settings_mapping(policy_settings(policy))})
     for kind in ("simulated", "kinematic"):  # in PyBullet, and by geometry without an engine
         # configuration: a key of the top file, for short commands
         node = {"kind": kind, "configuration": "${configuration}"}

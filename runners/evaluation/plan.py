@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from chsel.errors import require_choice
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
@@ -20,8 +18,6 @@ from replay.arguments import chosen_steps
 from runners.evaluation.contenders import Contender
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.metrics import MetricsConfig
-from runners.evaluation.policy_contenders import PolicyContender
-from runners.evaluation.table import PROBES, RESULTS
 from runners.evaluation.trial_configurations import (
     MOST_PROBES,
     SENSORS,
@@ -52,8 +48,7 @@ class Plan:
     between measures of the search; None: at its end alone. recordings: whether to write
     METHOD.mcap. outside: folders of hypothesis sets by label. logs: a folder of raw logs, for
     sessions of sensors; None: those of the simulated robot, in the evaluation's
-    folder. truth: how the true pose of such a session is sought. policies: by label; each probes in
-    sessions of its own, registered by the only contender.
+    folder. truth: how the true pose of such a session is sought.
     """
 
     folder: Path
@@ -72,7 +67,6 @@ class Plan:
     logs: Path | None = None
     truth: TruePoseSettings = field(default_factory=TruePoseSettings)
     plausible: bool = True  # whether to make plausible sets; without them there is no PD
-    policies: Mapping[str, PolicyContender] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -86,16 +80,6 @@ class Plan:
         """All that there are, by name."""
         found = configurations_of(self.kind, self.logs)
         return found if self.kind == SENSORS else with_faults(found)
-
-    @property
-    def labels(self) -> list[str]:
-        """What a trial has a part of the table of: policies, or methods and external results."""
-        return [*self.policies] or [*self.contenders, *self.outside]
-
-    @property
-    def schema(self) -> pa.Schema:
-        """The columns of such a part."""
-        return PROBES if self.policies else RESULTS
 
     @property
     def log_folder(self) -> Path:
@@ -214,12 +198,7 @@ class Task:
         return f"{self.trial.configuration}, seed {self.trial.seed}: {what}"
 
     def sessions(self, plan: Plan) -> tuple[Trial, ...]:
-        """The trials whose sessions the rows of the label need; with faults also that without.
-
-        A policy needs none: it makes a session of its own.
-        """
-        if plan.policies:
-            return ()
+        """The trials whose sessions the rows of the label need; with faults also that without."""
         clean = self.trial.without_faults(plan) if plan.plausible else self.trial
         return tuple(dict.fromkeys([clean, self.trial]))
 

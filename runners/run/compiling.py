@@ -9,7 +9,8 @@ from rich.progress import TaskID, TimeElapsedColumn
 
 from chsel.methods.method import Method
 from chsel.numerics.compiler import has_kernels, watched
-from chsel.rehearsal import warm_up, warm_up_sensing
+from chsel.policies.policy import Policy
+from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
 from replay.console import Console, Progress, TextColumn
 
 
@@ -40,12 +41,14 @@ class Compiling:
             self._progress.start()
             self._progress.stop()
 
-    def rehearse(self, method: Method, *, sensing: bool) -> None:
-        """Compile what `method` needs, and with `sensing` what turns images into points."""
+    def rehearse(self, method: Method, policy: Policy | None = None, *, sensing: bool) -> None:
+        """Compile what `method` needs, and `policy`; with `sensing` what turns images to points."""
         self._rehearsing = True
         if self._task is not None:
             self._progress.start()
         warm_up(method)
+        if policy is not None:
+            warm_up_policy(policy)
         if sensing:
             warm_up_sensing()
 

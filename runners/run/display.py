@@ -17,6 +17,7 @@ from rich.progress import BarColumn, TimeElapsedColumn
 from rich.table import Table
 
 from chsel.errors import InputWarning
+from chsel.policies.steering import Steering
 from chsel.problem.registration_problem import Trust
 from replay.console import Console, Progress, TextColumn
 from runners.run.session_run import FROM_SESSION, StepWarning
@@ -27,6 +28,14 @@ MEANINGS = {
     "several modes": "several poses explain the points; probe where they differ",
     "wide": "many poses explain the points; probe further sides",
     "nothing fits": "no pose explains the points; see the warning",
+}
+
+
+STOPPED = {
+    "spread": "the plausible poses are as close together as policy.stop.spread asks for",
+    "gain": "no probe promises to bring them closer by policy.stop.gain",
+    "actions": "no probe is left that can be made",
+    "budget": "policy.probes allows no more",
 }
 
 
@@ -84,6 +93,15 @@ class Display:
         numbers = f"probes 0 to {count - 1}" if count > 1 else "probe 0"
         self._console.print(f"{numbers}, numbered as the steps of the recording")
 
+    def stopped(self, steering: Steering) -> None:
+        """Why a steered session has ended, if it has by its policy."""
+        if steering.last is not None and steering.last.decision.stop:
+            problem, decision = steering.last
+            self._console.print(
+                f"stopped after {problem.key.step} probes: {STOPPED[decision.stop]} (spread "
+                f"{1000.0 * decision.spread:.1f} mm)"
+            )
+
     def working(self, stage: str, iteration: int, total: int) -> None:
         """A stage of the registration, or of reading, stands at `iteration` of `total`."""
         self._bar.show(stage, iteration, total)
@@ -94,7 +112,11 @@ class Display:
         text = f"probe {row['step']:>3} {row['outcome']:<7} {row['contacts']:>3} contacts"
         text += f" {row['free_points']:>6} free"
         if "best_cost" in row:
-            text += f"  cost {row['best_cost']:<8.3g} {row['distinct']:>2} distinct"
+            text += f"  cost {row['best_cost']:<8.3g}"
+        if "spread" in row:
+            text += f" spread {1000.0 * row['spread']:5.1f} mm"
+        elif "distinct" in row:
+            text += f" {row['distinct']:>2} distinct"
         self._console.print(f"{text} {row['seconds']:>5.2f} s")
 
     def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:

@@ -59,7 +59,8 @@ def run(
     """Run the session to its end or to Ctrl-C; whether it was interrupted."""
     if started.session == "recorded":  # the title was printed before its object was known
         display.say(f"object: {started.object}")
-    display.probes(scene.session.count)
+    steering = scene.steering
+    display.probes(scene.session.count if steering is None else steering.policy.settings.probes)
 
     def show(stage: str, iteration: int, total: int) -> None:
         interrupt.check()
@@ -76,6 +77,7 @@ def run(
         recording=config.recording,
         show=show,
         opening=scene.warnings,
+        steering=steering,
     )
     display.warn(scene.warnings)
     rows: list[Row] = []
@@ -107,6 +109,8 @@ def run(
     display.table(rows)
     if outcome == "interrupted":
         display.say("interrupted: the recording holds everything up to here")
+    if steering is not None:
+        display.stopped(steering)
     display.written(folder, ending.sizes())
     display.verdict(session_run.trust)
     return outcome == "interrupted"

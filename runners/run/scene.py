@@ -7,8 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from chsel.errors import InputWarning
+from chsel.errors import InputWarning, SessionError
 from chsel.numerics.threads import require_threads
+from chsel.policies import build_policy
+from chsel.policies.policy import Policy
+from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
@@ -23,12 +26,16 @@ from runners.sessions.depth_frame_session import DepthFrameSession
 from runners.sessions.faults import without_clean_faults
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
-from runners.sessions.session import Progress, Session, unwatched
+from runners.sessions.session import Progress, Session, Steerable, unwatched
 
 if TYPE_CHECKING:
     import trimesh
 
+GRID = "grid"
+"""The policy of a session that is not steered: it probes in its own order."""
 _OF_REAL_OBJECTS = ("points", "sensors")  # sessions whose points come from real objects
+FIRST_CONTACT = Start(contacts=1)
+"""When a steered session begins to register."""
 _NOT_OF_THE_RESULT = ("assets", "logs", "recording", "threads")
 
 
@@ -46,6 +53,7 @@ class ProbeConfig:
     object: ObjectConfig
     session: Any  # checked by the session's kind
     method: Any  # checked by the method
+    policy: Any  # checked by the policy
     preset: PresetName
     recording: RecordingConfig
     assets: AssetsConfig
@@ -81,6 +89,7 @@ class Scene:
     start: Start
     watcher: Watcher = field(default_factory=Watcher)  # gets the progress of what is read
     warnings: tuple[InputWarning, ...] = ()  # about the object
+    steering: Steering | None = None  # chooses the probes; None for the session's own order
 
     @property
     def report(self) -> Report | None:
@@ -107,18 +116,55 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
     session_config = dict(config.session)
     kind = str(session_config.pop("kind", None))
     settings = session_settings(kind, session_config)
+    policy = _policy(config.policy)
     if kind == "recorded":
         recorded = RecordedSession(settings)
         of = recorded.recorded
-        return Scene(recorded, of.object, of.mesh, of.sdf, recorded.start)
+        steering = _steering(policy, kind, recorded, of.sdf, config.seed)
+        start = recorded.start if policy is None else FIRST_CONTACT
+        return Scene(recorded, of.object, of.mesh, of.sdf, start, steering=steering)
     object_model, found = _load_object(config)
     session = open_session(kind, settings, object_model, config.seed, watcher)
     sdf = object_model.grid(settings, watcher)
     start = Start(settings.start_contacts, settings.start_probe)
+    steering = _steering(policy, kind, session, sdf, config.seed)
+    if steering is not None:
+        start = FIRST_CONTACT
     if kind in _OF_REAL_OBJECTS:
         found += check_size(object_model, session.workspace)
     name, mesh = object_model.name, object_model.mesh
-    return Scene(session, name, mesh, sdf, start, watcher, tuple(found))
+    return Scene(session, name, mesh, sdf, start, watcher, tuple(found), steering)
+
+
+def _policy(config: Mapping[str, Any]) -> Policy | None:
+    """The policy that is asked for; None for the session's own order."""
+    values = dict(config)
+    name = str(values.pop("name", None))
+    policy = build_policy(name, values)
+    return None if name == GRID else policy
+
+
+def _steering(
+    policy: Policy | None, kind: str, session: Session, sdf: SdfGrid, seed: int
+) -> Steering | None:
+    """What chooses a session's probes by a policy. SessionError if they cannot be chosen."""
+    if policy is None:
+        return None
+    if not isinstance(session, Steerable):
+        raise SessionError(
+            f"session {kind} cannot be steered, as its probes are given; accepted: policy=grid, or "
+            "session=kinematic, simulated or recorded"
+        )
+    actions = session.offer(policy.settings.actions)
+    return Steering(
+        policy,
+        sdf,
+        session.workspace,
+        session.free_resolution,
+        actions,
+        session.hand,
+        seed=seed,
+    )
 
 
 def _load_object(config: ProbeConfig) -> tuple[ObjectModel, list[InputWarning]]:
@@ -142,6 +188,8 @@ def session_started(
     session = scene.session
     recorded = {key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT}
     recorded["session"] = without_clean_faults(values["session"])
+    if scene.steering is None:
+        recorded.pop("policy", None)
     return SessionStarted(
         runner="probe",
         object=scene.object_name,

@@ -11,15 +11,24 @@ from chsel.errors import ChselError, InputWarning
 from chsel.methods import noise_of
 from chsel.methods.method import Method
 from chsel.plausible.symmetry import ObjectSymmetry
+from chsel.policies.steering import Steering
 from chsel.problem.input_checks import check_contacts, check_points
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.trust import check_trust
-from replay.events import Logged, Probe, ProblemPosed, Recorder, Timed
+from replay.events import (
+    ActionsOffered,
+    Decided,
+    Logged,
+    Probe,
+    ProblemPosed,
+    Recorder,
+    Timed,
+)
 from replay.registration import Registered, register_recorded
 from runners.run.recording import RecordingConfig
-from runners.sessions.session import Session
+from runners.sessions.session import Session, SessionEvent, Steerable
 
 Row = dict[str, Any]
 FROM_SESSION = "session"
@@ -54,15 +63,18 @@ class SessionRun:
         recording: RecordingConfig,
         show: Callable[[str, int, int], None],
         opening: Iterable[InputWarning] = (),
+        steering: Steering | None = None,
     ) -> None:
         """symmetry: of the object, for errors to the true pose; None where that is not known.
 
-        opening: warnings about what was opened, which are recorded with the first probe.
+        opening: warnings about what was opened, which are recorded with the first probe. steering:
+        chooses the probes of a session that can be steered; None for the session's own order.
         """
         self._session, self._online, self._method = session, online, method
         self._recorder, self._recording = recorder, recording
         self._symmetry, self._show = symmetry, show
         self._opening = tuple(opening)
+        self.steering = steering
         self.step = 0
         self.warnings: list[StepWarning] = []
         self.registered: Registered | None = None
@@ -78,6 +90,10 @@ class SessionRun:
 
         register: by default `register` of this run. catch: see `OnlineRegistration.steps`.
         """
+        if self.steering is not None:
+            self._recorder.record(ActionsOffered(-1, self.steering.actions, self.steering.hand))
+            self._decide(-1, self.steering)
+            self._recorder.flush()
         for step in self._online.steps(self._perceived(), register or self.register, catch):
             if step.failure is not None:
                 self.failed(step.step, step.failure)
@@ -96,6 +112,8 @@ class SessionRun:
                 if trust is not None:
                     self._warn(check_trust(trust, noise_of(self._method)))
                     self.trust, row["verdict"] = trust, trust.verdict
+            if self.steering is not None:
+                row |= self._decide(step.step, self.steering)
             self._recorder.record(Logged(step.step, "info", self._line(row)))
             if self._recording.timings:
                 self._recorder.record(Timed(step.step, self._seconds))
@@ -129,7 +147,7 @@ class SessionRun:
     def _perceived(self) -> Iterator[tuple[int, KnownPoints]]:
         """Record what the session yields, and hand on the new points of its probes."""
         begun = time.perf_counter()
-        for event in self._session.probes():
+        for event in self._events():
             self._recorder.record(event)
             if isinstance(event, Logged) and event.level == "warning":
                 self.warnings.append(StepWarning(event.step, FROM_SESSION, event.text))
@@ -138,8 +156,39 @@ class SessionRun:
                 self.registered, self.failure = None, ""
                 self._warn(self._opening)
                 self._seconds = {"probe": time.perf_counter() - begun}
+                if self.steering is not None and self.steering.felt(event.contacts):
+                    self._online.start_afresh(self.steering.policy.settings.surprise.larger)
                 yield event.step, event.new_points
                 begun = time.perf_counter()
+
+    def _events(self) -> Iterator[SessionEvent]:
+        """What the session yields, in its own order or as it is steered."""
+        if self.steering is None:
+            yield from self._session.probes()
+            return
+        assert isinstance(self._session, Steerable)
+        step = 0
+        while self.steering.last is not None and self.steering.last.decision.chosen >= 0:
+            yield from self._session.take(step, self.steering.last.decision.chosen)
+            step += 1
+
+    def _decide(self, step: int, steering: Steering) -> Row:
+        """Choose what follows a step, and record it; numbers about the choice."""
+        assert isinstance(self._session, Steerable)
+        begun, before = time.perf_counter(), steering.last
+        points, found = self._online.points.all(), self._online.previous
+        problem, decision = steering.decide(step + 1, points, found, self._session.available())
+        seconds = time.perf_counter() - begun
+        if step >= 0:
+            self._seconds["decision"] = seconds
+        self._recorder.record(Decided(step, problem, decision, steering.surprise))
+        row: Row = {"spread": decision.spread, "stop": decision.stop, "surprise": steering.surprise}
+        if before is not None:
+            chosen = before.decision.chosen
+            row["action"] = chosen
+            row["hit_chance"] = float(before.decision.hit_chance[chosen])
+            row["expected_spread"] = float(before.decision.expected_spread[chosen])
+        return row
 
     def _check_points(self) -> None:
         """Warn about points known so far; PointsError if they cannot be the object's."""

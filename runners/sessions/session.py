@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings
@@ -49,6 +49,7 @@ class Session(Protocol):
         """Let go of engines and files."""
 
 
+@runtime_checkable
 class Steerable(Session, Protocol):
     """A session whose probes can be chosen, one after the other, in place of `probes`."""
 

@@ -38,6 +38,7 @@ def test_the_object_of_a_session_shows_its_size_and_how_far_its_grid_is(
         ObjectConfig("ball", 1.0, 0.001, "ball", kind="file", path=str(tmp_path / "ball.ply")),
         {"kind": "points", "path": str(tmp_path / "points.npz"), "object_resolution": 0.02},
         {"name": "chsel"},
+        {"name": "grid"},
         PresetName("default"),
         RecordingConfig(),
         AssetsConfig(str(tmp_path), "https://nowhere.example"),

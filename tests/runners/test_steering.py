@@ -1,0 +1,135 @@
+"""Sessions whose probes a policy chooses, as a user runs them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from chsel.policies import build_policy
+from chsel.policies.steering import Steering
+from replay.events import Decided, Probe
+from replay.mcap.reader import Recording, read_recording
+from runners import probe
+from tests.runners.in_process import Done, run
+
+SESSION = (
+    "object=spam_can",
+    "session=kinematic",
+    "method=anchored",
+    "method.size=small",
+    "recording=mcap",
+)
+
+
+def steered(logs: Path, *overrides: str) -> tuple[Done, Recording, dict[str, Any]]:
+    done = run(probe.main, *SESSION, *overrides, f"logs={logs}", columns=120)
+    assert done.returncode == 0, done.stderr
+    (folder,) = (logs / "probe").iterdir()
+    summary = json.loads((folder / "summary.json").read_text())
+    return done, read_recording(folder / "recording.mcap"), summary
+
+
+def decided(recording: Recording) -> list[Decided]:
+    return [event for event in recording.events() if isinstance(event, Decided)]
+
+
+@pytest.fixture(scope="module")
+def informed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Done, Recording, dict[str, Any]]:
+    return steered(tmp_path_factory.mktemp("logs"), "policy=information", "policy.probes=3")
+
+
+def test_every_probe_follows_a_decision_and_the_last_decision_says_why_it_ends(
+    informed: tuple[Done, Recording, dict[str, Any]],
+) -> None:
+    done, recording, summary = informed
+    decisions = decided(recording)
+    assert [event.step for event in decisions] == [-1, 0, 1, 2]
+    assert [event.decision.stop for event in decisions] == ["", "", "", "budget"]
+    assert "stopped after 3 probes: policy.probes allows no more" in " ".join(done.stdout.split())
+    probes = [event for event in recording.events() if isinstance(event, Probe)]
+    actions = decisions[0].problem.actions
+    for before, made in zip(decisions, probes, strict=False):
+        chosen = before.decision.chosen
+        assert before.problem.available[chosen]
+        start = actions.world_from_hand[chosen]
+        np.testing.assert_allclose(made.gripper_path[0], start, atol=1e-9)
+        assert not decisions[made.step + 1].problem.available[chosen]
+    row = summary["steps"][1]
+    assert row["action"] == decisions[1].decision.chosen
+    assert row["spread"] == decisions[2].decision.spread
+    assert recording.start.config["policy"]["name"] == "information"
+
+
+def test_decisions_are_those_of_the_policy_from_the_recording_alone(
+    informed: tuple[Done, Recording, dict[str, Any]],
+) -> None:
+    config = dict(informed[1].start.config["policy"])
+    policy = build_policy(config.pop("name"), config)
+    for event in decided(informed[1]):
+        assert policy.decide(event.problem).digest == event.decision.digest
+
+
+def test_registration_begins_with_the_first_contact(
+    informed: tuple[Done, Recording, dict[str, Any]],
+) -> None:
+    probes = [event for event in informed[1].events() if isinstance(event, Probe)]
+    touched = [made.step for made in probes if len(made.contacts)]
+    assert informed[1].steps == tuple(range(touched[0], 3))
+
+
+def test_a_session_stops_when_the_plausible_poses_are_close_together(tmp_path: Path) -> None:
+    done, recording, _ = steered(tmp_path, "policy=information", "policy.stop.spread=0.1")
+    last = decided(recording)[-1]
+    assert last.decision.stop == "spread"
+    assert last.decision.spread <= 0.1 < decided(recording)[-2].decision.spread
+    assert "policy.stop.spread" in done.stdout
+
+
+def test_a_surprise_starts_the_next_registration_afresh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    felt = Steering.felt
+
+    def surprised(steering: Steering, contacts: np.ndarray) -> bool:
+        return felt(steering, contacts) or steering.last.problem.key.step == 2  # type: ignore[union-attr]
+
+    monkeypatch.setattr(Steering, "felt", surprised)
+    _, recording, _ = steered(tmp_path, "policy=information", "policy.probes=4")
+    sizes = [len(recording.problem(step).initial_set) for step in recording.steps]
+    assert dict(zip(recording.steps, sizes, strict=True))[2] == 90
+    assert len(recording.problem(2).low_cost_set) == 0
+    assert len(recording.problem(3).initial_set) == 30
+
+
+def test_the_grid_is_not_recorded_as_a_policy(tmp_path: Path) -> None:
+    _, recording, _ = steered(tmp_path, "policy=grid")
+    assert decided(recording) == []
+    assert "policy" not in recording.start.config
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("policy=informative",), "informative"),
+        (("policy=information", "policy.noise=0"), "noise is 0"),
+        (("policy=information", "policy.action.spacing=1"), "action"),
+        (("policy=information", "policy.actions.choice=sideways"), "accepted: configuration"),
+    ],
+)
+def test_a_mistake_is_one_line(overrides: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    done = run(probe.main, *SESSION, *overrides, f"logs={tmp_path}")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.strip().count("\n") == 0
+
+
+def test_given_points_cannot_be_steered(tmp_path: Path) -> None:
+    np.savez(tmp_path / "points.npz", surface=0.04 * np.eye(3))
+    place = f"session.path={tmp_path / 'points.npz'}"
+    done = run(probe.main, "session=points", place, "policy=information", f"logs={tmp_path}")
+    assert done.returncode == 2
+    assert "session points cannot be steered" in done.stderr
