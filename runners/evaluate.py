@@ -43,7 +43,8 @@ from runners.evaluation.trial_configurations import SENSORS, faulty_name
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
 from runners.run.scene import PresetName
-from runners.sessions.faults import CLEAN, LEVELS, without_clean_faults
+from runners.sessions.faults import CLEAN, LEVELS
+from runners.sessions.probing_settings import without_defaults
 
 _COLLECT = 300.0  # s between tables of what is finished so far
 _OF_TRIAL = ("configuration", "logs")
@@ -185,7 +186,7 @@ def _plan(config: EvaluateConfig) -> Plan:
     chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
     chosen = drawn(chosen, config.draws)
     logs = config.session.get("logs")
-    session = without_clean_faults(config.session)
+    session = without_defaults(config.session)
     return Plan(
         folder=Path(config.out).expanduser(),
         preset=config.preset.name,

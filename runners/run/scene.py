@@ -23,7 +23,7 @@ from runners.run.recording import RecordingConfig
 from runners.sensors.session_report import Report
 from runners.sessions import open_session, session_settings
 from runners.sessions.depth_frame_session import DepthFrameSession
-from runners.sessions.faults import without_clean_faults
+from runners.sessions.probing_settings import without_defaults
 from runners.sessions.recorded import RecordedSession
 from runners.sessions.sensors import SensorsSession
 from runners.sessions.session import Progress, Session, Steerable, unwatched
@@ -187,7 +187,7 @@ def session_started(
     """The first event of the recording."""
     session = scene.session
     recorded = {key: value for key, value in values.items() if key not in _NOT_OF_THE_RESULT}
-    recorded["session"] = without_clean_faults(values["session"])
+    recorded["session"] = without_defaults(values["session"])
     if scene.steering is None:
         recorded.pop("policy", None)
     return SessionStarted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -89,12 +89,6 @@ LEVELS: Mapping[str, FaultSettings] = {
 def level_name(faults: FaultSettings) -> str:
     """The name of the level with these settings, else OWN_LEVEL."""
     return next((name for name, level in LEVELS.items() if level == faults), OWN_LEVEL)
-
-
-def without_clean_faults(session: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a session as they are recorded: `faults` only where there are any."""
-    clean = asdict(LEVELS[CLEAN])
-    return {key: value for key, value in session.items() if (key, value) != ("faults", clean)}
 
 
 def probed_mesh(mesh: trimesh.Trimesh, faults: FaultSettings) -> trimesh.Trimesh:

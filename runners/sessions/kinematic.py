@@ -12,9 +12,9 @@ import trimesh
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 from runners.sessions.configurations import find_configuration
+from runners.sessions.described_hand import open_hand
 from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
-from runners.sessions.panda_hand import panda_hand
 from runners.sessions.placement import laid_down
 from runners.sessions.probing import ProbingSession
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
@@ -34,7 +34,7 @@ def open_kinematic(
     """
     configuration = find_configuration(configuration_name)
     probed = probed_mesh(mesh, settings.faults)
-    hand = panda_hand()
+    hand = open_hand(settings.hand)
     engine = KinematicEngine(probed, laid_down(mesh, configuration), settings, hand)
     return ProbingSession(engine, mesh, configuration, settings, seed, hand)
 

@@ -55,7 +55,10 @@ class ProbingHand:
         last = np.ceil(bounds[:, 1].max(axis=0) / spacing)
         axes = [np.arange(low, high + 1) * spacing for low, high in zip(first, last, strict=True)]
         nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        return nodes[np.max([_depth(solid, nodes) for solid in self.solids], axis=0) > depth]
+        deepest = np.full(len(nodes), -np.inf)
+        for solid in self.solids:
+            np.maximum(deepest, _depth(solid, nodes), out=deepest)
+        return nodes[deepest > depth]
 
     def _covering(self, index: int, spacing: float) -> FloatArray:
         """Points on one solid that are in no other; of faces that two share, those of the first."""
@@ -83,8 +86,15 @@ def world_from_gripper(positions: FloatArray, rotation: FloatArray = ROTATION) -
 
 
 def _depth(solid: trimesh.Trimesh, points: FloatArray) -> FloatArray:
-    """Distance (N,) from points (N, 3) to the surface of a convex solid, negative outside."""
-    depth = np.full(len(points), np.inf)
+    """Distance (N,) from points (N, 3) to the surface of a convex solid, negative outside.
+
+    It is minus infinity outside of the solid's bounding box.
+    """
+    lower, upper = np.asarray(solid.bounds)
+    near = ((points >= lower - _FLUSH) & (points <= upper + _FLUSH)).all(axis=1)
+    chosen, depth = points[near], np.full(int(near.sum()), np.inf)
     for normal, corner in zip(solid.face_normals, solid.triangles[:, 0], strict=True):
-        np.minimum(depth, (corner - points) @ normal, out=depth)
-    return depth
+        np.minimum(depth, (corner - chosen) @ normal, out=depth)
+    every = np.full(len(points), -np.inf)
+    every[near] = depth
+    return every

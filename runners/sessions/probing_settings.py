@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from chsel.errors import require_choice, require_positive
-from chsel.problem.settings import Presets
-from runners.sessions.faults import FaultSettings
+from chsel.problem.settings import Presets, build_settings
+from runners.sessions.described_hand import DescribedHand
+from runners.sessions.faults import CLEAN, LEVELS, FaultSettings
 
 BOUNDARIES = ("floor_slab", "box_shell", "both")
 SWEEPS = ("mini_steps", "control_steps")
@@ -39,6 +41,7 @@ class ProbingSettings:
     noise: float = 0.005  # standard deviation, of a command between -1 and 1
     faults: FaultSettings = field(default_factory=FaultSettings)
     """Of what is reported, and of the registered mesh."""
+    hand: DescribedHand = field(default_factory=DescribedHand)  # with which is probed
 
     presets: ClassVar[Presets] = {
         "paper": {
@@ -69,3 +72,15 @@ class ProbingSettings:
             require_positive(name, getattr(self, name))
         for name in ("start_contacts", "start_probe", "noise"):
             require_positive(name, getattr(self, name), zero=True)
+
+
+def without_defaults(session: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a session as they are recorded: `faults` and `hand` only where there are any."""
+    defaults = {"faults": LEVELS[CLEAN], "hand": DescribedHand()}
+    return {
+        key: value
+        for key, value in session.items()
+        if key not in defaults
+        or not isinstance(value, Mapping)
+        or build_settings(type(defaults[key]), value, f"session.{key}") != defaults[key]
+    }

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
 from runners.sessions.configurations import Configuration, find_configuration
+from runners.sessions.described_hand import open_hand
 from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
-from runners.sessions.panda_hand import panda_hand
 from runners.sessions.physics_engine import connect, silent
 from runners.sessions.placement import centre_of_mass, laid_down, lowest
 from runners.sessions.probing import ProbingSession
@@ -47,7 +47,7 @@ def open_simulated(
     Raises SessionError for an unknown configuration, or where PyBullet is not installed.
     """
     configuration = find_configuration(configuration_name)
-    hand = panda_hand()
+    hand = open_hand(settings.hand)
     engine = PyBulletEngine(mesh, configuration, settings, hand)
     return ProbingSession(engine, mesh, configuration, settings, seed, hand)
 

@@ -22,11 +22,10 @@ from runners.sessions.faults import (
     FaultSettings,
     level_name,
     probed_mesh,
-    without_clean_faults,
 )
 from runners.sessions.kinematic import open_kinematic
 from runners.sessions.probing import ProbingSession
-from runners.sessions.probing_settings import ProbingSettings
+from runners.sessions.probing_settings import ProbingSettings, without_defaults
 
 RADIUS, SIDE = 0.1, 0.02
 CENTRE = np.array([0.3, 0.0, 0.2])
@@ -194,9 +193,11 @@ def test_levels_have_names_and_are_recorded_unless_clean() -> None:
     assert [level_name(level) for level in LEVELS.values()] == list(LEVELS)
     assert level_name(replace(LEVELS["mixed"], contact_noise=0.004)) == "own"
     session = {"kind": "kinematic", "faults": settings_mapping(LEVELS[CLEAN])}
-    assert without_clean_faults(session) == {"kind": "kinematic"}
+    session["hand"] = {"urdf": None, "root": None, "boxes": []}
+    assert without_defaults(session) == {"kind": "kinematic"}
     session["faults"] = settings_mapping(LEVELS["mixed"])
-    assert without_clean_faults(session) == session
+    session["hand"] = {"urdf": "gripper.urdf"}
+    assert without_defaults(session) == session
 
 
 @pytest.mark.parametrize(
