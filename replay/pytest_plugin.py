@@ -58,38 +58,51 @@ class StoredReplay(pytest.File):
     def __init__(self, **more: Any) -> None:
         super().__init__(**more)
         self._coming: Iterator[Verdict] | None = None
-        self._verdicts: dict[int, Verdict] = {}
+        self._verdicts: dict[str, Verdict] = {}
 
     def collect(self) -> Iterable[pytest.Item]:
-        """An item for each registration that has a result; one that fails for an unusable file."""
+        """An item for each registration that has a result, and for each decision.
+
+        A file that cannot be used has one that fails.
+        """
         from chsel.errors import ChselError
+        from replay.comparing.policies import recorded_policy
         from replay.mcap.reader import read_recording
         from replay.registration import recorded_method
 
         try:
             recording = read_recording(self.path)
             recorded_method(recording)
-            steps = [step for step in recording.steps if recording.has_result(step)]
-            reason = "" if steps else f"recording {self.path} has no registration with a result"
+            items = [
+                (step, f"step {step}, {recording.start.method}")
+                for step in recording.steps
+                if recording.has_result(step)
+            ]
+            if recording.decision_steps:
+                policy = recorded_policy(recording).name
+                items += [
+                    (step, f"decision after step {step}, {policy}")
+                    for step in recording.decision_steps
+                ]
+            reason = "" if items else f"recording {self.path} has no registration with a result"
         except ChselError as error:
             reason = str(error)
         if reason:
             yield ReplayedItem.from_parent(self, name="recording", failure=reason)
             return
-        for step in steps:
-            name = f"step {step}, {recording.start.method}"
+        for step, name in sorted(items, key=lambda item: item[0]):
             yield ReplayedItem.from_parent(self, name=name, step=step)
 
-    def verdict(self, step: int) -> Verdict:
-        """The verdict on a step; those on other selected steps come before it."""
+    def verdict(self, name: str) -> Verdict:
+        """The verdict of an item; those on other selected steps come before it."""
         if self._coming is None:
             items = (item for item in self.session.items if item.parent is self)
             steps = [item.step for item in items if isinstance(item, ReplayedItem)]
             self._coming = _verdicts(self.path, steps)
-        while step not in self._verdicts:
+        while name not in self._verdicts:
             verdict = next(self._coming)
-            self._verdicts[verdict.step] = verdict
-        return self._verdicts[step]
+            self._verdicts[verdict.label] = verdict
+        return self._verdicts[name]
 
 
 def _verdicts(path: Path, steps: list[int]) -> Iterator[Verdict]:
@@ -101,7 +114,7 @@ def _verdicts(path: Path, steps: list[int]) -> Iterator[Verdict]:
 
 
 class ReplayedItem(pytest.Item):
-    """One registration, run again; or a file that cannot be, with the reason."""
+    """One registration or decision, made again; or a file that cannot be, with the reason."""
 
     parent: StoredReplay
 
@@ -117,7 +130,7 @@ class ReplayedItem(pytest.Item):
 
         if self._failure:
             pytest.fail(printable(self._failure), pytrace=False)
-        verdict = self.parent.verdict(self.step)
+        verdict = self.parent.verdict(self.name)
         if verdict.outcome != EQUAL:
             pytest.fail(f"{printable(str(self.path))}: {verdict.report()}", pytrace=False)
 

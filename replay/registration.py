@@ -116,7 +116,7 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
     preset: the recording's if it has one, or that of the change "preset=NAME".
     Raises SettingError for names and values that do not exist.
     """
-    pairs = [_pair(change) for change in changes]
+    pairs = [setting_change(change) for change in changes]
     preset = next((value for key, value in pairs if key == "preset"), None)
     recorded = recording.start.method
     if name in (None, recorded) and preset is None:
@@ -130,6 +130,17 @@ def other_method(recording: Recording, name: str | None, changes: Sequence[str])
                 value = {part: value}
             settings = changed_settings(settings, value, "method")
     return _named(name or recorded, settings)
+
+
+def setting_change(change: str) -> tuple[str, Any]:
+    """Key and value of a change such as "cost.free_scale=40"; SettingError if it is none."""
+    key, sign, value = change.partition("=")
+    if not sign or not key:
+        raise SettingError(f"{change!r} is not a setting; accepted: KEY=VALUE")
+    try:
+        return key, yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise SettingError(f"{change!r} has no value; accepted: KEY=VALUE, as in YAML") from None
 
 
 def recorded_online(recording: Recording, method: Method) -> OnlineRegistration:
@@ -198,13 +209,3 @@ def _recorded_preset(recording: Recording) -> str:
     preset = recording.start.config.get("preset")
     name = preset.get("name") if isinstance(preset, Mapping) else None
     return name if name in PRESETS else "default"
-
-
-def _pair(change: str) -> tuple[str, Any]:
-    key, sign, value = change.partition("=")
-    if not sign or not key:
-        raise SettingError(f"{change!r} is not a setting; accepted: KEY=VALUE")
-    try:
-        return key, yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise SettingError(f"{change!r} has no value; accepted: KEY=VALUE, as in YAML") from None

@@ -12,7 +12,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -24,13 +24,13 @@ from replay.mcap.reader import Recording, read_recording
 from replay.screenshot import headless_viewer, save_screenshot
 from runners.reporting.fault_pictures import KINDS
 from runners.reporting.figures import small_png
+from runners.reporting.probing_animation import animation
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 _MENU = 37  # height of the viewer's menu bar in a screenshot: about the machine, not the recording
 _WINDOW = (1920, 1200)  # of the animation, of which two views are shown
 _WIDTH = 720  # of the animation
 _FRAME, _LAST_FRAME = 400, 2500  # milliseconds
-_QUALITY = 62  # of 100, of the animation
 _TEXT_SIZE, _TEXT_COLOR = 22.0, (230, 232, 236)
 _SCENE, _LEGEND = "Scene", "Legend"
 
@@ -53,23 +53,6 @@ def session_webp(sessions: Sessions) -> bytes:
             frames.append(_frame(views, _caption(recording, probe.step)))
     times = [_FRAME] * (len(frames) - 1) + [_LAST_FRAME]
     return animation(frames, times)
-
-
-def animation(frames: Sequence[Image.Image], milliseconds: Sequence[int]) -> bytes:
-    """Frames of one size, each shown for its time, again and again, as a WebP file."""
-    stream = io.BytesIO()
-    first, *others = (frame.convert("RGB") for frame in frames)
-    first.save(
-        stream,
-        format="webp",
-        save_all=True,
-        append_images=others,
-        duration=list(milliseconds),
-        loop=0,
-        quality=_QUALITY,
-        method=6,
-    )
-    return stream.getvalue()
 
 
 def comparison_png(sessions: Sessions) -> bytes:

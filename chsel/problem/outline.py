@@ -30,6 +30,19 @@ def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
     return apart
 
 
+def outline_distances_to(sdf: SdfGrid, poses: Poses, other: Poses) -> FloatArray:
+    """How far the object's surface in each pose is from that in one other pose (B,), metres.
+
+    As in `outline_distances`. other: a single pose.
+    """
+    there = outline_in_world(sdf, poses)  # (B, Q, 3)
+    count, size = there.shape[:2]
+    forth = signed_distances(sdf, other, there.reshape(-1, 3)).reshape(count, size)
+    back = signed_distances(sdf, poses, outline_in_world(sdf, other)[0])  # (B, Q)
+    squares = in_order(forth**2) + in_order(back**2)
+    return np.sqrt(squares / (2 * max(size, 1)))
+
+
 def outline_in_world(sdf: SdfGrid, poses: Poses) -> FloatArray:
     """Points (B, Q, 3) on the object's surface in each pose; Q is 0 for a grid without surface."""
     outline = sdf.derived("outline", lambda: _outline(sdf))

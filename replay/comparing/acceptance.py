@@ -15,11 +15,14 @@ from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from replay.comparing.decisions_again import DecisionsAgain, decision_differences
 from replay.comparing.plausible import PlausibleSets
+from replay.comparing.policies import recorded_policy
 from replay.comparing.results import ResultDifferences, has_measured, recorded_registrations
 from replay.comparing.verification import Verdict
 from replay.environment import environment, environment_differences
 from replay.events import (
+    Decided,
     HypothesesFound,
     Measured,
     Probe,
@@ -43,7 +46,7 @@ from replay.registration import (
     symmetry_for_errors,
 )
 
-_RESULTS = (SnapshotTaken, Traced, HypothesesFound, Measured, Timed)
+_RESULTS = (SnapshotTaken, Traced, HypothesesFound, Measured, Timed)  # of a registration
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,22 @@ def result_changes(recorded: Recording, new: Recording) -> list[ResultChange]:
     return changes
 
 
+def decision_changes(recorded: Recording, new: Recording) -> list[Verdict]:
+    """What differs, step by step, between the decisions of both: as `verify` compares them."""
+    if not recorded.decision_steps:
+        return []
+    policy, differing = recorded_policy(recorded).name, environment_differences(recorded.start)
+    verdicts = []
+    for step in recorded.decision_steps:
+        now = new.decision(step)
+        found = decision_differences(
+            recorded.decision(step), now.problem.belief, now.decision, now.surprise
+        )
+        verdict = Verdict.of(step, policy, found, environment=differing, is_decision=True)
+        verdicts.append(verdict)
+    return verdicts
+
+
 def best_pose_moves(
     recorded: Hypotheses, new: Hypotheses, symmetry: ObjectSymmetry
 ) -> tuple[float, float]:
@@ -124,8 +143,15 @@ def best_pose_moves(
 
 
 def _register_again(recording: Recording, recorder: Recorder) -> None:
-    """Record a session with every registration run again; E_0 and E_l follow anew."""
+    """Record a session with every registration run again; E_0 and E_l follow anew.
+
+    Decisions are made again as well, of the recorded probes, whatever they choose.
+    """
     method, start = recorded_method(recording).method, recording.start
+    online = recorded_online(recording, method)
+    decisions = DecisionsAgain(recording) if recording.decision_steps else None
+
+    found: list[Hypotheses] = []  # the last result
 
     def perceived() -> Iterator[tuple[int, KnownPoints]]:
         """Record what comes from no registration; new points of each step with a result."""
@@ -134,6 +160,12 @@ def _register_again(recording: Recording, recorder: Recorder) -> None:
         for event in recording.events():
             if isinstance(event, Probe):
                 new.append(event.new_points)
+                larger = 0 if decisions is None else decisions.probed(event)
+                if larger:
+                    online.start_afresh(larger)
+            if isinstance(event, Decided) and decisions is not None:
+                event = decisions.again(event, found[-1] if found else None)
+                decisions.remember(event)
             if isinstance(event, SessionStarted):
                 recorder.record(dataclasses.replace(event, environment=environment()))
             elif isinstance(event, ProblemPosed) and recording.has_result(event.step):
@@ -159,7 +191,8 @@ def _register_again(recording: Recording, recorder: Recorder) -> None:
                 recorder.flush()
         if recording.has_timings:
             recorder.record(Timed(step, registered.seconds))
+        found[:] = [registered.hypotheses]
         return None if start.source else registered.hypotheses  # problems of another method stay
 
-    for _ in recorded_online(recording, method).steps(perceived(), register):
+    for _ in online.steps(perceived(), register):
         pass

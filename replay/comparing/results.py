@@ -48,6 +48,8 @@ class RecordedRegistration:
     new_points: KnownPoints  # since the problem before
     follows: bool  # whether E_0 and E_l are of results in this recording, none of them lost
     following: list[Event]  # also those of other steps
+    preceding: list[Event]  # since the problem before
+    is_first: bool  # whether there is no problem before
 
     @property
     def last_result(self) -> Hypotheses | None:
@@ -75,7 +77,7 @@ def recorded_registrations(recording: Recording) -> Iterator[RecordedRegistratio
     """The registrations of a recording, in their order."""
     events = recording.events(images=False)
     before, posed = _until_next_problem(events)
-    lost = False
+    lost, first = False, True
     while posed is not None:
         for event in before:
             lost = tells_loss(event) or (lost and not isinstance(event, HypothesesFound))
@@ -83,8 +85,8 @@ def recorded_registrations(recording: Recording) -> Iterator[RecordedRegistratio
         following, next_posed = _until_next_problem(events)
         follows = not recording.start.source and not lost
         points = KnownPoints.joined([KnownPoints(), *new])
-        yield RecordedRegistration(posed, points, follows, following)
-        before, posed = following, next_posed
+        yield RecordedRegistration(posed, points, follows, following, before, first)
+        before, posed, first = following, next_posed, False
 
 
 def _until_next_problem(events: Iterator[Event]) -> tuple[list[Event], ProblemPosed | None]:

@@ -97,6 +97,7 @@ def _start(
 ) -> SessionStarted:
     """The session's start, with another method, from here, and with its source."""
     config = {**recording.start.config, "method": method.config, "source": facts}
+    config.pop("policy", None)  # no decision is part of it
     if preset is not None:
         config["preset"] = {"name": preset}
     return dataclasses.replace(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import tee
 from multiprocessing import get_context
 from pathlib import Path
@@ -14,6 +14,8 @@ from pathlib import Path
 from chsel.errors import ChselError, RecordingError
 from chsel.numerics.threads import threads
 from chsel.problem.online_registration import OnlineStep
+from chsel.problem.registration_problem import Hypotheses
+from replay.comparing.decisions_again import DecisionsAgain
 from replay.comparing.results import (
     RecordedRegistration,
     ResultDifferences,
@@ -23,7 +25,7 @@ from replay.comparing.results import (
     stage_name,
 )
 from replay.environment import environment_differences
-from replay.events import Event, SnapshotTaken, Traced
+from replay.events import Decided, Event, Probe, SnapshotTaken, Traced
 from replay.lost_attachment import LostAttachment
 from replay.mcap.reader import Recording, read_recording
 from replay.recorder import ListRecorder
@@ -45,7 +47,7 @@ class Verdict:
     """What verifying one step showed."""
 
     step: int
-    method: str
+    method: str  # or policy
     outcome: str  # "equal", "differs", or "no result" where the recorded registration did not end
     stage: str = ""  # the first that differs
     before: int = 0  # how many recorded stages before it are equal
@@ -53,14 +55,21 @@ class Verdict:
     largest_ulps: int = 0  # over all of them
     environment: tuple[str, ...] = ()  # what of it is not as recorded
     seconds: float = 0.0  # of registering
+    is_decision: bool = False  # that follows the step, else its registration
+
+    @property
+    def label(self) -> str:
+        """What it is about: "step 3, chsel", or "decision after step 3, information"."""
+        return f"{'decision after ' * self.is_decision}step {self.step}, {self.method}"
 
     def report(self) -> str:
         """The verdict for people; several lines if it is "differs"."""
         if self.outcome != DIFFERS:
-            return f"step {self.step}, {self.method}: {self.outcome}"
+            return f"{self.label}: {self.outcome}"
+        stages = "values" if self.is_decision else "stages"
         lines = [
-            f"step {self.step}, {self.method}: differs",
-            f"first difference: {self.stage} ({self.before} recorded stages before it are equal)",
+            f"{self.label}: differs",
+            f"first difference: {self.stage} ({self.before} recorded {stages} before it are equal)",
             *self.differences,
             f"largest difference: {self.largest_ulps} ulp",
             "environment: " + ("; ".join(self.environment) or "the same as recorded"),
@@ -76,31 +85,33 @@ class Verdict:
         *,
         environment: tuple[str, ...],
         seconds: float = 0.0,
+        is_decision: bool = False,
     ) -> Verdict:
         """The verdict that follows from the differences of a result."""
+        about = cls(step, method, EQUAL, seconds=seconds, is_decision=is_decision)
         if not found.stage:
-            return cls(step, method, EQUAL, before=found.before, seconds=seconds)
-        return cls(
-            step,
-            method,
-            DIFFERS,
-            found.stage,
-            found.before,
-            tuple(found.lines),
-            found.largest_ulps,
-            environment,
-            seconds,
+            return replace(about, before=found.before)
+        return replace(
+            about,
+            outcome=DIFFERS,
+            stage=found.stage,
+            before=found.before,
+            differences=tuple(found.lines),
+            largest_ulps=found.largest_ulps,
+            environment=environment,
         )
 
 
 def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator[Verdict]:
-    """Verdicts on steps of a recording (None: on all that pose a problem), in their order.
+    """Verdicts on steps of a recording, in their order: on registrations and decisions.
 
-    Raises RecordingError if the recording does not have its method's settings, lacks a step, or has
-    lost its SDF grid.
+    steps: None for all that pose a problem or are followed by a decision. The belief of a decision
+    is compared where the registration before it is run again. Raises RecordingError if the
+    recording does not have the settings of its method or policy, lacks a step, or has lost its SDF
+    grid.
     """
     method = recorded_method(recording)
-    wanted = set(recording.checked_steps(steps))
+    wanted = set(steps_to_verify(recording, steps))
     if isinstance(recording.start.sdf, LostAttachment):
         raise RecordingError(f"recording {recording.path}: {recording.start.sdf.error()}")
     differing = environment_differences(recording.start)
@@ -108,11 +119,78 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
     perceived = ((one.posed.step, one.new_points) for one in again)
     online = recorded_online(recording, method.method)
     walked = online.steps(perceived, catch=ChselError)
-    for recorded, step in zip(registrations, walked, strict=True):
+    decisions = _DecisionVerdicts(recording, wanted, differing)
+    if not recording.steps:
+        yield from decisions.following(recording.events(images=False))
+    for recorded in registrations:
+        if recorded.is_first:
+            yield from decisions.following(recorded.preceding)
+        if decisions.larger:
+            online.start_afresh(decisions.larger)
+        step = next(walked)
+        found = None
         if step.step in wanted:
-            yield _verified(recording, recorded, step, method, differing)
+            verdict, found = _verified(recording, recorded, step, method, differing)
+            yield verdict
         if recorded.last_result is not None:
             online.remember(recorded.last_result)
+            decisions.registered(found)
+        yield from decisions.following(recorded.following)
+
+
+def steps_to_verify(recording: Recording, steps: Sequence[int] | None) -> tuple[int, ...]:
+    """Steps with a problem or a decision, in order; None means all. RecordingError if not."""
+    decided = set(recording.decision_steps)
+    if steps is None:
+        return tuple(sorted({*recording.steps, *decided}))
+    posed = recording.checked_steps([step for step in steps if step not in decided])
+    return tuple(sorted({*posed, *decided.intersection(steps)}))
+
+
+class _DecisionVerdicts:
+    """Makes decisions again on the way through a recording.
+
+    larger: the size of the next registration if an outcome since the last one makes it start
+    afresh, else 0.
+    """
+
+    def __init__(
+        self, recording: Recording, wanted: Container[int], environment: tuple[str, ...]
+    ) -> None:
+        self.larger = 0
+        self._again = DecisionsAgain(recording) if recording.decision_steps else None
+        self._wanted, self._environment = wanted, environment
+        self._result: Hypotheses | None = None  # of the last registration
+        self._known = True  # whether that was run again, or there was none
+
+    def registered(self, result: Hypotheses | None) -> None:
+        """A registration had a result, and has this one again; None if it was not run."""
+        self._result, self._known, self.larger = result, result is not None, 0
+
+    def following(self, events: Iterable[Event]) -> Iterator[Verdict]:
+        """Verdicts on the decisions among events."""
+        again = self._again
+        if again is None:
+            return
+        for event in events:
+            if isinstance(event, Probe):
+                self.larger = again.probed(event) or self.larger
+            elif isinstance(event, Decided):
+                if event.step in self._wanted:
+                    yield self._verdict(again, event)
+                again.remember(event)
+
+    def _verdict(self, again: DecisionsAgain, decided: Decided) -> Verdict:
+        begun = time.perf_counter()
+        found = again.differences(decided, self._result, known=self._known)
+        return Verdict.of(
+            decided.step,
+            again.name,
+            found,
+            environment=self._environment,
+            seconds=time.perf_counter() - begun,
+            is_decision=True,
+        )
 
 
 def _verified(
@@ -121,27 +199,31 @@ def _verified(
     again: OnlineStep,
     method: NamedMethod,
     environment: tuple[str, ...],
-) -> Verdict:
-    """Register a recorded problem again, and compare; again: the problem, posed today."""
+) -> tuple[Verdict, Hypotheses | None]:
+    """Register a recorded problem again, and compare; again: the problem, posed today.
+
+    Also returns the result, if there is one.
+    """
     start, posed, recorded = recording.start, registration.posed, registration.events
     if result_in(recorded) is None:
-        return Verdict(posed.step, method.name, NO_RESULT)
+        return Verdict(posed.step, method.name, NO_RESULT), None
     found = ResultDifferences()
     if registration.follows and again.problem is not None:
         found.add_sets(posed.problem, again.problem)
     elif registration.follows:  # such as after a result whose poses are not finite
         found.fail("making E_0", f"E_0 and E_l cannot be made again: {again.failure}")
     recorder = _PatientRecorder(recorded) if registration.complete else ListRecorder()
-    failure, seconds = "", 0.0
+    failure, seconds, result = "", 0.0, None
     try:
-        seconds = register_recorded(
+        registered = register_recorded(
             posed,
             method.method,
             recorder,
             start.world_from_object,
             symmetry_for_errors(start),
             snapshot_interval=snapshot_interval(recording.snapshots(posed.step)),
-        ).total_seconds
+        )
+        seconds, result = registered.total_seconds, registered.hypotheses
     except (_FarBeyondError, ChselError) as error:
         failure = str(error)
     found.add_stages(recorded, recorder.events)
@@ -150,7 +232,8 @@ def _verified(
         found.fail("the end of the registration", reason)
     if has_measured(recording, registration):
         found.add_measured(recording, recorded, recorder.events)
-    return Verdict.of(posed.step, method.name, found, environment=environment, seconds=seconds)
+    verdict = Verdict.of(posed.step, method.name, found, environment=environment, seconds=seconds)
+    return verdict, result
 
 
 class _FarBeyondError(Exception):
@@ -202,8 +285,18 @@ class FileVerdict:
 
     @property
     def equal(self) -> int:
-        """How many steps are equal."""
-        return sum(verdict.outcome == EQUAL for verdict in self.verdicts)
+        """How many registrations are equal."""
+        return sum(verdict.outcome == EQUAL for verdict in self.registrations)
+
+    @property
+    def registrations(self) -> list[Verdict]:
+        """The verdicts on registrations."""
+        return [verdict for verdict in self.verdicts if not verdict.is_decision]
+
+    @property
+    def decisions(self) -> list[Verdict]:
+        """The verdicts on decisions."""
+        return [verdict for verdict in self.verdicts if verdict.is_decision]
 
 
 def recordings_in(paths: Sequence[str | Path]) -> list[Path]:
@@ -241,9 +334,10 @@ def _verified_part(path: Path, steps: Sequence[int] | None, part: int, parts: in
     try:
         recording = read_recording(path)
         verdict.digest = recording.digest
-        wanted = recording.checked_steps(steps)
+        wanted = steps_to_verify(recording, steps)
         first, last = (len(wanted) * part // parts, len(wanted) * (part + 1) // parts)
-        if not any(recording.has_result(step) for step in wanted):
+        decided = set(recording.decision_steps)
+        if not any(recording.has_result(step) or step in decided for step in wanted):
             raise RecordingError(
                 f"recording {path} has no registration with a result to verify; accepted: a "
                 "recording of at least one"

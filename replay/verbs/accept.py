@@ -12,7 +12,12 @@ from pathlib import Path
 from rich.table import Table
 
 from chsel.errors import RecordingError
-from replay.comparing.acceptance import ResultChange, result_changes, write_accepted
+from replay.comparing.acceptance import (
+    ResultChange,
+    decision_changes,
+    result_changes,
+    write_accepted,
+)
 from replay.comparing.verification import EQUAL, recordings_in
 from replay.console import Console, plain_table
 from replay.files import sync_folder
@@ -38,22 +43,28 @@ def _accept(path: Path, *, ask: bool) -> int:
     recording = read_recording(path)
     new = path.with_name(f"{path.name}.{os.getpid()}.new")
     try:
-        changes = result_changes(recording, write_accepted(recording, new))
+        accepted = write_accepted(recording, new)
+        changes = result_changes(recording, accepted)
+        decisions = decision_changes(recording, accepted)
         differing = [change for change in changes if change.verdict.outcome != EQUAL]
-        if not differing:
+        others = [verdict for verdict in decisions if verdict.outcome != EQUAL]
+        if not differing and not others:
             console.print(f"{path}: all {len(changes)} results are as recorded, nothing to change")
             return 0
-        for change in differing:
-            for line in change.verdict.report().split("\n"):
+        for verdict in [*(change.verdict for change in differing), *others]:
+            for line in verdict.report().split("\n"):
                 console.print(line)
-        title = f"{path}: {len(differing)} of {len(changes)} results change"
-        console.print(_table(title, differing))
+        counts = f"{len(differing)} of {len(changes)} results"
+        if decisions:
+            counts += f" and {len(others)} of {len(decisions)} decisions"
+        title = f"{path}: {counts} change"
+        console.print(_table(title, differing) if differing else title)
         if ask and console.input("record these results as the expected ones? [y/N] ") != "y":
             console.print(f"{path}: left as it was")
             return 1
         new.replace(path)
         sync_folder(path.parent)
-        console.print(f"{path}: {len(differing)} of {len(changes)} results are new")
+        console.print(f"{path}: {counts} are new")
         return 0
     finally:
         new.unlink(missing_ok=True)

@@ -1,5 +1,7 @@
 """Run every registration of recordings again and compare hypotheses, costs and archives.
 
+Decisions of steered sessions are made again and compared, too.
+
 Status 0 if all bits are equal, 1 if not, 2 if a file cannot be used or holds no result.
 """
 
@@ -11,6 +13,7 @@ import time
 from chsel.numerics.threads import require_threads
 from replay.comparing.verification import (
     DIFFERS,
+    EQUAL,
     NO_RESULT,
     FileVerdict,
     recordings_in,
@@ -42,7 +45,7 @@ def run(given: argparse.Namespace) -> int:
             progress.advance(task)
             status = max(status, file.status)
             equal += file.equal
-            total += len(file.verdicts)
+            total += len(file.registrations)
     if len(paths) > 1:
         rate = total / (time.perf_counter() - begun)
         console.print(
@@ -55,17 +58,21 @@ def _print(console: Console, file: FileVerdict) -> None:
     if file.unusable:
         print_error(file.unusable)
         return
-    compared = [verdict for verdict in file.verdicts if verdict.outcome != NO_RESULT]
-    methods = ", ".join(sorted({verdict.method for verdict in file.verdicts})) or "no method"
+    registrations = file.registrations
+    compared = [verdict for verdict in registrations if verdict.outcome != NO_RESULT]
+    methods = ", ".join(sorted({verdict.method for verdict in registrations})) or "no method"
     line = f"{file.path}: {file.equal} of {len(compared)} steps equal ({methods}), "
+    if file.decisions:
+        equal = sum(verdict.outcome == EQUAL for verdict in file.decisions)
+        line += f"{equal} of {len(file.decisions)} decisions equal ({file.decisions[0].method}), "
     line += f"{file.seconds:.1f} s"
-    without = len(file.verdicts) - len(compared)
+    without = len(registrations) - len(compared)
     if without:
         line += f", {without} without a result"
     if file.digest:
         line += f", digest {file.digest}"
     console.print(line)
-    for verdict in compared:
+    for verdict in file.verdicts:
         if verdict.outcome == DIFFERS:
             for line in verdict.report().split("\n"):
                 console.print(line)

@@ -22,6 +22,8 @@ from runners.evaluation.plan import Plan
 from runners.evaluation.table import (
     ITERATIONS,
     ITERATIONS_ORDER,
+    PROBES,
+    PROBES_ORDER,
     RESULTS,
     RESULTS_ORDER,
     write_table,
@@ -44,8 +46,9 @@ _FIXED = (
     "logs",
     "truth",
     "plausible",
+    "steered",
 )
-_BEFORE = {"plausible": True}
+_BEFORE = {"plausible": True, "steered": False}
 """What keys mean that folders from before there were any lack."""
 
 
@@ -81,10 +84,14 @@ def writing_alone(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
 def collect(folder: Path) -> pa.Table:
     """Write results and, where iterations are measured, iterations; the former.
 
-    Every part that exists is in them, whoever made it and when.
+    An evaluation of policies has probes in place of both. Every part that exists is in them,
+    whoever made it and when.
     """
     experiment = read_experiment(folder)
     definition = definition_label(experiment["definition"])
+    if experiment.get("policies"):
+        parts = list(_parts(folder, experiment, ".parquet", ".failed.parquet"))
+        return write_table(folder, "probes", parts, PROBES, PROBES_ORDER, definition)
     if experiment["iterations"]["every"] is not None:
         parts = list(_parts(folder, experiment, ".iterations.parquet"))
         write_table(folder, "iterations", parts, ITERATIONS, ITERATIONS_ORDER, definition)
@@ -139,7 +146,7 @@ def _write(path: Path, values: Mapping[str, Any]) -> None:
 
 def _parts(folder: Path, experiment: Mapping[str, Any], *suffixes: str) -> Iterable[Path]:
     """Of every trial and label the first file with one of the suffixes."""
-    labels = [*experiment["methods"], *experiment["outside"]]
+    labels = [*experiment.get("policies", ())] or [*experiment["methods"], *experiment["outside"]]
     for configuration in experiment["configurations"]:
         for seed in experiment["seeds"]:
             trial = folder / "trials" / configuration / f"seed_{seed}"
@@ -169,6 +176,8 @@ def _described(
         "logs": None if plan.logs is None else str(plan.logs),
         "truth": settings_mapping(plan.truth) if plan.kind == SENSORS else None,
         "plausible": plan.plausible,
+        "policies": {label: one.config for label, one in plan.policies.items()},
+        "steered": bool(plan.policies),
         "commands": [_command()],
         "environment": environment(),
         "other_environments": [],
@@ -186,10 +195,14 @@ def _command() -> str:
 def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
     before = {**_BEFORE, **theirs}
     differing = [text for key in _FIXED for text in _differences(key, before.get(key), ours[key])]
-    known = theirs.get("methods") or {}
-    for label in known:
-        if label in ours["methods"]:
-            differing += _differences(f"methods.{label}", known[label], ours["methods"][label])
+    for kind in ("methods", "policies"):
+        known = theirs.get(kind) or {}
+        for label in known:
+            if label in ours[kind]:
+                differing += _differences(f"{kind}.{label}", known[label], ours[kind][label])
+    known, asked = list(theirs.get("methods") or {}), list(ours["methods"])
+    if ours["steered"] and before["steered"] and known != asked:
+        differing += _differences("methods", known, asked)
     if differing:
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise SettingError(
@@ -223,6 +236,7 @@ def _united(plan: Plan, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> d
         "seeds": sorted(seeds),
         "methods": {**theirs.get("methods", {}), **ours["methods"]},
         "outside": {**theirs.get("outside", {}), **ours["outside"]},
+        "policies": {**theirs.get("policies", {}), **ours["policies"]},
         "commands": list(dict.fromkeys(commands)),
         "environment": known[0],
         "other_environments": known[1:] + [here] * (here not in known),

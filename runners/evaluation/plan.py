@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from chsel.errors import require_choice
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
@@ -18,6 +20,8 @@ from replay.arguments import chosen_steps
 from runners.evaluation.contenders import Contender
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.metrics import MetricsConfig
+from runners.evaluation.policy_contenders import PolicyContender
+from runners.evaluation.table import PROBES, RESULTS
 from runners.evaluation.trial_configurations import (
     MOST_PROBES,
     SENSORS,
@@ -48,7 +52,8 @@ class Plan:
     between measures of the search; None: at its end alone. recordings: whether to write
     METHOD.mcap. outside: folders of hypothesis sets by label. logs: a folder of raw logs, for
     sessions of sensors; None: those of the simulated robot, in the evaluation's
-    folder. truth: how the true pose of such a session is sought.
+    folder. truth: how the true pose of such a session is sought. policies: by label; each probes in
+    sessions of its own, registered by the only contender.
     """
 
     folder: Path
@@ -67,6 +72,7 @@ class Plan:
     logs: Path | None = None
     truth: TruePoseSettings = field(default_factory=TruePoseSettings)
     plausible: bool = True  # whether to make plausible sets; without them there is no PD
+    policies: Mapping[str, PolicyContender] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -80,6 +86,16 @@ class Plan:
         """All that there are, by name."""
         found = configurations_of(self.kind, self.logs)
         return found if self.kind == SENSORS else with_faults(found)
+
+    @property
+    def labels(self) -> list[str]:
+        """What a trial has a part of the table of: policies, or methods and external results."""
+        return [*self.policies] or [*self.contenders, *self.outside]
+
+    @property
+    def schema(self) -> pa.Schema:
+        """The columns of such a part."""
+        return PROBES if self.policies else RESULTS
 
     @property
     def log_folder(self) -> Path:
@@ -198,7 +214,12 @@ class Task:
         return f"{self.trial.configuration}, seed {self.trial.seed}: {what}"
 
     def sessions(self, plan: Plan) -> tuple[Trial, ...]:
-        """The trials whose sessions the rows of the label need; with faults also that without."""
+        """The trials whose sessions the rows of the label need; with faults also that without.
+
+        A policy needs none: it makes a session of its own.
+        """
+        if plan.policies:
+            return ()
         clean = self.trial.without_faults(plan) if plan.plausible else self.trial
         return tuple(dict.fromkeys([clean, self.trial]))
 

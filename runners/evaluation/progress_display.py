@@ -125,11 +125,11 @@ class ProgressDisplay:
                 f"{np.mean(rotations):.1f} and {max(rotations):.1f} degrees"
             )
 
-    def written(self, folder: Path, results: pa.Table) -> None:
+    def written(self, folder: Path, results: pa.Table, name: str = "results") -> None:
         """Where the tables are."""
         failed = sum(text.startswith("failed") for text in results["status"].to_pylist())
         without = sum(text.startswith("no plaus") for text in results["status"].to_pylist())
-        text = f"{folder / 'results.parquet'}, results.csv: {results.num_rows} rows"
+        text = f"{folder / name}.parquet, {name}.csv: {results.num_rows} rows"
         text += f", {failed} failed" if failed else ""
         self.say(text + (f", {without} without a plausible set" if without else ""))
 

@@ -64,8 +64,39 @@ ITERATIONS = pa.schema(
 )
 """A row a (configuration, seed, method, step, iteration) of a search over an archive. Costs and
 metrics are of the hypotheses that the method would give if it ended there."""
+_FORECAST = ("hit_forecast", "forecast_spread")
+_DECISION = ("surprise", "seconds", "decision_seconds")
+PROBES = pa.schema(
+    [
+        *_KEYS[:3],
+        ("policy", pa.string()),
+        ("method", pa.string()),
+        ("preset", pa.string()),
+        (FAULTS, pa.string()),
+        ("step", pa.int64()),
+        ("probes", pa.int64()),
+        ("status", pa.string()),
+        *((name, pa.int64()) for name in ("contacts", "free_points", "action")),
+        ("hit", pa.bool_()),
+        *((name, pa.float64()) for name in (*_FORECAST, *_DECISION)),
+        *((name, pa.int64()) for name in ("hypotheses", "poses")),
+        *((name, pa.float64()) for name in ("error", "belief_error", "spread", "promised")),
+        ("stop", pa.string()),
+        *((name, pa.string()) for name in ("digest", "problem_digest", "decision_digest")),
+    ]
+)
+"""A row a (configuration, seed, policy, probe). Lengths in metres, surprise in nats. probes: how
+many are done. action: index of the one that was taken, of those offered. hit: whether it met the
+object; hit_forecast: the chance of it; forecast_spread: how wide the belief was expected to be
+after it. error: mean distance of the surface in a hypothesis from that in the true pose, of the
+last registration; before there is one, belief_error, which is the same of the belief's poses by
+their weights. poses: how many these are. spread: of the belief. promised: by how much the best
+action would narrow it. stop: why a session with the usual rules would end here, "" if it goes on.
+seconds: of the registration. decision_seconds: of choosing what comes next. status: "ok" or
+"failed: REASON"; what a row does not have is null."""
 RESULTS_ORDER = ("object", "configuration", "seed", "method", "step")
 ITERATIONS_ORDER = ("configuration", "seed", "method", "step", "iteration")
+PROBES_ORDER = ("object", "configuration", "seed", "policy", "step")
 
 
 def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, source: str = "") -> None:
@@ -94,6 +125,8 @@ def read_part(path: Path, schema: pa.Schema, definition: str) -> pa.Table:
         raise RecordingError(
             f"{path} cannot be read ({reason}); remove it to have it made again"
         ) from None
+    if DEFINITION not in schema.names:
+        return table
     others = set(table[DEFINITION].to_pylist()) - {definition}
     if others:
         raise RecordingError(

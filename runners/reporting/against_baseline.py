@@ -22,9 +22,12 @@ _PLACE = [*TRIAL, "step"]
 
 
 def against_baseline(subject: Subject) -> Section | None:
-    """Tables of all methods beside the baseline. Raises ReportError if that has no PD."""
+    """Tables of all methods beside the baseline. Raises ReportError if that has no PD.
+
+    None without a baseline, and for policies.
+    """
     evaluation, baseline = subject.evaluation, subject.baseline
-    if baseline is None:
+    if baseline is None or evaluation.is_steered:
         return None
     rows = with_ratios(evaluation.rows, baseline)
     text = (

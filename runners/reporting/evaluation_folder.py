@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,15 @@ from runners.evaluation.repeats import repeat_of
 EXPERIMENT = "experiment.json"
 RESULTS = "results.parquet"
 ITERATIONS = "iterations.parquet"
+PROBES = "probes.parquet"
 _ACCEPTED = "accepted: a folder that runners.evaluate has written"
-_SCHEMAS = {RESULTS: table.RESULTS, ITERATIONS: table.ITERATIONS}
+_SCHEMAS = {RESULTS: table.RESULTS, ITERATIONS: table.ITERATIONS, PROBES: table.PROBES}
 _NEEDED = {
     RESULTS: ("object", "configuration", "seed", "method", "step", "status", "diversity"),
     ITERATIONS: ("configuration", "seed", "method", "step", "iteration", "diversity"),
+    PROBES: ("object", "configuration", "seed", "policy", "probes", "status", "error", "spread"),
 }
-_KEYS = ("object", "configuration", "seed", "method", "status")  # no row is without
+_KEYS = ("object", "configuration", "seed", "method", "policy", "status")  # no row is without
 _UNNAMED = "an unnamed definition"
 TRIAL = ["configuration", "seed"]
 """The columns that tell trials apart."""
@@ -54,6 +56,9 @@ class Evaluation:
     iterations: pd.DataFrame  # the same for moments within registrations
     gathered: bool = False  # the rows are those of finished parts, as there is no table of all yet
     definition: str = ""  # label of the definition of the plausible sets behind all PD
+    # A row per probe with the columns of runners.evaluation.table.PROBES where policies were
+    # evaluated; `rows` has none then. Sorted by object, configuration, seed, policy and step.
+    probes: pd.DataFrame = field(default_factory=lambda: _rows([], PROBES))
 
     @property
     def name(self) -> str:
@@ -100,6 +105,17 @@ class Evaluation:
         without_draws = [repeat_of(label, asked)[0] for label in asked]
         return list(dict.fromkeys([*without_draws, *self.methods]))
 
+    @property
+    def is_steered(self) -> bool:
+        """Whether policies were evaluated, not methods."""
+        return bool(self.experiment.get("policies"))
+
+    @cached_property
+    def planned_policies(self) -> list[str]:
+        """Labels of policies that were asked for, then the others that have a row."""
+        asked = _names(self.experiment.get("policies"))
+        return list(dict.fromkeys([*asked, *sorted(self.probes["policy"].unique())]))
+
     def trial_folder(self, trial: Trial) -> Path:
         """The folder of the recordings of a trial."""
         configuration, seed = trial
@@ -133,6 +149,8 @@ def open_evaluation(folder: Path) -> Evaluation:
     if not folder.is_dir():
         raise ReportError(f"folder {folder} does not exist; {_ACCEPTED}")
     experiment = _experiment(folder / EXPERIMENT)
+    if experiment.get("policies"):
+        return _open_steered(folder, experiment)
     rows, gathered = _table(folder, RESULTS, "trials/*/seed_*/*.parquet")
     iterations, _ = _table(folder, ITERATIONS, "trials/*/seed_*/*.iterations.parquet")
     labels = {*rows["method"], *_asked_labels(experiment)}
@@ -141,6 +159,22 @@ def open_evaluation(folder: Path) -> Evaluation:
     iterations = _in_order(iterations, labels, [*order[1:-1], "iteration", "draw"])
     definition = _definition(folder, experiment, [*rows["definition"], *iterations["definition"]])
     return Evaluation(folder, experiment, rows, iterations, gathered, definition)
+
+
+def _open_steered(folder: Path, experiment: Mapping[str, Any]) -> Evaluation:
+    """An evaluation of policies."""
+    probes, gathered = _table(folder, PROBES, "trials/*/seed_*/*.parquet")
+    probes = probes.sort_values(["object", *TRIAL, "policy", "step"], na_position="first")
+    nothing = _rows([], RESULTS).assign(draw=0)
+    return Evaluation(
+        folder,
+        experiment,
+        nothing,
+        _rows([], ITERATIONS).assign(draw=0),
+        gathered,
+        _definition(folder, experiment, []),
+        probes.reset_index(drop=True),
+    )
 
 
 def _in_order(rows: pd.DataFrame, labels: set[str], order: list[str]) -> pd.DataFrame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 
@@ -29,6 +29,16 @@ _KNOWN = {
     "medial_constraint": MethodStyle("Medial Constraint", "#882255", "X", "-"),
     "medial_constraint_cma_me": MethodStyle("Medial Constraint (QD)", "#d889b8", "p", "--"),
 }
+_POLICIES = {
+    "grid": MethodStyle("grid", "#222222", "s", "--"),
+    "random": MethodStyle("random", "#999999", "d", "--"),
+    "nearest_mean": MethodStyle("nearest mean", "#56b4e9", "^", "-"),
+    "hit_chance": MethodStyle("hit chance", "#e69f00", "v", "-"),
+    "voxel_entropy": MethodStyle("voxel entropy", "#882255", "D", "-"),
+    "hypothesis_pruning": MethodStyle("hypothesis pruning", "#009e73", "X", "-"),
+    "information": MethodStyle("information", "#0072b2", "o", "-"),
+    "expected_loss": MethodStyle("expected loss", "#b2451c", "P", "-"),
+}
 _OTHERS = ("#117733", "#332288", "#999933", "#999999", "#661100", "#44aa99")
 _OTHER_MARKERS = ("h", "d", ">", "8", "*", "H")
 
@@ -39,8 +49,17 @@ def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
     A variant such as "chsel@paper" and a method from outside look the same in all figures of one
     report, by their place among the names.
     """
-    styles = {name: style for name, style in _KNOWN.items() if name in methods}
-    for index, name in enumerate(sorted(set(methods) - set(_KNOWN))):
+    return _styles(methods, _KNOWN)
+
+
+def policy_styles(policies: Sequence[str]) -> dict[str, MethodStyle]:
+    """The looks of policies, likewise."""
+    return _styles(policies, _POLICIES)
+
+
+def _styles(names: Sequence[str], known: Mapping[str, MethodStyle]) -> dict[str, MethodStyle]:
+    styles = {name: style for name, style in known.items() if name in names}
+    for index, name in enumerate(sorted(set(names) - set(known))):
         color = _OTHERS[index % len(_OTHERS)]
         marker = _OTHER_MARKERS[(index // len(_OTHERS) + index) % len(_OTHER_MARKERS)]
         styles[name] = MethodStyle(name, color, marker, ":")

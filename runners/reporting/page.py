@@ -16,7 +16,7 @@ from runners.reporting.section import Section
 from runners.reporting.tables import Cell, Table
 
 _LONG = 20  # rows, of tables that can be folded
-_NOT_SHOWN = ("environment", "other_environments", "commands", "methods", "format")
+_NOT_SHOWN = ("environment", "other_environments", "commands", "methods", "policies", "format")
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,11 @@ def page_of(evaluation: Evaluation, sections: Sequence[Section], command: str, k
         "and n is how many numbers are behind it.",
         f"Plausible sets are by the definition {evaluation.definition_text}.",
     ]
+    if evaluation.is_steered:
+        lead = [_lead_of_policies(evaluation)]
     if evaluation.gathered:
         lead.append("There is no table of the whole evaluation yet: this is what is finished.")
-    if rows.empty:
+    if rows.empty and evaluation.probes.empty:
         lead = ["Nothing is finished yet: there is no registration to report on."]
     commands = experiment.get("commands")
     made = [str(line) for line in commands] if isinstance(commands, list) else []
@@ -54,6 +56,16 @@ def page_of(evaluation: Evaluation, sections: Sequence[Section], command: str, k
         (*made, command),
         tuple(table for table in _made(experiment) if table.rows),
         kind,
+    )
+
+
+def _lead_of_policies(evaluation: Evaluation) -> str:
+    probes = evaluation.probes
+    methods = ", ".join(sorted(probes["method"].dropna().unique()))
+    return (
+        f"{probes['policy'].nunique()} policies on {len(trials_of(probes))} trials of "
+        f"{probes['object'].nunique()} objects: {len(probes)} probes, after which {methods} "
+        "registered, from the first contact on."
     )
 
 

@@ -9,8 +9,9 @@ from functools import cached_property
 from chsel.errors import require_choice
 from runners.reporting.evaluation_folder import Evaluation, ReportError
 from runners.reporting.figures import NotDrawn, Picture
-from runners.reporting.method_style import MethodStyle, method_styles
+from runners.reporting.method_style import MethodStyle, method_styles, policy_styles
 from runners.reporting.silhouette import VIEWS
+from runners.reporting.steered_sessions import SteeredSessions, steered_sessions
 from runners.reporting.tables import Table
 
 LAST_HALF = (
@@ -42,12 +43,22 @@ class Subject:
 
     evaluation: Evaluation
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
-    baseline: str | None = None  # a method to compare all others with
+    baseline: str | None = None  # a method, or policy, to compare all others with
 
     @cached_property
     def styles(self) -> Styles:
         """All methods in the order in which figures and tables have them, with their looks."""
         return method_styles(self.evaluation.planned_methods)
+
+    @cached_property
+    def sessions(self) -> SteeredSessions:
+        """Those of policies."""
+        return steered_sessions(self.evaluation, self.baseline)
+
+    @cached_property
+    def policy_styles(self) -> Styles:
+        """All policies that were asked for or have a session, with their looks."""
+        return policy_styles(self.evaluation.planned_policies)
 
     def styles_of(self, methods: Sequence[str]) -> Styles:
         """The same of some methods."""

@@ -1,4 +1,4 @@
-"""The outline of an object that is seen along an axis of the world."""
+"""The outline of an object that is seen along an axis of the world, or obliquely."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ CONTACT: Any = {
     "markeredgecolor": "#222222",
     "linestyle": "none",
 }
+# The directions (2, 3) in the world that an oblique view has to the right and upwards.
+_OBLIQUE = np.array([[0.795, -0.607, 0.0], [0.256, 0.336, 0.906]])
 _POINTS = 12_000
 _PIXELS = 160  # along the longer side of what is drawn
 
@@ -69,12 +71,42 @@ class Frame:
         return float((self.upper - self.lower).max()) / _PIXELS
 
 
+@dataclass(frozen=True)
+class Oblique(Frame):
+    """What is drawn of the world as seen from afar, from behind probes along +x and from above."""
+
+    @classmethod
+    def holding(cls, points: FloatArray, margin: float, *, aspect: float) -> Oblique:
+        """What holds all points (N, 3) with a margin, metres, in a panel of an aspect."""
+        flat = points @ _OBLIQUE.T
+        centre, size = 0.5 * (flat.min(axis=0) + flat.max(axis=0)), np.ptp(flat, axis=0)
+        width = max(size[0] + 2.0 * margin, (size[1] + 2.0 * margin) / aspect)
+        half = 0.5 * width * np.array([1.0, aspect])
+        return cls((0, 1), centre - half, centre + half)
+
+    def flat(self, points: FloatArray) -> FloatArray:
+        """Points (N, 3) as they are seen (N, 2)."""
+        return points @ _OBLIQUE.T
+
+    def set_on(self, axes: Axes, *, bottom: bool = True, left: bool = True) -> None:
+        """The limits of a panel without axes."""
+        super().set_on(axes, bottom=bottom, left=left)
+        axes.set_axis_off()
+
+
 class Silhouettes:
     """Draws outlines of one mesh in any pose."""
 
     def __init__(self, mesh: trimesh.Trimesh, frame: Frame) -> None:
         self._points = surface_points(mesh, _POINTS, StreamKey(0, 0))
         self._frame = frame
+
+    def fill(self, axes: Axes, world_from_object: FloatArray, color: str, *, alpha: float) -> None:
+        """All that is behind the mesh in one pose (4, 4); nothing where it is out of sight."""
+        mask = self.mask(world_from_object)
+        if mask.any():
+            smooth = np.pad(gaussian_filter(mask.astype(float), 0.8), 1)
+            axes.contourf(*self._centres(1), smooth.T, [0.5, 2.0], colors=[color], alpha=alpha)
 
     def draw(
         self,
@@ -109,10 +141,14 @@ class Silhouettes:
         closed = binary_fill_holes(binary_closing(padded, iterations=3))
         return np.asarray(closed)[3:-3, 3:-3]
 
-    def _centres(self) -> tuple[FloatArray, FloatArray]:
+    def _centres(self, beyond: int = 0) -> tuple[FloatArray, FloatArray]:
+        """Where the pixels are, with some beyond the border."""
         frame = self._frame
         count = np.ceil((frame.upper - frame.lower) / frame.pixel).astype(int)
-        x, y = (frame.lower[i] + (np.arange(count[i]) + 0.5) * frame.pixel for i in range(2))
+        x, y = (
+            frame.lower[i] + (np.arange(-beyond, count[i] + beyond) + 0.5) * frame.pixel
+            for i in range(2)
+        )
         return x, y
 
 

@@ -1,0 +1,168 @@
+"""Reports on policies: statistics of sessions with known answers, and the page."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from runners import report
+from runners.reporting.error_over_probes import ratios_to_best
+from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.forecast_calibration import first_stops, forecast_rows, hit_bins
+from runners.reporting.policies_compared import bootstrap_interval, paired
+from runners.reporting.steered_sessions import (
+    SteeredSessions,
+    censored_quantile,
+    first_below,
+    geometric_means,
+    steered_sessions,
+)
+from tests.runners.in_process import run
+from tests.runners.made_up_sessions import Row, session, write_sessions
+from tests.runners.test_report import page_of
+
+BUDGETS = {"information": 4, "grid": 4}
+
+
+def sessions_of(folder: Path, rows: list[Row], reference: str | None = None) -> SteeredSessions:
+    return steered_sessions(open_evaluation(write_sessions(folder, rows, BUDGETS)), reference)
+
+
+@pytest.fixture
+def rows() -> list[Row]:
+    """Three trials of two policies."""
+    forecasts = {"hit_forecast": [0.95, 0.85, 0.15, 0.85], "hit": [True, True, False, False]}
+    return [
+        *session("can", 20, "information", [80.0, 8.0, 4.0, 2.0], **forecasts),
+        *session("can", 20, "grid", [80.0, 40.0, 20.0, 10.0]),
+        *session("can", 21, "information", [50.0, 25.0, 9.0]),  # then no action is left
+        *session("can", 21, "grid", [50.0, 60.0, 30.0, 3.0]),
+        *session("drill", 20, "information", [60.0, 60.0, 60.0, 60.0]),
+        *session("drill", 20, "grid", [60.0, 70.0, 65.0, 30.0]),
+    ]
+
+
+def test_a_session_that_never_gets_there_needs_more_than_the_budget(
+    tmp_path: Path, rows: list[Row]
+) -> None:
+    errors = sessions_of(tmp_path, rows).errors
+    needed = first_below(errors.loc["information"], 0.010)
+    assert needed.to_dict() == {("can", 20): 2.0, ("can", 21): 3.0, ("drill", 20): math.inf}
+    # 10 mm is not below 10 mm.
+    assert first_below(errors.loc["grid"], 0.010).tolist() == [math.inf, 4.0, math.inf]
+    # The mean of those that got there, 2.5, would make the policy better by its failures.
+    assert censored_quantile(needed, 0.5) == 3.0
+    assert censored_quantile(first_below(errors.loc["grid"], 0.010), 0.5) == math.inf
+    assert censored_quantile(pd.Series([1.0, 2.0, math.inf, math.inf]), 0.5) == 2.0
+    assert math.isnan(censored_quantile(pd.Series([], dtype=float), 0.5))
+
+
+def test_a_session_that_ends_early_keeps_its_error(tmp_path: Path, rows: list[Row]) -> None:
+    found = sessions_of(tmp_path, rows)
+    assert found.errors.loc[("information", "can", 21)].tolist() == pytest.approx(
+        [0.05, 0.025, 0.009, 0.009]
+    )
+    assert set(found.solvable) == {("can", 20), ("can", 21)}
+    means = geometric_means(found.errors)
+    assert means.loc["information", 4] == pytest.approx((2.0 * 9.0 * 60.0) ** (1 / 3) / 1000.0)
+    ratios = ratios_to_best(found)
+    assert ratios[1] == pytest.approx(1.0)
+    assert ratios[3] == pytest.approx((4.0 * 9.0 * 60.0 / (20.0 * 30.0 * 65.0)) ** (1 / 3))
+
+
+def test_policies_are_compared_in_the_trials_that_all_have_finished(
+    tmp_path: Path, rows: list[Row]
+) -> None:
+    more = session("drill", 21, "grid", [1.0, 1.0, 1.0, 1.0])
+    failed = {**more[0], "policy": "information", "probes": None, "step": None, "error": None}
+    failed |= {"status": "failed: out of memory"}
+    found = sessions_of(tmp_path, [*rows, *more, failed])
+    assert (found.count, found.left_out, found.budget) == (3, 1, 4)
+    assert ("drill", 21) not in found.solvable
+
+
+def test_ratios_are_by_session_with_wins_and_an_interval(tmp_path: Path, rows: list[Row]) -> None:
+    of = paired(sessions_of(tmp_path, rows), "grid")
+    # Of 10 by 2 mm, 3 by 9 mm and 30 by 60 mm.
+    assert (of.sessions, of.wins, of.losses, of.sign_test) == (3, 1, 2, 1.0)
+    assert of.median == pytest.approx(0.5)
+    assert of.mean == pytest.approx((5.0 / 3.0 / 2.0) ** (1 / 3))
+    # Of two configurations either, or both, are drawn.
+    assert (of.lower, of.upper) == pytest.approx((0.5, (5.0 / 3.0) ** 0.5))
+    back = paired(sessions_of(tmp_path / "back", rows, "grid"), "information")
+    assert back.mean == pytest.approx(1.0 / of.mean)
+    assert (back.wins, back.losses) == (of.losses, of.wins)
+
+
+def test_the_interval_of_a_mean_is_that_of_independent_configurations() -> None:
+    values = np.random.default_rng(0).normal(2.0, 1.0, 200)
+    index = pd.MultiIndex.from_product([range(200), [0, 1, 2]], names=["configuration", "seed"])
+    lower, upper = bootstrap_interval(pd.Series(np.repeat(values, 3), index))
+    half = 1.96 * values.std() / 200**0.5  # three alike seeds are no more than one
+    assert lower == pytest.approx(values.mean() - half, abs=0.02)
+    assert upper == pytest.approx(values.mean() + half, abs=0.02)
+
+
+def test_forecasts_are_compared_with_outcomes(tmp_path: Path, rows: list[Row]) -> None:
+    found = forecast_rows(sessions_of(tmp_path, rows))
+    assert found["touched"].tolist() == [False, False, True, True]  # contacts: 0, 1, 2, 3 after
+    bins = hit_bins(found)
+    assert bins["total"].to_dict() == {1: 1, 8: 2, 9: 1}
+    assert bins["share"].to_dict() == {1: 0.0, 8: 0.5, 9: 1.0}
+    assert bins.loc[8, "forecast"] == pytest.approx(0.85)
+    assert hit_bins(found.assign(hit_forecast=1.0)).index.tolist() == [9]
+
+
+def test_a_stop_is_the_first_probe_with_a_small_spread(tmp_path: Path, rows: list[Row]) -> None:
+    stops = first_stops(sessions_of(tmp_path, rows).rows, 0.010)
+    found = {(row.policy, row.configuration, row.seed): row.probes for row in stops.itertuples()}
+    assert found == {
+        ("grid", "can", 20): 4,
+        ("grid", "can", 21): 4,
+        ("information", "can", 20): 2,
+        ("information", "can", 21): 3,
+    }
+
+
+def test_the_page_has_all_sections_and_numbers(tmp_path: Path, rows: list[Row]) -> None:
+    for row in rows:
+        row |= {"seconds": 0.05, "decision_seconds": None if row["policy"] == "grid" else 0.02}
+    write_sessions(tmp_path, rows, BUDGETS)
+    done = run(report.main, str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "no picture" not in done.stdout
+    page = page_of(tmp_path / "report")
+    needed = page.tables["Probes until the error of the set is below a limit"]
+    assert needed[0][:3] == ["policy", "to 20 mm", "to 10 mm"]
+    assert needed[1][:4] == ["information", "3 [2, >4]", "3 [2, >4]", ">4 [3, >4]"]
+    assert needed[1][4:] == ["67 [21, 94]", "100 [34, 100]", "2 [2, 3]"]
+    assert needed[2][:4] == ["grid", "4 [4, >4]", ">4 [4, >4]", ">4 [4, >4]"]
+    hits = page.tables["Chance of a hit, forecast and happened, %"]
+    assert hits[1] == ["information", "4", "70.0", "50.0", "+20.0"]
+    stops = page.tables["Stopping by the spread of the belief"]
+    assert stops[4][:6] == ["information", "10 mm", "3", "2", "2.5", "15 mm"]
+    times = page.tables["Milliseconds a probe, medians and 95th percentiles"]
+    assert times[1:] == [
+        ["information", "20", "20", "50", "50", "70", "70"],
+        ["grid", "-", "-", "50", "50", "50", "50"],
+    ]
+    names = {path.name for path in (tmp_path / "report").iterdir()}
+    assert {"error_over_probes.csv", "probes_needed.csv", "hit_forecasts.png"} <= names
+    done = run(report.main, str(tmp_path), "baseline=icp")
+    assert (done.returncode, done.stderr.strip()) == (
+        2,
+        "error: baseline icp has no session; accepted: information, grid",
+    )
+
+
+@pytest.mark.parametrize("kept", [0, 1, 4])
+def test_what_is_not_there_yet_is_said(tmp_path: Path, rows: list[Row], kept: int) -> None:
+    write_sessions(tmp_path, rows[:kept], BUDGETS)
+    done = run(report.main, str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    page = page_of(tmp_path / "report")
+    assert [line[0] for line in page.tables["What is there"][1:]] == ["information", "grid"]
