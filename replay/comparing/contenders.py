@@ -45,17 +45,32 @@ def contenders(
     for label in labels:
         if labels.count(label) > 1:
             raise SettingError(f"{label} is named twice; accepted: {METHODS_HELP}")
-    bases = {label: _base(recording, label) for label in labels}
+    settings = {label: _base(recording, label).settings for label in labels}
+    chosen = changes_by_label(labels, changes, settings, "method")
+    return tuple(_contender(recording, label, tuple(texts)) for label, texts in chosen.items())
+
+
+def changes_by_label(
+    labels: Sequence[str],
+    changes: Sequence[str],
+    settings: Mapping[str, Mapping[str, Any]],
+    kind: str,
+) -> dict[str, list[str]]:
+    """The changes KEY=VALUE that each label takes: of all labels, or of the one they name.
+
+    settings: of each label. kind: "method" or "policy". Raises SettingError for a change that
+    fits none.
+    """
     chosen: dict[str, list[str]] = {label: [] for label in labels}
     for change in changes:
-        one, key, text = _parted(change, labels)
+        one, key, text = _parted(change, labels, kind)
         asked = labels if one is None else [one]
-        having = [label for label in asked if _has(bases[label].settings, key)]
+        having = [label for label in asked if _has(settings[label], key, kind)]
         if not having:
-            raise SettingError(_unknown(key, {label: bases[label] for label in asked}))
+            raise SettingError(_unknown(key, {label: settings[label] for label in asked}, kind))
         for label in having:
             chosen[label].append(text)
-    return tuple(_contender(recording, label, tuple(texts)) for label, texts in chosen.items())
+    return chosen
 
 
 def recorded_or_none(recording: Recording) -> NamedMethod | None:
@@ -95,24 +110,25 @@ def _name_and_preset(label: str) -> tuple[str, list[str]]:
     return match["name"], [f"preset={match['preset']}"]
 
 
-def _parted(change: str, labels: Sequence[str]) -> tuple[str | None, str, str]:
+def _parted(change: str, labels: Sequence[str], kind: str) -> tuple[str | None, str, str]:
     """The label of a change, None for all; its key; and the change without the label."""
     key, sign, _ = change.partition("=")
     label, colon, inner = key.rpartition(":")
     if not sign or not (inner if colon else key):
-        raise SettingError(f"{change!r} is not a setting; accepted: KEY=VALUE or METHOD:KEY=VALUE")
+        accepted = f"KEY=VALUE or {kind.upper()}:KEY=VALUE"
+        raise SettingError(f"{change!r} is not a setting; accepted: {accepted}")
     if not colon:
         return None, key, change
     if label not in labels:
-        raise SettingError(f"{change!r} names no method here; accepted: {', '.join(labels)}")
+        raise SettingError(f"{change!r} names no {kind} here; accepted: {', '.join(labels)}")
     return label, inner, change[len(label) + 1 :]
 
 
-def _unknown(key: str, methods: Mapping[str, NamedMethod]) -> str:
-    """That no method has a setting, and which it may have been meant to be."""
-    labels = ", ".join(methods)
-    paths = sorted({path for made in methods.values() for path in _paths("", made.settings)})
-    close = difflib.get_close_matches(key.removeprefix("method."), paths, n=1)
+def _unknown(key: str, settings: Mapping[str, Mapping[str, Any]], kind: str) -> str:
+    """That no label has a setting, and which it may have been meant to be."""
+    labels = ", ".join(settings)
+    paths = sorted({path for each in settings.values() for path in _paths("", each)})
+    close = difflib.get_close_matches(key.removeprefix(f"{kind}."), paths, n=1)
     hint = f"did you mean {close[0]}? " if close else ""
     groups = dict.fromkeys(path.split(".")[0] for path in paths)
     return f"{key} does not exist in {labels}; {hint}accepted: {', '.join(groups)}"
@@ -127,12 +143,12 @@ def _paths(path: str, settings: Any) -> Iterator[str]:
         yield path
 
 
-def _has(settings: Mapping[str, Any], key: str) -> bool:
+def _has(settings: Mapping[str, Any], key: str, kind: str) -> bool:
     """Whether there is such a setting, as `other_method` finds it."""
-    if key == "preset":
+    if key == "preset" and kind == "method":
         return True
     inner: Any = settings
-    for name in key.removeprefix("method.").split("."):
+    for name in key.removeprefix(f"{kind}.").split("."):
         if not isinstance(inner, Mapping) or name not in inner:
             return False
         inner = inner[name]

@@ -1,7 +1,8 @@
 """Run several methods on exactly the same recorded problems, and judge all by one cost.
 
 A problem is as it was recorded: its low-cost set E_l follows from what the recorded method found
-before, so no method goes on from results of its own. Status 1 if a registration failed.
+before, so no method goes on from results of its own. Status 1 if a registration failed. With
+--policies, what policies decide after recorded steps of a steered session.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 from rich.progress import BarColumn, MofNCompleteColumn
 from rich.table import Table
 
-from chsel.errors import RecordingError
+from chsel.errors import RecordingError, SettingError
 from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.plausible_settings import DEFINITIONS
 from chsel.problem.registration_problem import Hypotheses
@@ -30,6 +31,15 @@ from replay.comparing.comparison import (
 from replay.comparing.contenders import METHODS_HELP, Contender, contenders
 from replay.comparing.csv_file import write_csv
 from replay.comparing.plausible import PlausibleSets
+from replay.comparing.policy_choices import (
+    POLICIES_HELP,
+    choice_table,
+    decision_problem,
+    median_table,
+    policy_choices,
+    policy_contenders,
+    write_choices,
+)
 from replay.console import Console, Progress, TextColumn, plain_table
 from replay.files import require_folder, require_new
 from replay.mcap.reader import Recording, read_recording
@@ -40,10 +50,17 @@ _FEW_STEPS = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The file, its steps, the methods with their settings, and what to save."""
     parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording")
-    parser.add_argument(
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument(
+        "--policies",
+        nargs="+",
+        metavar="POLICY",
+        help=f"{POLICIES_HELP}; after them KEY=VALUE for all policies that have the setting, or "
+        "POLICY:KEY=VALUE for one",
+    )
+    which.add_argument(
         "--methods",
         nargs="+",
-        required=True,
         metavar="METHOD",
         help=f"{METHODS_HELP}; after them KEY=VALUE for all methods that have the setting, or "
         "METHOD:KEY=VALUE for one",
@@ -73,6 +90,8 @@ def run(given: argparse.Namespace) -> int:
     outputs = _checked_outputs(given)
     require_threads("--threads", given.threads)
     recording = read_recording(given.file)
+    if given.policies:
+        return _compare_policies(given, recording)
     if not recording.steps:
         raise RecordingError(f"recording {given.file} has no registration problem to compare on")
     steps = chosen_steps(given.steps, recording.steps)
@@ -119,6 +138,37 @@ def run(given: argparse.Namespace) -> int:
     for path in outputs:
         console.print(f"written: {path}", soft_wrap=True)
     return int(any(outcome.label != recorded_label(recording) for outcome in failed))
+
+
+def _compare_policies(given: argparse.Namespace, recording: Recording) -> int:
+    """Print what policies decide, each step or in medians; 1 if one cannot."""
+    if any((given.plausible, given.save_plot, given.save_rerun)):
+        raise SettingError("--policies writes tables alone; accepted: with --save-csv")
+    if recording.offered is None:
+        decision_problem(recording, 0)  # says so
+    existing = sorted({*recording.decision_steps, *recording.steps})
+    steps = chosen_steps(given.steps, existing)
+    labels = [word for word in given.policies if "=" not in word]
+    changes = [word for word in given.policies if "=" in word]
+    policies = policy_contenders(recording, labels, changes)
+    with threads(given.threads):
+        choices = list(policy_choices(recording, policies, steps))
+    console, offered = Console(), recording.offered
+    assert offered is not None
+    if given.each or len(steps) <= _FEW_STEPS:
+        console.print(choice_table(offered.actions, choices, "each step, problems as recorded"))
+    if len(steps) > 1:
+        console.print(median_table(choices))
+    for policy in policies:
+        if policy.changes:
+            console.print(f"{policy.label} with {', '.join(policy.changes)}", soft_wrap=True)
+    failed = [choice for choice in choices if choice.failure]
+    for choice in failed:
+        console.print(f"step {choice.step}, {choice.label}: {choice.failure}", soft_wrap=True)
+    if given.save_csv is not None:
+        write_choices(given.save_csv, offered.actions, choices, policies)
+        console.print(f"written: {given.save_csv}", soft_wrap=True)
+    return int(bool(failed))
 
 
 def _checked_outputs(given: argparse.Namespace) -> list[Path]:

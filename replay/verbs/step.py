@@ -1,12 +1,14 @@
 """Register one recorded problem again, with another method or other settings; record that.
 
 The new recording has all that the problem follows from, and names its source by digest. Status 1
-if method and settings are the recorded ones and the result is not.
+if method and settings are the recorded ones and the result is not. With --policy nothing is
+registered: a table shows what policies decide after the step, from what was known then.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,8 +18,17 @@ from rich.table import Table
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import SettingError
 from chsel.methods import METHODS
+from chsel.policies.policy_registry import POLICIES
 from replay.arguments import path_argument
 from replay.comparing.comparison import common_cost, numbers_under, recorded_label
+from replay.comparing.policy_choices import (
+    PolicyContender,
+    choice_table,
+    decision_problem,
+    policy_choices,
+    policy_contenders,
+    recorded_policy_name,
+)
 from replay.comparing.step_again import StepAgain, register_step_again
 from replay.console import Console, plain_table
 from replay.files import require_new
@@ -39,6 +50,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "cost.free_scale=40, or preset=NAME",
     )
     parser.add_argument(
+        "--policy",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("NAME", "KEY=VALUE"),
+        help=f"one of {', '.join(POLICIES)}, then settings such as noise=0.01: what it decides "
+        "after the step; may be repeated",
+    )
+    parser.add_argument(
         "-o",
         "--out",
         type=path_argument,
@@ -57,6 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Register, record, and print how the result compares with the recorded one."""
+    if given.policy:
+        return _decide(given)
     name, changes = _named(given.method)
     interval = given.snapshot_interval
     if interval is not None and interval < 0:
@@ -85,10 +107,47 @@ def run(given: argparse.Namespace) -> int:
 
 def _named(words: Sequence[str]) -> tuple[str | None, list[str]]:
     """The method's name, None for the recorded one, and the changes of its settings."""
+    names = _names("method", words)
+    return (names[0] if names else None), [word for word in words if "=" in word]
+
+
+def _names(option: str, words: Sequence[str]) -> list[str]:
+    """At most one name among words."""
     names = [word for word in words if "=" not in word]
     if len(names) > 1:
-        raise SettingError(f"--method names {' and '.join(names)}; accepted: one, then KEY=VALUE")
-    return (names[0] if names else None), [word for word in words if "=" in word]
+        raise SettingError(f"--{option} names {' and '.join(names)}; accepted: one, then KEY=VALUE")
+    return names
+
+
+def _decide(given: argparse.Namespace) -> int:
+    """Print what policies decide after a step; 1 if one cannot."""
+    others = (given.method, given.out, given.snapshot_interval, given.save_rerun)
+    if any(other not in (None, []) for other in others):
+        raise SettingError("--policy registers and writes nothing; accepted: with FILE and --step")
+    recording = read_recording(given.file)
+    policies: list[PolicyContender] = []
+    for words in given.policy:
+        names, changes = _names("policy", words), [word for word in words if "=" in word]
+        if not names:
+            raise SettingError(f"--policy {words[0]} names none; accepted: {', '.join(POLICIES)}")
+        (made,) = policy_contenders(recording, names, changes)
+        again = sum(policy.named.name == made.named.name for policy in policies)
+        label = f"{made.label}#{again + 1}" if again and "#" not in made.label else made.label
+        policies.append(dataclasses.replace(made, label=label))
+    problem = decision_problem(recording, given.step)
+    choices = list(policy_choices(recording, policies, [given.step]))
+    console = Console()
+    title = f"after step {given.step} by {recorded_policy_name(recording)}: "
+    title += f"{len(problem.belief)} poses, "
+    title += f"{int(problem.available.sum())} of {len(problem.actions)} actions available"
+    console.print(choice_table(problem.actions, choices, title))
+    for policy in policies:
+        if policy.changes:
+            console.print(f"{policy.label} with {', '.join(policy.changes)}", soft_wrap=True)
+    for choice in choices:
+        if choice.failure:
+            console.print(f"{choice.label}: {choice.failure}", soft_wrap=True)
+    return int(any(choice.failure for choice in choices))
 
 
 def _table(recording: Recording, again: StepAgain) -> Table:
