@@ -35,6 +35,7 @@ from runners.evaluation.experiment import (
 from runners.evaluation.external_results import external_folders, read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
+from runners.evaluation.policy_contenders import chosen_policies
 from runners.evaluation.progress_display import Progress, ProgressDisplay
 from runners.evaluation.scheduling import Scheduling
 from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
@@ -89,6 +90,8 @@ class EvaluateConfig:
     faults: Any
     plausible: bool
     recordings: bool
+    policies: Any
+    policy: Any
     workers: int | None
     cluster: Any
 
@@ -109,6 +112,7 @@ def main(config: DictConfig) -> None:
         values["steps"] = str(values["steps"])
     checked = build_settings(EvaluateConfig, values, "evaluate")
     plan, cluster = _plan(checked), cluster_config(checked.cluster, checked.workers)
+    _check_policies(plan)
     levels = chosen_names("faults", checked.faults, LEVELS)
     clean = {name: one for name, one in plan.configurations.items() if one.faults == CLEAN}
     chosen = chosen_configurations(checked.configurations, clean)
@@ -145,8 +149,11 @@ def evaluate(
 
     scheduling = Scheduling(plan, trials, show)
     before = scheduling.progress
+    contenders = f"{len(plan.contenders)} methods"
+    if plan.policies:
+        contenders = f"{len(plan.policies)} policies"
     display.say(
-        f"evaluation in {plan.folder}: {len(trials)} trials, {len(plan.contenders)} methods, "
+        f"evaluation in {plan.folder}: {len(trials)} trials, {contenders}, "
         f"{before.total} tasks, of which {before.finished} are finished"
     )
     try:
@@ -160,10 +167,13 @@ def evaluate(
         results = collect(plan.folder)
         if sys.exc_info()[0] is KeyboardInterrupt:
             display.say("interrupted: what is finished stays, and the same command goes on")
-    display.summary(results, _labels(plan.folder), definition_text(plan.definition))
-    _print_by_faults(plan.folder)
-    display.true_poses(true_poses(plan.folder, read_experiment(plan.folder)))
-    display.written(plan.folder, results)
+    if plan.policies:
+        _print_policies(plan.folder)
+    else:
+        display.summary(results, _labels(plan.folder), definition_text(plan.definition))
+        _print_by_faults(plan.folder)
+        display.true_poses(true_poses(plan.folder, read_experiment(plan.folder)))
+    display.written(plan.folder, results, "probes" if plan.policies else "results")
     return any(text.startswith("failed") for text in results["status"].to_pylist())
 
 
@@ -181,10 +191,28 @@ def _print_by_faults(folder: Path) -> None:
         print_table(Console(), table)
 
 
+def _print_policies(folder: Path) -> None:
+    """How far each policy has come after how many probes."""
+    from runners.reporting.error_over_probes import error_table
+    from runners.reporting.evaluation_folder import open_evaluation
+    from runners.reporting.method_style import policy_styles
+    from runners.reporting.probes_needed import needed_table
+    from runners.reporting.steered_sessions import steered_sessions
+    from runners.reporting.tables import print_table
+
+    evaluation = open_evaluation(folder)
+    sessions = steered_sessions(evaluation)
+    if sessions.count:
+        styles = policy_styles(sessions.policies)
+        for table in (error_table(sessions, styles), needed_table(sessions, styles)):
+            print_table(Console(), table)
+
+
 def _plan(config: EvaluateConfig) -> Plan:
     given = {str(name): Path(folder).expanduser() for name, folder in config.outside.items()}
     chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
     chosen = drawn(chosen, config.draws)
+    policies = chosen_policies(config.policies, config.policy)
     logs = config.session.get("logs")
     session = without_defaults(config.session)
     return Plan(
@@ -203,8 +231,29 @@ def _plan(config: EvaluateConfig) -> Plan:
         outside=external_folders(given),
         logs=Path(str(logs)).expanduser() if logs is not None else None,
         truth=config.truth,
-        plausible=config.plausible,
+        plausible=config.plausible and not policies,
+        policies=policies,
     )
+
+
+def _check_policies(plan: Plan) -> None:
+    """Policies probe with one method, in sessions of their own."""
+    if not plan.policies:
+        return
+    accepted = "accepted with policies"
+    if len(plan.contenders) != 1:
+        raise SettingError(f"methods has {len(plan.contenders)}; {accepted}: one, such as anchored")
+    if plan.kind == SENSORS:
+        raise SettingError(f"session is {SENSORS}; {accepted}: kinematic, simulated")
+    for name, value, usual in (
+        ("starts", plan.starts, OWN),
+        ("steps", plan.steps, None),
+        ("iterations.every", plan.every, None),
+    ):
+        if value != usual:
+            raise SettingError(f"{name} is {value}; {accepted}: {usual or 'null'}")
+    if plan.outside:
+        raise SettingError(f"outside has {', '.join(plan.outside)}; {accepted}: none")
 
 
 def _check_faults(plan: Plan, levels: Sequence[str]) -> None:

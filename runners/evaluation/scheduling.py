@@ -10,8 +10,9 @@ from chsel.errors import ChselError
 from runners.evaluation.cluster import Connection
 from runners.evaluation.external_results import PRESET, external_digest, read_external
 from runners.evaluation.plan import Plan, Task, Trial
+from runners.evaluation.probe_rows import row_about
 from runners.evaluation.progress_display import Progress
-from runners.evaluation.table import RESULTS, Row, is_part, part_source, write_part
+from runners.evaluation.table import Row, is_part, part_source, write_part
 from runners.evaluation.tasks import Outcome, input_files, run_on_worker, store_files
 from runners.evaluation.trial_session import has_session, read_session
 from runners.run.probe_run import Interrupt
@@ -22,8 +23,7 @@ _TICK = 1.0  # s: how long is waited before what is shown is renewed
 
 def tasks_of(plan: Plan, trials: Sequence[Trial]) -> list[Task]:
     """All tasks of trials: their sessions, those without faults that they need, and all labels."""
-    labels = [*plan.contenders, *plan.outside]
-    methods = [Task(trial, label) for trial in trials for label in labels]
+    methods = [Task(trial, label) for trial in trials for label in plan.labels]
     sessions = [Task(session) for trial in trials for session in Task(trial).sessions(plan)]
     return [*dict.fromkeys(sessions), *methods]
 
@@ -151,7 +151,8 @@ class Scheduling:
         """Put the failure into the table; the next call tries again."""
         self.progress.failed[task] = reason
         if task.label:
-            write_part(task.failed(self._plan), self._failure_rows(task, reason), RESULTS)
+            rows = self._failure_rows(task, reason)
+            write_part(task.failed(self._plan), rows, self._plan.schema)
             return
         for other in [one for one in self._open if task.trial in one.sessions(self._plan)]:
             if other.label:
@@ -161,6 +162,9 @@ class Scheduling:
     def _failure_rows(self, task: Task, reason: str) -> list[Row]:
         """A row a step, or one without a step if there is no session that has the steps."""
         plan, trial = self._plan, task.trial
+        if plan.policies:
+            about = row_about(plan, trial, task.label)
+            return [{**about, "status": f"failed: {reason}"}]
         preset = PRESET if task.label in plan.outside else plan.contenders[task.label].preset
         steps: Sequence[int | None] = (None,)
         if has_session(plan, trial):

@@ -23,6 +23,7 @@ from replay.files import whole_file
 from runners.evaluation.external_results import ExternalResults, external_rows
 from runners.evaluation.plan import Plan, Task
 from runners.evaluation.run_method import run_method
+from runners.evaluation.run_policy import run_policy
 from runners.evaluation.trial_session import SESSION_FILES, make_session
 from runners.run.session_run import one_line
 
@@ -83,9 +84,10 @@ def run_task(
 ) -> Outcome:
     """Do a task in a new folder within `scratch`; a failure is an outcome, too.
 
-    external: what is to be ranked, in place of a method's results. warm: labels of methods that
-    have registered in this process before.
+    external: what is to be ranked, in place of a method's results. warm: labels that have been at
+    work in this process before.
     """
+    known = set() if warm is None else warm
     begun = time.perf_counter()
     with TemporaryDirectory(dir=scratch, prefix="task-") as name:
         folder = Path(name)
@@ -99,9 +101,10 @@ def run_task(
                 make_session(here, task.trial)
             elif external is not None:
                 external_rows(here, task.trial, task.label, external)
+            elif plan.policies:
+                run_policy(here, task.trial, plan.policies[task.label], known)
             else:
-                contender = plan.contenders[task.label]
-                run_method(here, task.trial, contender, set() if warm is None else warm)
+                run_method(here, task.trial, plan.contenders[task.label], known)
             made = _made(folder, files)
         except Exception as error:
             reason = one_line(error).replace(name, str(plan.folder))

@@ -49,7 +49,7 @@ def spread_table(sessions: SteeredSessions, styles: Styles) -> Table:
 
 def _means_table(sessions: SteeredSessions, styles: Styles, column: str, title: str) -> Table:
     means = _MM * geometric_means(sessions.over_probes(column))
-    shown = [probes for probes in means.columns if probes <= 2 or probes % 2 == 0]
+    shown = [n for n in means.columns if n <= 2 or n % 2 == 0 or n == sessions.budget]
     best = means.min()
     rows = [
         (

@@ -1,0 +1,233 @@
+"""`python -m runners.evaluate` with policies: small sessions for real, their rows and a report."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+
+from chsel.errors import SettingError
+from chsel.methods.anchored.anchored import Anchored
+from chsel.problem.outline import outline_distances
+from chsel.problem.poses import Poses, inverse
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from replay.mcap.reader import read_recording
+from runners import evaluate, probe, report
+from runners.evaluation.experiment import collect, join_experiment
+from runners.evaluation.plan import Task, Trial
+from runners.evaluation.policy_contenders import chosen_policies
+from runners.evaluation.probe_rows import spread_of
+from tests.runners.in_process import do_task, run
+from tests.runners.test_evaluate import stamps
+from tests.runners.test_evaluation import plan_in
+from tests.runners.test_report import page_of
+
+POLICY = ("policy.probes=3", "policy.belief.poses=20")
+SMALL = (
+    "experiment=next_probe",
+    "configurations=[can,mustard]",
+    "seeds=20",
+    "settings.anchored.size=small",
+    "recordings=true",
+    "cluster.dashboard=false",
+    "workers=1",
+    *POLICY,
+)
+POLICIES = "policies=[grid,information]"
+LABELS = ("grid", "information")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished evaluation of two policies on two configurations."""
+    folder = tmp_path_factory.mktemp("steered") / "out"
+    done = run(evaluate.main, *SMALL, POLICIES, f"out={folder}")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "2 trials, 2 policies, 4 tasks, of which 0 are finished" in done.stdout
+    assert "Probes until the error of the set is below a limit" in done.stdout
+    assert "probes.parquet, probes.csv: 12 rows" in done.stdout
+    return folder
+
+
+def rows_of(folder: Path) -> list[dict[str, Any]]:
+    return pyarrow.parquet.read_table(folder / "probes.parquet").to_pylist()
+
+
+def test_every_probe_has_a_row_that_the_recording_confirms(folder: Path) -> None:
+    rows = rows_of(folder)
+    keys = [(row["configuration"], row["policy"], row["probes"]) for row in rows]
+    names = [("can", "cracker_box"), ("mustard", "mustard")]
+    assert sorted(keys) == [
+        (name, label, probes) for name, _ in names for label in LABELS for probes in (1, 2, 3)
+    ]
+    for row in rows:
+        assert (row["status"], row["step"], row["poses"]) == ("ok", row["probes"] - 1, 20)
+        trial = folder / "trials" / row["configuration"] / "seed_20"
+        recording = read_recording(trial / f"{row['policy']}.mcap")
+        assert recording.probes[row["step"]].outcome == ("contact" if row["hit"] else "free")
+        if row["contacts"] > 0:  # from the first contact on
+            assert row["digest"] == recording.hypotheses(row["step"]).digest
+            assert row["problem_digest"] == recording.problem(row["step"]).digest
+            found = recording.hypotheses(row["step"]).object_from_world
+            assert row["error"] == pytest.approx(mean_error(recording.start, found).mean())
+        else:
+            assert (row["digest"], row["seconds"]) == (None, None)
+            assert row["error"] == row["belief_error"]
+        if row["policy"] == "information":
+            check_decision(row, recording)
+        else:
+            assert {row[name] for name in ("action", "hit_forecast", "decision_seconds")} == {None}
+
+
+def mean_error(start: Any, poses: np.ndarray) -> np.ndarray:
+    """Distances (B,) of poses (B, 4, 4) from the true one, by the table of all distances."""
+    every = np.concatenate([poses, inverse(start.world_from_object[None])])
+    return outline_distances(start.sdf, Poses.of(every))[-1, :-1]
+
+
+def check_decision(row: dict[str, Any], recording: Any) -> None:
+    """The forecasts are those of the decision before the probe, the rest of the one after it."""
+    before, after = (recording.decision(row["step"] - 1), recording.decision(row["step"]))
+    chosen = before.decision.chosen
+    assert row["action"] == chosen
+    assert row["hit_forecast"] == before.decision.hit_chance[chosen]
+    assert row["forecast_spread"] == before.decision.expected_spread[chosen]
+    assert row["surprise"] == after.surprise
+    assert row["spread"] == after.decision.spread
+    belief = after.problem.belief
+    assert spread_of(recording.start.sdf, belief) == pytest.approx(row["spread"], rel=1e-12)
+    errors = mean_error(recording.start, belief.object_from_world)
+    assert row["belief_error"] == pytest.approx(belief.weights @ errors)
+    best = after.decision.expected_spread[np.isfinite(after.decision.score)].min()
+    assert row["promised"] == row["spread"] - best
+    assert row["decision_seconds"] > 0.0
+
+
+def test_sessions_are_those_of_runners_probe(folder: Path, tmp_path: Path) -> None:
+    done = run(
+        probe.main,
+        *("object=mustard", "session=kinematic", "seed=20", "recording=mcap"),
+        *("method=anchored", "method.size=small", "policy=information", f"logs={tmp_path}"),
+        *(*POLICY, "policy.stop.spread=0", "policy.stop.gain=0"),
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    (path,) = tmp_path.glob("probe/*/recording.mcap")
+    recording = read_recording(path)
+    rows = [
+        row
+        for row in rows_of(folder)
+        if (row["configuration"], row["policy"]) == ("mustard", "information")
+    ]
+    assert [recording.decision(row["step"]).decision.digest for row in rows] == [
+        row["decision_digest"] for row in rows
+    ]
+    assert [row["digest"] for row in rows if row["digest"]] == [
+        recording.hypotheses(row["step"]).digest for row in rows if row["digest"]
+    ]
+
+
+def test_what_is_finished_is_not_done_again_and_policies_may_become_more(folder: Path) -> None:
+    before = stamps(folder)
+    again = run(evaluate.main, *SMALL, POLICIES, f"out={folder}")
+    assert "4 tasks, of which 4 are finished" in again.stdout
+    assert stamps(folder) == before
+    told = json.loads((folder / "experiment.json").read_text())
+    assert list(told["policies"]) == ["grid", "information"]
+    assert told["policies"]["grid"]["settings"]["probes"] == 3
+
+
+@pytest.mark.parametrize(
+    ("policies", "settings", "message"),
+    [
+        (["grid", "informative"], {}, "policy is 'informative'"),
+        ("grid,grid", {}, "policies has grid twice"),
+        ([], {}, "policies is []; accepted: all, or a list of NAME"),
+        ({"name": "grid", "label": "a/b"}, {}, "'a/b' is no label"),
+        ([{"name": "grid", "setings": {}}], {}, "did you mean settings?"),
+        (["a.b"], {}, "policies has 'a.b'"),
+        ("all", {"probes": 0}, "probes is 0"),
+        ("all", {"budget": 4}, "policy.budget does not exist"),
+    ],
+    ids=str,
+)
+def test_policies_that_do_not_exist_are_refused(
+    policies: Any, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SettingError, match=re.escape(message)):
+        chosen_policies(policies, settings)
+
+
+def test_a_policy_has_the_changes_of_all_and_its_own() -> None:
+    fine = {"name": "information", "label": "fine", "settings": {"noise": 0.001}}
+    found = chosen_policies(["information#a", fine], {"probes": 5, "noise": 0.004})
+    settings = {label: one.policy().settings for label, one in found.items()}
+    assert {label: (one.probes, one.noise) for label, one in settings.items()} == {
+        "information#a": (5, 0.004),
+        "fine": (5, 0.001),
+    }
+    assert chosen_policies(None, {}) == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["policy.probes=4"], "policies.grid.settings.probes is 4, was 3"),
+        (["methods=[anchored,icp]"], "methods has 2; accepted with policies: one"),
+        (["methods=chsel"], "methods is ['chsel'], was ['anchored']"),
+        (["steps=1"], "steps is 1; accepted with policies: null"),
+        (["session=sensors", "session/rig=cabinet"], "session is sensors; accepted with policies"),
+        (["policies=null"], "steered is False, was True"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], message: str) -> None:
+    before = stamps(folder)
+    done = run(evaluate.main, *SMALL, POLICIES, f"out={folder}", *arguments)
+    assert (done.returncode, message in done.stderr) == (2, True), done.stderr
+    assert stamps(folder) == before
+
+
+def test_a_report_is_about_these_sessions(folder: Path, tmp_path: Path) -> None:
+    done = run(report.main, str(folder), f"out={tmp_path}")
+    assert (done.returncode, done.stderr) == (0, "")
+    page = page_of(tmp_path)
+    assert page.tables["What is there"][1][:2] == ["grid", "2 of 2"]
+    errors = page.tables["Error of the set after so many probes, mm"]
+    assert errors[0] == ["policy", "1", "2", "3"]
+    last = [
+        row["error"] for row in rows_of(folder) if (row["policy"], row["probes"]) == ("grid", 3)
+    ]
+    assert float(errors[1][3]) == pytest.approx(1000.0 * np.sqrt(np.prod(last)), rel=0.01)
+
+
+def test_a_registration_that_fails_is_a_row_with_the_error_of_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register = Anchored.register
+
+    def sometimes(method: Anchored, problem: RegistrationProblem, *observer: Any) -> Hypotheses:
+        if problem.key.step == 1:
+            raise ValueError("no luck")
+        return register(method, problem, *observer)
+
+    monkeypatch.setattr(Anchored, "register", sometimes)
+    plan = plan_in(
+        tmp_path / "out",
+        [{"name": "anchored", "settings": {"size": "small"}}],
+        policies=chosen_policies("grid", {"probes": 2}),
+        steps=None,
+        plausible=False,
+        recordings=False,
+    )
+    plan.session.update(start_contacts=1, start_probe=0)  # type: ignore[attr-defined]
+    join_experiment(plan, "test", ["mustard"], [20])
+    assert do_task(plan, Task(Trial(20, "mustard"), "grid")) == ""
+    first, second = collect(plan.folder).to_pylist()
+    assert (first["status"], second["status"]) == ("ok", "failed: ValueError: no luck")
+    assert second["error"] == first["error"] > 0.0
+    assert (second["hypotheses"], second["seconds"]) == (None, None)
