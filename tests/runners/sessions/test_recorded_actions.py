@@ -1,0 +1,116 @@
+"""Recorded grids, taken in any order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chsel.errors import SessionError
+from chsel.next_probe.action_lattice import ActionSettings, ReachBall
+from chsel.numerics.arrays import FloatArray
+from replay.events import Probe
+from runners.objects.models import MODELS
+from runners.sessions.configurations import CONFIGURATIONS
+from runners.sessions.free_space import swept_voxels
+from runners.sessions.kinematic import open_kinematic
+from runners.sessions.probing_hand import ROTATION
+from runners.sessions.probing_settings import ProbingSettings
+from runners.sessions.recorded import RecordedSession, RecordedSettings
+from runners.sessions.recorded_actions import RecordedActions
+
+REPLAYS = Path(__file__).resolve().parents[2] / "replays"
+GRIDS = [("mustard_anchored", "mustard"), ("spam_can_chsel", "can"), ("drill_svgd", "drill")]
+
+
+def opened(name: str) -> tuple[RecordedSession, list[Probe]]:
+    session = RecordedSession(RecordedSettings(path=str(REPLAYS / f"{name}.mcap")))
+    return session, list(session.probes())
+
+
+@pytest.mark.parametrize(("name", "configuration"), GRIDS)
+def test_a_recorded_grid_is_offered_as_the_probes_that_it_was(
+    name: str, configuration: str
+) -> None:
+    session, probes = opened(name)
+    reach = ReachBall((0.0, 0.0, 0.0), 1e-6)
+    actions = session.offer(ActionSettings(choice="forward", reach=reach, speed=0.1))
+    assert len(actions) == len(probes)
+    places = [(-0.05, y, z) for y, z in CONFIGURATIONS[configuration].grid]
+    np.testing.assert_allclose(actions.world_from_hand[:, :3, 3], places, atol=0.003)
+    np.testing.assert_allclose(
+        actions.world_from_hand[:, :3, :3], ROTATION[None].repeat(len(probes), 0)
+    )
+    np.testing.assert_allclose(actions.length, 0.3, atol=0.001)
+    assert actions.seconds is not None
+    np.testing.assert_allclose(session.hand.bounds[1, 2], 0.1123)
+
+
+@pytest.mark.parametrize(("name", "configuration"), GRIDS)
+def test_in_the_recorded_order_all_points_are_as_recorded(name: str, configuration: str) -> None:
+    session, probes = opened(name)
+    session.offer(ActionSettings())
+    for step, before in enumerate(probes):
+        (probe,) = session.take(step, step)
+        assert probe.step == step
+        assert probe.new_points.digest == before.new_points.digest
+
+
+@pytest.mark.parametrize(("name", "configuration"), GRIDS)
+def test_in_any_order_the_same_is_known_in_the_end(name: str, configuration: str) -> None:
+    session, probes = opened(name)
+    session.offer(ActionSettings())
+    order = np.random.default_rng(0).permutation(len(probes)).tolist()
+    free, larger = [], 0
+    for step, action in enumerate(order):
+        (probe,) = session.take(step, action)
+        np.testing.assert_array_equal(probe.contacts, probes[action].contacts)
+        np.testing.assert_array_equal(probe.new_points.known, probes[action].new_points.known)
+        free.append(probe.new_points.free)
+        larger += len(probe.new_points.free) > len(probes[action].new_points.free)
+    assert larger > 3
+    assert not session.available().any()
+    with pytest.raises(SessionError, match="action 0 was taken before"):
+        list(session.take(0, 0))
+    recorded = np.concatenate([probe.new_points.free for probe in probes])
+    np.testing.assert_array_equal(in_order(np.concatenate(free)), in_order(recorded))
+
+
+def in_order(points: FloatArray) -> FloatArray:
+    return points[np.lexsort(points.T)]
+
+
+def test_a_probe_that_is_taken_first_shows_nearly_all_that_it_swept() -> None:
+    mesh = MODELS["mustard"]().apply_scale(2.5)
+    session = open_kinematic(mesh, "mustard", ProbingSettings(), 0)
+    probes, swept = [], []
+    for probe in session.probes():
+        path, lattice = np.array(session._gripper.path), session._voxels.lattice
+        probes.append(probe)
+        swept.append(swept_voxels(lattice, session._interior, path))
+        if len(probes) == 6:
+            break
+    workspace, initial = session.workspace, session.initial_points.free
+    every = RecordedActions(probes, session.hand, workspace, 0.025, depth=0.010)
+    shown = np.concatenate([initial, every.take(0, 5).new_points.free])
+    new, true = (
+        set(map(tuple, np.rint(p / 0.0125).astype(int).tolist())) for p in (shown, swept[5])
+    )
+    assert len(true - new) < 0.02 * len(true)
+    initially = set(map(tuple, np.rint(initial / 0.0125).astype(int).tolist()))
+    assert len(new - initially - true) < 0.02 * len(true)
+
+
+def test_what_cannot_be_steered_is_an_error(tmp_path: Path) -> None:
+    session, _ = opened("points_mustard")
+    with pytest.raises(SessionError, match=r"points_mustard.mcap does not describe the hand"):
+        session.offer(ActionSettings())
+    session, probes = opened("mustard_anchored")
+    short = [replace(probe, gripper_path=probe.gripper_path[:1]) for probe in probes]
+    with pytest.raises(SessionError, match="probe 0 has 1 poses of the hand; accepted"):
+        RecordedActions(short, session.hand, session.workspace, 0.025, depth=0.0)
+    still = [replace(probe, gripper_path=probe.gripper_path[[-1, -1]]) for probe in probes]
+    with pytest.raises(SessionError, match=r"no probe goes 0.01 m along the z axis of the hand"):
+        RecordedActions(still, session.hand, session.workspace, 0.025, depth=0.0)
