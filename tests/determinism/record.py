@@ -14,6 +14,7 @@ import torch
 
 from tests.determinism import libraries
 from tests.determinism.cases import CASES
+from tests.determinism.decisions import SCENES, decision_stages
 from tests.determinism.problems import grid
 from tests.determinism.stages import Scribbler, StageKeeper, Stages, nobody, run
 
@@ -62,9 +63,13 @@ def main() -> None:
     if arguments.again:
         for case in reversed(CASES.values()):
             run(case, grids[case.body], nobody)
+        for place in reversed(SCENES):
+            decision_stages(place, grids[place])
     for name, case in CASES.items():
         sdf = grids[case.body] if arguments.again else grid(case.body)
         record[name] = run(case, sdf, watch)
+    for place in SCENES:
+        record |= decision_stages(place, grids[place] if arguments.again else grid(place))
     write_record(arguments.out, record)
 
 

@@ -29,6 +29,7 @@ from chsel.qd.measures import MEASURES
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 from tests.determinism.cases import CASES
+from tests.determinism.decisions import decision_stages
 from tests.determinism.libraries import fused as contracted
 from tests.determinism.machine_code import assembly, called, fused, host, loose, optimised, target
 from tests.determinism.problems import grid, scene
@@ -56,6 +57,7 @@ def code() -> dict[str, str]:
     """Optimised code, with that of their callees, of the kernels that Python calls."""
     for name in ENOUGH:
         run(CASES[name], grid(CASES[name].body))
+    decision_stages("bracket", grid("bracket"))
     archive = GridArchive(MEASURES["position_2"], np.zeros(2), np.ones(2), bins=2, dimension=9)
     archive.cells_of(np.zeros((1, 2)))
     splat(np.zeros((1, 3)), np.zeros(3), 1.0, np.zeros((2, 2, 2)))
