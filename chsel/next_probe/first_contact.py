@@ -10,16 +10,17 @@ import numpy as np
 from chsel.next_probe.decision_problem import Actions, Belief
 from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.compiler import compiled, inner
+from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
 
-POINTS = 1200  # on the object's surface
+POINTS = 2000  # on the object's surface, among which a first contact is sought
+_FINE_POINTS = 20_000  # on it as well, of which those around the best of the others decide
 _CELL = 0.005  # metres: of two points that a hand sees in one cell, the nearer counts
-_MOST_CELLS = 400  # along a side of what a hand sees: cells of an object above 2 m are larger
+_MOST_CELLS = 60  # along a side of what a hand sees: of a larger object cells are larger
 
 
 class FirstContacts(NamedTuple):
@@ -27,6 +28,14 @@ class FirstContacts(NamedTuple):
 
     travel: FloatArray  # (K, A): way to the first contact, metres; inf where there is none
     contact: FloatArray  # (K, A, 3): that place on the object, world frame; 0 where there is none
+
+
+class TouchedPoints(NamedTuple):
+    """Points on an object's surface, in its frame, metres."""
+
+    points: FloatArray  # (N, 3)
+    fine: FloatArray  # (F, 3): many more, by which of `points` is the nearest
+    first: Any  # (N + 1,): where the fine points of each begin
 
 
 class Moves(NamedTuple):
@@ -52,11 +61,12 @@ def first_contacts(
 ) -> FirstContacts:
     """Follow every action in every pose to the first contact of the hand's front.
 
-    The object is points of its surface, some millimetres apart, and where the hand starts beyond
-    one of them, the way to the first contact is negative: it would have met it on its way to the
-    start. Longer ways than an action's are inf.
+    The object is points of its surface: some, then the many around those three of them that the
+    hand meets first. Where it starts beyond a point, the way to it is negative: it would have met
+    it on its way to the start. Longer ways than an action's are inf.
     """
-    points = touched_points(sdf)
+    surface = touched_points(sdf)
+    points = surface.points
     poses = np.array(Poses.of(belief.object_from_world).numbers)
     count, front = len(poses), hand.front
     travel = np.full((count, len(actions)), np.inf)
@@ -76,16 +86,26 @@ def first_contacts(
 
     def run(first: int, last: int, view: _View) -> None:
         for moves in groups:
-            meet(points, poses, moves, front, view, cell, (travel, contact), (first, last))
+            meet(surface, poses, moves, front, view, cell, (travel, contact), (first, last))
 
     spread(run, count, scratch, least=10)
     return FirstContacts(travel, contact)
 
 
-def touched_points(sdf: SdfGrid) -> FloatArray:
-    """Points (N, 3) on the object's surface, in its frame, that a hand can touch."""
+def touched_points(sdf: SdfGrid) -> TouchedPoints:
+    """Points on the object's surface that a hand can touch."""
+    return sdf.derived("touched", lambda: _touched_points(sdf))
+
+
+def _touched_points(sdf: SdfGrid) -> TouchedPoints:
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    return sdf.derived("touched", lambda: surface_points(sdf, POINTS, stream))
+    points = surface_points(sdf, POINTS, stream)
+    fine = surface_points(sdf, _FINE_POINTS, stream)
+    owner = np.empty(len(fine), dtype=np.int64)
+    find_nearest(points, fine, owner)
+    order = np.argsort(owner, kind="stable")
+    first = np.searchsorted(owner[order], np.arange(len(points) + 1))
+    return TouchedPoints(points, np.ascontiguousarray(fine[order]), first)
 
 
 def _radius(points: FloatArray) -> float:
@@ -111,63 +131,118 @@ def moves_by_orientation(actions: Actions) -> Iterator[Moves]:
 
 
 @compiled
+def find_nearest(points: Any, others: Any, nearest: Any) -> None:
+    """Fill nearest (F,) with the index of the nearest of points (N, 3) to each of others (F, 3)."""
+    for f in range(len(others)):
+        least = np.inf
+        for n in range(len(points)):
+            x, y = points[n, 0] - others[f, 0], points[n, 1] - others[f, 1]
+            z = points[n, 2] - others[f, 2]
+            squared = x * x + y * y + z * z
+            if squared < least:
+                least, nearest[f] = squared, n
+
+
+@compiled
 def meet(
-    points: Any, poses: Any, moves: Any, front: Any, view: Any, cell: Any, out: Any, some: Any
+    surface: Any, poses: Any, moves: Any, front: Any, view: Any, cell: Any, out: Any, some: Any
 ) -> None:
     """Fill the rows of some poses (first, last) in `out`, travel and contact of FirstContacts."""
     travel, contact = out
     heights, hx, hy, side = front.heights, front.lower[0], front.lower[1], front.cell
     nx, ny = heights.shape
-    seen = view.seen
+    seen, turn, fine = view.seen, moves.rotation, surface.fine
+    width, per_side = nx * side, 1.0 / side
+    best, hand_from_object = np.empty(3, dtype=np.int64), np.empty(12)
     for k in range(some[0], some[1]):
-        lower = _look(points, poses[k], moves.rotation, view, cell)
+        _turn(turn, poses[k], hand_from_object)
+        lower = _look(surface.points, hand_from_object, view, cell)
         rows = len(view.rows) - 1
         for a in range(len(moves.which)):
             x, y, z = moves.starts[a, 0] + hx, moves.starts[a, 1] + hy, moves.starts[a, 2]
             first = int(min(max((x - lower) / cell, 0.0), rows + 0.0))
-            last = int(min(max((x + nx * side - lower) / cell + 1.0, 0.0), rows + 0.0))
-            least, met = np.inf, -1
+            last = int(min(max((x + width - lower) / cell + 1.0, 0.0), rows + 0.0))
+            least, second, third = np.inf, np.inf, np.inf
+            best[:] = -1
             for n in range(view.rows[first], view.rows[last]):
                 p = view.order[n]
-                i, j = (seen[p, 0] - x) / side, (seen[p, 1] - y) / side
+                i, j = (seen[p, 0] - x) * per_side, (seen[p, 1] - y) * per_side
                 if i >= 0.0 and i < nx and j >= 0.0 and j < ny:
                     way = seen[p, 2] - z - heights[int(i), int(j)]
                     if way < least:
-                        least, met = way, p
+                        least, second, third = way, least, second
+                        best[2], best[1], best[0] = best[1], best[0], p
+                    elif way < second:
+                        second, third = way, second
+                        best[2], best[1] = best[1], p
+                    elif way < third:
+                        third, best[2] = way, p
+            if best[0] < 0:
+                continue
+            place = (seen[best[0], 0], seen[best[0], 1], seen[best[0], 2])
+            for b in range(3):
+                if best[b] < 0:
+                    break
+                for n in range(surface.first[best[b]], surface.first[best[b] + 1]):
+                    u, v, w = _turned(hand_from_object, fine[n, 0], fine[n, 1], fine[n, 2])
+                    i, j = (u - x) * per_side, (v - y) * per_side
+                    if i >= 0.0 and i < nx and j >= 0.0 and j < ny:
+                        way = w - z - heights[int(i), int(j)]
+                        if way < least:
+                            least, place = way, (u, v, w)
             if least <= moves.length[a]:
                 column = moves.which[a]
                 travel[k, column] = least
                 for axis in range(3):
-                    r = moves.rotation
                     contact[k, column, axis] = (
-                        r[axis] * seen[met, 0] + r[3 + axis] * seen[met, 1]
-                    ) + r[6 + axis] * seen[met, 2]
+                        turn[axis] * place[0] + turn[3 + axis] * place[1]
+                    ) + turn[6 + axis] * place[2]
 
 
 @inner
-def _look(points: Any, pose: Any, turn: Any, view: Any, cell: Any) -> Any:
+def _turn(turn: Any, pose: Any, hand_from_object: Any) -> None:
+    """Fill (12,) with the rotation into axes of the hand, then the pose's translation.
+
+    turn (9,): hand_from_world. pose (12,): object_from_world, whose rotation is transposed.
+    """
+    for row in range(3):
+        for column in range(3):
+            hand_from_object[3 * row + column] = (
+                turn[3 * row] * pose[3 * column] + turn[3 * row + 1] * pose[3 * column + 1]
+            ) + turn[3 * row + 2] * pose[3 * column + 2]
+        hand_from_object[9 + row] = pose[9 + row]
+
+
+@leaf
+def _turned(pose: Any, x: Any, y: Any, z: Any) -> Any:
+    """A place of the object in axes of the hand."""
+    p, q, r = x - pose[9], y - pose[10], z - pose[11]
+    return (
+        pose[0] * p + pose[1] * q + pose[2] * r,
+        pose[3] * p + pose[4] * q + pose[5] * r,
+        pose[6] * p + pose[7] * q + pose[8] * r,
+    )
+
+
+@inner
+def _look(points: Any, hand_from_object: Any, view: Any, cell: Any) -> Any:
     """Turn the object into the axes of the hand, and order what is seen of it by rows of x.
 
     Returns the x of the first row's edge.
     """
     seen, nearest = view.seen, view.nearest
-    size = len(nearest)
+    size, per_cell = len(nearest), 1.0 / cell
     low_x, low_y = np.inf, np.inf
     for n in range(len(points)):
-        p, q, r = points[n, 0] - pose[9], points[n, 1] - pose[10], points[n, 2] - pose[11]
-        x = pose[0] * p + pose[3] * q + pose[6] * r
-        y = pose[1] * p + pose[4] * q + pose[7] * r
-        z = pose[2] * p + pose[5] * q + pose[8] * r
-        seen[n, 0] = turn[0] * x + turn[1] * y + turn[2] * z
-        seen[n, 1] = turn[3] * x + turn[4] * y + turn[5] * z
-        seen[n, 2] = turn[6] * x + turn[7] * y + turn[8] * z
-        low_x, low_y = min(low_x, seen[n, 0]), min(low_y, seen[n, 1])
+        x, y, z = _turned(hand_from_object, points[n, 0], points[n, 1], points[n, 2])
+        seen[n, 0], seen[n, 1], seen[n, 2] = x, y, z
+        low_x, low_y = min(low_x, x), min(low_y, y)
     for i in range(size):
         for j in range(size):
             nearest[i, j] = -1
     for n in range(len(points)):
-        i = min(int((seen[n, 0] - low_x) / cell), size - 1)
-        j = min(int((seen[n, 1] - low_y) / cell), size - 1)
+        i = min(int((seen[n, 0] - low_x) * per_cell), size - 1)
+        j = min(int((seen[n, 1] - low_y) * per_cell), size - 1)
         before = nearest[i, j]
         if before < 0 or seen[n, 2] < seen[before, 2]:
             nearest[i, j] = n

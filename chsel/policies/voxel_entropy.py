@@ -86,7 +86,7 @@ def filled_points(sdf: SdfGrid, side: float) -> FloatArray:
     stride = max(int(0.5 * side / sdf.resolution), 1)
     inside = np.argwhere(sdf.values[::stride, ::stride, ::stride] <= 0.0) * stride
     inside = inside[evenly_spaced(len(inside), _MOST_POINTS)]
-    return np.concatenate([touched_points(sdf), sdf.origin + inside * sdf.resolution])
+    return np.concatenate([touched_points(sdf).points, sdf.origin + inside * sdf.resolution])
 
 
 def known_voxels(points: KnownPoints, box: VoxelBox) -> BoolArray:
