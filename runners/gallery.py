@@ -79,6 +79,18 @@ def fault_png(sessions: Sessions, *, level: str) -> bytes:
     return (folder / f"{level}.png").read_bytes()
 
 
+def next_probe_webp(sessions: Sessions) -> bytes:
+    """A drill found on the paper's grid and by information, side by side."""
+    shared = ("object=drill", "session=kinematic", "method=anchored", "recording=mcap")
+    grid = sessions.run("grid", *shared, "session.start_contacts=1", "session.start_probe=0")
+    steered = sessions.run("information", *shared, "policy=information")
+    webp = sessions.folder / "next_probe.webp"
+    files = {"grid": grid, "information": steered}
+    named = [f"{title}={folder / 'recording.mcap'}" for title, folder in files.items()]
+    _run("runners.reporting.probing_animation", str(webp), *named)
+    return webp.read_bytes()
+
+
 def robot_log_png(sessions: Sessions) -> bytes:
     """The viewer on the log of a simulated robot."""
     log = sessions.folder / "drill.mcap"
@@ -96,6 +108,7 @@ PICTURES: dict[str, Callable[[Sessions], bytes]] = {
     "docs/anchored.png": anchored_png,
     **{f"docs/real_data/{level}.png": partial(fault_png, level=level) for level in KINDS},
     "docs/robot_log.png": robot_log_png,
+    "docs/next_probe.webp": next_probe_webp,
 }
 """What makes the content of each file."""
 

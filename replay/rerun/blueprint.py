@@ -29,6 +29,7 @@ Bounds = tuple[FloatArray, FloatArray]
 """Lower and upper corner (3,) of a box in the world, metres."""
 _DIRECTION = np.array([-0.55, -0.72, 0.42])  # from the box; probes move along +x
 _DISTANCE = 1.08  # in diagonals of the box
+_STEERED = 1.25  # times as far, as actions start beyond the workspace
 _LOOK_DOWN = 0.07  # in heights of the box, whose near corner would be cut off
 _OUT_OF_SIGHT = 0.05  # of the hypotheses' corners, at either end of each axis
 PlayState = Literal["paused", "following"]
@@ -58,7 +59,7 @@ def session_blueprint(
     decisions to show. sensors: of a robot session, their pictures beside all. follow: show the last
     probe, otherwise the first registration, which must be there then.
     """
-    view = scene_view(workspace, in_sight=in_sight)
+    view = scene_view(workspace, in_sight=in_sight, distance=_STEERED if steered else 1.0)
     strips = [legend_view(), *([legend_view("score_legend", "Scores")] if steered else [])]
     scene = rrb.Vertical(view, *strips, row_shares=[9, *(1 for _ in strips)])
     upper: list[rrb.View | rrb.Container] = [scene, _text_views()]
@@ -105,11 +106,13 @@ def scene_view(
     *,
     in_sight: Bounds | None = None,
     more: Sequence[str] = (),
+    distance: float = 1.0,
 ) -> rrb.Spatial3DView:
     """The scene under the entity `root`, looked at obliquely from where the probes come from.
 
     in_sight: what fills the view; by default the workspace.
-    more: entities beside it that the view shows too, each with all below it.
+    more: entities beside it that the view shows too, each with all below it. distance: of the eye,
+    times what has that in sight.
     """
     lower, upper = workspace.bounds
     diagonal = float(np.linalg.norm(upper - lower))
@@ -125,7 +128,7 @@ def scene_view(
             stroke_width=1.0,
             color=GRID,
         ),
-        eye_controls=_eye_on(in_sight or (lower, upper)),
+        eye_controls=_eye_on(in_sight or (lower, upper), distance),
         overrides={f"/{root}/{path}": _up_to_now() for path in CUMULATIVE},
     )
 
@@ -180,10 +183,10 @@ def _curve_views(*, pose_known: bool, timed: bool) -> list[rrb.View | rrb.Contai
 
 def _steered_views(views: list[rrb.View | rrb.Container]) -> list[rrb.View | rrb.Container]:
     """The curves of decisions ahead of the others, whose plot of the search is behind costs."""
-    spread, hit, surprise = (
-        curves_view(f"decision/{kind}", name, legend=kind == "spread")
-        for kind, name in DECISION_CURVES.items()
-    )
+    root, names = "decision", DECISION_CURVES
+    spread = curves_view(f"{root}/spread", names["spread"])
+    hit = curves_view(f"{root}/hit", names["hit"], legend=False, y_range=(-0.05, 1.05))
+    surprise = curves_view(f"{root}/surprise", names["surprise"], legend=False)
     costs, search, *others = views
     of_costs = rrb.Tabs(*costs.contents, search) if isinstance(costs, rrb.Tabs) else costs
     return [spread, rrb.Vertical(hit, surprise), *others, of_costs]
@@ -205,14 +208,23 @@ def _text_views() -> rrb.Container:
 
 
 def curves_view(
-    root: str, name: str, *, legend: bool = True, whole: bool = True
+    root: str,
+    name: str,
+    *,
+    legend: bool = True,
+    whole: bool = True,
+    y_range: tuple[float, float] | None = None,
 ) -> rrb.TimeSeriesView:
-    """The curves under the entity `root`, whole or from the first moment to shortly after now."""
+    """The curves under the entity `root`, whole or from the first moment to shortly after now.
+
+    y_range: by default as the curves need it.
+    """
     start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seq=4)
     return rrb.TimeSeriesView(
         origin=f"/{root}",
         name=name,
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
+        axis_y=None if y_range is None else rrb.ScalarAxis(range=y_range),
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=start if whole else now)),
     )
 
@@ -272,14 +284,14 @@ def bounds_in_sight(started: SessionStarted, sets: Iterable[Hypotheses]) -> Boun
     return lower, upper
 
 
-def _eye_on(in_sight: Bounds) -> rrb.EyeControls3D:
+def _eye_on(in_sight: Bounds, distance: float) -> rrb.EyeControls3D:
     """An eye that has a box in sight, obliquely from where the probes come from."""
     lower, upper = in_sight
     centre = (lower + upper) / 2
     away = _DIRECTION / np.linalg.norm(_DIRECTION) * np.linalg.norm(upper - lower)
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
-        position=centre + _DISTANCE * away,
+        position=centre + distance * _DISTANCE * away,
         look_target=centre - (0.0, 0.0, _LOOK_DOWN * (upper[2] - lower[2])),
         eye_up=(0.0, 0.0, 1.0),
     )

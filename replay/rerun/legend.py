@@ -44,8 +44,8 @@ _KINDS: dict[str, Rgb] = {
     "true pose": OBJECT,
 }
 _ACTIONS: dict[str, Rgb] = {
-    "next probe": CHOSEN,
-    "its forecast": FORECAST,
+    "next": CHOSEN,
+    "forecast": FORECAST,
     "not possible": UNAVAILABLE,
 }
 _SCORE_STEPS = 12

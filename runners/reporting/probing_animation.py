@@ -271,7 +271,7 @@ def _on_the_way(probe: Probe, part: float) -> FloatArray:
 def _title(session: ShownSession, done: int, step: int | None) -> str:
     if step is None:
         return f"{session.title}: {done} probes"
-    ended = ", stopped" if done == session.count else ""
+    ended = ", ended" if done == session.count else ""
     return f"{session.title}: {done} probes{ended}, error {session.errors[step]:.0f} mm"
 
 
