@@ -163,6 +163,7 @@ def _register_again(recording: Recording, recorder: Recorder) -> None:
                 larger = 0 if decisions is None else decisions.probed(event)
                 if larger:
                     online.start_afresh(larger)
+                    found.clear()
             if isinstance(event, Decided) and decisions is not None:
                 event = decisions.again(event, found[-1] if found else None)
                 decisions.remember(event)

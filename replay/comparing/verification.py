@@ -174,7 +174,9 @@ class _DecisionVerdicts:
             return
         for event in events:
             if isinstance(event, Probe):
-                self.larger = again.probed(event) or self.larger
+                larger = again.probed(event)
+                if larger:  # what was found before is forgotten
+                    self.larger, self._result, self._known = larger, None, True
             elif isinstance(event, Decided):
                 if event.step in self._wanted:
                     yield self._verdict(again, event)

@@ -1,4 +1,4 @@
-"""What can be exported of a recording: hypotheses, points, archives, numbers, images."""
+"""What can be exported of a recording, by name: here all but decisions."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import chosen_steps
+from replay.content.export_decisions import exported_decisions
 from replay.content.export_files import Exported, require_any
 from replay.events import SensorImage
 from replay.mcap.contents import Contents
@@ -181,6 +182,7 @@ EXPORTS = {
     "archive": exported_archive,
     "metrics": exported_metrics,
     "images": exported_images,
+    "decisions": exported_decisions,
 }
 """By the name that `--what` takes."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from replay.mcap.damaged import recover_hint
 from replay.mcap.encoding import decode
 from replay.mcap.file import LIMITS, StoredMessage
 from replay.mcap.plain_config import config_from_json
-from replay.mcap.schemas import FORMAT_VERSION, MESSAGES
+from replay.mcap.schemas import FORMAT_VERSION, MESSAGES, STEP_TIME
 from replay.mcap.texts import check_name
 from replay.raw.log_info import is_other_programs
 from replay.raw.raw_file import RawFile, unwatched
@@ -45,6 +45,9 @@ class RecordingInfo:
     damage: str | None = None  # what is wrong, None if nothing is
     rig: Mapping[str, str] | None = None  # name and source of a robot session's sensors
     digest: str = ""  # of the whole recording, "" before format 3 and without an end
+    # Of a steered session: `name`, and of the decision after the last probe `stop` and `spread`,
+    # metres; None where that is unknown.
+    policy: Mapping[str, Any] | None = None
 
     @property
     def registrations(self) -> int:
@@ -73,6 +76,7 @@ class RecordingInfo:
             "bytes": self.size,
             **self.session,
             "rig": None if self.rig is None else dict(self.rig),
+            "policy": None if self.policy is None else dict(self.policy),
             "outcome": self.outcome,
             "registrations": self.registrations,
             "integrity": integrity,
@@ -122,17 +126,33 @@ def _from_index(path: Path) -> RecordingInfo:
         raise RecordingError(f"recording {path} has no session or no contents")
     contents, ended, rig = found["/contents"], found.get("/session_ended"), found.get("/rig")
     channels, rows = file.channels.by_id, decode("Contents", contents)
+    session, steps = _session(path, found["/session"]), _rows(rows)
     return RecordingInfo(
         path,
         file.size,
-        _session(path, found["/session"]),
-        _rows(rows),
+        session,
+        steps,
         None if ended is None else decode("SessionEnded", ended)["outcome"],
         file.attachments,
         {channels[number].topic: count for number, count in (file.counts or {}).items()},
         rig=None if rig is None else _rig(path, decode("Rig", rig)),
         digest=rows["digest"],
+        policy=_policy(path, session["config"], lambda: _last_decision(file, steps)),
     )
+
+
+def _last_decision(file: RawFile, steps: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """The values of the message on the decision after the last probe, None if there is none.
+
+    Raises RecordingError if what is read is damaged.
+    """
+    faults: list[str] = []
+    begin = ((steps[-1]["step"] if steps else -1) + 1) * STEP_TIME
+    wanted = Wanted(frozenset({"/decision"}), begin, begin + STEP_TIME)
+    messages = list(file.messages(wanted, faults.append, unwatched))
+    if faults:
+        raise RecordingError(f"recording {file.path}: {faults[0]}")
+    return decode("Decision", messages[-1].data) if messages else None
 
 
 def _by_index(file: RawFile, *topics: str) -> dict[str, bytes]:
@@ -158,11 +178,12 @@ def _from_everything(path: Path) -> RecordingInfo:
 
     tally = _Tally()
     recording = read_recording(path, partial=True, watch=tally.take)
-    steps, damage = _checked_steps(recording)
+    steps, damage, last = _checked_steps(recording)
+    session = _session(path, tally.session)
     return RecordingInfo(
         path,
         path.stat().st_size,
-        _session(path, tally.session),
+        session,
         steps,
         None if recording.ended is None else recording.ended.outcome,
         recording.attachments,
@@ -172,20 +193,31 @@ def _from_everything(path: Path) -> RecordingInfo:
         damage=recording.damage or damage,
         rig=None if recording.rig is None else _rig(path, vars(recording.rig)),
         digest=recording.digest if recording.damage is None else "",
+        policy=_policy(path, session["config"], lambda: last),
     )
 
 
-def _checked_steps(recording: Recording) -> tuple[tuple[Mapping[str, Any], ...], str | None]:
-    """A mapping for each probe, the digests of problems checked; and the first that is wrong."""
+def _checked_steps(
+    recording: Recording,
+) -> tuple[tuple[Mapping[str, Any], ...], str | None, Mapping[str, Any] | None]:
+    """A mapping for each probe, the digests of problems checked; and the first that is wrong.
+
+    Then stop and spread of the decision after the last probe, None if there is none.
+    """
+    from replay.events import Decided, Probe
     from replay.mcap.contents import Contents
 
-    contents, damage = Contents(), None
+    contents, damage, last = Contents(), None, None
     try:
         for event in recording.events():
             contents.take(event)
+            if isinstance(event, Probe):
+                last = None
+            elif isinstance(event, Decided):
+                last = {"stop": event.decision.stop, "spread": event.decision.spread}
     except RecordingError as error:
         damage = str(error).removeprefix(f"recording {recording.path}: ")
-    return _rows(contents.values()), damage
+    return _rows(contents.values()), damage, last
 
 
 class _Tally:
@@ -223,6 +255,22 @@ def _session(path: Path, data: bytes) -> dict[str, Any]:
         "mesh_digest": values["mesh_digest"],
         "environment": values["environment"],
         "config": config,
+    }
+
+
+def _policy(
+    path: Path,
+    config: Mapping[str, Any],
+    last: Callable[[], Mapping[str, Any] | None],
+) -> dict[str, Any] | None:
+    """Of a steered session: name, and how its last decision stopped it; else None."""
+    group = config.get("policy")
+    if not isinstance(group, Mapping):
+        return None
+    name, decision = str(group.get("name", "")), last()
+    check_name(f"the policy of recording {path}", name)
+    return {"name": name} | {
+        part: None if decision is None else decision[part] for part in ("stop", "spread")
     }
 
 

@@ -68,10 +68,20 @@ class RecordedDecision:
         """Which it follows."""
         return int(self.values["step"])
 
+    def check_actions(self, offered: ActionsOffered) -> None:
+        """Raise RecordingError unless the decision is about as many actions as are offered."""
+        about, count = len(self.values["score"]), len(offered.actions)
+        if about != count:
+            raise RecordingError(
+                f"the decision of step {self.step} is about {about} actions, not the {count} "
+                "offered"
+            )
+
     def completed(
         self, start: SessionStarted, offered: ActionsOffered, points: KnownPoints
     ) -> Decided:
         """With its problem, from all points so far; RecordingError unless that was recorded."""
+        self.check_actions(offered)
         values = self.values
         problem = DecisionProblem(
             sdf=start.sdf,
@@ -89,14 +99,9 @@ class RecordedDecision:
         return Decided(self.step, problem, self.decision, self.surprise)
 
 
-def decision_from(values: Mapping[str, Any], offered: ActionsOffered | None) -> RecordedDecision:
-    """The decision in a message; RecordingError unless it is one about the actions offered."""
+def decision_from(values: Mapping[str, Any]) -> RecordedDecision:
+    """The decision in a message; RecordingError unless it has its digest."""
     step = values["step"]
-    if offered is None:
-        raise RecordingError(f"a decision of step {step} has no actions before it")
-    if len(values["score"]) != len(offered.actions):
-        counts = f"{len(values['score'])} actions, not the {len(offered.actions)} offered"
-        raise RecordingError(f"the decision of step {step} is about {counts}")
     decision = Decision(**shared_arguments(Decision, values))
     check_digest(f"the decision of step {step}", decision.digest, values["digest"])
     return RecordedDecision(values, decision, values["surprise"])

@@ -180,7 +180,7 @@ class EventReader:
             case "/hypotheses":
                 return self._hypotheses(values)
             case "/decision":
-                return decision_from(values, self._offered)
+                return self._decision(values)
             case _:
                 event = event_from(topic, values)
                 if isinstance(event, ActionsOffered):
@@ -242,6 +242,12 @@ class EventReader:
         grid = f"the SDF grid of the problem of step {step}"
         check_digest(grid, self._sdf_digest, values["sdf_digest"])
         return RecordedProblem(values)
+
+    def _decision(self, values: dict[str, Any]) -> RecordedDecision:
+        entry = decision_from(values)
+        if self._offered is not None:  # else it is out of place
+            entry.check_actions(self._offered)
+        return entry
 
     def _hypotheses(self, values: dict[str, Any]) -> HypothesesFound:
         step, archive = values["step"], values["archive"]

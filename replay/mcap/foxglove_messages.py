@@ -31,6 +31,7 @@ SCENE: Mapping[str, type[Message]] = {
     "/object_surface": PointCloud,
     "/hypothesis_meshes": SceneUpdate,
     "/hypothesis_surfaces": PointCloud,
+    "/next_probe": SceneUpdate,
     **{f"/all_points/{kind}/{n}": PointCloud for kind in POINT_CLASSES for n in range(LEVELS)},
 }
 """Topics of `viewer_messages`, which recordings of older programs do not have."""

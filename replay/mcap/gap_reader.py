@@ -74,7 +74,8 @@ class GapReader(EventReader):
         points = self._points.all()
         if isinstance(entry, RecordedProblem):
             return ProblemPosed(entry.step, entry.completed(self.start.sdf, points))
-        assert self._offered is not None  # as the decision was read
+        if self._offered is None:
+            raise RecordingError(f"the decision of step {entry.step} has lost its actions")
         return entry.completed(self.start, self._offered, points)
 
     def _append(self, entry: Entry) -> None:

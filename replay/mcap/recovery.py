@@ -22,6 +22,7 @@ from replay.events import (
 )
 from replay.files import new_file
 from replay.lost_attachment import LostAttachment
+from replay.mcap.decision_messages import RecordedDecision
 from replay.mcap.event_reader import Entry, RecordedProblem
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
@@ -105,6 +106,7 @@ class _Recovery:
         self._order = EventOrder()
         self._lost_steps: set[int] = set()  # of registrations
         self._blind = False  # whether images are lost with their rig
+        self._undecided = False  # whether decisions are lost with the actions offered
 
     def events(self) -> Iterator[Event]:
         """Each event as it was; where some are lost, a warning; an end where there is none."""
@@ -189,6 +191,11 @@ class _Recovery:
                 self._blind = True
                 yield from self._lost("all images of sensors: their rig was lost before")
             return
+        if isinstance(entry, RecordedDecision) and not self._order.has_actions:
+            if not self._undecided:
+                self._undecided = True
+                yield from self._lost("all decisions: the actions offered were lost before")
+            return
         if isinstance(entry, _OF_REGISTRATION) and step in self._lost_steps:
             return  # with its problem
         try:
@@ -199,6 +206,9 @@ class _Recovery:
             if isinstance(entry, (RecordedProblem, *_OF_REGISTRATION)):
                 self._lost_steps.add(step)
                 what = f"the registration of step {step}"
+            elif isinstance(entry, RecordedDecision):
+                what = f"the decision after step {step}"
+            if isinstance(entry, (RecordedProblem, RecordedDecision, *_OF_REGISTRATION)):
                 reason = "something it needs was lost before" if reader.wanting else reason
             yield from self._lost(f"{what}: {reason}")
         else:

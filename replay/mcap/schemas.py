@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from chsel.next_probe.decision_problem import STOPS
 from replay.mcap.validation import (
     Check,
     ascending_costs,
@@ -32,6 +31,7 @@ from replay.mcap.validation import (
     session_end,
     short_name,
     short_names,
+    stop_reason,
     voxel_side,
 )
 
@@ -199,7 +199,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "key_step": "uint32",
         "problem_digest": "string",
         "chosen": "sint32",
-        "stop": ("string", one_of(*STOPS)),
+        "stop": ("string", stop_reason),
         "spread": ("double", between(0.0, 1e6, "m")),
         "score": "f8[A]",
         "hit_chance": ("f8[A]", chances),
@@ -279,5 +279,6 @@ SINCE_VERSION: Mapping[str, int] = {
     "/seal": SEALED_SINCE,
     "/actions": 4,
     "/decision": 4,
+    "/next_probe": 4,  # for viewers
 }
 """Topics that a recording of a lower version does not have."""

@@ -73,6 +73,13 @@ def session_end(field: str, value: str) -> None:
         raise RecordingError(f"{field} is {value!r}; accepted: {accepted}")
 
 
+def stop_reason(field: str, value: str) -> None:
+    """Why a decision makes no further probe, "" if it makes one."""
+    from chsel.next_probe.decision_problem import STOPS
+
+    one_of(*STOPS)(field, value)
+
+
 def sensor_name(field: str, value: str) -> None:
     """A word, as it is a part of names of files and topics."""
     check_name(field, value)

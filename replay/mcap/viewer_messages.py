@@ -30,7 +30,7 @@ from chsel.problem.poses import inverse, quaternions
 from chsel.problem.registration_problem import Hypotheses
 from replay.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
 from replay.colors import OBJECT as OBJECT_COLOR
-from replay.events import Event, HypothesesFound, Probe, SessionStarted
+from replay.events import Decided, Event, HypothesesFound, Probe, SessionStarted
 from replay.lost_attachment import is_lost
 from replay.mcap.foxglove_messages import (
     LEVELS,
@@ -59,6 +59,7 @@ _OBJECT_OPACITY = 0.6
 _BEST_OPACITY, _OTHER_OPACITY = 0.9, 0.25
 _SURFACE_POINTS = 100  # of each hypothesis
 _OBJECT = "object"  # the frame
+_ARROW = 0.01  # metres: width of the arrow of the next probe
 _MOST_FACES = 400
 _FINEST, _COARSEST = 40, 4  # cells along the longest side of a mesh's bounds
 _BLOCKS = 8  # that one level of all points holds before they move to the next
@@ -97,6 +98,8 @@ class Views:
                 if self._scene is not None:
                     yield "/hypothesis_meshes", partial(self._scene.hypothesis_meshes, found)
                     yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, found)
+            case Decided():
+                yield "/next_probe", partial(next_probe, event)
 
     def _all_points(self, new: KnownPoints) -> Iterator[View]:
         """The clouds of all points so far that change with new ones."""
@@ -190,6 +193,28 @@ def poses_in_world(world_from_body: FloatArray, time: int) -> bytes:
     """Poses (B, 4, 4) as positions and quaternions."""
     poses = _poses(world_from_body)
     return serialized(PosesInFrame(timestamp=stamp(time), frame_id=WORLD, poses=poses))
+
+
+def next_probe(event: Decided, time: int) -> bytes:
+    """The chosen action as an arrow from the start of the hand to its end; nothing after a stop."""
+    entity = SceneEntity(timestamp=stamp(time), id="next probe", frame_id=WORLD)
+    chosen, actions = event.decision.chosen, event.problem.actions
+    if chosen >= 0:
+        start = actions.world_from_hand[chosen]
+        along = [start[:3, 2], start[:3, 0], start[:3, 1]]  # an arrow points along its x axis
+        pose = start.copy()
+        pose[:3, :3] = np.stack(along, axis=1)
+        length = float(actions.length[chosen])
+        (place,) = _poses(pose[None])
+        entity.arrows.add(
+            pose=place,
+            shaft_length=0.8 * length,
+            shaft_diameter=_ARROW,
+            head_length=0.2 * length,
+            head_diameter=2.5 * _ARROW,
+            color=Color(r=CONTACT[0] / 255.0, g=CONTACT[1] / 255.0, b=CONTACT[2] / 255.0, a=1.0),
+        )
+    return serialized(SceneUpdate(entities=[entity]))
 
 
 def object_in_world(world_from_object: FloatArray, time: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Write hypotheses, points, archives, numbers or images of a recording as npz, csv or json."""
+"""Write hypotheses, points, archives, numbers, images or decisions as npz, csv or json."""
 
 from __future__ import annotations
 

@@ -99,6 +99,7 @@ def _facts(info: RecordingInfo) -> Table:
         "object": session["object"],
         "session": f"{session['session']}, runner {session['runner']}; {counts}",
         "method": f"{session['method']}{preset}, seed {session['seed']}",
+        "policy": _policy(info),
         "source": f"recording {session['source']}" if session["source"] else "",
         "rig": "" if info.rig is None else f"{info.rig['name']}, raw log {info.rig['source']}",
         "true pose": "known" if session["true_pose"] else "unknown",
@@ -112,6 +113,18 @@ def _facts(info: RecordingInfo) -> Table:
         "integrity": info.integrity,
     }
     return fact_table(facts)
+
+
+def _policy(info: RecordingInfo) -> str:
+    """The policy of a steered session, and how it stopped; empty if there is none."""
+    if info.policy is None:
+        return ""
+    stop, spread = info.policy["stop"], info.policy["spread"]
+    text = f"{info.policy['name']}, decisions {info.messages.get('/decision', 0)}, "
+    if spread is None:
+        return f"{text}none after the last probe"
+    ended = f"stopped by {stop}" if stop else "not stopped"
+    return f"{text}{ended}, spread of the poses {1000.0 * spread:.1f} mm"
 
 
 def _messages(info: RecordingInfo) -> str:

@@ -223,6 +223,7 @@ def _is_empty(recording, what: str) -> bool:
         ],
         "metrics": probes,
         "images": recording.image_steps,
+        "decisions": recording.decision_steps,
     }[what]
 
 

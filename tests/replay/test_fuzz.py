@@ -34,7 +34,8 @@ def test_the_originals_are_small_and_equal_to_what_is_registered_today(
         path.write_bytes(original.data)
         with quiet():
             verdicts = list(verify(read_recording(path)))
-        assert [verdict.outcome for verdict in verdicts] == ["equal", "equal"]
+        assert {verdict.outcome for verdict in verdicts} == {"equal"}
+        assert len(verdicts) == (7 if original.name == "steered" else 2)
 
 
 @pytest.mark.parametrize("block", range(3))

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from chsel.errors import ChselError, RecordingError
+from replay.comparing.policies import recorded_policy
 from replay.comparing.recording_diff import recording_diff
 from replay.comparing.verification import DIFFERS, EQUAL, Verdict, verify
 from replay.content.recording_info import recording_info
@@ -32,6 +33,7 @@ from tests.tools.small_recordings import (
     METHODS,
     registered_session,
     robot_session,
+    steered_session,
     write_recording,
 )
 
@@ -51,9 +53,10 @@ class Original:
 
 
 def originals(folder: Path) -> list[Original]:
-    """A small recording of each method, and one of a robot with sensors."""
+    """A small recording of each method, one of a robot with sensors, and one that is steered."""
     sessions = {name: registered_session(name) for name in METHODS}
     sessions["sensors"] = robot_session("gradient_descent")
+    sessions["steered"] = steered_session()
     made = []
     for name, events in sessions.items():
         data = write_recording(folder / f"{name}.mcap", events)
@@ -150,8 +153,15 @@ def ask(path: Path, whole: Path, outcome: str) -> None:
 def _check_verdict(
     verdict: Verdict, recording: Recording, events: Sequence[Event], original: Original
 ) -> None:
-    """Whether registering anew, apart from `verify`, says the same."""
+    """Whether registering or deciding anew, apart from `verify`, says the same."""
     step = verdict.step
+    if verdict.is_decision:
+        decided, policy = recording.decision(step), recorded_policy(recording).policy
+        if verdict.outcome == EQUAL and policy.decide(decided.problem).digest != (
+            decided.decision.digest
+        ):
+            raise WrongOutcome(f'the decision of step {step} is "equal", but today has other bits')
+        return
     if verdict.outcome == EQUAL:
         method = recorded_method(recording).method
         if method.register(recording.problem(step)).digest != recording.hypotheses(step).digest:

@@ -19,7 +19,14 @@ from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import ChselError
 from chsel.problem.points import KnownPoints
-from replay.events import Event, Probe, ProblemPosed, SessionStarted
+from replay.events import (
+    ActionsOffered,
+    Decided,
+    Event,
+    Probe,
+    ProblemPosed,
+    SessionStarted,
+)
 from replay.mcap.encoding import message_class
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.schemas import RECORDS
@@ -476,8 +483,9 @@ def _change_leaf(config: Any, random: Random) -> None:
 
 
 def _consistent(events: list[Event]) -> list[Event]:
-    """Problems with the grid and the points that the events before them give."""
+    """Problems with the grid, the points and the actions that the events before them give."""
     made: list[Event] = []
+    offered: ActionsOffered | None = None
     start: SessionStarted | None = None
     points = KnownPoints()
     for event in events:
@@ -488,6 +496,13 @@ def _consistent(events: list[Event]) -> list[Event]:
         elif isinstance(event, ProblemPosed) and start is not None:
             problem = dataclasses.replace(event.problem, points=points, sdf=start.sdf)
             event = ProblemPosed(event.step, problem)
+        elif isinstance(event, ActionsOffered):
+            offered = event
+        elif isinstance(event, Decided) and start is not None and offered is not None:
+            parts = {"actions": offered.actions, "hand": offered.hand, "points": points}
+            parts |= {"sdf": start.sdf, "workspace": start.workspace}
+            parts |= {"free_resolution": start.free_resolution}
+            event = dataclasses.replace(event, problem=dataclasses.replace(event.problem, **parts))
         made.append(event)
     return made
 

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from chsel.errors import ChselError, RecordingError
-from chsel.next_probe.decision_problem import STOPS
 from replay.events import ActionsOffered, Decided, Event, Measured, Probe, ProblemPosed
 from replay.mcap import event_reader
 from replay.mcap.reader import read_recording
-from replay.mcap.schemas import FORMAT_VERSION, MESSAGES, UNSTEERED_VERSION
+from replay.mcap.schemas import FORMAT_VERSION, UNSTEERED_VERSION
 
 Write = Callable[[list[Event]], Path]
 
@@ -130,9 +129,3 @@ def test_the_problem_of_a_decision_follows_from_what_came_before(
     events = [stale if event is second else event for event in steered_events]
     with pytest.raises(RecordingError, match="points, a grid, a workspace, actions or a hand that"):
         write(events)
-
-
-def test_the_reasons_to_stop_are_those_of_decisions() -> None:
-    (_, check) = MESSAGES["Decision"]["stop"]
-    for stop in STOPS:
-        check("stop", stop)

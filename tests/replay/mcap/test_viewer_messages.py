@@ -243,7 +243,8 @@ class TestLayout:
         assert set(topics) == drawn
         shown = {name for name, settings in topics.items() if settings["visible"]}
         all_points = {name for name in VIEWS if name.startswith("/all_points/")}
-        assert shown == {"/hypothesis_meshes", "/object_mesh", "/gripper_path", *all_points}
+        drawn_at_first = {"/hypothesis_meshes", "/object_mesh", "/gripper_path", "/next_probe"}
+        assert shown == {*drawn_at_first, *all_points}
 
     def test_its_curves_are_of_fields_that_are_recorded(self) -> None:
         values = [
