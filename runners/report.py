@@ -58,6 +58,10 @@ def main(config: DictConfig) -> None:
     with drawing(), waiting.status("drawing") if waiting.is_terminal else nullcontext():
         sections = sections_of(subject)
         _write(out, subject, sections, checked)
+    if subject.evaluation.is_steered:
+        for table in (table for section in sections[1:] for table in section.tables):
+            print_table(console, table)
+            console.print()
     for section in sections:
         if section.missing:
             line = f"no picture of {section.title}: {section.missing}"

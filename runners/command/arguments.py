@@ -36,6 +36,7 @@ _PATH_KEYS = (
     r"package\.directory",
     r"package\.python",
     r"pose",
+    r"session\.hand\.urdf",
     r"session\.logs",
     r"session\.path",
     r"session\.pose",

@@ -14,7 +14,12 @@ from runners.reporting.figures import (
     positive_scale,
 )
 from runners.reporting.section import Section, Styles, drawn
-from runners.reporting.steered_sessions import LEAST_ERROR, SteeredSessions, geometric_means
+from runners.reporting.steered_sessions import (
+    LEAST_ERROR,
+    SteeredSessions,
+    bootstrap_interval,
+    geometric_means,
+)
 from runners.reporting.tables import Cell, Table, number
 
 _MM = 1000.0
@@ -29,8 +34,8 @@ def error_over_probes(sessions: SteeredSessions, styles: Styles) -> Section:
         "mean square over points of both surfaces, on average over the set; before the first "
         "contact, of the poses that the free space allows. Spread: the same between two poses of "
         f"the belief. Geometric means over {sessions.count} sessions, which all policies have; "
-        f"errors below {_MM * LEAST_ERROR:g} mm count as {_MM * LEAST_ERROR:g} mm. Bands are the "
-        "25th to 75th percentiles."
+        f"errors below {_MM * LEAST_ERROR:g} mm count as {_MM * LEAST_ERROR:g} mm. Bands are 95 % "
+        "intervals of these means, by a bootstrap over configurations."
     )
     tables = (error_table(sessions, styles), spread_table(sessions, styles), *_ratios(sessions))
     title = "Error and spread over probes"
@@ -95,14 +100,10 @@ def picture_over_probes(sessions: SteeredSessions, styles: Styles) -> Picture:
         values = _MM * sessions.over_probes(column)
         means = geometric_means(values / _MM) * _MM
         for policy in sessions.policies:
-            own = values.loc[[policy]]
-            found = pd.DataFrame(
-                {
-                    "lower": own.quantile(0.25),
-                    "median": means.loc[policy],  # what the line shows
-                    "upper": own.quantile(0.75),
-                }
-            ).clip(lower=_MM * LEAST_ERROR)
+            logs = np.log(values.loc[policy].clip(lower=_MM * LEAST_ERROR))
+            bands = [np.exp(bootstrap_interval(logs[probes])) for probes in logs]
+            found = pd.DataFrame(bands, index=logs.columns, columns=["lower", "upper"])
+            found["median"] = means.loc[policy]  # what the line shows
             draw_quartiles(panel, found, styles[policy], alpha=0.08)
             found = found.rename(columns={"median": "geometric_mean"}).rename_axis("probes")
             data.append(found.reset_index().assign(number=column, policy=policy))

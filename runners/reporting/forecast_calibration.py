@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
 from runners.reporting.evaluation_folder import TRIAL
 from runners.reporting.figures import NotDrawn, Picture, legend_of_methods, new_figure
+from runners.reporting.method_style import MethodStyle
 from runners.reporting.section import Section, Styles, drawn
 from runners.reporting.statistics import shares
 from runners.reporting.steered_sessions import SESSION, SteeredSessions
@@ -17,6 +20,7 @@ STOP_FACTOR = 1.5  # of the spread at which a session stops; an error above is a
 _ALL = "all"
 _BINS = np.linspace(0.0, 1.0, 11)
 _MM = 1000.0
+_TOGETHER = MethodStyle("all, with 95 % intervals", "#cc3311", "", "-")
 
 
 def forecast_calibration(sessions: SteeredSessions, styles: Styles) -> Section | None:
@@ -138,18 +142,19 @@ def picture_of_hits(sessions: SteeredSessions, styles: Styles) -> Picture:
         if own.empty:
             continue
         found, style = hit_bins(own), styles[policy]
-        percent = 100.0 * found[["forecast", "share", "lower", "upper"]]
-        axes.errorbar(
-            percent["forecast"],
-            percent["share"],
-            yerr=[percent["share"] - percent["lower"], percent["upper"] - percent["share"]],
-            color=style.color,
-            marker=style.marker,
-            linestyle=style.line,
-            elinewidth=0.6,
-        )
+        looks: Any = {"color": style.color, "marker": style.marker, "linestyle": style.line}
+        axes.plot(100.0 * found["forecast"], 100.0 * found["share"], linewidth=0.8, **looks)
         shown.append(style)
         data.append(found.reset_index().assign(policy=policy))
+    found = hit_bins(rows)
+    percent = 100.0 * found[["forecast", "share", "lower", "upper"]]
+    below, above = percent["share"] - percent["lower"], percent["upper"] - percent["share"]
+    bars: Any = {"yerr": [below.clip(lower=0.0), above.clip(lower=0.0)], "color": _TOGETHER.color}
+    axes.errorbar(
+        percent["forecast"], percent["share"], linewidth=2.4, elinewidth=1.0, capsize=3.0, **bars
+    )
+    data.append(found.reset_index().assign(policy=_ALL))
+    shown.append(_TOGETHER)
     legend_of_methods(figure, shown)
     trials = rows.groupby(TRIAL).ngroups
     alt = f"Hits over their forecast chance, {len(rows)} probes in {trials} trials."

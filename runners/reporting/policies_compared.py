@@ -10,14 +10,17 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from runners.reporting.section import Section, Styles
-from runners.reporting.steered_sessions import LEAST_ERROR, SteeredSessions, geometric_means
+from runners.reporting.steered_sessions import (
+    LEAST_ERROR,
+    SteeredSessions,
+    bootstrap_interval,
+    geometric_means,
+)
 from runners.reporting.tables import Cell, Table, number, range_text
 
 PROBES = 10
 """After so many probes errors are compared, or at the end of shorter sessions."""
 _MM = 1000.0
-_RESAMPLES = 2000
-_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -92,19 +95,6 @@ def paired(sessions: SteeredSessions, policy: str) -> Paired:
         math.exp(lower),
         math.exp(upper),
     )
-
-
-def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
-    """95 % interval of the mean of values by (configuration, seed), configurations resampled.
-
-    The same every time.
-    """
-    groups = values.groupby("configuration")
-    sums, counts = groups.sum().to_numpy(), groups.size().to_numpy()
-    drawn = np.random.default_rng(_SEED).integers(len(sums), size=(_RESAMPLES, len(sums)))
-    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    lower, upper = np.quantile(means, [0.025, 0.975])
-    return float(lower), float(upper)
 
 
 def by_table(sessions: SteeredSessions, styles: Styles, by: str) -> Table:

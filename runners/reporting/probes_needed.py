@@ -95,8 +95,8 @@ def picture_of_found(sessions: SteeredSessions, styles: Styles) -> Picture:
     )
     axes.set_ylim(-2.0, 102.0)
     axes.set_xlim(1.0, max(sessions.budget, 2))
-    axes.set_xlabel("probes")
-    axes.set_ylabel(f"sessions that were below {_MM * GOOD:g} mm, %; dotted: solvable")
+    axes.set_xlabel("probes; dotted: sessions that any policy solves")
+    axes.set_ylabel(f"sessions below {_MM * GOOD:g} mm, %")
     legend_of_methods(figure, [styles[policy] for policy in sessions.policies])
     alt = f"Sessions below {_MM * GOOD:g} mm after {at[-1]} probes: {', '.join(texts)}."
     table = pd.DataFrame(data, index=pd.Index(at, name="probes")).reset_index()

@@ -17,6 +17,8 @@ REFERENCE = "information"
 LEAST_ERROR = 1e-4  # metres: an error below counts as this in geometric means
 GOOD = 0.010  # metres: what counts as found
 LIMITS = (0.020, GOOD, 0.005)  # metres
+_RESAMPLES = 2000
+_SEED = 0
 SESSION = ["policy", *TRIAL]
 """The columns that tell sessions apart."""
 
@@ -90,6 +92,19 @@ def geometric_means(values: pd.DataFrame) -> pd.DataFrame:
     """By policy and number of probes, of `over_probes`, metres."""
     logs = np.log(values.clip(lower=LEAST_ERROR))
     return np.exp(logs.groupby("policy", sort=False).mean())
+
+
+def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
+    """95 % interval of the mean of values by (configuration, seed), configurations resampled.
+
+    The same every time.
+    """
+    groups = values.groupby("configuration")
+    sums, counts = groups.sum().to_numpy(), groups.size().to_numpy()
+    drawn = np.random.default_rng(_SEED).integers(len(sums), size=(_RESAMPLES, len(sums)))
+    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    lower, upper = np.quantile(means, [0.025, 0.975])
+    return float(lower), float(upper)
 
 
 def first_below(values: pd.DataFrame, limit: float) -> pd.Series:

@@ -13,9 +13,10 @@ from runners import report
 from runners.reporting.error_over_probes import ratios_to_best
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.forecast_calibration import first_stops, forecast_rows, hit_bins
-from runners.reporting.policies_compared import bootstrap_interval, paired
+from runners.reporting.policies_compared import paired
 from runners.reporting.steered_sessions import (
     SteeredSessions,
+    bootstrap_interval,
     censored_quantile,
     first_below,
     geometric_means,
@@ -135,6 +136,7 @@ def test_the_page_has_all_sections_and_numbers(tmp_path: Path, rows: list[Row]) 
     done = run(report.main, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     assert "no picture" not in done.stdout
+    assert "Error beside information after 4 probes" in done.stdout
     page = page_of(tmp_path / "report")
     needed = page.tables["Probes until the error of the set is below a limit"]
     assert needed[0][:3] == ["policy", "to 20 mm", "to 10 mm"]
