@@ -83,7 +83,8 @@ def next_probe_webp(sessions: Sessions) -> bytes:
     """A drill found on the paper's grid and by information, side by side."""
     shared = ("object=drill", "session=kinematic", "method=anchored", "recording=mcap")
     grid = sessions.run("grid", *shared, "session.start_contacts=1", "session.start_probe=0")
-    steered = sessions.run("information", *shared, "policy=information")
+    choices = ("policy=information", "policy.stop.spread=0.005")
+    steered = sessions.run("information", *shared, *choices)
     webp = sessions.folder / "next_probe.webp"
     files = {"grid": grid, "information": steered}
     named = [f"{title}={folder / 'recording.mcap'}" for title, folder in files.items()]

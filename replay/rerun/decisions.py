@@ -87,6 +87,8 @@ class ActionArrows:
 
     def set_up(self, actions: Actions) -> None:
         """Store an arrow for each action, all of them unavailable yet."""
+        if len(actions) == 0:
+            return
         starts, ways = _starts(actions), _ways(actions)
         size = float(np.linalg.norm(np.ptp(np.concatenate([starts, starts + ways]), axis=0)))
         longest = min(_ARROW * size, float(actions.length.max()))
