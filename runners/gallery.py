@@ -32,6 +32,8 @@ _WINDOW = (1920, 1200)  # of the animation, of which two views are shown
 _WIDTH = 720  # of the animation
 _FRAME, _LAST_FRAME = 400, 2500  # milliseconds
 _TEXT_SIZE, _TEXT_COLOR = 22.0, (230, 232, 236)
+_KINEMATIC_DRILL = ("object=drill", "session=kinematic", "method=anchored")
+_STEERED = ("policy=information", "policy.stop.spread=0.005")
 _SCENE, _LEGEND = "Scene", "Legend"
 
 
@@ -81,15 +83,20 @@ def fault_png(sessions: Sessions, *, level: str) -> bytes:
 
 def next_probe_webp(sessions: Sessions) -> bytes:
     """A drill found on the paper's grid and by information, side by side."""
-    shared = ("object=drill", "session=kinematic", "method=anchored", "recording=mcap")
-    grid = sessions.run("grid", *shared, "session.start_contacts=1", "session.start_probe=0")
-    choices = ("policy=information", "policy.stop.spread=0.005")
-    steered = sessions.run("information", *shared, *choices)
+    starts = ("session.start_contacts=1", "session.start_probe=0")
+    grid = sessions.run("grid", *_KINEMATIC_DRILL, *starts)
+    steered = sessions.run("information", *_KINEMATIC_DRILL, *_STEERED)
     webp = sessions.folder / "next_probe.webp"
     files = {"grid": grid, "information": steered}
     named = [f"{title}={folder / 'recording.mcap'}" for title, folder in files.items()]
     _run("runners.reporting.probing_animation", str(webp), *named)
     return webp.read_bytes()
+
+
+def next_probe_png(sessions: Sessions) -> bytes:
+    """The viewer on the steered one of these sessions, at a decision."""
+    folder = sessions.run("information", *_KINEMATIC_DRILL, *_STEERED)
+    return _viewer(folder / "recording.rrd", sessions.folder, step=2)
 
 
 def robot_log_png(sessions: Sessions) -> bytes:
@@ -110,6 +117,7 @@ PICTURES: dict[str, Callable[[Sessions], bytes]] = {
     **{f"docs/real_data/{level}.png": partial(fault_png, level=level) for level in KINDS},
     "docs/robot_log.png": robot_log_png,
     "docs/next_probe.webp": next_probe_webp,
+    "docs/next_probe.png": next_probe_png,
 }
 """What makes the content of each file."""
 
