@@ -42,7 +42,7 @@ def policies_compared(sessions: SteeredSessions, styles: Styles) -> Section | No
     """None unless there are sessions of two policies."""
     if len(sessions.policies) < 2 or not sessions.count:
         return None
-    probes = min(PROBES, sessions.budget)
+    probes = sessions.after(PROBES)
     text = (
         f"Errors of the set after {probes} probes, session by session. A ratio is the error of a "
         f"policy by that of {styles[sessions.reference].title} in the same configuration with the "
@@ -73,13 +73,13 @@ def paired_table(sessions: SteeredSessions, styles: Styles) -> Table:
         "The interval is a bootstrap over configurations, of which all seeds are drawn together; "
         "the sign test takes sessions as independent."
     )
-    name = f"Error beside {title} after {min(PROBES, sessions.budget)} probes"
+    name = f"Error beside {title} after {sessions.after(PROBES)} probes"
     return Table(name, (*header, *ratios), tuple(rows), note=note)
 
 
 def paired(sessions: SteeredSessions, policy: str) -> Paired:
     """A policy beside the reference."""
-    errors = sessions.errors[min(PROBES, sessions.budget)].clip(lower=LEAST_ERROR)
+    errors = sessions.errors[sessions.after(PROBES)].clip(lower=LEAST_ERROR)
     logs = np.log(errors.loc[policy] / errors.loc[sessions.reference])
     wins, losses = int((logs > 0.0).sum()), int((logs < 0.0).sum())
     test = binomtest(wins, wins + losses).pvalue if wins + losses else 1.0
@@ -99,7 +99,7 @@ def paired(sessions: SteeredSessions, policy: str) -> Paired:
 
 def by_table(sessions: SteeredSessions, styles: Styles, by: str) -> Table:
     """Geometric means of the errors by what a column of the rows holds, mm."""
-    probes = min(PROBES, sessions.budget)
+    probes = sessions.after(PROBES)
     rows = []
     for value, some in sessions.rows.groupby(by, sort=True):
         trials = pd.MultiIndex.from_frame(some[["configuration", "seed"]].drop_duplicates())

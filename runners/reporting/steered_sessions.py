@@ -44,12 +44,15 @@ class SteeredSessions:
         return self.over_probes("error")
 
     def over_probes(self, column: str) -> pd.DataFrame:
-        """A row per session (policy, configuration, seed), a column per number of probes from 1.
+        """A row per session (policy, configuration, seed), a column per number of probes.
 
-        A session that ends before the budget keeps its last number.
+        A session that ends before others keeps its last number.
         """
-        table = self.rows.pivot(index=SESSION, columns="probes", values=column)
-        return table.reindex(columns=range(1, self.budget + 1)).ffill(axis=1)
+        return self.rows.pivot(index=SESSION, columns="probes", values=column).ffill(axis=1)
+
+    def after(self, probes: int) -> int:
+        """This number of probes, or the greatest below it that any session has."""
+        return max(number for number in self.errors.columns if number <= probes)
 
     @cached_property
     def solvable(self) -> pd.MultiIndex:
@@ -100,9 +103,9 @@ def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
     The same every time.
     """
     groups = values.groupby("configuration")
-    sums, counts = groups.sum().to_numpy(), groups.size().to_numpy()
+    sums, counts = groups.sum().to_numpy(), groups.count().to_numpy()
     drawn = np.random.default_rng(_SEED).integers(len(sums), size=(_RESAMPLES, len(sums)))
-    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1).clip(min=1)
     lower, upper = np.quantile(means, [0.025, 0.975])
     return float(lower), float(upper)
 

@@ -10,11 +10,13 @@ import pandas as pd
 import pytest
 
 from runners import report
+from runners.evaluation.table import PROBES
 from runners.reporting.error_over_probes import ratios_to_best
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.forecast_calibration import first_stops, forecast_rows, hit_bins
 from runners.reporting.policies_compared import paired
 from runners.reporting.steered_sessions import (
+    SESSION,
     SteeredSessions,
     bootstrap_interval,
     censored_quantile,
@@ -23,6 +25,7 @@ from runners.reporting.steered_sessions import (
     steered_sessions,
 )
 from tests.runners.in_process import run
+from tests.runners.made_up_evaluations import write_table
 from tests.runners.made_up_sessions import Row, session, write_sessions
 from tests.runners.test_report import page_of
 
@@ -168,3 +171,31 @@ def test_what_is_not_there_yet_is_said(tmp_path: Path, rows: list[Row], kept: in
     assert (done.returncode, done.stderr) == (0, "")
     page = page_of(tmp_path / "report")
     assert [line[0] for line in page.tables["What is there"][1:]] == ["information", "grid"]
+
+
+def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(
+    tmp_path: Path, rows: list[Row]
+) -> None:
+    write_sessions(tmp_path, rows, BUDGETS)
+    whole = steered_sessions(open_evaluation(tmp_path))
+    (tmp_path / "probes.parquet").unlink()
+    for row in rows:
+        part = tmp_path / "trials" / row["configuration"] / f"seed_{row['seed']}"
+        part.mkdir(parents=True, exist_ok=True)
+        same = [one for one in rows if all(one[name] == row[name] for name in SESSION)]
+        write_table(part / f"{row['policy']}.parquet", same, PROBES)
+    evaluation = open_evaluation(tmp_path)
+    assert evaluation.gathered
+    pd.testing.assert_frame_equal(steered_sessions(evaluation).errors, whole.errors)
+
+
+def test_numbers_that_cannot_be_are_neither_drawn_nor_counted(
+    tmp_path: Path, rows: list[Row]
+) -> None:
+    odd = [{**rows[0], "probes": probes, "step": probes} for probes in (-1, 0, 2**62)]
+    odd += [{**rows[4], "error": math.nan, "spread": math.inf}, {**rows[8], "status": "failed: x"}]
+    write_sessions(tmp_path, [*odd, *rows], {})
+    assert run(report.main, str(tmp_path)).returncode == 0
+    write_sessions(tmp_path, [*odd, *rows], BUDGETS)
+    found = steered_sessions(open_evaluation(tmp_path))
+    assert found.errors.shape == (6, 4)
