@@ -187,8 +187,7 @@ class McapRecorder(Recorder):
     def _write_decision(self, event: Decided) -> None:
         problem, start, offered = event.problem, self._start, self._offered
         assert start is not None
-        assert offered is not None
-        if not (
+        if offered is None or not (
             self._is_given(problem)
             and (problem.workspace, problem.free_resolution)
             == (start.workspace, start.free_resolution)

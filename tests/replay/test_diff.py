@@ -24,6 +24,7 @@ from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.foxglove_messages import FOXGLOVE
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import RECORDS
+from tests.replay.conftest import with_decisions
 
 Messages = list[tuple[str, int, bytes]]
 
@@ -378,7 +379,7 @@ def test_files_that_cannot_be_used_are_named(events, write, tmp_path, capsys):
 
 def test_every_topic_is_met(sensor_events, write):
     """So that no topic of the table is passed over in silence, but seals, which follow from all."""
-    path = write(sensor_events)
+    path = write(with_decisions(sensor_events))
     with path.open("rb") as file:
         topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
     assert set(RECORDS) <= topics
