@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
+from chsel.problem.poses import apply
 from replay.mcap.reader import read_recording
+from replay.rerun.meshes import deepest
 from runners.reporting import probing_animation
 from runners.reporting.probing_animation import (
     Moment,
@@ -17,6 +21,7 @@ from runners.reporting.probing_animation import (
     ShownSession,
     moments,
 )
+from runners.reporting.silhouette import Oblique
 from tests.runners.made_up_evaluations import REPLAYS
 
 CHSEL = REPLAYS / "mustard_chsel.mcap"  # four probes, results after the last two
@@ -65,6 +70,24 @@ def test_a_frame_has_poses_contacts_paths_and_errors_of_each_session() -> None:
         assert [line.get_color() for line in ways] == ["#aaaaaa"] * 9 + ["#555555"]
     drawn = [line.get_xydata().tolist() for line in curves.lines]
     assert drawn == [session.curve(9).tolist() for session in sessions]
+
+
+def test_the_hand_is_drawn_where_it_is_and_its_forecast_ahead_of_it() -> None:
+    met = np.array([[0.1, 0.0, 0.2], [0.2, 0.1, 0.2]])
+    hand = trimesh.creation.box(extents=(0.05, 0.1, 0.1))
+    session = replace(shown(CLAMP), hand=hand, forecasts={9: met})
+    drawn, path = ProbingAnimation([session]), session.probes[9].gripper_path
+    panel, _ = drawn.figure(Moment(9, 1.0, 0)).axes
+    (dots,) = (line for line in panel.lines if line.get_marker() == ".")
+    frame = Oblique((0, 1), np.zeros(2), np.ones(2))
+    np.testing.assert_allclose(dots.get_xydata(), frame.flat(met))
+    fill = np.concatenate([path.vertices for path in panel.collections[-1].get_paths()])
+    corners = frame.flat(apply(path[deepest(path)], hand.vertices))
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(fill, axis=0), end(corners, axis=0), atol=0.015)
+    after, _ = drawn.figure(Moment(10, 0.0, 0)).axes
+    assert len(after.collections) == len(session.poses[9]) + 1  # no hand
+    assert "." not in [line.get_marker() for line in after.lines]
 
 
 def test_the_command_writes_an_animation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

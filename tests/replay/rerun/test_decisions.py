@@ -214,6 +214,11 @@ def test_the_log_says_what_was_decided(rows: dict[str, list[Row]]) -> None:
     ]
 
 
+def test_the_text_about_the_session_names_the_policy(rows: dict[str, list[Row]]) -> None:
+    ((_, values),) = rows["/session"]
+    assert "| policy | **information** |" in values["TextDocument:text"][0]
+
+
 def test_only_steered_sessions_have_views_of_decisions(tmp_path: Path, recording: Path) -> None:
     kept: Any = (e for e in session() if not isinstance(e, ActionsOffered | Decided))
     plain = write(tmp_path / "b.rrd", kept)
