@@ -21,6 +21,7 @@ from chsel.numerics.threads import threads as use_threads
 from chsel.problem.online_registration import OnlineSettings, first_initial_set
 from chsel.problem.settings import in_preset
 from chsel.problem.streams import StreamKey
+from runners.benchmarks.decisions import decisions
 from runners.benchmarks.depth_images import depth_images
 from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
 from runners.benchmarks.plausible_sets import plausible_sets
@@ -185,6 +186,7 @@ MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
     "free_points": free_points,
     "hypotheses": hypotheses,
     "methods": methods,
+    "decisions": decisions,
     "plausible_sets": plausible_sets,
     "depth_images": depth_images,
     "evaluation": evaluation,

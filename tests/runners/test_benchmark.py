@@ -15,11 +15,13 @@ import pytest
 import torch
 from matplotlib.container import BarContainer
 
+from chsel.policies import POLICIES
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from runners import benchmark
 from runners.benchmarks.benchmark_tables import number, ratios
 from runners.benchmarks.comparison import BenchmarkError, require_equal
+from runners.benchmarks.decisions import decisions
 from runners.benchmarks.measures import methods
 from runners.benchmarks.plausible_sets import plausible_sets
 from runners.benchmarks.plot import picture_of_benchmark
@@ -262,6 +264,16 @@ def test_plausible_sets_of_34_million_poses_are_measured() -> None:
     assert all(len(row.samples) == 2 and min(row.samples) > 0.0 for row in taken)
     poses = [row.median for row in rows if row.unit == "poses"]
     assert poses == [15**3 * 10_101] * 3
+
+
+def test_every_policy_decides_about_200_actions() -> None:
+    rows = list(decisions(scope(repeats=2)))
+    assert [row.case.split(",")[0] for row in rows] == [*POLICIES] * 2
+    assert [row.at for row in rows] == [30.0] * len(POLICIES) + [100.0] * len(POLICIES)
+    assert all("poses, 1" in row.case for row in rows)  # 200 at most
+    assert all(len(row.samples) == 2 and min(row.samples) > 0.0 for row in rows)
+    by_poses = [np.median([row.median for row in rows if row.at == at]) for at in (30.0, 100.0)]
+    assert by_poses[0] < by_poses[1]
 
 
 def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> None:
