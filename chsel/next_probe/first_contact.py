@@ -15,10 +15,12 @@ from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.subset import farthest_points
 from chsel.problem.surface import surface_points
 
-POINTS = 2000  # on the object's surface, among which a first contact is sought
+POINTS = 800  # on the object's surface, evenly spread, among which a first contact is sought
 _FINE_POINTS = 20_000  # on it as well, of which those around the best of the others decide
+_CANDIDATES = 5000  # of these, from which the others are taken
 _CELL = 0.005  # metres: of two points that a hand sees in one cell, the nearer counts
 _MOST_CELLS = 60  # along a side of what a hand sees: of a larger object cells are larger
 
@@ -48,12 +50,12 @@ class Moves(NamedTuple):
 
 
 class _View(NamedTuple):
-    """Scratch: what of an object a hand sees that moves towards it, nearest points by rows of x."""
+    """Scratch: what of an object a hand sees that moves towards it, nearest points by cells."""
 
     nearest: Any  # (G, G): index of the point seen in a cell, -1 for none
     seen: FloatArray  # (N, 3): points in axes of the hand, as they are computed
-    rows: Any  # (G + 1,): where the points of each row begin in `order`
-    order: Any  # (N,): indices of the points that are seen, row by row
+    begin: Any  # (G, G + 1): where the points of each cell begin in `order`
+    order: Any  # (N,): indices of the points that are seen, by rows of x, then by y
 
 
 def first_contacts(
@@ -80,7 +82,7 @@ def first_contacts(
         return _View(
             np.empty((size, size), dtype=np.int64),
             np.empty((len(points), 3)),
-            np.empty(size + 1, dtype=np.int64),
+            np.empty((size, size + 1), dtype=np.int64),
             np.empty(len(points), dtype=np.int64),
         )
 
@@ -99,8 +101,8 @@ def touched_points(sdf: SdfGrid) -> TouchedPoints:
 
 def _touched_points(sdf: SdfGrid) -> TouchedPoints:
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    points = surface_points(sdf, POINTS, stream)
     fine = surface_points(sdf, _FINE_POINTS, stream)
+    points = fine[farthest_points(fine[:_CANDIDATES], POINTS)]
     owner = np.empty(len(fine), dtype=np.int64)
     find_nearest(points, fine, owner)
     order = np.argsort(owner, kind="stable")
@@ -152,31 +154,34 @@ def meet(
     heights, hx, hy, side = front.heights, front.lower[0], front.lower[1], front.cell
     nx, ny = heights.shape
     seen, turn, fine = view.seen, moves.rotation, surface.fine
-    width, per_side = nx * side, 1.0 / side
+    width_x, width_y, per_side, per_cell = nx * side, ny * side, 1.0 / side, 1.0 / cell
     best, hand_from_object = np.empty(3, dtype=np.int64), np.empty(12)
     for k in range(some[0], some[1]):
         _turn(turn, poses[k], hand_from_object)
-        lower = _look(surface.points, hand_from_object, view, cell)
-        rows = len(view.rows) - 1
+        low_x, low_y = _look(surface.points, hand_from_object, view, cell)
+        size = len(view.nearest)
         for a in range(len(moves.which)):
             x, y, z = moves.starts[a, 0] + hx, moves.starts[a, 1] + hy, moves.starts[a, 2]
-            first = int(min(max((x - lower) / cell, 0.0), rows + 0.0))
-            last = int(min(max((x + width - lower) / cell + 1.0, 0.0), rows + 0.0))
+            first = int(min(max((x - low_x) * per_cell, 0.0), size + 0.0))
+            last = int(min(max((x + width_x - low_x) * per_cell + 1.0, 0.0), size + 0.0))
+            left = int(min(max((y - low_y) * per_cell, 0.0), size + 0.0))
+            right = int(min(max((y + width_y - low_y) * per_cell + 1.0, 0.0), size + 0.0))
             least, second, third = np.inf, np.inf, np.inf
             best[:] = -1
-            for n in range(view.rows[first], view.rows[last]):
-                p = view.order[n]
-                i, j = (seen[p, 0] - x) * per_side, (seen[p, 1] - y) * per_side
-                if i >= 0.0 and i < nx and j >= 0.0 and j < ny:
-                    way = seen[p, 2] - z - heights[int(i), int(j)]
-                    if way < least:
-                        least, second, third = way, least, second
-                        best[2], best[1], best[0] = best[1], best[0], p
-                    elif way < second:
-                        second, third = way, second
-                        best[2], best[1] = best[1], p
-                    elif way < third:
-                        third, best[2] = way, p
+            for row in range(first, last):
+                for n in range(view.begin[row, left], view.begin[row, right]):
+                    p = view.order[n]
+                    i, j = (seen[p, 0] - x) * per_side, (seen[p, 1] - y) * per_side
+                    if i >= 0.0 and i < nx and j >= 0.0 and j < ny:
+                        way = seen[p, 2] - z - heights[int(i), int(j)]
+                        if way < least:
+                            least, second, third = way, least, second
+                            best[2], best[1], best[0] = best[1], best[0], p
+                        elif way < second:
+                            second, third = way, second
+                            best[2], best[1] = best[1], p
+                        elif way < third:
+                            third, best[2] = way, p
             if best[0] < 0:
                 continue
             place = (seen[best[0], 0], seen[best[0], 1], seen[best[0], 2])
@@ -226,9 +231,9 @@ def _turned(pose: Any, x: Any, y: Any, z: Any) -> Any:
 
 @inner
 def _look(points: Any, hand_from_object: Any, view: Any, cell: Any) -> Any:
-    """Turn the object into the axes of the hand, and order what is seen of it by rows of x.
+    """Turn the object into the axes of the hand, and order what is seen of it by cells.
 
-    Returns the x of the first row's edge.
+    Returns x and y of the first cell's corner.
     """
     seen, nearest = view.seen, view.nearest
     size, per_cell = len(nearest), 1.0 / cell
@@ -248,10 +253,10 @@ def _look(points: Any, hand_from_object: Any, view: Any, cell: Any) -> Any:
             nearest[i, j] = n
     count = 0
     for i in range(size):
-        view.rows[i] = count
         for j in range(size):
+            view.begin[i, j] = count
             if nearest[i, j] >= 0:
                 view.order[count] = nearest[i, j]
                 count += 1
-    view.rows[size] = count
-    return low_x
+        view.begin[i, size] = count
+    return low_x, low_y
