@@ -21,6 +21,7 @@ from runners.benchmarks.registrations import Scope
 from runners.benchmarks.timing import Row, in_turn, milliseconds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.sessions import open_session, session_settings
+from runners.sessions.session import Steerable
 
 _OBJECT = ObjectConfig("drill", 2.5, 0.001, "drill")
 _POSES = (30, 100)
@@ -50,6 +51,7 @@ def _probed(seed: int) -> tuple[DecisionProblem, FloatArray]:
     session = open_session(
         "kinematic", session_settings("kinematic", {}), load_object(_OBJECT, Path()), seed
     )
+    assert isinstance(session, Steerable)
     actions = session.offer(ActionSettings())
     points = session.initial_points
     for step in range(3):

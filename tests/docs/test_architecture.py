@@ -15,7 +15,9 @@ import yaml
 from numba.core.caching import _CacheLocator
 
 from chsel import CompiledCost
+from chsel.next_probe.forecast import Forecast
 from chsel.numerics.compiler import cache_directory, kernel_sources
+from replay.events import Decided
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.evaluation_folder import open_evaluation
 from tests.docs.page import commands_in, named_blocks, section, shell, take_over
@@ -24,7 +26,13 @@ from tests.runners.made_up_evaluations import made_up_rows, write_evaluation
 PAGE = "architecture.md"
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGES = ("chsel", "conf", "replay", "runners")
-RECIPES = ("Adding a method", "Adding an object", "Adding a session kind", "Adding an event")
+RECIPES = (
+    "Adding a method",
+    "Adding a policy",
+    "Adding an object",
+    "Adding a session kind",
+    "Adding an event",
+)
 REPORT_RECIPES = ("Adding a figure", "Adding a column")
 
 
@@ -111,6 +119,22 @@ def test_its_kernel_is_checked_as_all_are(copy: Path) -> None:
     code = "from chsel.numerics.compiler import kernel_sources as k; print(*k(), sep='\\n')"
     assert str(copy / "chsel" / "methods" / "annealing.py") in run(f'python -c "{code}"', copy)
     assert list((copy / "kernels").rglob("annealing.accepted*.nbi"))
+
+
+def test_a_policy_scores_by_how_far_the_hand_gets(copy: Path) -> None:
+    recording = recorded(copy, "clamp_gradient_descent")
+    assert recording.start.config["policy"]["limit"] == 0.2
+    decisions = [event for event in recording.events() if isinstance(event, Decided)]
+    assert [event.step for event in decisions] == [-1, 0, 1, 2]
+    for event in decisions:
+        problem, score = event.problem, event.decision.score
+        first = Forecast(problem, 0.002).first
+        way = np.minimum(first.travel, problem.actions.length)
+        mean = problem.belief.weights @ way
+        scatter = np.sqrt(problem.belief.weights @ np.minimum(np.abs(way - mean), 0.2) ** 2)
+        taken = np.isfinite(score)
+        assert score[taken] == pytest.approx(scatter[taken], abs=1e-9)
+        assert taken.sum() > 50
 
 
 def test_an_object_is_probed_where_its_configuration_says(copy: Path) -> None:
