@@ -53,6 +53,7 @@ class KinematicEngine:
         self.world_from_object = world_from_object
         self._object = _Surface(mesh, world_from_object)
         self._patches = self._forward = _patches(hand)
+        self._turn = np.eye(3)  # of the patches, from how a hand probes along x
         self._position = np.array(START)
         self._force = settings.max_force
         # No point of a patch is nearer to the object than this; kept true as the hand moves.
@@ -82,7 +83,9 @@ class KinematicEngine:
     def place(self, pose: FloatArray) -> bool:
         """Put the hand at a pose (4, 4); False, and not to be used, if the object is there."""
         turn, position = turned_from_forward(pose[:3, :3]), pose[:3, 3]
-        self._patches, self._position = self._forward.turned(turn), position
+        if not (turn == self._turn).all():
+            self._turn, self._patches = turn, self._forward.turned(turn)
+        self._position = position
         patches = self._patches
         self._clearance = self._object.distance(patches.centres + position) - patches.radii
         close = np.isin(patches.labels, np.flatnonzero(self._clearance <= 0.0))
