@@ -77,6 +77,13 @@ PLANTS = {
         "cracker_box_chsel",
         "choosing the hypotheses",
     ),
+    "the choice of an action": Plant(
+        "chsel/policies/policy.py",
+        "chosen = -1 if stop else int(np.argmax(score))",
+        "chosen = -1 if stop else int(np.argsort(score)[-2])",
+        "box_steered",
+        "the choice",
+    ),
 }
 
 
@@ -131,7 +138,7 @@ def test_a_planted_change_is_found_and_its_stage_named(
     done = runs[name]
     assert done.returncode == 1, done.stderr
     stages = re.findall(r"first difference: (.*) \(", done.stdout)
-    steps = re.findall(r"step \d+, \w+: differs", done.stdout)
+    steps = re.findall(r"step -?\d+, \w+: differs", done.stdout)
     assert len(steps) == len(stages) > 0
     assert set(stages) == {PLANTS[name].stage}, done.stdout
 

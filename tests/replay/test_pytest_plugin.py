@@ -102,6 +102,7 @@ def test_every_object_and_method_has_stored_replays_of_a_modest_size() -> None:
     assert {(name, method) for name in objects for method in chsel} <= found
     for method in METHODS:
         assert len({name for name, stored in found if stored == method}) >= 4, method
+    assert any("policy" in start.config for start in starts)
     assert {"simulated", "points"} <= {start.session for start in starts}
 
 

@@ -22,9 +22,11 @@ from chsel.problem.poses import apply, axis_angle, compose
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import PRESETS
 from runners.objects.loader import ObjectConfig, load_object
+from tests.tools.small_recordings import steered_session, write_recording
 
 FOLDER = Path(__file__).parents[1] / "replays"
 MOST_BYTES = 2**20
+STEERED = "box_steered"  # the one with decisions
 _POINTS = "points.npz"
 _BRIEF = ["recording=mcap", "recording.snapshot_interval=0"]
 _SMALL = ["session.object_resolution=0.03", "session.free_resolution=0.05"]
@@ -91,6 +93,7 @@ def cases() -> dict[str, list[str]]:
     points = [*_OF_POINTS, "session.object_resolution=0.01"]
     plane = "method.plane={plane_height: 0.0}"
     return found | {
+        STEERED: [],  # of `tests.tools.small_recordings`: those of commands are larger
         "points_mustard": ["object=mustard", *points, *_QUICK, "recording.snapshot_interval=10"],
         "points_two_passes": ["object=drill", *points, *_QUICK, "method.passes=2", "seed=3"],
         "points_on_a_table": [
@@ -137,6 +140,10 @@ def write_points(path: Path, name: str) -> None:
 def make(name: str, arguments: list[str]) -> Path:
     """Run the session and keep its recording."""
     target = FOLDER / f"{name}.mcap"
+    if name == STEERED:
+        target.unlink(missing_ok=True)
+        write_recording(target, steered_session())
+        return target
     with tempfile.TemporaryDirectory() as folder:
         if "session=points" in arguments:
             write_points(Path(folder) / _POINTS, arguments[0].removeprefix("object="))
