@@ -26,7 +26,7 @@ from chsel.problem.settings import positive
 from chsel.problem.subset import evenly_spaced
 
 _MOST_VOXELS = 1_000_000
-_MOST_POINTS = 20_000  # inside of an object
+_MOST_POINTS = 5000  # inside of an object
 _WIDEST = 250  # cells that a hand is widened by, at most
 
 
