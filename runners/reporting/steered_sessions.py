@@ -88,7 +88,7 @@ def _probes(policy: Any) -> int:
     """The budget of a policy by experiment.json; 0 if that does not say."""
     settings = policy.get("settings") if isinstance(policy, Mapping) else None
     probes = settings.get("probes") if isinstance(settings, Mapping) else None
-    return probes if isinstance(probes, int) else 0
+    return probes if isinstance(probes, int) and probes > 0 else 0
 
 
 def geometric_means(values: pd.DataFrame) -> pd.DataFrame:

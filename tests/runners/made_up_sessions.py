@@ -35,7 +35,7 @@ def session(
     ]
 
 
-def write_sessions(folder: Path, rows: Sequence[Row], budgets: Mapping[str, int]) -> Path:
+def write_sessions(folder: Path, rows: Sequence[Row], budgets: Mapping[str, int | None]) -> Path:
     """A folder with these rows. budgets: probes of a session, by policy."""
     policies = {
         name: {"name": name, "settings": {"probes": probes}} for name, probes in budgets.items()

@@ -180,7 +180,6 @@ def test_a_policy_has_the_changes_of_all_and_its_own() -> None:
         (["methods=[anchored,icp]"], "methods has 2; accepted with policies: one"),
         (["methods=chsel"], "methods is ['chsel'], was ['anchored']"),
         (["steps=1"], "steps is 1; accepted with policies: null"),
-        (["session=sensors", "session/rig=cabinet"], "session is sensors; accepted with policies"),
         (["policies=null"], "steered is False, was True"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

@@ -15,6 +15,8 @@ from runners.reporting.error_over_probes import ratios_to_best
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.forecast_calibration import first_stops, forecast_rows, hit_bins
 from runners.reporting.policies_compared import paired
+from runners.reporting.section import Subject
+from runners.reporting.sections import sections_of
 from runners.reporting.steered_sessions import (
     SESSION,
     SteeredSessions,
@@ -167,10 +169,15 @@ def test_the_page_has_all_sections_and_numbers(tmp_path: Path, rows: list[Row]) 
 @pytest.mark.parametrize("kept", [0, 1, 4])
 def test_what_is_not_there_yet_is_said(tmp_path: Path, rows: list[Row], kept: int) -> None:
     write_sessions(tmp_path, rows[:kept], BUDGETS)
-    done = run(report.main, str(tmp_path))
-    assert (done.returncode, done.stderr) == (0, "")
-    page = page_of(tmp_path / "report")
-    assert [line[0] for line in page.tables["What is there"][1:]] == ["information", "grid"]
+    first, *others = sections_of(Subject(open_evaluation(tmp_path)))
+    counts = next(table for table in first.tables if table.title == "What is there")
+    there = [(line[0].text, line[1].text, line[3].text) for line in counts.rows]
+    if kept == 0:
+        assert there == [("information", "0 of 0", "0"), ("grid", "0 of 0", "0")]
+        assert {one.missing for one in others} == {"no session is finished by all policies"}
+    else:  # of the one that has begun
+        assert there == [("information", "1 of 1", str(kept)), ("grid", "0 of 1", "0")]
+        assert "policies-compared" not in {one.name for one in others}
 
 
 def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(
@@ -194,8 +201,10 @@ def test_numbers_that_cannot_be_are_neither_drawn_nor_counted(
 ) -> None:
     odd = [{**rows[0], "probes": probes, "step": probes} for probes in (-1, 0, 2**62)]
     odd += [{**rows[4], "error": math.nan, "spread": math.inf}, {**rows[8], "status": "failed: x"}]
-    write_sessions(tmp_path, [*odd, *rows], {})
-    assert run(report.main, str(tmp_path)).returncode == 0
+    write_sessions(tmp_path, [*odd, *rows], dict.fromkeys(BUDGETS))
+    evaluation = open_evaluation(tmp_path)
+    assert steered_sessions(evaluation).errors.shape == (6, 5)
+    assert len(sections_of(Subject(evaluation))) == 6
     write_sessions(tmp_path, [*odd, *rows], BUDGETS)
     found = steered_sessions(open_evaluation(tmp_path))
     assert found.errors.shape == (6, 4)
