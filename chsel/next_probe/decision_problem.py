@@ -96,6 +96,11 @@ class DecisionProblem:
 
     def __post_init__(self) -> None:
         require_positive("free_resolution", self.free_resolution)
+        farthest = float(np.abs(self.hand.bounds).max())
+        if farthest > FARTHEST:
+            raise SettingError(
+                f"the hand reaches {farthest:.3g} m from its origin; accepted: up to {FARTHEST:g} m"
+            )
         flags = frozen(
             "available", self.available, (len(self.actions),), dtype=np.bool_, error=SettingError
         )

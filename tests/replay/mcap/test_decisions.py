@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chsel.errors import ChselError, RecordingError
+from chsel.errors import ChselError, RecordingError, SettingError
+from chsel.next_probe.hand_shape import HandShape
 from replay.events import ActionsOffered, Decided, Event, Measured, Probe, ProblemPosed
 from replay.mcap import event_reader
 from replay.mcap.reader import read_recording
@@ -119,6 +120,15 @@ def test_actions_are_offered_once_at_the_start_of_a_steered_session(
     ):
         with pytest.raises(RecordingError, match=message):
             write(events)
+
+
+def test_a_hand_far_from_its_origin_makes_no_problem(steered_events: list[Event]) -> None:
+    """Its front, in cells of millimetres, would have none."""
+    problem = next(event.problem for event in steered_events if isinstance(event, Decided))
+    for offset in (2e6, 1e17, 1e300):
+        hand = HandShape(problem.hand.vertices + offset, problem.hand.faces)
+        with pytest.raises(SettingError, match=r"the hand reaches .* m from its origin; accepted"):
+            dataclasses.replace(problem, hand=hand)
 
 
 def test_the_problem_of_a_decision_follows_from_what_came_before(
