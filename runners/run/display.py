@@ -113,10 +113,9 @@ class Display:
         text += f" {row['free_points']:>6} free"
         if "best_cost" in row:
             text += f"  cost {row['best_cost']:<8.3g}"
+            text += "" if "spread" in row else f" {row['distinct']:>2} distinct"
         if "spread" in row:
-            text += f" spread {1000.0 * row['spread']:5.1f} mm"
-        elif "distinct" in row:
-            text += f" {row['distinct']:>2} distinct"
+            text += f" spread{1000.0 * row['spread']:6.1f} mm"
         self._console.print(f"{text} {row['seconds']:>5.2f} s")
 
     def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
