@@ -102,7 +102,7 @@ class ConfiguredPolicy(Generic[Settings]):
         settings = self.settings
         if problem.key.step >= settings.probes:
             return "budget"
-        if forecast.spread <= settings.stop.spread:
+        if settings.stop.spread > 0.0 and forecast.spread <= settings.stop.spread:
             return "spread"
         if not feasible.any():
             return "actions"

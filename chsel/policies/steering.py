@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from chsel.errors import ChselError
 from chsel.next_probe.belief import belief_after, belief_before
 from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
 from chsel.next_probe.hand_shape import HandShape
@@ -54,7 +55,8 @@ class Steering:
     ) -> Choice:
         """What to do after so many probes, by the last result; None before there was one.
 
-        points: all that are known. available (A,): the actions that can be taken now.
+        points: all that are known. available (A,): the actions that can be taken now. Raises
+        ChselError if the policy, of another package, gives something else than a decision.
         """
         key = StreamKey(self._seed, done)
         problem = DecisionProblem(
@@ -68,7 +70,9 @@ class Steering:
             self.hand,
             key,
         )
-        self.last = Choice(problem, self.policy.decide(problem))
+        decision = self.policy.decide(problem)
+        _check(problem, decision)
+        self.last = Choice(problem, decision)
         return self.last
 
     def belief(self, points: KnownPoints, hypotheses: Hypotheses | None, key: StreamKey) -> Belief:
@@ -81,10 +85,33 @@ class Steering:
     def felt(self, contacts: FloatArray) -> bool:
         """Take note of the outcome of the chosen action; whether it starts registration afresh.
 
-        contacts (C, 3): where the hand has met the object, the first one first; world frame.
+        contacts (C, 3): where the hand has met the object, the first one first; world frame. Raises
+        ChselError if there was no action.
         """
-        assert self.last is not None
+        if self.last is None or self.last.decision.chosen < 0:
+            raise ChselError("no action was chosen; accepted: an outcome after `decide` chose one")
         contact = np.asarray(contacts[0]) if len(contacts) else None
         settings = self.policy.settings
         self.surprise = surprise(*self.last, settings.noise, contact)
         return bool(self.surprise > settings.surprise.limit)
+
+
+def _check(problem: DecisionProblem, decision: Decision) -> None:
+    """Raise ChselError unless a decision is about this problem."""
+    count, poses, chosen = len(problem.actions), len(problem.belief), decision.chosen
+    wrong = [
+        f"{name} of shape {np.shape(getattr(decision, name))}"
+        for name in ("score", "hit_chance", "blocked_chance", "expected_spread")
+        if np.shape(getattr(decision, name)) != (count,)
+    ]
+    stops = decision.stop != ""
+    taken = not stops and 0 <= chosen < count and bool(problem.available[chosen])
+    if not taken and not (stops and chosen == -1):
+        wrong.append(f"action {chosen} with stop {decision.stop!r}")
+    elif np.shape(decision.contacts) != ((poses, 3) if taken else (0, 3)):
+        wrong.append(f"contacts of shape {np.shape(decision.contacts)}")
+    if wrong:
+        raise ChselError(
+            f"the policy decided on {wrong[0]}; accepted: an available action of {count} and its "
+            f"contacts in {poses} poses, or -1 with a reason to stop"
+        )
