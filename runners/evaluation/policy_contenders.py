@@ -13,8 +13,6 @@ from chsel.policies.policy_registry import POLICIES, build_policy, policy_settin
 from chsel.problem.settings import build_settings, changed_settings, settings_mapping
 from runners.evaluation.contenders import require_label
 
-GRID = "grid"
-"""The policy that takes the probes of the session's own grid, without any decision."""
 _LABEL = re.compile(r"(?P<name>\w+)(#[\w+-]+)?")
 _ACCEPTED = f"all, or a list of NAME, NAME#MARK or {{name, label, settings}}; {', '.join(POLICIES)}"
 
