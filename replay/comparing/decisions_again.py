@@ -58,7 +58,8 @@ class DecisionsAgain:
         before, self.surprise = self._before, None
         if before is None or before.step != probe.step - 1:
             return 0
-        if len(before.decision.contacts) != len(before.problem.belief):  # a stop, or no forecast
+        forecast = len(before.decision.contacts) == len(before.problem.belief)
+        if before.decision.chosen < 0 or not forecast:  # a stop, or of a policy without forecasts
             return 0
         afresh = self._steering.felt(probe.contacts)
         self.surprise = self._steering.surprise

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import trimesh
 
 from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings, straight_actions
@@ -131,6 +130,8 @@ def _push(probe: Probe) -> tuple[FloatArray, float]:
 
 def _interior(hand: HandShape, spacing: float, depth: float) -> FloatArray:
     """Points (M, 3) in the hand, deeper than `depth` in one of its bodies, in its frame."""
+    import trimesh
+
     mesh = trimesh.Trimesh(hand.vertices, hand.faces, process=False)
     bodies = [body for body in mesh.split(only_watertight=False) if body.is_watertight]
     count = sum(float(np.prod(body.extents)) for body in bodies) / spacing**3
