@@ -106,7 +106,7 @@ def test_a_surprise_starts_the_next_registration_afresh(
 
 
 def test_the_grid_is_not_recorded_as_a_policy(tmp_path: Path) -> None:
-    _, recording, _ = steered(tmp_path, "policy=grid")
+    _, recording, _ = steered(tmp_path, "policy=grid", "session.start_contacts=99")
     assert decided(recording) == []
     assert "policy" not in recording.start.config
 
