@@ -115,7 +115,7 @@ class Display:
             text += f"  cost {row['best_cost']:<8.3g}"
             text += "" if "spread" in row else f" {row['distinct']:>2} distinct"
         if "spread" in row:
-            text += f" spread{1000.0 * row['spread']:6.1f} mm"
+            text += f" spread {1000.0 * row['spread']:3.0f} mm"
         self._console.print(f"{text} {row['seconds']:>5.2f} s")
 
     def warn(self, warnings: Iterable[InputWarning | StepWarning]) -> None:
