@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import DecisionProblem
+from chsel.next_probe.decision_problem import Belief, DecisionProblem
 from chsel.next_probe.first_contact import FirstContacts, first_contacts
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled
@@ -17,6 +17,7 @@ from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import spread
 from chsel.problem.outline import in_order
 from chsel.problem.poses import Poses
+from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.subset import surface_descriptors
 
 _FARTHEST = 60.0  # exponents beyond count as zero
@@ -68,17 +69,12 @@ class Forecast:
 
         Root mean square difference of distances from 64 places on surfaces of the belief.
         """
-        poses = Poses.of(self.problem.belief.object_from_world)
-        descriptors = surface_descriptors(self.problem.sdf, poses)
-        apart: FloatArray = np.empty((len(poses), len(poses)))
-        distances_between(np.ascontiguousarray(descriptors.T), apart)
-        return apart
+        return surface_distances(self.problem.sdf, self.problem.belief)
 
     @cached_property
     def spread(self) -> float:
         """Mean distance of two surfaces drawn from the belief, metres."""
-        weights = self.problem.belief.weights
-        return float(in_order(weights * in_order(weights * self.distances)))
+        return mean_distance(self.problem.belief, self.distances)
 
     @cached_property
     def gains(self) -> _Gains:
@@ -98,6 +94,19 @@ class Forecast:
     def _chance(self, flags: BoolArray) -> FloatArray:
         """Weight (A,) of the poses with a flag, of flags (K, A)."""
         return in_order(np.where(flags, self.problem.belief.weights[:, None], 0.0).T)
+
+
+def surface_distances(sdf: SdfGrid, belief: Belief) -> FloatArray:
+    """See `Forecast.distances`."""
+    descriptors = surface_descriptors(sdf, Poses.of(belief.object_from_world))
+    apart: FloatArray = np.empty((len(belief), len(belief)))
+    distances_between(np.ascontiguousarray(descriptors.T), apart)
+    return apart
+
+
+def mean_distance(belief: Belief, distances: FloatArray) -> float:
+    """Mean of distances (K, K), metres, over two poses drawn from a belief."""
+    return float(in_order(belief.weights * in_order(belief.weights * distances)))
 
 
 @compiled

@@ -103,7 +103,7 @@ def require_label(label: str) -> None:
     """Raise SettingError for a label that cannot be the name of a file here."""
     if not _FILE_NAME.fullmatch(label) or label in TAKEN:
         raise SettingError(
-            f"{label!r} is no label; accepted: letters, digits and any of _ @ # + -, "
+            f"{label!r} is not a label; accepted: letters, digits and any of _ @ # + -, "
             f"other than {', '.join(TAKEN)}"
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from chsel.next_probe.belief import belief_after, belief_before
 from chsel.next_probe.decision_problem import Belief, Decision
-from chsel.next_probe.forecast import distances_between
+from chsel.next_probe.forecast import mean_distance, surface_distances
 from chsel.numerics.arrays import FloatArray
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
@@ -16,7 +16,6 @@ from chsel.problem.outline import in_order, outline_distances_to
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from chsel.problem.subset import surface_descriptors
 from runners.evaluation.plan import Plan, Trial
 from runners.run.scene import Scene
 from runners.run.session_run import SessionRun
@@ -120,10 +119,7 @@ class ProbeRows:
 
 def spread_of(sdf: SdfGrid, belief: Belief) -> float:
     """Mean distance of two surfaces drawn from a belief, metres, as decisions have it."""
-    descriptors = surface_descriptors(sdf, Poses.of(belief.object_from_world))
-    apart: FloatArray = np.empty((len(belief), len(belief)))
-    distances_between(np.ascontiguousarray(descriptors.T), apart)
-    return float(in_order(belief.weights * in_order(belief.weights * apart)))
+    return mean_distance(belief, surface_distances(sdf, belief))
 
 
 def promised_gain(decision: Decision) -> float | None:

@@ -147,7 +147,7 @@ def test_what_is_finished_is_not_done_again_and_policies_may_become_more(folder:
         (["grid", "informative"], {}, "policy is 'informative'"),
         ("grid,grid", {}, "policies has grid twice"),
         ([], {}, "policies is []; accepted: all, or a list of NAME"),
-        ({"name": "grid", "label": "a/b"}, {}, "'a/b' is no label"),
+        ({"name": "grid", "label": "a/b"}, {}, "'a/b' is not a label"),
         ([{"name": "grid", "setings": {}}], {}, "did you mean settings?"),
         (["a.b"], {}, "policies has 'a.b'"),
         ("all", {"probes": 0}, "probes is 0"),

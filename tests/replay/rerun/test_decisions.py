@@ -236,7 +236,7 @@ def test_only_steered_sessions_have_views_of_decisions(tmp_path: Path, recording
 @pytest.mark.parametrize(
     ("score", "fractions"),
     [
-        ([-1e308, 1e308, 0.0], [0.0, 1.0, 0.5]),  # whose difference is no number
+        ([-1e308, 1e308, 0.0], [0.0, 1.0, 0.5]),  # whose difference is not finite
         ([1e-300, 0.0], [1.0, 0.0]),
         ([2.0, 2.0], [1.0, 1.0]),
     ],
