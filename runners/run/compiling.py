@@ -8,7 +8,8 @@ from typing import Self
 from rich.progress import TaskID, TimeElapsedColumn
 
 from chsel.methods.method import Method
-from chsel.numerics.compiler import has_kernels, watched
+from chsel.numerics.compiler import watched
+from chsel.numerics.kernel_cache import has_kernels
 from chsel.policies.policy import Policy
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
 from replay.console import Console, Progress, TextColumn

@@ -17,7 +17,8 @@ from numba.core.registry import CPUDispatcher
 
 from chsel.methods.cvo.gaussian_blur import splat
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.compiler import compiled, kernel_sources
+from chsel.numerics.compiler import compiled
+from chsel.numerics.kernel_sources import kernel_sources
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance

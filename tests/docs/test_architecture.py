@@ -12,11 +12,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from numba.core.caching import _CacheLocator
 
 from chsel import CompiledCost
 from chsel.next_probe.forecast import Forecast
-from chsel.numerics.compiler import cache_directory, kernel_sources
+from chsel.numerics.kernel_cache import cache_directory
 from replay.events import Decided
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.evaluation_folder import open_evaluation
@@ -76,14 +75,9 @@ def run(command: str, folder: Path) -> str:
 
 def take_kernels(folder: Path) -> None:
     """Copy the machine code of the kernels that the copy has unchanged, which spares a minute."""
-    code = "from chsel.numerics.compiler import cache_directory; print(cache_directory())"
+    code = "from chsel.numerics.kernel_cache import cache_directory; print(cache_directory())"
     place = Path(run(f'python -c "{code}"', folder).strip())
-    subpath = _CacheLocator.get_suitable_cache_subpath
-    for source in kernel_sources():
-        made = cache_directory() / subpath(str(source))
-        if made.is_dir():
-            theirs = place / subpath(str(folder / source.relative_to(REPOSITORY)))
-            shutil.copytree(made, theirs, dirs_exist_ok=True)
+    shutil.copytree(cache_directory(), place, dirs_exist_ok=True)
 
 
 def path_of(folder: Path, name: str) -> Path:
@@ -116,9 +110,9 @@ def test_a_method_has_the_presets_of_its_groups(copy: Path) -> None:
 
 
 def test_its_kernel_is_checked_as_all_are(copy: Path) -> None:
-    code = "from chsel.numerics.compiler import kernel_sources as k; print(*k(), sep='\\n')"
+    code = "from chsel.numerics.kernel_sources import kernel_sources as k; print(*k(), sep='\\n')"
     assert str(copy / "chsel" / "methods" / "annealing.py") in run(f'python -c "{code}"', copy)
-    assert list((copy / "kernels").rglob("annealing.accepted*.nbi"))
+    assert list((copy / "kernels").rglob("annealing.accepted*.nbc"))
 
 
 def test_a_policy_scores_by_how_far_the_hand_gets(copy: Path) -> None:

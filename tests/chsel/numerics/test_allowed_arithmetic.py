@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from chsel.numerics.compiler import kernel_sources
+from chsel.numerics.kernel_sources import kernel_sources
 
 SOURCES = kernel_sources()
 ALLOWED_IN_MATH = {"sqrt", "floor", "ceil", "isfinite", "inf", "pi"}

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from chsel.numerics import compiler
+from chsel.numerics import kernel_cache, kernel_sources
+from chsel.numerics.kernel_sources import kernel_sources as compiler_sources
 
 ROOT = Path(__file__).resolve().parents[3]
 COMPUTE = """
@@ -149,34 +151,151 @@ def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(
     assert str(tmp_path) in said
 
 
-def twice(value: float) -> float:
-    return 2.0 * value
+PLANTED = {
+    "far.py": "from chsel.numerics.compiler import leaf\n@leaf\ndef far(x):\n    return x + 1.0\n",
+    "near.py": """
+from chsel.numerics.compiler import inner
+from planted.far import far
+@inner
+def near(x):
+    return 2.0 * far(x)
+""",
+    "called.py": """
+from chsel.numerics.compiler import compiled
+from planted.near import near
+def value_of(model):
+    raise NotImplementedError
+@compiled
+def total(model, x):
+    return value_of(model) + near(x)
+""",
+    "model.py": """
+from typing import NamedTuple
+from chsel.numerics.compiler import implements
+from planted.called import value_of
+class Model(NamedTuple):
+    scale: float
+@implements(value_of, Model)
+def _value_of(model):
+    return 100.0 * model.scale
+""",
+    "unrelated.py": "from chsel.numerics.compiler import leaf\n@leaf\ndef f(x):\n    return x\n",
+    "__init__.py": "",
+}
+CHANGES = {  # what is written in place of what, in which file; and the total then
+    "nothing": ("unrelated.py", "", "", 304.0),
+    "a file that the kernel does not use": ("unrelated.py", "return x", "return -x", 304.0),
+    "a callee": ("near.py", "2.0", "3.0", 306.0),
+    "a leaf three files away": ("far.py", "1.0", "2.0", 306.0),
+    "what implements the model": ("model.py", "100.0", "200.0", 604.0),
+    "a field": ("model.py", "scale", "size", 304.0),
+    "the kernel": ("called.py", "+ near", "- near", 296.0),
+}
+CALLED_AFTER_CHANGES = """
+import json, os, sys
+from pathlib import Path
+import numpy as np
+import chsel.numerics.compiler
+files, changes = json.loads(sys.argv[1]), json.loads(sys.argv[2])
+for name, (file, old, new, _) in changes.items():
+    if os.fork() == 0:  # a process that has loaded the compiler alone
+        for path, text in files.items():
+            Path("planted", path).write_text(text.replace(old, new) if path == file else text)
+        sys.path.insert(0, ".")
+        sys.dont_write_bytecode = True
+        from planted import model, called, unrelated
+        total = called.total(model.Model(3.0), 1.0)
+        compiled = sum(called.total.stats.cache_misses.values())
+        if name == "the kernel":
+            Path("planted", "called.py").write_text("while it runs")
+            called.total(model.Model(3.0), 1)
+        print(json.dumps([name, total, compiled, len(list(Path("kept").rglob("*.nbc")))]))
+        sys.stdout.flush()
+        os._exit(0)
+    os.wait()
+"""
 
 
-def test_kernels_are_saved_while_no_other_process_saves(monkeypatch: pytest.MonkeyPatch) -> None:
-    events: list[str] = []
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_kernel_is_compiled_again_if_what_it_runs_has_changed_and_only_then(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "planted").mkdir()
+    environment = {**os.environ, "CHSEL_CACHE_DIR": str(tmp_path / "kept")}
+    environment["PYTHONPATH"] = str(ROOT)
+    command = [sys.executable, "-c", CALLED_AFTER_CHANGES, json.dumps(PLANTED)]
+    command.append(json.dumps(CHANGES))
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [(name, total) for name, total, _, _ in rows] == [
+        (name, change[-1]) for name, change in CHANGES.items()
+    ]
+    unchanged = "a file that the kernel does not use"
+    assert [name for name, _, compiled, _ in rows if not compiled] == [unchanged]
+    kept = [number for *_, number in rows]
+    assert kept == [1, 1, 2, 3, 4, 5, 7]
 
-    class Lock:
-        def __init__(self, path: Path) -> None:
-            assert path.parent == compiler.cache_directory()
 
-        def __enter__(self) -> None:
-            events.append("locked")
+def test_imports_are_found_as_python_finds_them() -> None:
+    """Reading them with a pattern takes a twentieth of the time."""
+    for path in compiler_sources():
+        file, tree = kernel_sources._read(path), ast.parse(path.read_text())
+        expected = {
+            name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names))
+        } | {
+            alias.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Import)
+            for alias in node.names
+        }
+        assert expected <= file.imported
+    text = b"from . import a\nfrom ..b import (\n    c,\n)\nimport d.e as f, g\n"
+    relative = kernel_sources.SourceFile("x.y.z", Path("z.py"), Path(), text)
+    assert relative.imported >= {"x.y", "x.y.a", "x.b", "x.b.c", "d.e", "g"}
 
-        def __exit__(self, *_: object) -> None:
-            events.append("free")
 
-    monkeypatch.setattr(compiler, "FileLock", Lock)
-    save = compiler._one_at_a_time(lambda *arguments: events.extend(arguments))
-    save("signature", "code")
-    assert events == ["locked", "signature", "code", "free"]
-    kernel: Any = compiler.compiled(twice)
-    assert kernel._cache.save_overload.__qualname__.startswith("_one_at_a_time")
+def test_code_that_nobody_uses_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def file(path: Path, days: float) -> Path:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+        os.utime(path, (time.time() - 86400.0 * days,) * 2)
+        return path
+
+    old, new = file(tmp_path / ("0" * 16) / "a.nbi", 61), file(tmp_path / ("1" * 16) / "a.nbc", 59)
+    theirs = file(tmp_path / "notes" / "a.nbc", 900)
+    more = [file(tmp_path / f"{n:016x}" / "a.nbc", n) for n in range(2, 2 + 15)]
+    folder = tmp_path / ("f" * 16)
+    versions = [file(folder / f"a.f-11111111-{n}.nbc", n) for n in range(9)]
+    others = [file(folder / f"a.f-22222222-{n}.nbc", 30) for n in range(3)]
+    kernel_cache._prune(versions[0])
+    assert not old.exists()
+    assert not new.exists()  # the sixteenth of those that are left, beside that in use
+    assert all(path.exists() for path in (*more, theirs, *versions[:8], *others))
+    assert not versions[8].exists()
+
+
+def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
+    names = {"CHSEL_CACHE_DIR": str(tmp_path / "kept")}
+    first, _ = result_of(start(COMPUTE, tmp_path, **names))
+    kept = kernels_in(tmp_path)
+    for path in kept:
+        whole = bytearray(path.read_bytes())
+        whole[len(whole) // 2] ^= 1
+        path.write_bytes(whole)
+    again, said = result_of(start(COMPUTE, tmp_path, **names))
+    assert again == first
+    assert "compiling the kernels" in said
+    assert kernels_in(tmp_path) == kept
 
 
 def names_from_elsewhere(source: Path) -> set[str]:
     """Names that kernels of a file take from files without kernels, as "kernel: name"."""
-    tree, kernel_files = ast.parse(source.read_text()), set(compiler.kernel_sources())
+    tree, kernel_files = ast.parse(source.read_text()), set(compiler_sources())
     elsewhere = {
         alias.asname or alias.name
         for node in tree.body
@@ -203,9 +322,7 @@ def _is_read(node: ast.AST) -> bool:
 
 def test_kernels_take_constants_from_kernel_files_alone(tmp_path: Path) -> None:
     """Machine code holds them, and other files are not in its fingerprint."""
-    assert {
-        name for source in compiler.kernel_sources() for name in names_from_elsewhere(source)
-    } == set()
+    assert {name for source in compiler_sources() for name in names_from_elsewhere(source)} == set()
     planted = tmp_path / "planted.py"
     planted.write_text(
         "from chsel.problem.sdf_grid import COARSEST\n@leaf\ndef f(x):\n    return x + COARSEST\n"
