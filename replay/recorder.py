@@ -61,16 +61,25 @@ class BackgroundRecorder(Recorder):
     """
 
     def __init__(
-        self, recorder: Recorder, *, most: int = 16, patient: bool = True, optional: str = ""
+        self,
+        recorder: Recorder,
+        *,
+        most: int = 16,
+        patient: bool = True,
+        behind: BackgroundRecorder | None = None,
+        optional: str = "",
     ) -> None:
         """A recorder in front of another one.
 
         most: events that may wait; the caller who records one more waits for its place. patient:
-        False lets `flush` only ask for it. optional: what to do about a recording that is not
+        False lets `flush` only ask for it. behind: one that gets the same events first, and that
+        callers wait for; this one works only while it has nothing to do, as threads of Python take
+        turns, and each turn can take 5 ms. optional: what to do about a recording that is not
         written; where this is given, a RecordingError is a warning that ends with it, and no more
         is recorded.
         """
         self._recorder = recorder
+        self._behind = behind
         self._jobs: Queue[Callable[[], None] | None] = Queue(most)
         self._error: BaseException | None = None
         self._closed = False
@@ -96,8 +105,12 @@ class BackgroundRecorder(Recorder):
         else:
             self._jobs.put(self._recorder.flush)
             if self._patient:
-                self._jobs.join()
+                self.wait()
             self._raise_error()
+
+    def wait(self) -> None:
+        """Wait until there is nothing to do, whether it went well or not."""
+        self._jobs.join()
 
     def close(self) -> None:
         """Record what waits, and close the other recorder, also after an error."""
@@ -114,12 +127,15 @@ class BackgroundRecorder(Recorder):
         """What the thread does: one job after the other, none after an error."""
         while (job := self._jobs.get()) is not None:
             try:
+                if self._behind is not None:
+                    self._behind.wait()
                 if self._error is None:
                     self._run(job)
             except BaseException as error:
                 self._error = error
             finally:
                 self._jobs.task_done()
+        self._jobs.task_done()
 
     def _run(self, job: Callable[[], None]) -> None:
         if self._ended:
@@ -136,6 +152,6 @@ class BackgroundRecorder(Recorder):
         """Raise an error once; the jobs behind it are dropped by then."""
         if self._error is not None:
             if not self._closed:
-                self._jobs.join()
+                self.wait()
             error, self._error = self._error, None
             raise error

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 RIGID_TOLERANCE = 1e-6
 SENSOR_TOLERANCE = 1e-3  # of poses from files and sensors, which are often rounded
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # the axes behind each, in a circle
 _SMALL = 1e-6  # radians, below which a straight line is as good as an arc
 
 
@@ -99,10 +100,12 @@ def stacked(object_from_world: Any) -> FloatArray:
 
 def check_rigid(name: str, transforms: FloatArray, tolerance: float = RIGID_TOLERANCE) -> None:
     """Raise PoseError unless every (4, 4) of transforms (B, 4, 4) is a rotation and translation."""
-    rotations = transforms[:, :3, :3]
-    products = np.einsum("bij,bkj->bik", rotations, rotations) - np.eye(3)
-    handed = np.einsum("bi,bi->b", np.cross(rotations[:, 0], rotations[:, 1]), rotations[:, 2])
-    good = (np.abs(products).max(axis=(1, 2), initial=0.0) < tolerance) & (handed > 0)
+    rows = np.ascontiguousarray(transforms[:, :3, :3].transpose(1, 2, 0))  # (3, 3, B)
+    products = (rows[[0, 1, 2, 0, 0, 1]] * rows[[0, 1, 2, 1, 2, 2]]).sum(axis=1)  # (6, B)
+    products[:3] -= 1.0  # of each row with itself
+    x, y, z = rows
+    handed = ((x[_NEXT] * y[_AFTER] - x[_AFTER] * y[_NEXT]) * z).sum(axis=0)
+    good = (np.abs(products).max(axis=0, initial=0.0) < tolerance) & (handed > 0)
     good &= (transforms[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
     if not good.all():
         index = int(np.argmin(good))

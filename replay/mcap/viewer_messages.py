@@ -41,6 +41,7 @@ from replay.mcap.foxglove_messages import (
     serialized,
     stamp,
 )
+from replay.mcap.wire import length_prefix
 
 if TYPE_CHECKING:
     import trimesh
@@ -63,6 +64,8 @@ _ARROW = 0.01  # metres: width of the arrow of the next probe
 _MOST_FACES = 400
 _FINEST, _COARSEST = 40, 4  # cells along the longest side of a mesh's bounds
 _BLOCKS = 8  # that one level of all points holds before they move to the next
+_ENTITIES = SceneUpdate.ENTITIES_FIELD_NUMBER
+_TRIANGLES = SceneEntity.TRIANGLES_FIELD_NUMBER
 _POINT = np.dtype([("position", "<f4", 3), ("color", "u1", 4)])
 
 
@@ -96,8 +99,9 @@ class Views:
                 found = event.hypotheses
                 yield "/hypothesis_poses", partial(poses_in_world, inverse(found.object_from_world))
                 if self._scene is not None:
-                    yield "/hypothesis_meshes", partial(self._scene.hypothesis_meshes, found)
-                    yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, found)
+                    shown = _shown(found)
+                    yield "/hypothesis_meshes", partial(self._scene.hypothesis_meshes, *shown)
+                    yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, *shown)
             case Decided():
                 yield "/next_probe", partial(next_probe, event)
 
@@ -118,7 +122,10 @@ class SceneMessages:
         step = -(-len(self._vertices) // _SURFACE_POINTS)
         self._surface = self._vertices[::step]  # (S, 3)
         points = [Point3(x=x, y=y, z=z) for x, y, z in self._vertices.tolist()]
-        self._triangles = TriangleListPrimitive(points=points, indices=faces.ravel().tolist())
+        # Parts of the bytes of its triangles, in the order of the fields: pose, points, color,
+        # indices. A message for each hypothesis repeats them, which takes protobuf far longer.
+        self._points = serialized(TriangleListPrimitive(points=points))
+        self._indices = serialized(TriangleListPrimitive(indices=faces.ravel().tolist()))
 
     def object_mesh(self, time: int) -> bytes:
         """The object where the frame "object" is."""
@@ -130,16 +137,14 @@ class SceneMessages:
         color = np.array(OBJECT_COLOR, np.uint8)
         return colored_cloud(self._vertices, color, time, frame=_OBJECT)
 
-    def hypothesis_meshes(self, found: Hypotheses, time: int) -> bytes:
-        """The object at each distinct hypothesis, the best one bright."""
-        poses, colors = _shown(found)
+    def hypothesis_meshes(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:
+        """The object at each hypothesis (D, 4, 4), in its color (D, 3), the best one bright."""
         opacities = [_BEST_OPACITY, *[_OTHER_OPACITY] * len(poses)]
         shown = [(*color, a) for color, a in zip(colors.tolist(), opacities, strict=False)]
         return self._scene("hypotheses", WORLD, poses, shown, time)
 
-    def hypothesis_surfaces(self, found: Hypotheses, time: int) -> bytes:
+    def hypothesis_surfaces(self, poses: FloatArray, colors: ColorArray, time: int) -> bytes:
         """The same as points of the surface."""
-        poses, colors = _shown(found)
         points = self._surface @ poses[:, :3, :3].swapaxes(-1, -2) + poses[:, None, :3, 3]
         return colored_cloud(
             points.reshape(-1, 3), np.repeat(colors, len(self._surface), axis=0), time
@@ -155,12 +160,14 @@ class SceneMessages:
     ) -> bytes:
         """The object at poses (B, 4, 4), each in a color: red, green, blue to 255, opacity to 1."""
         entity = SceneEntity(timestamp=stamp(time), id=name, frame_id=frame, frame_locked=True)
+        parts = [serialized(entity)]
         for pose, (r, g, b, a) in zip(_poses(poses), colors, strict=True):
-            triangles = entity.triangles.add()
-            triangles.CopyFrom(self._triangles)
-            triangles.pose.CopyFrom(pose)
-            triangles.color.CopyFrom(Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=a))
-        return serialized(SceneUpdate(entities=[entity]))
+            color = Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=a)
+            placed = serialized(TriangleListPrimitive(pose=pose))
+            colored = serialized(TriangleListPrimitive(color=color))
+            triangles = (placed, self._points, colored, self._indices)
+            parts += (length_prefix(_TRIANGLES, triangles), *triangles)
+        return b"".join((length_prefix(_ENTITIES, parts), *parts))
 
 
 class CumulativePoints:

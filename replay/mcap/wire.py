@@ -1,4 +1,4 @@
-"""Counts what is in the bytes of a protobuf message before anything is made of it.
+"""The bytes of protobuf messages: what is in them, counted before anything is made of it.
 
 Two bytes can make an empty message or a number in a list that takes fifty in memory, so that a
 large message of such would take far more memory than the file has bytes.
@@ -6,6 +6,7 @@ large message of such would take far more memory than the file has bytes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from google.protobuf.message import DecodeError
@@ -26,6 +27,17 @@ def parsed(kind: Any, data: bytes) -> Any:
         return kind.FromString(data)
     except DecodeError:
         raise RecordingError(f"a message is not a valid {kind.DESCRIPTOR.full_name}") from None
+
+
+def length_prefix(field: int, parts: Sequence[bytes]) -> bytes:
+    """What stands before a message in a field, given its number and all bytes of the message."""
+    prefix = bytearray()
+    for value in (field << 3 | _LENGTH, sum(map(len, parts))):
+        while value > 0x7F:
+            prefix.append(value & 0x7F | 0x80)
+            value >>= 7
+        prefix.append(value)
+    return bytes(prefix)
 
 
 def check_wire(descriptor: Any, data: bytes) -> None:

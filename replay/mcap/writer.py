@@ -10,7 +10,7 @@ import numpy as np
 
 from chsel.errors import RecordingError
 from chsel.next_probe.decision_problem import DecisionProblem
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, same_bits
 from chsel.problem.points import GrowingPoints, KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.events import (
@@ -170,7 +170,7 @@ class McapRecorder(Recorder):
                 "before it do not give"
             )
         values = event_values(event)
-        if self._last_elites is not None and _same(problem.low_cost_set, self._last_elites):
+        if self._last_elites is not None and same_bits(problem.low_cost_set, self._last_elites):
             values["low_cost_set"] = None
         self._record(event.topic, event.step, values)
 
@@ -204,8 +204,7 @@ class McapRecorder(Recorder):
         """Whether points and grid of a problem are those of the events before."""
         assert self._points is not None
         assert self._start is not None
-        known = self._points.all()
-        same_points = problem.points.digest == known.digest
+        same_points = problem.points.same(self._points.all())
         return same_points and problem.sdf.digest == self._start.sdf.digest
 
     def _write_hypotheses(self, event: HypothesesFound) -> None:
@@ -231,8 +230,3 @@ class McapRecorder(Recorder):
         data = encode(RECORDS[topic], values)
         self._file.add(topic, step, lambda time: data)
         return data
-
-
-def _same(a: FloatArray, b: FloatArray) -> bool:
-    """Equal to the bit, unlike `==`, for which -0 is 0."""
-    return a.shape == b.shape and a.tobytes() == b.tobytes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -30,6 +31,7 @@ class Clock:
         self._step = 0
         self._stages: dict[str, int] = {}
         self._registering = False
+        self._known = threading.local()  # what the stream has: each thread sets its own
 
     @property
     def iteration(self) -> int:
@@ -61,6 +63,7 @@ class Clock:
         """What is logged in the block is on the timeline of registrations alone, as its first."""
         self._registering = True
         self._stream.reset_time()
+        self._known.moments = {}
         self._stream.set_time(REGISTRATION, sequence=self._step)
         try:
             yield
@@ -81,7 +84,11 @@ class Clock:
         self._set()
 
     def _set(self) -> None:
-        self._stream.set_time(PROBE, sequence=self._step)
-        self._stream.set_time(ITERATION, sequence=self._now)
+        moments = {PROBE: self._step, ITERATION: self._now}
         if self._registering:
-            self._stream.set_time(REGISTRATION, sequence=self._step)
+            moments[REGISTRATION] = self._step
+        before = getattr(self._known, "moments", {})
+        for timeline, moment in moments.items():
+            if before.get(timeline) != moment:
+                self._stream.set_time(timeline, sequence=moment)
+        self._known.moments = moments

@@ -16,6 +16,7 @@ from replay.recorder import BackgroundRecorder, TeeRecorder
 
 IN_RUN_FOLDER = "a logs=DIR that can be written"
 """What is accepted where a file of a run cannot be written."""
+_PICTURES = 64  # events that may wait to be drawn: those of a registration, mostly
 # What Rerun itself would print of a failing disk, over several lines; one line of ours says it.
 _LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
@@ -63,12 +64,14 @@ def write_in_run_folder(path: Path, text: str) -> None:
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
     """A recorder to all files that `config` asks for, each written by a thread of its own.
 
-    After every step the run waits for the MCAP file, the full record, and not for the pictures.
-    Beside it, pictures that cannot be written are a warning.
+    After every step the run waits for the MCAP file, the full record, and not for the pictures,
+    which are drawn while that file has all events. Beside it, pictures that cannot be written are a
+    warning.
     """
     recorders: list[Recorder] = []
-    if config.mcap:
-        recorders.append(BackgroundRecorder(McapRecorder(folder / "recording.mcap")))
+    record = BackgroundRecorder(McapRecorder(folder / "recording.mcap")) if config.mcap else None
+    if record is not None:
+        recorders.append(record)
     if config.rerun or config.live:
         os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
         from replay.rerun.rerun_recorder import RerunRecorder
@@ -76,5 +79,9 @@ def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
         path = folder / "recording.rrd" if config.rerun else None
         pictures = RerunRecorder(path, live=config.live)
         optional = "`replay view` makes it anew" if config.mcap else ""
-        recorders.append(BackgroundRecorder(pictures, patient=False, optional=optional))
+        recorders.append(
+            BackgroundRecorder(
+                pictures, most=_PICTURES, patient=False, behind=record, optional=optional
+            )
+        )
     return TeeRecorder(recorders)

@@ -121,6 +121,19 @@ def test_who_records_faster_than_the_recorder_has_to_wait():
     assert gate.calls == ["in work", 0, 1, 2, "fifth", "close"]
 
 
+def test_who_comes_behind_another_works_only_while_that_has_nothing_to_do():
+    first, second = Gate(is_open=False), Gate()
+    ahead = BackgroundRecorder(first)
+    tee = TeeRecorder([ahead, BackgroundRecorder(second, patient=False, behind=ahead)])
+    tee.record("event")
+    assert first.entered.wait(60)
+    assert not second.entered.wait(0.05)
+    first.gate.set()
+    tee.flush()
+    tee.close()
+    assert first.calls == second.calls == ["event", "flush", "close"]
+
+
 def test_equal_events_give_the_bytes_of_a_recorder_without_a_thread(tmp_path, events, write):
     path = tmp_path / "background.mcap"
     recorder = BackgroundRecorder(McapRecorder(path))

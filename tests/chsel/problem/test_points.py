@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -54,6 +56,13 @@ def test_merging_appends_class_by_class_and_changes_the_digest() -> None:
 
 def test_digest_tells_classes_apart() -> None:
     assert KnownPoints(free=[[1, 2, 3]]).digest != KnownPoints(occupied=[[1, 2, 3]]).digest
+
+
+def test_the_same_points_are_those_of_the_same_digest() -> None:
+    arrays = ({"free": [[0, 1, 2]]}, {"free": [[-0.0, 1, 2]]}, {"known": [[0, 1, 2]]})
+    points = [KnownPoints(**arrays[n]) for n in (0, 0, 1, 2)]
+    for a, b in itertools.product(points, points):
+        assert a.same(b) == (a.digest == b.digest)
 
 
 def test_voxels_keep_one_point_each_at_their_centres() -> None:

@@ -86,9 +86,10 @@ def test_quaternions_of_random_rotations_turn_vectors_alike() -> None:
 
 
 def test_a_scene_holds_the_object_at_each_distinct_hypothesis(events, write):
-    (entity,) = SceneUpdate.FromString(
-        messages(write(events), "/hypothesis_meshes")[-1][2]
-    ).entities
+    data = messages(write(events), "/hypothesis_meshes")[-1][2]
+    scene = SceneUpdate.FromString(data)
+    assert scene.SerializeToString(deterministic=True) == data  # put together of bytes
+    (entity,) = scene.entities
     found = last_found(events)
     poses = inverse(found.object_from_world[~found.duplicate])
     assert len(entity.triangles) == len(poses) == 3
