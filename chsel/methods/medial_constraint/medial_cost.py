@@ -8,14 +8,16 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from chsel.methods.medial_constraint.least_distances import least_distances
 from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls
 from chsel.methods.medial_constraint.medial_kernels import (
     MedialModel,
+    MedialScratch,
     medial_costs_of_poses,
-    medial_places,
+    medial_scratch,
 )
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Places
+from chsel.numerics.cell_set import triple
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
@@ -66,16 +68,7 @@ class MedialCost:
         self.space = space or SE3Space()
         self.space_arrays = self.space.arrays
         self.balls = _balls_of(problem, settings) if balls is None else balls
-        self.model = MedialModel(
-            field=distance_field(problem.sdf, settings.lookup, settings.outside),
-            least=_least_values(problem.sdf, settings.lookup),
-            centres=self.balls.centres.T.copy(),
-            radii=self.balls.radii,
-            known=problem.points.known.T.copy(),
-            known_sdf=problem.points.sdf.copy(),
-            ball_scale=settings.ball_scale,
-            known_scale=settings.known_scale,
-        )
+        self.model = _model(problem, self.balls, settings)
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d) of the search space."""
@@ -88,9 +81,34 @@ class MedialCost:
         spread(run, len(poses), self.work, least=_POSES_PER_THREAD)
         return costs
 
-    def work(self) -> Places:
+    def work(self) -> MedialScratch:
         """Scratch for one thread."""
-        return medial_places(self.model)
+        return medial_scratch(self.model)
+
+
+def _model(problem: RegistrationProblem, balls: Balls, settings: MedialCostSettings) -> MedialModel:
+    sdf, centres, radii = problem.sdf, balls.centres.T, balls.radii
+    middle = np.zeros(3)
+    if len(balls):
+        middle = (centres.min(axis=1) + centres.max(axis=1)) / 2.0
+    from_middle = np.empty((4, len(radii)), dtype=np.float32)
+    from_middle[:3], from_middle[3] = centres - middle[:, None], radii
+    from_middle[3] = np.nextafter(from_middle[3], np.float32(np.inf))
+    return MedialModel(
+        field=distance_field(sdf, settings.lookup, settings.outside),
+        values=sdf.values.reshape(-1),
+        least=_least_values(sdf, settings.lookup),
+        bounds=least_distances(sdf, settings.outside, float(radii.max(initial=0.0))),
+        centres=centres.copy(),
+        radii=radii,
+        middle=triple(middle),
+        span=float(np.abs(from_middle[:3]).max(initial=0.0)),
+        balls=from_middle,
+        known=problem.points.known.T.copy(),
+        known_sdf=problem.points.sdf.copy(),
+        ball_scale=settings.ball_scale,
+        known_scale=settings.known_scale,
+    )
 
 
 def _balls_of(problem: RegistrationProblem, settings: MedialCostSettings) -> Balls:
