@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
     from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
     from chsel.next_probe.hand_shape import HandShape
+    from chsel.numerics.threads import set_threads
     from chsel.policies import build_policy
     from chsel.policies.steering import Steering
     from chsel.problem.mesh import load_mesh
@@ -62,6 +63,7 @@ __all__ = [
     "build_policy",
     "load_mesh",
     "register",
+    "set_threads",
     "trust_in",
 ]
 
@@ -90,6 +92,7 @@ _PLACES = {
     "build_policy": "policies",
     "load_mesh": "problem.mesh",
     "register": "api",
+    "set_threads": "numerics.threads",
     "trust_in": "problem.trust",
 }
 

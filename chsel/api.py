@@ -7,10 +7,9 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
 from chsel.methods import build_method, noise_of, preset_settings, trust_by
@@ -24,6 +23,9 @@ from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import changed_settings
 from chsel.problem.trust import check_trust
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 def register(
@@ -129,6 +131,8 @@ def _known_points(surface: Any, free: Any, occupied: Any, known: Any, sdf: Any) 
 def _grid(target: trimesh.Trimesh | SdfGrid, resolution: float | None) -> SdfGrid:
     if isinstance(target, SdfGrid):
         return target
+    import trimesh  # which takes longer to import than a registration
+
     if not isinstance(target, trimesh.Trimesh):
         path = target if isinstance(target, str | Path) else "mesh.obj"
         shown = quoted(target) if isinstance(target, str | Path) else f"a {type(target).__name__}"

@@ -10,6 +10,7 @@ import yaml
 from omegaconf import DictConfig
 
 from chsel.methods import build_method
+from chsel.numerics.threads import set_threads
 from chsel.problem.settings import build_settings
 from replay.startup import importing
 from runners.command.program import command, plain
@@ -28,9 +29,8 @@ def main(config: DictConfig) -> None:
     display = Display(f"{_title(checked)}, preset {checked.preset.name}, seed {checked.seed}")
     with importing():  # what takes long, after there is something to read
         import igl  # noqa: F401
-        import torch
         import trimesh  # noqa: F401
-    torch.set_num_threads(checked.threads)
+    set_threads(checked.threads)
     method_config = dict(checked.method)
     method_name = str(method_config.pop("name", None))
     method = build_method(method_name, method_config)

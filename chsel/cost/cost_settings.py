@@ -29,7 +29,7 @@ class CostSettings(CheckedSettings):
     interior_spacing: Annotated[float | None, positive] = None  # metres; by default |alpha|
     volume_normalise: bool = False  # weigh interior points by their share of a free voxel
     known_tolerance: Annotated[float, not_negative] = 0.0  # dead band of known-SDF points, metres
-    lookup: Annotated[str, one_of(*LOOKUPS)] = "trilinear"  # how the SDF is read, see SdfGrid.query
+    lookup: Annotated[str, one_of(*LOOKUPS)] = "trilinear"  # how the SDF is read, see SdfGrid.at
     outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
     # "defined" is violation times normal (Eqs. 8 to 10), "exact" the derivative of the value.
     gradient: Annotated[str, one_of(*GRADIENTS)] = "defined"

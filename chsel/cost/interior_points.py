@@ -51,8 +51,7 @@ def interior_points(sdf: SdfGrid, settings: CostSettings) -> InteriorPoints:
             f"accepted: at most {_MAX_NODES:.0e}, so a coarser interior_spacing"
         )
     nodes = lower + np.indices(counts).reshape(3, -1).T * spacing
-    query = sdf.query(nodes, lookup=settings.lookup, outside=settings.outside)
-    s, n = (part.numpy() for part in query)
+    s, n = sdf.at(nodes, lookup=settings.lookup, outside=settings.outside)
     inside = s < alpha
     if not bool(inside.any()):
         raise SettingError(

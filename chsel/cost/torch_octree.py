@@ -27,7 +27,7 @@ class Pairs(NamedTuple):
 class FreeTree:
     """Free points (N, 3) in an octree, and the cells of a grid that violate them.
 
-    alpha: the level, metres, below which a point is violated. lookup: see SdfGrid.query.
+    alpha: the level, metres, below which a point is violated. lookup: see SdfGrid.at.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class FreeTree:
         device: torch.device,
     ) -> None:
         tree = octree(free, spacing)
-        self._sdf, self._lookup = sdf, lookup
+        self._grid, self._lookup = sdf.on(device), lookup
         self._clearance = as_tensor(cells_below(sdf, alpha, lookup).clearance, device)
         self._centres = as_tensor(tree.spheres[:3].T, device)  # of the nodes, then the points
         self._radii = as_tensor(tree.spheres[3], device)
@@ -79,8 +79,8 @@ class FreeTree:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Moved centres (P, 3), their squared distances (P,) to the grid, clearances there (P,)."""
         centres = moved(rotation, translation, self._centres[node])
-        inside = self._sdf.clamped(centres)
-        clearance = self._clearance[self._sdf.cells(inside, self._lookup)]
+        inside = self._grid.clamped(centres)
+        clearance = self._clearance[self._grid.cells(inside, self._lookup)]
         return centres, squared_length(centres - inside)[:, 0], clearance
 
 

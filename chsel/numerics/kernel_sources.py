@@ -24,6 +24,7 @@ _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
 )
+_TUPLE: Any = types.BaseTuple
 _WORD = re.compile(rb"\w+")
 _files: dict[Path, SourceFile] = {}
 _replaced: set[Path] = set()
@@ -120,7 +121,7 @@ def signature_text(arguments: tuple[types.Type, ...]) -> str:
 
 
 def _type_text(kind: Any) -> str:
-    if not isinstance(kind, types.BaseTuple):
+    if not isinstance(kind, _TUPLE):
         return repr(kind)
     name = _full_name(kind.instance_class) if hasattr(kind, "instance_class") else ""
     return f"{name}({signature_text(tuple(kind))})"
@@ -129,7 +130,7 @@ def _type_text(kind: Any) -> str:
 def _models(arguments: tuple[Any, ...]) -> Iterator[Any]:
     """The classes of all named tuples among types, those within others included."""
     for kind in arguments:
-        if isinstance(kind, types.BaseTuple):
+        if isinstance(kind, _TUPLE):
             if hasattr(kind, "instance_class"):
                 yield kind.instance_class
             yield from _models(tuple(kind))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -10,22 +11,19 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
-import numpy as np
-
 from chsel.errors import EngineError, SettingError
-from chsel.numerics.compiler import compiled
 
-_VALUES = np.array([5e-324, 2.3e-308, 1.0, 2.0**-55])  # an array, so that nothing is folded
+_SMALLEST, _SMALL, _ONE, _TINY = 5e-324, 2.3e-308, 1.0, 2.0**-55
 
 
 def require_ieee_arithmetic() -> None:
     """Raise EngineError if this thread flushes subnormals to zero, or does not round to nearest."""
-    if not _rounds_to_nearest(_VALUES):
+    if not _rounds_to_nearest(_ONE, _TINY):
         raise EngineError(
             "this thread does not round to the nearest number, so results would differ from those "
             "of other machines; accepted: the usual rounding mode, fesetround(FE_TONEAREST)"
         )
-    if not _keeps_subnormals(_VALUES):
+    if not _keeps_subnormals(_SMALLEST, _SMALL):
         raise EngineError(
             "this thread flushes subnormal numbers to zero, so results would differ from those of "
             "other machines; accepted: IEEE arithmetic (torch.set_flush_denormal(False), and no "
@@ -33,16 +31,14 @@ def require_ieee_arithmetic() -> None:
         )
 
 
-@compiled
-def _keeps_subnormals(values: Any) -> Any:
+def _keeps_subnormals(smallest: float, small: float) -> bool:
     """Whether subnormal operands, and subnormal results, differ from zero."""
-    return values[0] > 0.0 and values[1] * 0.25 > 0.0
+    return smallest > 0.0 and small * 0.25 > 0.0
 
 
-@compiled
-def _rounds_to_nearest(values: Any) -> Any:
+def _rounds_to_nearest(one: float, tiny: float) -> bool:
     """Rounding up would raise the sum; rounding down or towards zero, lower the difference."""
-    return values[2] + values[3] == values[2] and values[2] - values[3] == values[2]
+    return one + tiny == one and one - tiny == one
 
 
 MOST_THREADS = 256  # of a process, or processes of a command; a larger number is a mistake
@@ -57,14 +53,12 @@ def spread(
     *,
     least: int = 1,
 ) -> None:
-    """Call run(first, last, scratch) on pieces of range(count), on as many threads as torch uses.
+    """Call run(first, last, scratch) on pieces of range(count), on `thread_count()` threads.
 
     scratch: makes the scratch of one thread. The pieces must not depend on each other. least: the
     smallest number that is worth another thread.
     """
-    import torch
-
-    most = min(torch.get_num_threads(), count // least)
+    most = min(thread_count(), count // least)
     if most <= 1 or hasattr(_thread, "is_worker"):  # it must not wait for workers
         if count:
             run(0, count, scratch())
@@ -93,21 +87,62 @@ def require_threads(name: str, count: object) -> None:
         raise SettingError(f"{name} is {count!r}; accepted: an integer from 1 to {MOST_THREADS}")
 
 
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Use `count` threads within this context, in torch and in the kernels.
+def thread_count() -> int:
+    """How many threads kernels use: what was set here, else what torch uses where it is imported.
+
+    Else what torch would use: OMP_NUM_THREADS, or one for each core that this process may use.
+    """
+    if _setting.count is not None:
+        return _setting.count
+    torch = _imported_torch()
+    if torch is not None:
+        return int(torch.get_num_threads())
+    named = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    if named.isdecimal() and int(named) >= 1:
+        return min(int(named), MOST_THREADS)
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count()
+    return min(cores or 1, MOST_THREADS)
+
+
+def set_threads(count: int) -> None:
+    """Use `count` threads from now on, in the kernels and, where it is imported, in torch.
 
     Raises SettingError unless it is an integer from 1 to MOST_THREADS.
     """
     require_threads("threads", count)
-    import torch
+    _setting.count = count
+    torch = _imported_torch()
+    if torch is not None:
+        torch.set_num_threads(count)
 
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Use `count` threads within this context. See set_threads."""
+    before, torch = _setting.count, _imported_torch()
+    in_torch = torch.get_num_threads() if torch is not None else None
+    set_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        _setting.count = before
+        if torch is not None:
+            torch.set_num_threads(in_torch)
+
+
+class _Setting:
+    """The number of threads of this process, if one was set."""
+
+    count: int | None = None
+
+
+_setting = _Setting()
+
+
+def _imported_torch() -> Any:
+    """The module torch if it is imported, and to the end: importing it takes seconds."""
+    torch = sys.modules.get("torch")
+    return torch if hasattr(torch, "set_num_threads") else None
 
 
 @cache

@@ -116,7 +116,7 @@ def _region(sdf: SdfGrid, level: float, lookup: str) -> Region:
 
     def make() -> Region:
         box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
-        active = sdf.active_cells(level + _LEVEL_ROUNDING, lookup).numpy().reshape(sdf.shape)
+        active = sdf.active_cells(level + _LEVEL_ROUNDING, lookup)
         return Region(box, clearance_of(active, sdf.resolution))
 
     return sdf.derived(("evaluation region", level, lookup), make)

@@ -39,7 +39,7 @@ class EvaluationCostSettings(CheckedSettings):
     # Metres that a point may be on the wrong side; 0 in the paper.
     tolerance: Annotated[float, not_negative] = 0.01
     occupied: bool = True  # whether occupied points count
-    lookup: Annotated[str, one_of(*LOOKUPS)] = "nearest"  # how the SDF is read, see SdfGrid.query
+    lookup: Annotated[str, one_of(*LOOKUPS)] = "nearest"  # how the SDF is read, see SdfGrid.at
     outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
 
 

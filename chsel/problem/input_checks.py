@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from chsel.errors import PointsError, PointsWarning
 from chsel.numerics.arrays import BoolArray, FloatArray
@@ -83,6 +82,8 @@ def _distance_to_free(points: KnownPoints, diameter: float) -> Iterator[PointsWa
     near = _diagonal(np.concatenate([contacts, free])) <= most
     if near or len(contacts) == 0 or len(free) == 0:
         return
+    from scipy.spatial import cKDTree  # which takes longer to import than most registrations
+
     distance, _ = cKDTree(free).query(contacts)
     far = distance > most
     if far.any():

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from chsel.errors import MeshError, MeshWarning, quoted, require_positive
 from chsel.numerics.arrays import digest, frozen
@@ -99,6 +97,8 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
 
     The distance between two bodies is that of the boxes around them; near bodies count as one.
     """
+    from scipy.sparse.csgraph import connected_components
+
     lower, upper = _boxes(mesh)
     apart = np.maximum(np.maximum(lower[:, None] - upper, lower - upper[:, None]), 0.0)
     distance = np.sqrt((apart**2).sum(axis=2))  # (bodies, bodies)
@@ -116,6 +116,9 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
 
 def _boxes(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corners (bodies, 3) of the boxes of connected faces, largest first."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     a, b, c = np.asarray(mesh.faces).T
     edges = np.concatenate([a, b]), np.concatenate([b, c])
     count = len(mesh.vertices)

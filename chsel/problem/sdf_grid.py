@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from chsel.errors import MeshError, SdfError, quoted, require_choice, require_positive
-from chsel.numerics.arrays import FloatArray, IntArray, digest, frozen
-from chsel.problem.poses import as_tensor, length
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen
 
 if TYPE_CHECKING:
     import torch
     import trimesh
     from torch import Tensor
+
+    from chsel.problem.torch_grid import TorchGrid
 
 LOOKUPS = ("nearest", "trilinear")
 OUTSIDE = ("surface_point", "bounding_box")
@@ -51,16 +52,6 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     gradient = away / np.where(near, 1.0, distance)[:, None]
     gradient[near] = _face_normals(vertices, faces[face[near]])
     return np.asarray(signed, dtype=np.float64), gradient
-
-
-class _Tensors(NamedTuple):
-    """A grid on a device."""
-
-    first: Tensor  # (3,): first node, metres
-    last: Tensor  # (3,): last node, metres
-    top: Tensor  # (3,): indices of the last node that is the lowest of eight
-    values: Tensor  # (nodes,), metres
-    gradients: Tensor  # (nodes, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,11 +165,12 @@ class SdfGrid:
     def _derived(self) -> dict[Hashable, Any]:
         return {}
 
-    def active_cells(self, level: float, lookup: str) -> Tensor:
-        """Flags of the cells, numbered as by `cells`, that read any value below `level`."""
-        import torch
+    def active_cells(self, level: float, lookup: str) -> BoolArray:
+        """Whether cells (nx, ny, nz) read any value below `level`.
 
-        below = self.values < level
+        A cell is that around a node for lookup "nearest", and beyond a node for "trilinear".
+        """
+        below: BoolArray = self.values < level
         if lookup == "trilinear":
             padded = np.pad(below, ((0, 1), (0, 1), (0, 1)))
             nx, ny, nz = self.shape
@@ -186,38 +178,11 @@ class SdfGrid:
                 padded[i : i + nx, j : j + ny, k : k + nz] for i, j, k in np.ndindex(2, 2, 2)
             ]
             below = np.logical_or.reduce(corners)
-        return torch.from_numpy(below.reshape(-1).copy())
+        return below
 
-    def cells(self, points: Tensor, lookup: str) -> Tensor:
-        """Flat index (P,) of the nodes that points (P, 3) within the grid read.
-
-        The nearest node for lookup "nearest", the lowest of eight nodes for "trilinear".
-        """
-        cell = (points - self._on(points.device).first) * (1.0 / self.resolution)
-        return self._flat(cell.round() if lookup == "nearest" else self._base(cell))
-
-    def clamped(self, points: Tensor) -> Tensor:
-        """The points of the grid's box (P, 3) nearest to points (P, 3), never NaN."""
-        grid = self._on(points.device)
-        return points.fmax(grid.first).fmin(grid.last)
-
-    def _base(self, cell: Tensor) -> Tensor:
-        """The lowest of the eight nodes around grid coordinates (P, 3)."""
-        return cell.floor().minimum(self._on(cell.device).top)
-
-    def _on(self, device: torch.device) -> _Tensors:
-        """The grid on a device, where it stays."""
-
-        def make() -> _Tensors:
-            tables = self.values.reshape(-1), self.gradients.reshape(-1, 3)
-            parts = (*self.bounds, np.array(self.shape) - 2.0, *tables)
-            return _Tensors(*(as_tensor(part, device) for part in parts))
-
-        return self.derived(("tensors", device), make)
-
-    def query(
-        self, points: Any, *, lookup: str = "nearest", outside: str = "surface_point"
-    ) -> tuple[Tensor, Tensor]:
+    def at(
+        self, points: FloatArray, *, lookup: str = "nearest", outside: str = "surface_point"
+    ) -> tuple[FloatArray, FloatArray]:
         """Signed distance (P,) and gradient (P, 3) at object-frame points (P, 3).
 
         lookup "nearest" takes the nearest node, ties to even (CHSEL, Sec. IV-B); "trilinear"
@@ -225,51 +190,76 @@ class SdfGrid:
         distance to the surface point closest to the grid's nearest point, an upper bound;
         "bounding_box" returns the distance to the grid's box.
         """
+        require_choice("lookup", lookup, LOOKUPS)
+        require_choice("outside", outside, OUTSIDE)
+        points = np.asarray(points, dtype=np.float64)
+        first, last = self.bounds
+        clamped = np.fmin(np.fmax(points, first), last)
+        read = self._nearest if lookup == "nearest" else self._trilinear
+        value, gradient = read((clamped - first) * (1.0 / self.resolution))
+        beyond = (clamped != points).any(axis=1)
+        if beyond.any():
+            away = points[beyond] - clamped[beyond]
+            if outside == "surface_point":
+                unit = gradient[beyond] / _lengths(gradient[beyond])
+                away = away + value[beyond, None] * unit
+            distance = _lengths(away)
+            value[beyond] = distance[:, 0]
+            gradient[beyond] = away / distance
+        return value, gradient
+
+    def query(
+        self, points: Any, *, lookup: str = "nearest", outside: str = "surface_point"
+    ) -> tuple[Tensor, Tensor]:
+        """The same in torch, on the device of the points, which may round otherwise. See `at`."""
         import torch
 
         require_choice("lookup", lookup, LOOKUPS)
         require_choice("outside", outside, OUTSIDE)
         points = torch.as_tensor(points, dtype=torch.float64)
-        clamped = self.clamped(points)
-        read = self._nearest if lookup == "nearest" else self._trilinear
-        first = self._on(points.device).first
-        value, gradient = read((clamped - first) * (1.0 / self.resolution))
-        beyond = (clamped != points).any(dim=1)
-        if not bool(beyond.any()):
-            return value, gradient
-        away = points[beyond] - clamped[beyond]
-        if outside == "surface_point":
-            unit = gradient[beyond] / length(gradient[beyond])
-            away = away + value[beyond, None] * unit
-        distance = length(away)
-        value[beyond] = distance[:, 0]
-        gradient[beyond] = away / distance
-        return value, gradient
+        return self.on(points.device).query(points, lookup=lookup, outside=outside)
 
-    def _nearest(self, cell: Tensor) -> tuple[Tensor, Tensor]:
+    def on(self, device: torch.device) -> TorchGrid:
+        """The grid in torch on a device, where it stays."""
+        from chsel.problem.torch_grid import TorchGrid
+
+        def make() -> TorchGrid:
+            return TorchGrid(self.bounds, self.resolution, self.values, self.gradients, device)
+
+        return self.derived(("torch", device), make)
+
+    def _nearest(self, cell: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Value and gradient at grid coordinates (P, 3) by the nearest node."""
-        index = self._flat(cell.round())
-        grid = self._on(cell.device)
-        return grid.values[index], grid.gradients[index]
+        index = self._flat(np.rint(cell))
+        return self.values.reshape(-1)[index], self.gradients.reshape(-1, 3)[index]
 
-    def _trilinear(self, cell: Tensor) -> tuple[Tensor, Tensor]:
+    def _trilinear(self, cell: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Value and gradient at grid coordinates (P, 3) by interpolation between 8 nodes."""
-        base = self._base(cell)
+        base = np.minimum(np.floor(cell), np.array(self.shape) - 2.0)
         fraction = cell - base
         sides = (1.0 - fraction, fraction)
-        first = self._flat(base)
-        grid, (_, ny, nz) = self._on(cell.device), self.shape
-        value, gradient = cell.new_zeros(len(cell)), cell.new_zeros(cell.shape)
+        first, (_, ny, nz) = self._flat(base), self.shape
+        values, gradients = self.values.reshape(-1), self.gradients.reshape(-1, 3)
+        value, gradient = np.zeros(len(cell)), np.zeros(cell.shape)
         for i, j, k in np.ndindex(2, 2, 2):
             weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
             index = first + (i * ny + j) * nz + k
-            value = value + weight * grid.values[index]
-            gradient = gradient + weight[:, None] * grid.gradients[index]
+            value = value + weight * values[index]
+            gradient = gradient + weight[:, None] * gradients[index]
         return value, gradient
 
-    def _flat(self, index: Tensor) -> Tensor:
+    def _flat(self, index: FloatArray) -> IntArray:
         _, ny, nz = self.shape
-        return ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).long()
+        flat: IntArray = ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).astype(np.int64)
+        return flat
+
+
+def _lengths(vectors: FloatArray) -> FloatArray:
+    """Lengths (P, 1) of vectors (P, 3), of at least 1e-12, summed in the order of the axes."""
+    squares = vectors * vectors
+    sums = (squares[:, 0:1] + squares[:, 1:2]) + squares[:, 2:3]
+    lengths: FloatArray = np.maximum(np.sqrt(sums), 1e-12)
+    return lengths
 
 
 def _parts(nodes: FloatArray, face_count: int) -> list[FloatArray]:

@@ -19,11 +19,11 @@ class DistanceField(NamedTuple):
     box: Box
     table: FloatArray  # (nodes, 4): value and gradient of each node
     trilinear: bool  # interpolate, else read the nearest node
-    box_distance: bool  # how distances continue outside of the grid, see SdfGrid.query
+    box_distance: bool  # how distances continue outside of the grid, see SdfGrid.at
 
 
 def distance_field(sdf: SdfGrid, lookup: str, outside: str) -> DistanceField:
-    """The signed distance field that kernels read; lookup, outside: see SdfGrid.query."""
+    """The signed distance field that kernels read; lookup, outside: see SdfGrid.at."""
     trilinear = lookup == "trilinear"
     box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
     return DistanceField(box, sdf.table, trilinear, outside == "bounding_box")
@@ -34,8 +34,7 @@ def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
 
     def make() -> Region:
         box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
-        below = sdf.active_cells(level, lookup).numpy().reshape(sdf.shape)
-        return Region(box, clearance_of(below, sdf.resolution))
+        return Region(box, clearance_of(sdf.active_cells(level, lookup), sdf.resolution))
 
     return sdf.derived(("cells below", level, lookup), make)
 

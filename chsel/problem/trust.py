@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from chsel.errors import PointsWarning, PoseError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -69,7 +68,7 @@ def trust_in(
     apart = outline_distances(sdf, poses[errors <= ALIKE * least])
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
-    count, mode = connected_components(apart <= gap, directed=False)
+    count, mode = _components(apart <= gap)
     spread = _root_mean_square(apart[0])
     if error > limit or noise.outliers > MOST_OUTLIERS:
         verdict = NOTHING
@@ -186,3 +185,18 @@ def _widest(apart: FloatArray, mode: IntArray) -> float:
 
 def _root_mean_square(values: FloatArray) -> float:
     return math.sqrt(math.fsum((values**2).tolist()) / len(values))
+
+
+def _components(adjacent: BoolArray) -> tuple[int, IntArray]:
+    """How many parts a symmetric graph (K, K) has, and the part of each of its nodes (K,)."""
+    count, part = 0, np.full(len(adjacent), -1)
+    for first in range(len(adjacent)):
+        if part[first] >= 0:
+            continue
+        reached = np.zeros(len(adjacent), dtype=np.bool_)
+        newest = np.arange(len(adjacent)) == first
+        while newest.any():
+            reached |= newest
+            newest = adjacent[newest].any(axis=0) & ~reached
+        part[reached], count = count, count + 1
+    return count, part

@@ -74,8 +74,8 @@ class Probed:
         lower, upper = corners.min(axis=0) - _AROUND, corners.max(axis=0) + _AROUND
         shape = np.ceil((upper - lower) / _SPACING).astype(int)
         points = lower + _SPACING * np.indices(tuple(shape)).reshape(3, -1).T
-        height, _ = self._far.query(apply(inverse(pose), points), lookup="trilinear")
-        return points[height.numpy() > 0.0]
+        height, _ = self._far.at(apply(inverse(pose), points), lookup="trilinear")
+        return points[height > 0.0]
 
     def case(self, fault: str) -> Case:
         """Points with one of FAULTS."""

@@ -47,5 +47,4 @@ def _distances(
     problem: RegistrationProblem, object_from_world: FloatArray, points: FloatArray
 ) -> FloatArray:
     """Signed distances (N,) of points (N, 3) in the world, between the nodes of the grid."""
-    values, _ = problem.sdf.query(apply(object_from_world, points), lookup="trilinear")
-    return np.asarray(values.numpy(), dtype=np.float64)
+    return problem.sdf.at(apply(object_from_world, points), lookup="trilinear")[0]

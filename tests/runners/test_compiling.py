@@ -47,6 +47,7 @@ def noting(self, *given, **named):
 
 rehearsed, rehearse, Compiling.rehearse = set(), Compiling.rehearse, noting
 probe.main()
+print("torch", "torch" in sys.modules)
 print("rehearsed", len(rehearsed), "more", sorted(specialised() - rehearsed))
 """
 QUICK = (
@@ -100,6 +101,7 @@ def test_a_session_needs_no_kernel_that_the_rehearsal_did_not(
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
+    assert "torch False" in done.stdout
     rehearsed, more = re.findall(r"rehearsed (\d+) more (.*)", done.stdout)[0]
     assert int(rehearsed) > 5
     assert more == "[]"

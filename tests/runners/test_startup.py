@@ -72,6 +72,44 @@ def test_help_of_replay_waits_for_no_heavy_import(verb: str, tmp_path: Path) -> 
     assert "usage: replay" in done.stdout
 
 
+REGISTERED = """
+import sys
+import numpy as np
+import chsel
+
+nodes = np.indices((9, 9, 9)) * 0.01 - 0.04
+radius = np.sqrt((nodes**2).sum(axis=0))
+gradients = np.moveaxis(nodes / np.maximum(radius, 1e-9), 0, -1)
+ball = chsel.SdfGrid(np.full(3, -0.04), 0.01, radius - 0.025, gradients)
+free = 0.02 * np.argwhere(np.ones((6, 6, 6))) - 0.05
+free = free[(free**2).sum(axis=1) > 0.035**2]
+for method in sys.argv[1:]:
+    chsel.register(ball, surface=0.025 * np.eye(3), free=free, method=method)
+print([name for name in sys.argv[0].split() if name in sys.modules])
+"""
+
+
+def test_registrations_import_nothing_that_they_do_not_need() -> None:
+    unwanted = " ".join(
+        (
+            *HEAVY,
+            "scipy.ndimage",
+            "scipy.spatial",
+            "scipy.sparse",
+            "hydra",
+            "rerun",
+            "pandas",
+            "mcap",
+        )
+    )
+    code = REGISTERED.replace("sys.argv[0]", repr(unwanted))
+    command = [sys.executable, "-c", code, "chsel", "anchored", "icp", "svgd", "cvo"]
+    command.append("medial_constraint")
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
+
+
 @pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(
@@ -79,7 +117,7 @@ def test_help_of_replay_waits_for_no_heavy_import(verb: str, tmp_path: Path) -> 
     [
         (["runners.probe"], "hydra"),
         (["runners.probe"], "numba"),
-        (["runners.probe", "logs=l"], "torch"),
+        (["runners.probe", "logs=l"], "igl"),
         (["runners.report", "x"], "pyarrow"),
         (["replay", "verify", "x.mcap"], "numba"),
     ],

@@ -202,7 +202,7 @@ def _pairs_of(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, IntArra
     """Surface points and normals (Q, 3), and pairs (P, 2) of them in the order of lengths (P,)."""
     stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
     surface = surface_points(sdf, SURFACE_POINTS, stream)
-    normals = sdf.query(surface, lookup="trilinear")[1].numpy()
+    normals = sdf.at(surface, lookup="trilinear")[1]
     normals = normals / np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-12)
     i, j = np.triu_indices(len(surface), 1)
     lengths = np.sqrt(((surface[i] - surface[j]) ** 2).sum(axis=1))

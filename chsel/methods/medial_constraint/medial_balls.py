@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.clearance import squared_clearances
 from chsel.numerics.compiler import compiled, inner
 from chsel.problem.points import VoxelGrid, Workspace
 
 MOST_VOXELS = 30_000_000
-_FAR = 2**60
 _TOLERANCE = 2e-3  # half sides, by which a ball may stick out of the one that holds it
 
 
@@ -45,7 +45,7 @@ def medial_balls(
         return Balls(np.zeros((0, 3)), np.zeros(0))
     flags = VoxelGrid.around(inside, resolution, MOST_VOXELS).flags
     squared = np.empty(flags.shape, dtype=np.int64)
-    squared_clearances(flags, squared)
+    squared_clearances(flags, squared, 1)
     medial = np.zeros(squared.shape, dtype=np.bool_)
     _mark_medial(squared, medial)
     voxels = np.argwhere(medial)
@@ -61,50 +61,6 @@ def _row_starts(medial: BoolArray) -> IntArray:
     in_row = np.count_nonzero(medial, axis=2)
     ends = np.cumsum(in_row).reshape(in_row.shape)
     return np.concatenate([ends[:, :1] - in_row[:, :1], ends], axis=1)
-
-
-@compiled
-def squared_clearances(inside: BoolArray, out: IntArray) -> None:
-    """Fill out (nx, ny, nz) with squared distances from the centres of voxels to the set's border.
-
-    In half sides of a voxel: the least over all voxels w that are not inside, taken as cubes, of
-    the sum over the axes of max(2 |v - w| - 1, 0)^2, computed axis by axis (Felzenszwalb and
-    Huttenlocher, 2012). At least one voxel must be outside.
-    """
-    flat, flags = out.reshape(-1), inside.reshape(-1)
-    for n in range(len(flat)):
-        flat[n] = _FAR if flags[n] else 0
-    nx, ny, nz = out.shape
-    line = np.empty(max(nx, ny, nz), dtype=np.int64)
-    _along(flat, nz, 1, line)
-    _along(flat, ny, nz, line)
-    _along(flat, nx, ny * nz, line)
-
-
-@inner
-def _along(flat: IntArray, count: int, stride: int, line: IntArray) -> None:
-    """One axis, whose neighbours are `stride` apart in lines of `count` voxels."""
-    for block in range(0, len(flat), count * stride):
-        for start in range(block, block + stride):
-            for k in range(count):
-                line[k] = flat[start + k * stride]
-            for k in range(count):
-                flat[start + k * stride] = _nearest(line, count, k)
-
-
-@inner
-def _nearest(line: IntArray, count: int, k: int) -> int:
-    """The least of line[j] + max(2 |k - j| - 1, 0)^2, going outwards while that can be less."""
-    least, reach = line[k], max(k, count - 1 - k)
-    for step in range(1, reach + 1):
-        along = (2 * step - 1) * (2 * step - 1)
-        if along >= least:
-            break
-        if step <= k:
-            least = min(least, line[k - step] + along)
-        if k + step < count:
-            least = min(least, line[k + step] + along)
-    return least
 
 
 @compiled

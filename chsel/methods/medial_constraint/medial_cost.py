@@ -38,7 +38,7 @@ class MedialCostSettings(CheckedSettings):
     # does, whose balls never enter the cost.
     ball_scale: Annotated[float, not_negative] = 1.0
     known_scale: Annotated[float, not_negative] = 1.0
-    lookup: Annotated[str, one_of(*LOOKUPS)] = "trilinear"  # how the SDF is read, see SdfGrid.query
+    lookup: Annotated[str, one_of(*LOOKUPS)] = "trilinear"  # how the SDF is read, see SdfGrid.at
     outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
 
     presets: ClassVar[Presets] = {

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel.errors import SettingError
-from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls, squared_clearances
+from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.clearance import squared_clearances
 from chsel.problem.points import Workspace
 
 SIDE = 0.025
@@ -131,7 +132,7 @@ def test_points_over_too_many_voxels_are_an_error_that_says_so() -> None:
 
 def clearances(inside: BoolArray) -> IntArray:
     squared = np.full(inside.shape, -7, dtype=np.int64)
-    squared_clearances(inside, squared)
+    squared_clearances(inside, squared, 1)
     return squared
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -41,6 +42,32 @@ def test_a_number_of_threads_that_cannot_be_meant_is_refused(count: Any) -> None
         pass
     assert torch.get_num_threads() == before
     require_threads("threads", 256)
+
+
+SETTINGS = """
+import sys
+from chsel.numerics.threads import set_threads, thread_count, threads
+seen = [thread_count()]
+with threads(2):
+    seen.append(thread_count())
+seen.append(thread_count())
+assert "torch" not in sys.modules
+import torch
+torch.set_num_threads(4)
+seen.append(thread_count())
+with threads(2):
+    seen += [thread_count(), torch.get_num_threads()]
+seen.append(torch.get_num_threads())
+set_threads(6)
+print(*seen, thread_count(), torch.get_num_threads())
+"""
+
+
+def test_the_number_of_threads_is_what_was_set_or_that_of_torch_or_openmp() -> None:
+    command = [sys.executable, "-c", SETTINGS]
+    environment = {**os.environ, "OMP_NUM_THREADS": "3,1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert (done.stdout, done.stderr) == ("3 2 3 4 2 2 4 6 6\n", "")
 
 
 def test_every_thread_works_in_scratch_of_its_own(threads: int) -> None:

@@ -145,16 +145,31 @@ def test_bounding_box_distance_is_that_to_the_grid(grid: SdfGrid) -> None:
     np.testing.assert_allclose(gradient.numpy(), [[1.0, 0.0, 0.0]])
 
 
+@pytest.mark.parametrize("outside", ["surface_point", "bounding_box"])
+@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
+def test_torch_looks_up_the_same_bits_within_the_grid_and_rounds_square_roots_beyond(
+    grid: SdfGrid, lookup: str, outside: str
+) -> None:
+    points = np.random.default_rng(5).uniform(-0.3, 0.3, (5000, 3))
+    points[:3] = [np.nan, np.inf, -0.0]
+    ours = grid.at(points, lookup=lookup, outside=outside)
+    theirs = [part.numpy() for part in grid.query(points, lookup=lookup, outside=outside)]
+    for part, other in zip(ours, theirs, strict=True):
+        within = ((points >= grid.bounds[0]) & (points <= grid.bounds[1])).all(axis=1)
+        assert part[within].tobytes() == other[within].tobytes()
+        np.testing.assert_allclose(part, other, rtol=1e-14, atol=1e-15)
+
+
 @pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
 def test_active_cells_are_those_that_read_a_value_below_the_level(
     grid: SdfGrid, lookup: str
 ) -> None:
     import torch
 
-    active = grid.active_cells(-0.01, lookup).numpy()
+    active = grid.active_cells(-0.01, lookup).reshape(-1)
     points = torch.tensor(np.random.default_rng(4).uniform(*grid.bounds, (20_000, 3)))
     sdf, _ = grid.query(points, lookup=lookup)
-    flags = active[grid.cells(points, lookup).numpy()]
+    flags = active[grid.on(points.device).cells(points, lookup).numpy()]
     assert flags[(sdf < -0.01).numpy()].all()
     if lookup == "nearest":
         assert not flags[(sdf >= -0.01).numpy()].any()
