@@ -12,6 +12,7 @@ from typing import Any
 
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.chsel import ChselSettings
+from chsel.methods.gradient_descent import DescentSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.qd.selection import OutputSettings
 
@@ -19,6 +20,7 @@ LEFT_OUT: Mapping[type, Mapping[str, Any]] = {
     OnlineSettings: {"update": "noise"},
     OutputSettings: {"choice": "lowest", "margin": None},
     ChselSettings: {"starts": None},
+    DescentSettings: {"race": None},
     # The search changed with these; recordings without them were accepted anew at these values.
     AnchoredSettings: {"outer_share": 0.25, "outer_noise": 1.0, "shared_error": 0.004},
 }

@@ -42,6 +42,11 @@ MOST_PASSES = 10_000
 _BEST = 0.2  # of the estimates: those that the next pass starts around
 
 
+def _racing() -> DescentSettings:
+    """Starts that are far behind after some blocks would end in minima that nobody asks for."""
+    return DescentSettings(stop_below=None, race=(1.0, 1.0, 0.5, 0.5, 0.25))
+
+
 @dataclass(frozen=True)
 class ChselSettings(CheckedSettings):
     """All settings of CHSEL."""
@@ -49,7 +54,7 @@ class ChselSettings(CheckedSettings):
     search: Annotated[str, one_of(*SEARCHES)] = "cma_mega"
     passes: Annotated[int, positive, at_most(MOST_PASSES)] = 1  # each around the best of the last
     cost: CostSettings = field(default_factory=CostSettings)
-    descent: DescentSettings = field(default_factory=DescentSettings)
+    descent: DescentSettings = field(default_factory=_racing)
     archive: ArchiveSettings = field(default_factory=ArchiveSettings)
     emitter: EmitterSettings = field(default_factory=EmitterSettings)
     output: OutputSettings = field(default_factory=OutputSettings)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -36,36 +38,67 @@ class DescentSettings(CheckedSettings):
     restarts: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 10
     iterations: Annotated[int, positive, at_most(MOST_ITERATIONS)] = 50  # of a block
     rate: Annotated[float, positive] = 0.01  # Adam's step size
-    # End when a block lowers the costs by no more than this fraction on average over the starts;
-    # None: never end early.
+    # End when a block lowers the costs by no more than this fraction on average over the starts
+    # that descend in it; None: never end early.
     stop_below: float | None = 1e-6
+    # Share of the starts that descend in each block, those of the lowest costs; the last holds for
+    # all further blocks. None: all descend to the end.
+    race: tuple[float, ...] | None = None
 
-    presets: ClassVar[Presets] = {"paper": {"stop_below": None}, "reference": {}}
+    presets: ClassVar[Presets] = {
+        "paper": {"stop_below": None, "race": None},
+        "reference": {"stop_below": 1e-6, "race": None},
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_most("restarts x iterations", self.restarts * self.iterations, MOST_ITERATIONS)
         if self.stop_below is not None and not np.isfinite(self.stop_below):
             raise SettingError(f"stop_below is {self.stop_below}; accepted: a number, or null")
+        if self.race is not None and not _falls_from_1(self.race):
+            raise SettingError(
+                f"race is {list(self.race)}; accepted: null, or shares above 0 and at most 1, none "
+                "above the one before"
+            )
+
+    def runners(self, block: int, starts: int) -> int:
+        """How many of the starts descend in a block."""
+        if self.race is None:
+            return starts
+        return math.ceil(self.race[min(block, len(self.race) - 1)] * starts)
+
+
+def _falls_from_1(shares: tuple[float, ...]) -> bool:
+    falling = all(share <= before for before, share in pairwise((1.0, *shares)))
+    return bool(shares) and falling and shares[-1] > 0.0
 
 
 def descend(
     objective: Objective, starts: Poses, settings: DescentSettings, observer: Observer
 ) -> tuple[Poses, FloatArray]:
-    """Estimates E' with their costs (B,), from B starts, each of which descends on its own."""
+    """Estimates E' with their costs (B,), from B starts, each of which descends on its own.
+
+    Starts that drop out of the race stay where they are.
+    """
     space, total = objective.space, settings.restarts * settings.iterations
     vectors = space.encode(starts)
     costs = objective.costs(vectors)
     observer.trace("descent", 0, vectors.copy(), costs.copy())
+    running = np.arange(len(starts))
     for restart in range(settings.restarts):
-        before = costs
-        moved = objective.descended(vectors, len(starts), settings.rate, settings.iterations)
-        vectors = space.encode(space.poses(moved))
-        costs = objective.costs(vectors)
+        lowest = np.argsort(costs[running], kind="stable")
+        running = np.sort(running[lowest[: settings.runners(restart, len(starts))]])
+        before = costs[running]
+        moved = objective.descended(
+            vectors[running], len(starts), settings.rate, settings.iterations
+        )
+        vectors[running] = space.encode(space.poses(moved))
+        costs[running] = objective.costs(vectors[running])
         done = (restart + 1) * settings.iterations
         observer.trace("descent", done, vectors.copy(), costs.copy())
         observer.progress("descent", done, total)
-        if settings.stop_below is not None and _mean_gain(before, costs) <= settings.stop_below:
+        gain = _mean_gain(before, costs[running])
+        if settings.stop_below is not None and gain <= settings.stop_below:
             break
     return space.poses(vectors), costs
 

@@ -18,14 +18,15 @@ from replay.settings_migration import LEFT_OUT, completed
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
 ROWS = [(cls, name, value) for cls, row in LEFT_OUT.items() for name, value in row.items()]
+_LATER = {"starts", "descent.race", "output.choice", "output.margin"}
 STORED = {
-    "clamp_chsel": {"starts", "output.choice", "output.margin", "online.update"},
-    "spam_can_chsel_cma_me": {"starts", "output.choice", "output.margin", "online.update"},
-    "points_two_passes": {"starts", "output.choice", "output.margin"},
+    "clamp_chsel": {*_LATER, "online.update"},
+    "spam_can_chsel_cma_me": {*_LATER, "online.update"},
+    "points_two_passes": _LATER,
     "clamp_medial_constraint_cma_me": {"output.choice", "output.margin"},
-    "cracker_box_gradient_descent": {"online.update"},
+    "cracker_box_gradient_descent": {"descent.race", "online.update"},
     "mustard_anchored": {"outer_share", "outer_noise", "shared_error"},
-    "points_default_chsel": set(),
+    "points_default_chsel": {"descent.race"},
 }
 """Stored recordings, and what each leaves out."""
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -155,3 +156,19 @@ def test_each_start_descends_as_if_it_were_alone() -> None:
     together = objective.descended(vectors, 4.0, 0.01, 20)
     alone = objective.descended(vectors[2:3], 4.0, 0.01, 20)
     np.testing.assert_array_equal(together[2:3], alone)
+
+
+def test_only_the_lowest_go_on_in_a_race_and_move_as_they_would_without_one() -> None:
+    objective, racing, free = contacts(), Watcher(), Watcher()
+    settings = DescentSettings(restarts=3, iterations=5, rate=0.001, stop_below=None)
+    race = replace(settings, race=(1.0, 0.5, 0.2))
+    descend(objective, Poses.of(starts(5)), settings, free)
+    descend(objective, Poses.of(starts(5)), race, racing)
+    going = np.arange(5)
+    for block, count in enumerate((5, 3, 1)):
+        before, after = racing.traces[block], racing.traces[block + 1]
+        going = np.sort(going[np.argsort(before.cost[going])[:count]])
+        out = np.setdiff1d(np.arange(5), going)
+        np.testing.assert_array_equal(after.vectors[out], before.vectors[out])
+        np.testing.assert_array_equal(after.vectors[going], free.traces[block + 1].vectors[going])
+        np.testing.assert_array_equal(after.cost, objective.costs(after.vectors))

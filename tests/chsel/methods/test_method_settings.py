@@ -90,7 +90,14 @@ REFUSED: dict[type[Any], list[tuple[dict[str, Any], str]]] = {
         ({"surface_band": -1.0}, "^surface_band is -1.0"),
         ({"stop_below": -1.0}, "^stop_below is -1.0"),
     ],
-    DescentSettings: [({"stop_below": NAN}, "^stop_below is nan")],
+    DescentSettings: [
+        ({"stop_below": NAN}, "^stop_below is nan"),
+        ({"race": []}, r"^race is \[\]; accepted: null, or shares"),
+        ({"race": [0.5, 0.6]}, "^race is .*none above the one before"),
+        ({"race": [1.0, 0.0]}, "^race is .*above 0"),
+        ({"race": [1.0, NAN]}, "^race is "),
+        ({"race": [1.5]}, "^race is .*at most 1"),
+    ],
     IcpSettings: [
         ({"surface_points": 0}, "^surface_points is 0"),
         ({"surface_points": 10**9}, "^surface_points is "),
