@@ -6,6 +6,7 @@ block's centre moves it: the values of the grid around that place bound its sign
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,17 +18,16 @@ from chsel.problem.sdf_grid import SdfGrid
 _HALVINGS = 3  # of a block, into up to eight
 _TOPS = 48  # uppermost blocks at least
 _REACH = 6.0  # cells that a radius may span, else cells are joined
+_PADDING = 2  # cells around the SDF grid, beyond the radius
 _LEAST_OUTWARD = 1e-9
-_UNSURE = 1e-6  # cells: nearer to a border than that, a position may be on either side
 
 
 class Blocks(NamedTuple):
     """Positions in a forest of N blocks: the uppermost blocks first, single positions last."""
 
     centres: FloatArray  # (3, N), m
-    layer: IntArray  # (N,) of each block
+    layers: IntArray  # (L + 1,) the first block of each layer, then N
     starts: IntArray  # (N + 1,) the first block within each
-    tops: int  # number of uppermost blocks
     position: IntArray  # (N,) number of a block's only position, -1 for a block of several
     radii: FloatArray  # (L,) of the blocks of each layer, m
 
@@ -49,9 +49,8 @@ def blocks_of(positions: FloatArray, margin: float) -> Blocks:
     radii = np.array([max(radius for _, radius in layer) for layer in spheres])
     return Blocks(
         centres=np.array([centre for layer in spheres for centre, _ in layer]).T.copy(),
-        layer=np.repeat(np.arange(len(layers)), [len(layer) for layer in layers]),
+        layers=np.concatenate([[0], np.cumsum([len(layer) for layer in layers])]),
         starts=len(layers[0]) + np.concatenate([[0], np.cumsum(children)]),
-        tops=len(layers[0]),
         position=position,
         radii=radii * (1.0 + 1e-9) + margin,
     )
@@ -79,73 +78,122 @@ def _centre_and_radius(points: FloatArray) -> tuple[FloatArray, float]:
 BOUNDS_LAYER = np.dtype(
     [(f"corner_{axis}", np.float64) for axis in "xyz"]  # of the first cell, object frame, m
     + [("inverse", np.float64)]  # cells per metre
-    + [("low", np.float64)]  # the box of the SDF grid, in cells: its lower side on all axes,
-    + [(f"high_{axis}", np.float64) for axis in "xyz"]  # and its upper sides
-    + [(f"most_{axis}", np.float64) for axis in "xyz"]  # the greatest index of a cell
-    + [("across", np.float64)]  # steps in the table to the next cell on the first axis,
-    + [("along", np.float64)]  # and on the second
-    + [("row", np.float64)]  # of the first cell in the table
-    + [("radius", np.float64)]  # m
-    + [("unsure", np.float64)]  # cells: nearer to the border of a cell, its bounds do not hold
+    + [(f"most_{axis}", np.float32) for axis in "xyz"]  # the greatest index of a cell
+    + [("across", np.int32)]  # steps in the table to the next cell on the first axis,
+    + [("along", np.int32)]  # and on the second
+    + [("row", np.int32)]  # of the first cell in the table
+    + [("unknown", np.int32)]  # row of what bounds nothing
+    + [("unsure", np.float32)]  # cells: nearer to the border of a cell, its bounds do not hold
 )
 
 
 class DistanceBounds(NamedTuple):
-    """What the signed distance is at least and at most within a radius of the points of a cell.
+    """How far from a value v the signed distance is at least within a radius of points of a cell.
 
-    A grid of cells for the radius of each layer of blocks. Beyond the box of the SDF grid, the
-    distance is at least the root of reach * d^2 + s^2, with the distance d to the box and the
-    lower bound s at the box's nearest point, if that is above 0.
+    A grid of cells for the radius of each layer of blocks, which reaches beyond the SDF's; beyond
+    its outermost cells, the distance is no less than there. With a common v of all points, the
+    table has max(least - v, v - most, 0) and 0, else the least distance and minus the most.
     """
 
     layers: Any  # (L,) of BOUNDS_LAYER
-    table: Any  # (cells, 2) least and greatest distance, m, the layers one after the other; float32
-    reach: float
+    table: Any  # (2, cells), m, the layers one after the other; float32
+    common: bool  # whether v is that of all points
 
 
-def bounds_of(sdf: SdfGrid, lookup: str, outside: str, radii: FloatArray) -> DistanceBounds:
+def bounds_of(
+    sdf: SdfGrid,
+    lookup: str,
+    outside: str,
+    radii: FloatArray,
+    *,
+    value: float | None,
+    slack: float,
+) -> DistanceBounds:
     """Bounds of what a grid reads within each of the radii (L,), in metres, of any point.
 
-    The last radius is that of single positions: no more than what rounding moves them.
+    The last radius is that of single positions: no more than what rounding moves them. value: v,
+    None if points differ. slack: cells that a point may be away from where it is looked up.
     """
-    key = ("bounds", lookup, outside, tuple(radii.tolist()))
-    return sdf.derived(key, lambda: _bounds(sdf, lookup, outside, radii))
+    key = ("bounds", lookup, outside, tuple(radii.tolist()), value, slack)
+    return sdf.derived(key, lambda: _bounds(sdf, lookup, outside, radii, value, slack))
 
 
-def _bounds(sdf: SdfGrid, lookup: str, outside: str, radii: FloatArray) -> DistanceBounds:
+def _bounds(
+    sdf: SdfGrid,
+    lookup: str,
+    outside: str,
+    radii: FloatArray,
+    value: float | None,
+    slack: float,
+) -> DistanceBounds:
     lowest, highest, corner = _cells(sdf, lookup)
     deep = outside == "surface_point" and _points_outward(sdf)
+    # With gradients that point away from the grid's box, the nearest surface point is nearer to
+    # the box's inside, so that a way out of the box adds to the way to the surface.
+    adds = deep or outside == "bounding_box"
     layers, tables, row = np.zeros(len(radii), dtype=BOUNDS_LAYER), [], 0
     for n, radius in enumerate(radii.tolist()):
         factor = max(1, int(radius / (_REACH * sdf.resolution)))
-        size, unsure = factor * sdf.resolution, 0.0
+        size, unsure = factor * sdf.resolution, -1.0
         if n < len(radii) - 1:
+            radius += slack * size
             low = _least_around(_least_of_joined(lowest, factor), size, radius)
             high = -_least_around(_least_of_joined(-highest, factor), size, radius)
         else:
-            low, high, unsure = lowest.copy(), highest, max(_UNSURE, radius / size)
+            low, high, unsure = lowest.copy(), highest, slack + radius / size
         if not deep:
             _open_border(low, size, radius)
+        padding = math.ceil(radius / size) + _PADDING
+        low, high = _padded(sdf, low, high, corner, size, radius, padding=padding, adds=adds)
         _, ny, nz = low.shape
-        layers[n] = (
-            *corner,
-            1.0 / size,
-            (sdf.bounds[0] - corner)[0] / size,
-            *(sdf.bounds[1] - corner) / size,
-            *(np.array(low.shape) - 1),
-            ny * nz,
-            nz,
-            row,
-            radius,
-            unsure,
-        )
-        table = np.stack([_rounded(low, -np.inf), _rounded(high, np.inf)], axis=-1)
-        tables.append(table.reshape(-1, 2))
-        row += low.size
-    # With gradients that point away from the grid's box, the nearest surface point is nearer to
-    # the box's inside, so that a way out of the box adds to the way to the surface.
-    reach = 1.0 if deep or outside == "bounding_box" else 0.0
-    return DistanceBounds(layers, np.concatenate(tables), reach)
+        unknown = row + low.size
+        shape = np.array(low.shape) - 1
+        first = corner - padding * size
+        layers[n] = (*first, 1.0 / size, *shape, ny * nz, nz, row, unknown, unsure)
+        tables.append(_table(low.reshape(-1), high.reshape(-1), value))
+        row = unknown + 1
+    return DistanceBounds(layers, np.concatenate(tables, axis=1), value is not None)
+
+
+def _padded(
+    sdf: SdfGrid,
+    low: FloatArray,
+    high: FloatArray,
+    corner: FloatArray,
+    size: float,
+    radius: float,
+    *,
+    padding: int,
+    adds: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Bounds of cells (nx, ny, nz) with those of so many around; `adds`: see `_bounds`.
+
+    Where all within the radius is beyond the SDF grid at a distance d, its distance is at least
+    |s|, or the root of d^2 + s^2, with the lower bound s at the nearest point of the grid, if that
+    is above 0. Where the greatest distance is positive, some of it may be beyond the grid, where
+    it does not hold.
+    """
+    gaps = []
+    for axis in range(3):
+        cells = np.arange(-padding, low.shape[axis] + padding)
+        first, last = (sdf.bounds[:, axis] - corner[axis]) / size
+        gaps.append(np.maximum(np.maximum(first - (cells + 1), cells - last), 0.0) ** 2)
+    away = np.sqrt(gaps[0][:, None, None] + gaps[1][:, None] + gaps[2]) * (size - 1e-6 * size)
+    away = np.maximum(away - radius, 0.0)
+    low, high = np.pad(low, padding, mode="edge"), np.pad(high, padding, mode="edge")
+    beyond = np.sqrt((away**2 if adds else 0.0) + np.maximum(low, 0.0) ** 2)
+    high = np.where((high < 0.0) & (away == 0.0), high, np.inf)
+    return np.where(away > 0.0, beyond, low), high
+
+
+def _table(low: FloatArray, high: FloatArray, value: float | None) -> Any:
+    """The table (2, cells + 1) of a layer, see DistanceBounds, rounded down; last: no bound."""
+    if value is None:
+        return _rounded(np.append([low, -high], [[-np.inf], [-np.inf]], axis=1))
+    bound = np.maximum(np.maximum(low - value, value - high), 0.0)
+    table = np.zeros((2, len(low) + 1), dtype=np.float32)
+    table[0, :-1] = np.maximum(_rounded(bound), 0.0)
+    return table
 
 
 def _cells(sdf: SdfGrid, lookup: str) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -205,6 +253,6 @@ def _points_outward(sdf: SdfGrid) -> bool:
     return True
 
 
-def _rounded(values: FloatArray, towards: float) -> Any:
-    """Numbers of 32 bits that are no nearer than `values` on the far side of them."""
-    return np.nextafter(values.astype(np.float32), np.float32(towards))
+def _rounded(values: FloatArray) -> Any:
+    """Lower numbers of 32 bits."""
+    return np.nextafter(values.astype(np.float32), np.float32(-np.inf))

@@ -14,7 +14,9 @@ _REFERENCE_COUNT = re.compile(r"(= )(?:tail )?call i8 @llvm\.x86\.atomic\.[^\n]*
 _OF_ONE_CPU = re.compile(r"llvm\.(?:x86|aarch64|arm|ppc)\.[\w.]+")
 _TARGET = re.compile(r'^target (?:datalayout|triple) = ".*"\n', re.MULTILINE)
 _DECLARED = re.compile(r"^declare [^@\n]*@([\w.]+)\(", re.MULTILINE)
-_PYTHON = re.compile(r"_?(?:Py|NRT_|numba_|llvm\.(?!fma|exp|log|sin|cos|tan|pow|a(?:sin|cos|tan)))")
+_PYTHON = re.compile(
+    r"_?(?:Py|NRT_|numba_|llvm\.(?!fma|exp(?!erimental\.noalias)|log|sin|cos|tan|pow|a(?:sin|cos|tan)))"
+)
 _LOOSE = re.compile(r"\b(?:fast|reassoc|contract|arcp|afn|nsz)\b(?= )|llvm\.fmuladd|llvm\.fma\b")
 _FUSED = re.compile(
     r"^\s+(vfn?m(?:add|sub|addsub|subadd)\w*|fn?m(?:add|sub)|fml[as]|fml[as]l2?|bfmla\w*)\s.*$",

@@ -82,6 +82,7 @@ def brute_force(
     share=st.floats(0.0, 0.6),
     tops=st.sampled_from([1, 8, 48]),
     aligned=st.booleans(),
+    value=st.sampled_from([None, 0.0, 0.02]),
 )
 def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
     seed: int,
@@ -91,10 +92,14 @@ def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
     share: float,
     tops: int,
     aligned: bool,
+    value: float | None,
 ) -> None:
-    """Also where points come to lie on the borders of cells, if aligned."""
+    """Also where points lie on the borders of cells, if aligned; value: that of all points."""
     stream = np.random.default_rng(seed)
     problem, truth = scene(stream, OBJECTS[kind](stream), far=far)
+    if value is not None:
+        known_sdf = np.full(len(problem.points.known), value)
+        problem = replace(problem, points=replace(problem.points, known_sdf=known_sdf))
     if aligned:
         known = np.rint(problem.points.known / 0.01) * 0.01
         problem = replace(problem, points=replace(problem.points, known=known))
