@@ -11,13 +11,19 @@ import numpy as np
 from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.hand_shape import HandShape
+from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
 from chsel.plausible.pose_metrics import result_numbers
+from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance
 from chsel.policies.policy import Policy, StopSettings
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose
+from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.surface import surface_points
 from chsel.problem.trust import trust_in
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
@@ -75,6 +81,24 @@ def warm_up_policy(policy: Policy) -> None:
         steering.felt(np.zeros((1, 3)))
     except Exception:  # as above
         return
+
+
+def warm_up_plausible() -> None:
+    """Compile the kernels of the plausible set and of what is measured by it, or load them.
+
+    See `warm_up`.
+    """
+    surface = _RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
+    points = KnownPoints(np.full((1, 3), 0.05), np.zeros((1, 3)), surface, np.zeros(6))
+    ball, first, key = _ball(), np.eye(4)[None], StreamKey(0, 0)
+    problem = RegistrationProblem(ball, points, first, _WORKSPACE, 0.02, key)
+    grid = PoseGridSettings(rotations=5, upright=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # as above
+        members = plausible_set(problem, first[0], PlausibleSettings(epsilon=10.0, grid=grid))
+        samples = surface_points(ball, 4, key.stream(Purpose.METRIC_POINTS))
+        distance = SurfaceDistance(ball, None, samples, DistanceSettings(method="grid"))
+        distance.between(first, members.world_from_object)
 
 
 def _register_twice(method: Method) -> None:

@@ -31,6 +31,7 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
 from chsel.numerics.kernel_sources import code_digest, loaded, signature_text
+from chsel.numerics.packaged_code import has_packaged_code, packaged_code
 
 CACHE_VARIABLE = "CHSEL_CACHE_DIR"
 KEPT_DAYS = 60  # how long a folder of code stays that nobody uses
@@ -63,10 +64,13 @@ class KernelCache(NullCache):
         if name is None:
             return None
         path = cache_directory() / name
-        payload = _checked(path)
+        payload = _checked(_contents(path))
+        if payload is None:
+            payload = _checked(packaged_code(name))
+        else:
+            _touch(path)
         if payload is None:
             return None
-        _touch(path)
         return CompileResult._rebuild(target_context, *pickle.loads(payload))
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -119,8 +123,8 @@ def cache_directory() -> Path:
 
 
 def has_kernels() -> bool:
-    """Whether any kernel was compiled and kept earlier."""
-    return any(cache_directory().glob("*.nbc"))
+    """Whether any kernel was compiled and kept earlier, or came with the package."""
+    return has_packaged_code() or any(cache_directory().glob("*.nbc"))
 
 
 def _environment() -> str:
@@ -137,11 +141,16 @@ def _digest(payload: bytes) -> bytes:
     return hashlib.blake2b(payload, digest_size=_CHECK_SIZE).digest()
 
 
-def _checked(path: Path) -> bytes | None:
-    """What a file holds behind its digest, or None if there is no such file or it is damaged."""
+def _contents(path: Path) -> bytes | None:
     try:
-        whole = path.read_bytes()
+        return path.read_bytes()
     except OSError:
+        return None
+
+
+def _checked(whole: bytes | None) -> bytes | None:
+    """What a file holds behind its digest, or None if there is no such file or it is damaged."""
+    if whole is None:
         return None
     payload = whole[_CHECK_SIZE:]
     return payload if _digest(payload) == whole[:_CHECK_SIZE] else None
