@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from chsel.cost.cost_kernels import FreeTerm, Model, costs_of_poses, neighbours_of
+from chsel.cost.cost_kernels import Model, costs_of_poses, work_of
 from chsel.cost.cost_settings import CostSettings
+from chsel.cost.free_kernels import FreeTerm
 from chsel.cost.interior_points import InteriorPoints, interior_points
-from chsel.errors import SettingError, require_choice
+from chsel.errors import require_choice
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Region, box_of, clearance_of, triple
-from chsel.numerics.lattice import MOST_CELLS, NO_LATTICE, cell_centres, lattice_of
+from chsel.numerics.cell_set import CellSet, Region, box_of, cell_set_of, triple
+from chsel.numerics.near_points import rough_tree
 from chsel.numerics.octree import Tree, octree, rounding_margin
 from chsel.numerics.pose_tuples import Triple
 from chsel.numerics.threads import require_ieee_arithmetic, spread
@@ -23,16 +24,16 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import cells_below, distance_field
 
-CULLINGS = ("automatic", "none", "octree", "lattice")
+CULLINGS = ("octree", "none")
+_NOWHERE = np.zeros(0, dtype=np.float32)
 _POSES_PER_THREAD = 200  # fewer are evaluated faster than a thread wakes up
 
 
 class CompiledCost:
     """The relaxed cost (CHSEL, Eq. 7) of RelaxedCost, compiled and exactly culled.
 
-    culling: how the free points that cost something are found, which changes no bit. "none" looks
-    up all of them, "octree" walks a tree of them, "lattice" looks for the lattice point in every
-    cell of the object, "automatic" takes the faster of the last two.
+    culling: how the free points that cost something are found, which changes no bit: "octree"
+    walks a tree of them, "none" looks up all of them.
     Raises SettingError if the settings do not fit the object or the points, EngineError if this
     thread does not round as IEEE 754 specifies.
     """
@@ -44,7 +45,7 @@ class CompiledCost:
         settings: CostSettings | None = None,
         *,
         free_resolution: float = 0.01,
-        culling: str = "automatic",
+        culling: str = "octree",
     ) -> None:
         require_ieee_arithmetic()
         require_choice("culling", culling, CULLINGS)
@@ -71,11 +72,14 @@ class CompiledCost:
         return cls(problem.sdf, problem.points, settings, free_resolution=resolution)
 
     def at_level(self, sdf: SdfGrid, level: float) -> Model:
-        """The model of direct free points with another penetration tolerance, without a lattice."""
-        region = cells_below(sdf, level, self.settings.lookup)
-        centre, radius = _sphere_around_cells(sdf, level, self.settings.lookup)
+        """The model of direct free points with another penetration tolerance."""
+        lookup = self.settings.lookup
+        centre, radius = _sphere_around_cells(sdf, level, lookup)
         free = self.model.free._replace(
-            region=region, centre=centre, radius=radius, lattice=NO_LATTICE
+            region=cells_below(sdf, level, lookup),
+            cells=_cell_set_below(sdf, level, lookup),
+            centre=centre,
+            radius=radius,
         )
         return self.model._replace(free=free, alpha=level)
 
@@ -87,60 +91,63 @@ class CompiledCost:
         """Costs (B,) of poses."""
         costs = np.empty(len(poses))
 
-        def run(first: int, last: int, near: Any) -> None:
-            costs_of_poses(self.model, poses.numbers, costs, first, last, near)
+        def run(first: int, last: int, work: Any) -> None:
+            costs_of_poses(self.model, poses.numbers, costs, first, last, work)
 
-        spread(run, len(poses), lambda: neighbours_of(self.model), least=_POSES_PER_THREAD)
+        spread(run, len(poses), lambda: work_of(self.model), least=_POSES_PER_THREAD)
         return costs
 
 
 def _free_term(
     sdf: SdfGrid, free: FloatArray, settings: CostSettings, free_resolution: float, culling: str
 ) -> FreeTerm:
-    if settings.free_term == "interior" and culling == "lattice":
-        raise SettingError(
-            "culling is lattice, which free_term interior has none of; "
-            "accepted: automatic, octree, none"
-        )
     is_interior = settings.free_term == "interior" and len(free) > 0
-    weights, normals, lattice = np.zeros(0), np.zeros((0, 3)), None
     if is_interior:
         tree, interior = sdf.derived(("interior", settings), lambda: _interior_tree(sdf, settings))
-        weights, normals = interior.weights(settings, free_resolution), interior.normals
+        weights = interior.weights(settings, free_resolution)[:, None]
+        weights = np.concatenate([weights, weights * interior.normals], axis=1)
         voxels = VoxelGrid.around(free, free_resolution)
         box = box_of(voxels.origin, free_resolution, voxels.flags.shape)
-        region = Region(box, clearance_of(voxels.flags, free_resolution))
+        region, cells = Region(box, _NOWHERE), cell_set_of(box, voxels.flags)
         centre, radius = _sphere_around(interior.points, 0.0)
+        lower, upper = box.first, box.last
     else:
-        alpha, lookup = settings.alpha, settings.lookup
+        alpha, lookup, weights = settings.alpha, settings.lookup, np.zeros((0, 4))
         tree, region = octree(free, free_resolution), cells_below(sdf, alpha, lookup)
+        cells = _cell_set_below(sdf, alpha, lookup)
         centre, radius = _sphere_around_cells(sdf, alpha, lookup)
-        cells = int((region.clearance < 0.0).sum())
-        if len(free) and cells == 0:
+        if len(free) and not (region.clearance < 0.0).any():
             warnings.warn(
                 f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
                 "use a smaller penetration_tolerance",
                 stacklevel=4,
             )
-        if culling == "lattice" or (culling == "automatic" and cells <= MOST_CELLS):
-            lattice = lattice_of(tree, free_resolution, region)
-        if culling == "lattice" and lattice is None:
-            raise SettingError(
-                "culling is lattice, but free points are no lattice coarser than the diagonal of "
-                "an SDF cell; accepted: automatic, octree, none"
-            )
+        points = free if len(free) else np.zeros((1, 3))
+        lower, upper = triple(points.min(axis=0)), triple(points.max(axis=0))
     return FreeTerm(
         interior=is_interior,
+        exhaustive=culling == "none",
         tree=tree,
+        rough=rough_tree(tree),
         region=region,
+        cells=cells,
         weights=weights,
-        normals=normals,
         centre=centre,
         radius=radius,
-        slack=np.inf if culling == "none" else 0.0,
+        lower=lower,
+        upper=upper,
         margin=_margin(tree, region),
-        lattice=lattice or NO_LATTICE,
     )
+
+
+def _cell_set_below(sdf: SdfGrid, level: float, lookup: str) -> CellSet:
+    """The cells of a grid that read any value below `level`, derived once."""
+
+    def make() -> CellSet:
+        region = cells_below(sdf, level, lookup)
+        return cell_set_of(region.box, (region.clearance < 0.0).reshape(sdf.shape))
+
+    return sdf.derived(("cell set below", level, lookup), make)
 
 
 def _interior_tree(sdf: SdfGrid, settings: CostSettings) -> tuple[Tree, InteriorPoints]:
@@ -168,6 +175,14 @@ def _sphere_around_cells(sdf: SdfGrid, level: float, lookup: str) -> tuple[Tripl
         return _sphere_around(centres, 0.5 / region.box.inverse)
 
     return sdf.derived(("sphere", level, lookup), make)
+
+
+def cell_centres(region: Region) -> FloatArray:
+    """Centres (3, A) of the cells of a region, in the order of their indices."""
+    box, cells = region.box, np.flatnonzero(region.clearance < 0.0)
+    plane, k = np.divmod(cells, int(box.along))
+    index = np.stack([*np.divmod(plane, int(box.across / box.along)), k])
+    return np.array(box.first)[:, None] + (index + 0.5 * box.between) / box.inverse
 
 
 def _sphere_around(points: FloatArray, margin: float) -> tuple[Triple, float]:

@@ -7,17 +7,12 @@ from typing import Any
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_kernels import (
-    MOST_SLACK,
-    Model,
-    Neighbours,
-    evaluate,
-    forget,
-    neighbours_of,
-)
+from chsel.cost.cost_kernels import Model, Work, evaluate, forget, gradient_of, put_pose, work_of
+from chsel.cost.free_kernels import MOST_SLACK
+from chsel.cost.pose_lanes import LANES, SUMS
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, implements, leaf, spliced
-from chsel.numerics.pose_tuples import decode, pull_back
+from chsel.numerics.pose_tuples import all_finite, decode, pull_back
 from chsel.numerics.threads import spread
 from chsel.problem.search_space import SearchSpace
 
@@ -42,47 +37,68 @@ def cost_of(model, space, vector, work):
     raise NotImplementedError
 
 
-@implements(cost_of, Model)
-def _relaxed_cost_of(model, space, vector, near):
-    return evaluate(model, decode(space, vector), near, 0.0).cost
+def costs_of(model, space, vectors, costs, work):
+    """Fill the costs (B,) of search vectors (B, d), likewise; infinite if one is not finite."""
+    raise NotImplementedError
+
+
+@implements(costs_of, Model)
+def _relaxed_costs_of(model, space, vectors, costs, work):
+    for first in range(0, len(vectors), LANES):
+        count = min(LANES, len(vectors) - first)
+        for lane in range(count):
+            vector = vectors[first + lane]
+            if all_finite(vector):
+                put_pose(work.lanes, lane, decode(space, vector))
+            else:
+                work.lanes[lane] = np.inf
+        evaluate(model, work, 0, count, 0.0)
+        for lane in range(count):
+            costs[first + lane] = work.lanes[SUMS + lane]
 
 
 @spliced
-def cost_and_gradient_of(model, space, vector, gradient, near):
+def cost_and_gradient_of(model, space, vector, gradient, work):
     """The cost of a search vector (d,); fills its gradient (d,)."""
-    sums = evaluate(model, decode(space, vector), near, 0.0)
-    pull_back(space, vector, sums.by_pose, gradient)
-    return sums.cost
+    put_pose(work.lanes, 0, decode(space, vector))
+    evaluate(model, work, 0, 1, 0.0)
+    pull_back(space, vector, gradient_of(work.lanes, 0), gradient)
+    return work.lanes[SUMS]
 
 
 @compiled
-def costs_and_gradients(model, space, vectors, costs, gradients, first, last, near):
+def costs_and_gradients(model, space, vectors, costs, gradients, first, last, work):
     """Fill costs (B,) and gradients (B, d) at search vectors (B, d), from `first` to `last`."""
     for n in range(first, last):
-        costs[n] = cost_and_gradient_of(model, space, vectors[n], gradients[n], near)
+        costs[n] = cost_and_gradient_of(model, space, vectors[n], gradients[n], work)
 
 
 @compiled
-def descend(model, space, vectors, rate, divisor, iterations, first, last, near):
-    """Move search vectors (B, d), from `first` to before `last`, by Adam.
+def descend(model, space, vectors, rate, divisor, iterations, first, last, work):
+    """Move search vectors (B, d), from `first` to before `last`, by Adam, LANES at a time.
 
     divisor: what gradients are divided by.
     """
     dimension = vectors.shape[1]
-    gradient, moments = np.empty(dimension), np.empty((2, dimension))
-    for n in range(first, last):
-        vector = vectors[n]
+    gradient, moments = np.empty(dimension), np.empty((LANES, 2, dimension))
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
         moments[:] = 0.0
         power1 = power2 = 1.0
-        forget(near)
+        forget(work)
         for _ in range(iterations):
-            sums = evaluate(model, decode(space, vector), near, MOST_SLACK)
-            pull_back(space, vector, sums.by_pose, gradient)
+            for lane in range(count):
+                put_pose(work.lanes, lane, decode(space, vectors[start + lane]))
+            evaluate(model, work, 0, count, MOST_SLACK)
             power1 *= BETA1
             power2 *= BETA2
-            for j in range(dimension):
-                slope = gradient[j] / divisor
-                vector[j] -= adam_step(slope, moments, j, (power1, power2), rate, EPSILON)
+            for lane in range(count):
+                vector = vectors[start + lane]
+                pull_back(space, vector, gradient_of(work.lanes, lane), gradient)
+                for j in range(dimension):
+                    slope = gradient[j] / divisor
+                    step = adam_step(slope, moments[lane], j, (power1, power2), rate, EPSILON)
+                    vector[j] -= step
 
 
 class Objective:
@@ -94,9 +110,9 @@ class Objective:
         self.model = cost.model
         self.space_arrays = space.arrays
 
-    def work(self) -> Neighbours:
+    def work(self) -> Work:
         """Scratch for one thread."""
-        return neighbours_of(self.model)
+        return work_of(self.model)
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d)."""
@@ -106,9 +122,9 @@ class Objective:
         """Costs (B,) and the defined gradients (B, d) at vectors (B, d)."""
         costs, gradients = np.empty(len(vectors)), np.empty(vectors.shape)
 
-        def run(first: int, last: int, near: Any) -> None:
+        def run(first: int, last: int, work: Any) -> None:
             space = self.space_arrays
-            costs_and_gradients(self.model, space, vectors, costs, gradients, first, last, near)
+            costs_and_gradients(self.model, space, vectors, costs, gradients, first, last, work)
 
         spread(run, len(vectors), self.work)
         return costs, gradients
@@ -119,9 +135,9 @@ class Objective:
         """Vectors (B, d) after some iterations of Adam; gradients are divided by `divisor`."""
         moved = np.array(vectors)
 
-        def run(first: int, last: int, near: Any) -> None:
+        def run(first: int, last: int, work: Any) -> None:
             space = self.space_arrays
-            descend(self.model, space, moved, rate, divisor, iterations, first, last, near)
+            descend(self.model, space, moved, rate, divisor, iterations, first, last, work)
 
         spread(run, len(moved), self.work)
         return moved

@@ -8,15 +8,16 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_kernels import MOST_SLACK, Model, Neighbours, evaluate, neighbours_of
+from chsel.cost.cost_kernels import Model, Work, evaluate, gradient_of, put_pose, work_of
 from chsel.cost.cost_settings import CostSettings
+from chsel.cost.free_kernels import MOST_SLACK
 from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective, adam_step
+from chsel.cost.pose_lanes import LANES
 from chsel.errors import require_at_most
 from chsel.methods.method import ConfiguredMethod
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import exp, log
-from chsel.numerics.octree import Candidates
 from chsel.numerics.pose_tuples import decode, pull_back
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
@@ -31,7 +32,7 @@ from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negati
 from chsel.qd.selection import ranked_hypotheses
 
 _LEAST = 1e-8  # of 2 h^2, which keeps gamma finite
-_MOST_REMEMBERED = 20_000_000  # points around all particles, 28 bytes each
+_MOST_REMEMBERED = 40_000_000  # points around all particles, 16 bytes each
 
 
 class Particles(NamedTuple):
@@ -61,23 +62,6 @@ def particles_at(vectors: FloatArray) -> Particles:
     )
 
 
-class Surroundings(NamedTuple):
-    """What each of P particles has around it, see Neighbours.
-
-    P is B, so that each remembers its neighbours, or 1 where that would be too large.
-    """
-
-    x: FloatArray  # (P, S)
-    y: FloatArray
-    z: FloatArray
-    kept: Any  # (P, S)
-    number: IntArray  # (P, 1)
-    slack: FloatArray  # (P, 1)
-    gathered: FloatArray  # (P, 12)
-    last: FloatArray  # (P, 12)
-    scratch: Candidates  # of all particles
-
-
 class SteinStep(NamedTuple):
     """How particles move in an iteration."""
 
@@ -87,23 +71,10 @@ class SteinStep(NamedTuple):
     rate: float  # of Adam
 
 
-def surroundings_of(model: Model, count: int) -> Surroundings:
-    """Those of so many particles, met for the first time."""
-    scratch = neighbours_of(model).candidates
-    size = len(scratch.x)
-    rows = count if count * size <= _MOST_REMEMBERED else 1
-    x, y, z = (np.empty((rows, size)) for _ in range(3))
-    return Surroundings(
-        x=x,
-        y=y,
-        z=z,
-        kept=np.empty((rows, size), dtype=scratch.kept.dtype),
-        number=np.zeros((rows, 1), dtype=np.int64),
-        slack=np.full((rows, 1), -1.0),
-        gathered=np.zeros((rows, 12)),
-        last=np.zeros((rows, 12)),
-        scratch=scratch,
-    )
+def surroundings_of(model: Model, count: int) -> Work:
+    """Scratch in which so many particles remember their neighbours, if it is not too large."""
+    size = model.free.tree.spheres.shape[1]
+    return work_of(model, count if count * size <= _MOST_REMEMBERED else LANES)
 
 
 @compiled
@@ -113,8 +84,8 @@ def svgd(
     """Move particles up log p = -beta C, and apart, by so many steps (SteinStep) of Adam."""
     vectors, powers = particles.vectors, particles.powers
     for _ in range(iterations):
-        for n in range(len(vectors)):
-            _fill_score(model, space, particles, around, n, settings.sharpness)
+        for first in range(0, len(vectors), LANES):
+            _fill_scores(model, space, particles, around, first, settings.sharpness)
         direct(particles, settings.scale, settings.median)
         powers[0] *= BETA1
         powers[1] *= BETA2
@@ -125,23 +96,22 @@ def svgd(
 
 
 @spliced
-def _fill_score(
-    model: Any, space: Any, particles: Any, around: Any, n: Any, sharpness: Any
+def _fill_scores(
+    model: Any, space: Any, particles: Any, around: Any, first: Any, sharpness: Any
 ) -> None:
-    """Fill the gradient (d,) of log p at the n-th particle."""
-    vector, score = particles.vectors[n], particles.scores[n]
-    row = n if len(around.x) > 1 else 0
-    most_slack = MOST_SLACK if len(around.x) > 1 else 0.0
-    x, y, z, kept, scratch = around.x, around.y, around.z, around.kept, around.scratch
-    candidates = Candidates(
-        x[row], y[row], z[row], scratch.radius, scratch.places, scratch.nodes, kept[row]
-    )
-    gathered, last = around.gathered[row], around.last[row]
-    near = Neighbours(candidates, around.number[row], around.slack[row], gathered, last)
-    sums = evaluate(model, decode(space, vector), near, most_slack)
-    pull_back(space, vector, sums.by_pose, score)
-    for j in range(len(score)):
-        score[j] *= -sharpness
+    """Fill the gradients (LANES, d) of log p from the first of some particles."""
+    vectors, lanes = particles.vectors, around.lanes
+    count = min(LANES, len(vectors) - first)
+    remembers = len(around.near.slack) >= len(vectors)
+    for lane in range(count):
+        put_pose(lanes, lane, decode(space, vectors[first + lane]))
+    slack = MOST_SLACK if remembers else 0.0
+    evaluate(model, around, first if remembers else 0, count, slack)
+    for lane in range(count):
+        score = particles.scores[first + lane]
+        pull_back(space, vectors[first + lane], gradient_of(lanes, lane), score)
+        for j in range(len(score)):
+            score[j] *= -sharpness
 
 
 @inner

@@ -11,6 +11,8 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.clearance import squared_clearances
 from chsel.numerics.compiler import inner, leaf
 
+_FARTHEST = 15  # cells, the greatest distance that a byte holds squared
+
 
 class Box(NamedTuple):
     """The nodes of a grid and the cells of its points, in numbers alone."""
@@ -29,6 +31,17 @@ class Region(NamedTuple):
 
     box: Box
     clearance: Any  # (nodes,) -1 in the set, else at most the squared distance to it, m^2; float32
+
+
+class CellSet(NamedTuple):
+    """A set of grid cells in two small tables: which cells it has, and how far others are from it.
+
+    Distances are those between cells as boxes, in sides of a cell: 0 for neighbours, too.
+    """
+
+    box: Box
+    bits: Any  # (words,) one bit for each cell, and a last one that is set; uint32
+    squares: Any  # (nodes,) squared distance to the set, at most 225; uint8
 
 
 def box_of(
@@ -58,6 +71,18 @@ def clearance_of(cells: BoolArray, resolution: float) -> Any:
     squared = (distance * (1.0 - 1e-6)) ** 2
     squared[cells] = -1.0
     return squared.astype(np.float32).reshape(-1)
+
+
+def cell_set_of(box: Box, cells: BoolArray) -> CellSet:
+    """The set of the flagged cells (nx, ny, nz) of a box."""
+    flags = np.zeros((cells.size // 32 + 1) * 32, dtype=bool)
+    flags[: cells.size] = cells.reshape(-1)
+    flags[cells.size] = True
+    words = np.packbits(flags, bitorder="little").view("<u4").astype(np.uint32)
+    squares = np.empty(cells.shape, dtype=np.int64)
+    squared_clearances(~cells, squares, 2)
+    squares = np.minimum(squares // 4, _FARTHEST * _FARTHEST).astype(np.uint8)
+    return CellSet(box, words, squares.reshape(-1))
 
 
 class Places(NamedTuple):
@@ -91,15 +116,15 @@ def locate(move, box, x, y, z, places, count):
         f = min(max(first[2], c), last[2])
         beyond[n] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
         a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
-        d = _node(a, box.between, most[0])
-        e = _node(b, box.between, most[1])
-        f = _node(c, box.between, most[2])
+        d = node_of(a, box.between, most[0])
+        e = node_of(b, box.between, most[1])
+        f = node_of(c, box.between, most[2])
         u[n], v[n], w[n] = a - d, b - e, c - f
         cell[n] = np.int32(d * box.across + e * box.along + f)
 
 
 @leaf
-def _node(g, between, most):
+def node_of(g, between, most):
     """The node of the cell that holds a grid coordinate: the nearest, or the one below."""
     nearest = np.rint(g)
     below = nearest - between

@@ -145,6 +145,15 @@ def finite(pose):
 
 
 @leaf
+def all_finite(vector):
+    """Whether a vector holds neither infinity nor NaN."""
+    finite = True
+    for x in vector:
+        finite &= np.isfinite(x)
+    return finite
+
+
+@leaf
 def rigid(pose):
     """Whether the rows of a pose's rotation are orthonormal up to rounding."""
     worst = 0.0

@@ -42,7 +42,7 @@ def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
 @leaf
 def distance_in_box(field, places, n):
     """Signed distance and gradient (s, n_x, n_y, n_z) at place n, which is in the box."""
-    table, at = field.table, places.cell[n]
+    table, at = field.table, np.uint64(places.cell[n])
     if field.trilinear:
         u, v, w = places.u[n], places.v[n], places.w[n]
         return distance_between_nodes(field.box, table, at, u, v, w)
@@ -52,12 +52,13 @@ def distance_in_box(field, places, n):
 @leaf
 def distance_between_nodes(box, table, base, u, v, w):
     """The same in the cell whose lowest node is `base`, at fractions u, v, w of its sides."""
-    across, along = int(box.across), int(box.along)
-    s = nx = ny = nz = 0.0
+    # Unsigned, as an index that may be negative costs more instructions than the sum.
+    across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
+    lowest, s, nx, ny, nz = np.uint64(base), 0.0, 0.0, 0.0, 0.0
     for corner in range(8):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
         weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
-        at = base + a * across + b * along + c
+        at = lowest + np.uint64(a) * across + np.uint64(b) * along + np.uint64(c)
         s += weight * table[at, 0]
         nx += weight * table[at, 1]
         ny += weight * table[at, 2]

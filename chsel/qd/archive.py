@@ -10,6 +10,7 @@ import numpy as np
 from chsel.errors import ChselError
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner
+from chsel.numerics.pose_tuples import all_finite
 from chsel.problem.registration_problem import ArchiveSnapshot
 from chsel.problem.search_space import SearchSpace
 from chsel.qd.measures import Measure
@@ -86,15 +87,6 @@ def batch_of(count: int, dimension: int, measures: int) -> Batch:
         value=np.full(count, -np.inf),
         order=np.arange(count),
     )
-
-
-@inner
-def all_finite(vector: FloatArray) -> bool:
-    """Whether a vector holds neither infinity nor NaN."""
-    finite = True
-    for x in vector:
-        finite &= np.isfinite(x)
-    return finite
 
 
 @compiled

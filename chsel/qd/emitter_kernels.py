@@ -11,14 +11,14 @@ from chsel.cost.objective import (
     BETA2,
     adam_step,
     cost_and_gradient_of,
-    cost_of,
+    costs_of,
 )
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
+from chsel.numerics.pose_tuples import all_finite
 from chsel.qd.archive import (
     Batch,
     Cells,
-    all_finite,
     cell_for,
     insert,
     keep_better,
@@ -143,11 +143,11 @@ def _evaluate(landscape: Landscape, batch: Batch) -> None:
     """Fill objectives and measures; a vector that is not finite is not looked up anywhere."""
     model, space, measure, work = landscape
     vectors, objectives, measures = batch.vectors, batch.objectives, batch.measures
+    costs_of(model, space, vectors, objectives, work)
     for i in range(len(objectives)):
-        vector = vectors[i]
-        if all_finite(vector):
-            objectives[i] = -cost_of(model, space, vector, work)
-            measures_of(space, measure, vector, measures[i])
+        if all_finite(vectors[i]):
+            objectives[i] = -objectives[i]
+            measures_of(space, measure, vectors[i], measures[i])
         else:
             objectives[i] = -np.inf
 

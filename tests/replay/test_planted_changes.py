@@ -32,19 +32,17 @@ PLANTS = {
         "chsel/qd/selection.py", "def select_elites(", "def select_elites(", "cracker_box_chsel", ""
     ),
     "a constant of the cost": Plant(
-        "chsel/cost/cost_kernels.py",
-        "value = model.known_scale * excess",
-        "value = 1.0000000000001 * model.known_scale * excess",
+        "chsel/cost/pose_lanes.py",
+        "value = scale * excess",
+        "value = 1.0000000000001 * scale * excess",
         "points_exact_descent",
         "descent, iteration 0",
     ),
     "the order of a sum": Plant(
-        "chsel/cost/cost_kernels.py",
+        "chsel/cost/pose_lanes.py",
         "xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
-        "    locate(pose, model.field.box, xs, ys, zs, places, len(xs))\n"
         "    for n in range(len(xs)):\n",
         "xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
-        "    locate(pose, model.field.box, xs, ys, zs, places, len(xs))\n"
         "    for n in range(len(xs) - 1, -1, -1):\n",
         "points_exact_descent",
         "descent, iteration 0",

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.cost.cost_kernels import Model, remember, travel
+from chsel.cost.cost_kernels import Model
+from chsel.cost.free_kernels import remember, travel
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner, leaf, spliced

@@ -13,12 +13,13 @@ from chsel.methods.medial_constraint.medial_cost import MedialCost
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.elementary import logs
+from chsel.numerics.pose_tuples import all_finite
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Observer
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
-from chsel.qd.archive import all_finite, rank
+from chsel.qd.archive import rank
 from chsel.qd.evolution_kernels import Strategy, ask, strategy_around, tell
 
 MOST_GENERATIONS = 20_000

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.cost.objective import cost_of
+from chsel.cost.objective import cost_of, costs_of
 from chsel.methods.medial_constraint.least_distances import ASTRAY, LeastDistances
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled, implements, inner, spliced
-from chsel.numerics.pose_tuples import Triple, decode, finite, moved, pose_at
+from chsel.numerics.pose_tuples import Triple, all_finite, decode, finite, moved, pose_at
 from chsel.problem.sdf_lookup import DistanceField, distance_in_box, distance_in_place
 
 _ROUNDING = 4e-7  # of the terms of a sum of three products and a number, all of 32 bits
@@ -201,6 +201,14 @@ def _known_mean(model, pose, places):
 @implements(cost_of, MedialModel)
 def _medial_cost_of(model, space, vector, scratch):
     return medial_cost(model, decode(space, vector), scratch)
+
+
+@implements(costs_of, MedialModel)
+def _medial_costs_of(model, space, vectors, costs, scratch):
+    for n in range(len(vectors)):
+        costs[n] = np.inf
+        if all_finite(vectors[n]):
+            costs[n] = medial_cost(model, decode(space, vectors[n]), scratch)
 
 
 @compiled

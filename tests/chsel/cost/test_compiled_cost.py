@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -58,7 +57,7 @@ class Case:
     def sdf(self) -> SdfGrid:
         return grid_of(self.shape)
 
-    def objective(self, culling: str = "automatic") -> Objective:
+    def objective(self, culling: str = "octree") -> Objective:
         cost = CompiledCost(
             self.sdf,
             self.points,
@@ -69,11 +68,8 @@ class Case:
         return Objective(cost, self.space)
 
     def other_cullings(self) -> list[Objective]:
-        """Every culling that these points allow."""
-        found = [self.objective("none"), self.objective("octree")]
-        with suppress(SettingError):
-            found.append(self.objective("lattice"))
-        return found
+        """Every culling but the default."""
+        return [self.objective("none")]
 
 
 @st.composite
@@ -373,18 +369,10 @@ EDGES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("free_term", "spacing", "named"),
-    [("interior", 0.05, "interior has none"), ("direct", 0.001, "no lattice coarser")],
-)
-def test_a_culling_that_does_not_fit_is_refused(free_term: str, spacing: float, named: str) -> None:
+def test_an_unknown_culling_is_refused() -> None:
     sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.01)
-    points = KnownPoints(free=np.eye(3) * 0.2)
-    settings = CostSettings(free_term=free_term)
-    with pytest.raises(SettingError, match=f"culling is lattice.*{named}.*accepted: automatic"):
-        CompiledCost(sdf, points, settings, free_resolution=spacing, culling="lattice")
-    with pytest.raises(SettingError, match="culling is 'quick'; accepted: automatic, none"):
-        CompiledCost(sdf, points, settings, culling="quick")
+    with pytest.raises(SettingError, match="culling is 'quick'; accepted: octree, none"):
+        CompiledCost(sdf, KnownPoints(free=np.eye(3) * 0.2), culling="quick")
 
 
 @pytest.mark.parametrize(
@@ -481,13 +469,12 @@ def test_matrices_that_are_no_rotations_cost_the_same_bits_with_every_culling(
     transforms[0, :3, :3] = 5.0 * np.eye(3)
     transforms[1, :3, :3] = np.diag([0.1, 4.0, 0.0])
     sdf, points, changes = grid_of("box"), KnownPoints(free), CostSettings(free_term=free_term)
-    automatic, tree, direct = (
+    tree, direct = (
         CompiledCost(sdf, points, changes, free_resolution=free_resolution, culling=culling)
-        for culling in ("automatic", "octree", "none")
+        for culling in ("octree", "none")
     )
     costs = direct.evaluate(transforms)
     assert (costs > 0.0).sum() > 20
-    assert_same_bits(automatic.evaluate(transforms), costs)
     assert_same_bits(tree.evaluate(transforms), costs)
 
 

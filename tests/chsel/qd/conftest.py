@@ -8,6 +8,7 @@ from typing import Any
 import numba
 import pytest
 
+from chsel.numerics.pose_tuples import all_finite
 from chsel.qd import emitter_kernels as kernels
 from chsel.qd.emitters import SEARCHES
 
@@ -18,10 +19,23 @@ def searches_around() -> Iterator[Callable[..., None]]:
     with pytest.MonkeyPatch.context() as patch:
 
         def around(*functions: Any) -> None:
-            for function in functions:
+            for function in functions[1:]:
                 patch.setattr(kernels, function.__name__, function)
+            patch.setattr(kernels, "costs_of", _one_by_one(functions[0]))
             for name in SEARCHES:
                 loop: Any = getattr(kernels, name)
                 patch.setattr(kernels, name, numba.njit(error_model="numpy")(loop.py_func))
 
         yield around
+
+
+def _one_by_one(cost_of: Any) -> Any:
+    """What fills the costs of several vectors, of what returns that of one."""
+
+    @numba.njit
+    def costs_of(model, space, vectors, costs, work):  # type: ignore[no-untyped-def]
+        for n in range(len(vectors)):
+            if all_finite(vectors[n]):
+                costs[n] = cost_of(model, space, vectors[n], work)
+
+    return costs_of

@@ -1,0 +1,165 @@
+"""Several poses evaluated together at the same points, each in a lane of vector instructions.
+
+A lane does what it would do alone, in the same order, so that no result depends on the others.
+The numbers of all lanes are in one array, a row of LANES for each quantity. Loops over the lanes
+become vector code because they read and write nothing else.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from chsel.numerics.cell_set import node_of
+from chsel.numerics.compiler import inner, leaf
+from chsel.problem.sdf_lookup import distance_between_nodes
+
+LANES = 8
+POSE = 0  # the first of 12 rows
+SUMS = 12 * LANES  # the first of 13 rows: costs, and their gradients by the poses
+_AWAY = 25 * LANES  # the first of 3 rows: from the nearest point of the grid's box
+_BEYOND = 28 * LANES  # its square
+_PLACE = 29 * LANES  # the first of 3 rows: from the node of the cell, in cells
+_CELL = 32 * LANES
+_READ = 33 * LANES  # the first of 4 rows: signed distance and gradient
+SIZE = 37 * LANES
+_SHORTEST = 1e-12
+
+
+@inner
+def add_occupied(model, lanes):
+    """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
+    xs, ys, zs = model.occupied[0], model.occupied[1], model.occupied[2]
+    for n in range(len(xs)):
+        x, y, z = xs[n], ys[n], zs[n]
+        _read(model.field, lanes, x, y, z)
+        _add_violations(model, lanes, x, y, z)
+
+
+@inner
+def add_known(model, lanes):
+    """sum |s - v|, with gradient (s - v) n, over points of known signed distance (Eq. 10)."""
+    xs, ys, zs = model.known[0], model.known[1], model.known[2]
+    for n in range(len(xs)):
+        x, y, z = xs[n], ys[n], zs[n]
+        _read(model.field, lanes, x, y, z)
+        _add_differences(model, lanes, model.known_sdf[n], x, y, z)
+
+
+@inner
+def _add_violations(model, lanes, x, y, z):
+    scale, alpha, exact = model.occupied_scale, model.alpha, model.exact_gradient
+    for at in range(LANES):
+        violation = max(alpha + lanes[_READ + at], 0.0)
+        size = scale * slope(exact, violation)
+        value = scale * violation
+        _add(lanes, at, value, size, x, y, z)
+
+
+@inner
+def _add_differences(model, lanes, known_sdf, x, y, z):
+    scale, tolerance, exact = model.known_scale, model.known_tolerance, model.exact_gradient
+    for at in range(LANES):
+        difference = lanes[_READ + at] - known_sdf
+        excess = max(abs(difference) - tolerance, 0.0)
+        size = scale * slope(exact, excess)
+        size = size if difference > 0.0 else -size
+        value = scale * excess
+        _add(lanes, at, value, size, x, y, z)
+
+
+@leaf
+def slope(exact, violation):
+    """The violation itself, as the paper defines the gradient, or that of its value."""
+    if exact:
+        return 1.0 if violation > 0.0 else 0.0
+    return violation
+
+
+@leaf
+def _add(lanes, at, value, size, x, y, z):
+    """Add a value, and the gradient of size times normal at a world point."""
+    gx, gy, gz = (
+        size * lanes[_READ + LANES + at],
+        size * lanes[_READ + 2 * LANES + at],
+        size * lanes[_READ + 3 * LANES + at],
+    )
+    lanes[SUMS + at] += value
+    lanes[SUMS + LANES + at] += gx * x
+    lanes[SUMS + 2 * LANES + at] += gx * y
+    lanes[SUMS + 3 * LANES + at] += gx * z
+    lanes[SUMS + 4 * LANES + at] += gy * x
+    lanes[SUMS + 5 * LANES + at] += gy * y
+    lanes[SUMS + 6 * LANES + at] += gy * z
+    lanes[SUMS + 7 * LANES + at] += gz * x
+    lanes[SUMS + 8 * LANES + at] += gz * y
+    lanes[SUMS + 9 * LANES + at] += gz * z
+    lanes[SUMS + 10 * LANES + at] += gx
+    lanes[SUMS + 11 * LANES + at] += gy
+    lanes[SUMS + 12 * LANES + at] += gz
+
+
+@inner
+def _read(field, lanes, x, y, z):
+    """Read signed distance and gradient at a world point, which is elsewhere for each pose."""
+    _locate(field.box, lanes, x, y, z)
+    table, beyond = field.table, 0.0
+    for at in range(LANES):
+        cell = np.uint64(np.int64(lanes[_CELL + at]))
+        if field.trilinear:
+            u, v = lanes[_PLACE + at], lanes[_PLACE + LANES + at]
+            w = lanes[_PLACE + 2 * LANES + at]
+            s, nx, ny, nz = distance_between_nodes(field.box, table, cell, u, v, w)
+        else:
+            one = np.uint64(1)
+            s, nx = table[cell, np.uint64(0)], table[cell, one]
+            ny, nz = table[cell, np.uint64(2)], table[cell, np.uint64(3)]
+        lanes[_READ + at], lanes[_READ + LANES + at] = s, nx
+        lanes[_READ + 2 * LANES + at], lanes[_READ + 3 * LANES + at] = ny, nz
+        beyond = max(beyond, lanes[_BEYOND + at])
+    if beyond > 0.0:
+        _go_beyond(field.box_distance, lanes)
+
+
+@inner
+def _locate(box, lanes, x, y, z):
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    for at in range(LANES):
+        a = lanes[at] * x + lanes[LANES + at] * y + lanes[2 * LANES + at] * z
+        b = lanes[3 * LANES + at] * x + lanes[4 * LANES + at] * y + lanes[5 * LANES + at] * z
+        c = lanes[6 * LANES + at] * x + lanes[7 * LANES + at] * y + lanes[8 * LANES + at] * z
+        a, b = a + lanes[9 * LANES + at], b + lanes[10 * LANES + at]
+        c = c + lanes[11 * LANES + at]
+        d = min(max(first[0], a), last[0])  # in this order, NaN ends up in the box
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
+        a, b, c = a - d, b - e, c - f
+        lanes[_BEYOND + at] = a * a + b * b + c * c
+        lanes[_AWAY + at], lanes[_AWAY + LANES + at], lanes[_AWAY + 2 * LANES + at] = a, b, c
+        a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
+        d = node_of(a, box.between, most[0])
+        e = node_of(b, box.between, most[1])
+        f = node_of(c, box.between, most[2])
+        lanes[_PLACE + at], lanes[_PLACE + LANES + at] = a - d, b - e
+        lanes[_PLACE + 2 * LANES + at] = c - f
+        lanes[_CELL + at] = d * box.across + e * box.along + f
+
+
+@inner
+def _go_beyond(box_distance, lanes):
+    """What is read outside of the box, from what was read at its nearest point; see SdfGrid."""
+    for at in range(LANES):
+        s, nx = lanes[_READ + at], lanes[_READ + LANES + at]
+        ny, nz = lanes[_READ + 2 * LANES + at], lanes[_READ + 3 * LANES + at]
+        ax, ay = lanes[_AWAY + at], lanes[_AWAY + LANES + at]
+        az = lanes[_AWAY + 2 * LANES + at]
+        if not box_distance:
+            length = max(np.sqrt(nx * nx + ny * ny + nz * nz), _SHORTEST)
+            ax += s * (nx / length)
+            ay += s * (ny / length)
+            az += s * (nz / length)
+        length = max(np.sqrt(ax * ax + ay * ay + az * az), _SHORTEST)
+        outside = lanes[_BEYOND + at] > 0.0
+        lanes[_READ + at] = length if outside else s
+        lanes[_READ + LANES + at] = ax / length if outside else nx
+        lanes[_READ + 2 * LANES + at] = ay / length if outside else ny
+        lanes[_READ + 3 * LANES + at] = az / length if outside else nz
