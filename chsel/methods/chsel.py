@@ -42,9 +42,9 @@ MOST_PASSES = 10_000
 _BEST = 0.2  # of the estimates: those that the next pass starts around
 
 
-def _racing() -> DescentSettings:
-    """Starts that are far behind after some blocks would end in minima that nobody asks for."""
-    return DescentSettings(stop_below=None, race=(1.0, 1.0, 0.5, 0.5, 0.25))
+# Most starts end in minima that nobody asks for: many, of which few go on.
+_DESCENT = DescentSettings(restarts=5, stop_below=None, race=(1.0, 0.5, 0.25))
+_EMITTER = EmitterSettings(iterations=30)
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,26 @@ class ChselSettings(CheckedSettings):
     search: Annotated[str, one_of(*SEARCHES)] = "cma_mega"
     passes: Annotated[int, positive, at_most(MOST_PASSES)] = 1  # each around the best of the last
     cost: CostSettings = field(default_factory=CostSettings)
-    descent: DescentSettings = field(default_factory=_racing)
+    descent: DescentSettings = _DESCENT
     archive: ArchiveSettings = field(default_factory=ArchiveSettings)
-    emitter: EmitterSettings = field(default_factory=EmitterSettings)
+    emitter: EmitterSettings = _EMITTER
     output: OutputSettings = field(default_factory=OutputSettings)
     online: OnlineSettings = field(default_factory=OnlineSettings)
     starts: AnchoredStarts | None = field(default_factory=AnchoredStarts)  # beside E_0
     plane: PlaneSettings | None = None  # restricts the poses to SE(2)
 
-    presets: ClassVar[Presets] = {"paper": {"starts": None}, "reference": {"starts": None}}
+    presets: ClassVar[Presets] = {
+        "paper": {
+            "starts": None,
+            "descent": {"restarts": 10, "race": None},
+            "emitter": {"iterations": 100},
+        },
+        "reference": {
+            "starts": None,
+            "descent": {"restarts": 10, "race": None, "stop_below": 1e-6},
+            "emitter": {"iterations": 100},
+        },
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -45,10 +45,7 @@ class DescentSettings(CheckedSettings):
     # all further blocks. None: all descend to the end.
     race: tuple[float, ...] | None = None
 
-    presets: ClassVar[Presets] = {
-        "paper": {"stop_below": None, "race": None},
-        "reference": {"stop_below": 1e-6, "race": None},
-    }
+    presets: ClassVar[Presets] = {"paper": {"stop_below": None}, "reference": {}}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -248,8 +248,8 @@ def _spans(ascending: FloatArray, wanted: FloatArray, reach: FloatArray | float)
 class AnchoredStarts(CheckedSettings):
     """How many poses on contacts CHSEL descends from, beside E_0."""
 
-    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 10_000  # poses that are drawn
-    kept: Annotated[int, positive, at_most(MOST_KEPT)] = 30  # those of them that score best
+    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 20_000  # poses that are drawn
+    kept: Annotated[int, positive, at_most(MOST_KEPT)] = 60  # those of them that score best
     anchors: AnchorSettings = field(default_factory=AnchorSettings)
 
 
