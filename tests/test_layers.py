@@ -53,7 +53,14 @@ MAY_IMPORT = {
         "evaluation": {"objects", "sensors", "sessions", "simulated_robot", "command", "run"},
         "published_package": {"sessions", "evaluation"},
         "reporting": {"objects", "sessions", "evaluation"},
-        "benchmarks": {"objects", "sessions", "run", "published_package", "reporting"},
+        "benchmarks": {
+            "objects",
+            "sessions",
+            "run",
+            "evaluation",
+            "published_package",
+            "reporting",
+        },
     },
 }
 """Folders of a package (`registration` is a file), and those of it that each may import."""

@@ -12,10 +12,11 @@ from rich.box import MARKDOWN, SIMPLE_HEAD, Box
 from rich.table import Table
 
 from replay.console import Console
-from runners.benchmarks.registrations import PRESETS
 from runners.run.recording import write_in_run_folder
 
 Values = Mapping[str, Any]
+_PACKAGE = "package"  # begins the names of its registrations
+_MEASURE_WIDTH = 12  # characters, on the terminal
 _PAGE_WIDTH = 160  # characters: no table is wider
 
 
@@ -56,12 +57,12 @@ def number(value: float) -> str:
 
 
 def ratios(rows: Sequence[Values], row: Values) -> dict[str, float]:
-    """How many times as long as ours, in each preset, the median of a package's row is."""
-    if not row["who"].startswith("package"):
+    """How many times as long as the median of one of ours those of the packages' rows are."""
+    if row["who"].startswith(_PACKAGE):
         return {}
-    ours = {r["who"]: r["median"] for r in rows if r["case"] == row["case"]}
-    names = [who for who in ours if who.startswith("ours")]
-    return {who.removeprefix("ours, "): row["median"] / ours[who] for who in names}
+    beside = {r["who"]: r["median"] for r in rows if r["case"] == row["case"]}
+    packages = [who for who in beside if who.startswith(_PACKAGE)]
+    return {who: beside[who] / row["median"] for who in packages}
 
 
 def _machine(machine: Values) -> list[str]:
@@ -80,44 +81,50 @@ def _machine(machine: Values) -> list[str]:
 
 
 def _show_comparison(console: Console, rows: Sequence[Values], box: Box) -> None:
-    compared = any(row["times_ours"] for row in rows)
+    packages = list(dict.fromkeys(who for row in rows for who in row["faster"]))
     title = "one registration in ms"
-    if compared:
-        title += "; x ref, pap, def: times ours in preset reference, paper, default"
+    if packages:
+        title += "; x: how many times as long the package takes, with its own cost and with Eq. 8"
     for line in (title, "cost: of the best pose, by Eq. 7 with nearest lookup for all", ""):
         console.print(line, soft_wrap=True)
     table = Table(box=box, show_edge=box is MARKDOWN, collapse_padding=True)
     for name in ("problem", "registration"):
         table.add_column(name, no_wrap=True)
-    ratio_names = [f"x {preset[:3]}" for preset in PRESETS] if compared else []
+    ratio_names = [who.replace("package", "x").replace("x, ", "x ") for who in packages]
     for name in ("median", "quartiles", *ratio_names, "cost"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
-        times = [number(value) for value in row["times_ours"].values()] or [""] * len(ratio_names)
+        times = [number(row["faster"][who]) if who in row["faster"] else "" for who in packages]
         cells = [row["case"], row["who"], number(row["median"]), _quartiles(row)]
         table.add_row(*cells, *times, number(row["lowest_cost"]))
     console.print(table)
 
 
 def _show_calls(console: Console, problems: Mapping[str, Values]) -> None:
-    """How often the package asked for its cost: twice an iteration of the search, once a step."""
-    calls = {
-        name: problem["did"]["package"]["cost_calls"]
-        for name, problem in problems.items()
-        if "package" in problem["did"]
-    }
-    if calls:
-        counts = ", ".join(f"{name} {count}" for name, count in calls.items())
-        for line in ("", f"cost calls of the package, counted: {counts}", ""):
-            console.print(line)
+    """How often the package asked for its cost: twice an iteration of the search, once a step.
+
+    And how many poses the descents of CHSEL evaluated, in each preset.
+    """
+    lines = []
+    for name, problem in problems.items():
+        did = problem["did"]
+        descended = {who: one.get("poses_descended", 0) for who, one in did.items()}
+        counts = [f"{who.removeprefix('ours, ')} {n}" for who, n in descended.items() if n]
+        calls = ""
+        if "package" in did:
+            calls = f"; cost calls of the package {did['package']['cost_calls']}"
+        lines.append(f"{name}: {', '.join(counts)}{calls}")
+    for line in ("", "poses evaluated in descents, counted:", "", *lines, ""):
+        console.print(f"- {line}" if line in lines else line, soft_wrap=True)
 
 
 def _show_alone(console: Console, rows: Sequence[Values], box: Box) -> None:
     console.print("this library alone: median and quartiles")
     console.print()
     table = Table(box=box, show_edge=box is MARKDOWN, collapse_padding=True)
-    for name in ("measure", "case", "preset"):
-        table.add_column(name)
+    table.add_column("measure", max_width=None if box is MARKDOWN else _MEASURE_WIDTH)
+    table.add_column("case")
+    table.add_column("method", no_wrap=True)
     for name in ("median", "quartiles", ""):
         table.add_column(name, justify="right")
     previous = ""

@@ -1,7 +1,7 @@
 """Measurements that need a process of their own: memory, and the time to start.
 
 As a program: `python -m runners.benchmarks.fresh JSON` imports the library, registers once if JSON
-names a preset, and prints its peak memory.
+names a preset, and prints its peak memory. It imports torch first if JSON says so.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +33,30 @@ def time_of_imports() -> float:
     return _run({})[0]
 
 
+def time_of_torch() -> float:
+    """Seconds of a process that only imports torch."""
+    begun = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "import torch"], check=True)
+    return time.perf_counter() - begun
+
+
 def first_and_later_start(
     problem: Path, preset: str, steps: Steps, repeats: int
-) -> tuple[float, tuple[float, ...]]:
-    """Seconds of processes that register once: with no compiled kernel on disk, and with all."""
+) -> tuple[float, dict[str, tuple[float, ...]]]:
+    """Seconds of processes that register once: with no compiled kernel on disk, and with all.
+
+    The latter in turn without torch, which no registration needs, and with torch imported, too.
+    """
+    from runners.benchmarks.timing import in_turn  # it imports torch, which a fresh process lacks
+
     task = _task(problem, preset, steps)
     with tempfile.TemporaryDirectory() as folder:
         first = _run(task, cache=folder)[0]
-        return first, tuple(_run(task, cache=folder)[0] for _ in range(repeats))
+        later = {
+            name: partial(lambda task: _run(task, cache=folder)[0], {**task, "torch": torch})
+            for name, torch in (("later", False), ("later, with torch", True))
+        }
+        return first, in_turn(repeats, later)
 
 
 def _task(problem: Path, preset: str | None, steps: Steps) -> dict[str, Any]:
@@ -63,10 +80,9 @@ def _run(task: dict[str, Any], cache: str | None = None) -> tuple[float, dict[st
 
 def main(task: dict[str, Any]) -> None:
     """Do the task of one such process."""
+    if task.get("torch"):
+        import torch  # noqa: F401
     if task:
-        import torch
-
-        torch.set_num_threads(1)
         steps = Steps(**task["steps"])
         problem = load_problem(Path(task["problem"]))
         method(task["preset"], steps, steps.search).register(problem)

@@ -23,10 +23,16 @@ from chsel.problem.settings import in_preset
 from chsel.problem.streams import StreamKey
 from runners.benchmarks.decisions import decisions
 from runners.benchmarks.depth_images import depth_images
-from runners.benchmarks.fresh import first_and_later_start, memory_of_one, time_of_imports
+from runners.benchmarks.fresh import (
+    first_and_later_start,
+    memory_of_one,
+    time_of_imports,
+    time_of_torch,
+)
+from runners.benchmarks.pd_over_time import pd_over_time
 from runners.benchmarks.plausible_sets import plausible_sets
 from runners.benchmarks.problems import PROBLEMS, PosedProblem, Problem, pose
-from runners.benchmarks.recording_cost import recorded_registrations
+from runners.benchmarks.recording_cost import NO_FILE, recorded_registrations
 from runners.benchmarks.registrations import PRESETS, Scope, StageTimer, register
 from runners.benchmarks.timing import Row, in_turn, milliseconds
 
@@ -34,6 +40,8 @@ _PROBLEM = "real_20"
 _BESIDE = "chsel"
 _THREADED = ("real_20", "large_20")
 _THREADS = (1, 2)
+_SPREAD = (*PRESETS, "anchored, medium")
+_STAGED = (*PRESETS, "anchored, adaptive")
 _POSES = 100_000
 _POSES_AT_ONCE = 1000
 _POSES_ON_GPU = (100_000, 1_000_000, 10_000_000)
@@ -43,49 +51,62 @@ _LONGEST = 3.0  # seconds
 def stages(scope: Scope) -> Iterator[Row]:
     """Adam, search, and all else of a registration."""
     posed = pose(PROBLEMS[_PROBLEM], scope.seed)
-    for preset in PRESETS:
+    for name in _STAGED:
         parts: dict[str, list[float]] = {}
         for _ in range(scope.repeats + 1):
             timer = StageTimer()
-            seconds, _ = register(posed, preset, scope.steps, scope.steps.search, timer)
+            seconds, _ = register(posed, name, scope.steps, scope.steps.search, timer)
             taken = {**timer.seconds, "other": seconds - sum(timer.seconds.values())}
             for stage, value in taken.items():
                 parts.setdefault(stage, []).append(1000.0 * value)
         for stage, samples in parts.items():
-            yield Row("stage", stage, preset, "ms", tuple(samples[1:]))
+            yield Row("stage", stage, name, "ms", tuple(samples[1:]))
 
 
 def threads(scope: Scope) -> Iterator[Row]:
-    """One and two threads, in turn."""
+    """One and two threads, in turn, and how many times as fast two are."""
 
-    def measured(posed: PosedProblem, preset: str, count: int) -> float:
+    def measured(posed: PosedProblem, name: str, count: int) -> float:
         with use_threads(count):
-            return 1000.0 * scope.seconds(posed, preset)
+            return 1000.0 * scope.seconds(posed, name)
 
     for problem in _THREADED:
         posed = pose(PROBLEMS[problem], scope.seed)
-        for preset in PRESETS:
-            cases = {str(count): partial(measured, posed, preset, count) for count in _THREADS}
-            for name, samples in in_turn(scope.repeats, cases).items():
-                yield Row("threads", f"{problem}, {name}", preset, "ms", samples, float(name))
+        for name in _SPREAD:
+            cases = {str(count): partial(measured, posed, name, count) for count in _THREADS}
+            samples = in_turn(scope.repeats, cases)
+            for count, taken in samples.items():
+                yield Row("threads", f"{problem}, {count}", name, "ms", taken, float(count))
+            one, two = (samples[str(count)] for count in _THREADS)
+            yield Row("speed-up", problem, name, "x", tuple(np.divide(one, two).tolist()))
 
 
 def free_points(scope: Scope) -> Iterator[Row]:
-    """Growth with the free points: in a larger box at the same spacing, and more densely."""
+    """Growth with the free points: in a larger box at the same spacing, and more densely.
+
+    Also how many times as long the most of them take as the fewest.
+    """
     for spread, measure in ((True, "free, more space"), (False, "free, denser")):
+        medians: dict[str, dict[int, float]] = {preset: {} for preset in PRESETS}
         for count in scope.free_points:
-            problem = Problem(free_points=count, spread=spread)
-            actual = len(pose(problem, scope.seed).free)
+            posed = pose(Problem(free_points=count, spread=spread), scope.seed)
+            actual = len(posed.free)
             for preset in PRESETS:
-                samples = scope.timed(problem, preset)
-                yield Row(measure, f"{actual}", preset, "ms", samples, float(actual))
+                row = Row(measure, f"{actual}", preset, "ms", scope.timed(posed, preset), actual)
+                medians[preset][actual] = row.median
+                yield row
+        for preset, grown in medians.items():
+            few, many = min(grown), max(grown)
+            ratio = grown[many] / grown[few]
+            yield Row(f"{measure}, growth", f"{few} to {many}", preset, "x", (ratio,))
 
 
 def hypotheses(scope: Scope) -> Iterator[Row]:
     """Growth with B."""
     for count in scope.hypotheses:
+        posed = pose(Problem(hypotheses=count), scope.seed)
         for preset in PRESETS:
-            samples = scope.timed(Problem(hypotheses=count), preset)
+            samples = scope.timed(posed, preset)
             yield Row("hypotheses", str(count), preset, "ms", samples, float(count))
 
 
@@ -150,12 +171,16 @@ def _rate(evaluate: Callable[[FloatArray], FloatArray], poses: FloatArray, repea
 
 
 def recording(scope: Scope) -> Iterator[Row]:
-    """What writing both recordings adds to a registration."""
+    """What writing recordings adds to a registration; it is little, and measured the more often."""
     posed = pose(PROBLEMS[_PROBLEM], scope.seed)
     for preset in PRESETS:
-        samples = recorded_registrations(posed, preset, scope.steps, scope.repeats)
+        samples = recorded_registrations(posed, preset, scope.steps, scope.repeats**2)
         for case, values in samples.items():
             yield Row("recording", case, preset, "ms", values)
+        for case, values in samples.items():
+            if case != NO_FILE:
+                added = tuple(np.subtract(values, samples[NO_FILE]).tolist())
+                yield Row("recording, added", f"{case}, goal 5 ms", preset, "ms", added)
 
 
 def memory(scope: Scope) -> Iterator[Row]:
@@ -172,12 +197,18 @@ def memory(scope: Scope) -> Iterator[Row]:
 def start(scope: Scope) -> Iterator[Row]:
     """Seconds of a whole process: imports alone; one registration, kernels not yet compiled."""
     posed = pose(PROBLEMS[_PROBLEM], scope.seed)
-    imports = tuple(time_of_imports() for _ in range(scope.repeats))
-    yield Row("start", "imports alone", "", "s", imports)
+    alone = in_turn(
+        scope.repeats, {"import torch": time_of_torch, "imports alone": time_of_imports}
+    )
+    for case, seconds in alone.items():
+        yield Row("start", case, "", "s", seconds)
     with _saved(posed) as path:
         first, later = first_and_later_start(path, "default", scope.steps, scope.repeats)
     yield Row("start", "first, compiling", "default", "s", (first,))
-    yield Row("start", "later", "default", "s", later)
+    for case, seconds in later.items():
+        yield Row("start", case, "default", "s", seconds)
+    over = np.subtract(later["later, with torch"], np.median(alone["import torch"]))
+    yield Row("start", "over import torch, goal 1.5 s", "default", "s", tuple(over.tolist()))
 
 
 MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
@@ -186,6 +217,7 @@ MEASURES: dict[str, Callable[[Scope], Iterator[Row]]] = {
     "free_points": free_points,
     "hypotheses": hypotheses,
     "methods": methods,
+    "pd_over_time": pd_over_time,
     "decisions": decisions,
     "plausible_sets": plausible_sets,
     "depth_images": depth_images,

@@ -18,8 +18,9 @@ from runners.benchmarks.timing import in_turn
 from runners.run.recording import RecordingConfig, open_recorder
 
 _PROBE = 0.1  # seconds: what a probe takes, in which a recorder may end what it has begun
+NO_FILE = "none"
 _FILES = {
-    "none": RecordingConfig(mcap=False, rerun=False),
+    NO_FILE: RecordingConfig(mcap=False, rerun=False),
     "mcap": RecordingConfig(rerun=False),
     "both": RecordingConfig(),
 }

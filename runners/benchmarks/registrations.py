@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
+import inspect
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
 
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.torch_cost import RelaxedCost
+from chsel.cost.objective import Objective
 from chsel.errors import require_positive
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Observer
 from chsel.problem.settings import in_preset
-from runners.benchmarks.problems import PosedProblem, Problem, pose
+
+if TYPE_CHECKING:
+    from runners.benchmarks.problems import PosedProblem
 
 PRESETS = ("reference", "paper", "default")
+EQUAL_STEPS = ("reference", "paper")
+"""Presets that do as many steps as the package; all else is registered as it ships."""
+SIZES = tuple(f"anchored, {size}" for size in ("small", "medium", "adaptive"))
+OURS = (*PRESETS, *SIZES)
+"""Registrations by this library: presets of CHSEL, and sizes of the method `anchored`."""
 
 
 @dataclass(frozen=True)
 class Steps:
-    """How much every registration does, by either package; none stops early."""
+    """How much EQUAL_STEPS and the package do, neither of which stops early."""
 
     restarts: int = 10  # of descent
     adam: int = 50  # Adam steps of a restart
@@ -37,27 +48,48 @@ class Steps:
         return self.long_search if long else self.search
 
 
-def method(preset: str, steps: Steps, search: int) -> Method:
-    """CHSEL in a preset, with all steps done."""
-    settings = preset_settings("chsel", preset)
-    descent = replace(
-        settings.descent, restarts=steps.restarts, iterations=steps.adam, stop_below=None
-    )
-    emitter = replace(settings.emitter, iterations=search)
-    return build_method("chsel", replace(settings, descent=descent, emitter=emitter))
+def method(name: str, steps: Steps, search: int) -> Method:
+    """One of OURS: with all steps done, or as it ships but for the iterations of its search."""
+    if name in SIZES:
+        settings = replace(preset_settings("anchored"), size=name.removeprefix("anchored, "))
+        return build_method("anchored", settings)
+    settings = preset_settings("chsel", name)
+    settings = replace(settings, emitter=replace(settings.emitter, iterations=search))
+    if name in EQUAL_STEPS:
+        descent = replace(
+            settings.descent, restarts=steps.restarts, iterations=steps.adam, stop_below=None
+        )
+        settings = replace(settings, descent=descent)
+    return build_method("chsel", settings)
+
+
+@contextmanager
+def descents_counted() -> Iterator[list[int]]:
+    """Collects how many poses each call of Adam evaluates with their gradients."""
+    counts: list[int] = []
+    descended = Objective.descended
+    bound = inspect.signature(descended).bind
+
+    def counted(*given: Any, **named: Any) -> FloatArray:
+        values = bound(*given, **named).arguments
+        counts.append(len(values["vectors"]) * values["iterations"])
+        return descended(*given, **named)
+
+    with patch.object(Objective, "descended", counted):
+        yield counts
 
 
 def register(
     posed: PosedProblem,
-    preset: str,
+    name: str,
     steps: Steps,
     search: int,
     observer: Observer | None = None,
 ) -> tuple[float, Hypotheses]:
-    """Seconds from arrays to hypotheses, and these; only the SDF grid is there already."""
+    """Seconds from arrays to hypotheses by one of OURS, and these; only the SDF grid is there."""
     begun = time.perf_counter()
     problem = posed.registration_problem()
-    hypotheses = method(preset, steps, search).register(problem, observer)
+    hypotheses = method(name, steps, search).register(problem, observer)
     return time.perf_counter() - begun, hypotheses
 
 
@@ -72,19 +104,21 @@ class Scope:
     hypotheses: tuple[int, ...] = ()
     gpu: bool = False  # whether evaluation is measured there, too
 
-    def timed(self, problem: Problem, preset: str) -> tuple[float, ...]:
+    def timed(self, posed: PosedProblem, name: str) -> tuple[float, ...]:
         """Milliseconds of repeated registrations of a problem, after one that is not counted."""
-        posed = pose(problem, self.seed)
-        self.seconds(posed, preset)
-        return tuple(1000.0 * self.seconds(posed, preset) for _ in range(self.repeats))
+        self.seconds(posed, name)
+        return tuple(1000.0 * self.seconds(posed, name) for _ in range(self.repeats))
 
-    def seconds(self, posed: PosedProblem, preset: str) -> float:
-        """Seconds of one registration."""
-        return register(posed, preset, self.steps, self.steps.search)[0]
+    def seconds(self, posed: PosedProblem, name: str) -> float:
+        """Seconds of one registration by one of OURS."""
+        return register(posed, name, self.steps, self.steps.search)[0]
 
 
 def common_costs(posed: PosedProblem, poses: FloatArray) -> FloatArray:
     """Costs (B,) of poses (B, 4, 4) under the paper's equation: the same measure for everyone."""
+    # A registration needs no torch, and a fresh process that is timed does not import it for this.
+    from chsel.cost.torch_cost import RelaxedCost
+
     paper = in_preset(CostSettings(), "paper")
     return RelaxedCost.of(posed.registration_problem(), paper).evaluate(poses)
 

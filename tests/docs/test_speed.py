@@ -10,6 +10,9 @@ _NAMES = {
     "ours, `default`": "ours, default",
     "ours, `paper`": "ours, paper",
     "ours, `reference`": "ours, reference",
+    "`anchored`, small": "anchored, small",
+    "`anchored`, medium": "anchored, medium",
+    "`anchored`, adaptive": "anchored, adaptive",
     "package": "package",
     "package, Eq. 8": "package, Eq. 8",
 }

@@ -23,11 +23,13 @@ from runners.benchmarks.benchmark_tables import number, ratios
 from runners.benchmarks.comparison import BenchmarkError, require_equal
 from runners.benchmarks.decisions import decisions
 from runners.benchmarks.measures import methods
+from runners.benchmarks.pd_over_time import PD, pd_over_time
 from runners.benchmarks.plausible_sets import plausible_sets
 from runners.benchmarks.plot import picture_of_benchmark
 from runners.benchmarks.problems import PROBLEMS, WORKSPACE, PosedProblem, Problem, drill, pose
-from runners.benchmarks.registrations import PRESETS, Scope, Steps
+from runners.benchmarks.registrations import EQUAL_STEPS, PRESETS, SIZES, Scope, Steps
 from runners.benchmarks.timing import Row, in_turn
+from runners.evaluation.plan import Trial
 from runners.published_package.environment import PackageError
 from runners.published_package.problem_file import load_problem
 from runners.published_package.process import PublishedPackage
@@ -210,11 +212,13 @@ def test_ratios_are_of_the_same_problem() -> None:
     rows = [
         {"case": "x", "who": "ours, paper", "median": 2.0},
         {"case": "x", "who": "package", "median": 30.0},
-        {"case": "x", "who": "ours, default", "median": 3.0},
+        {"case": "x", "who": "package, Eq. 8", "median": 300.0},
+        {"case": "x", "who": "anchored, small", "median": 3.0},
         {"case": "y", "who": "ours, paper", "median": 5.0},
     ]
-    assert ratios(rows, rows[1]) == {"paper": 15.0, "default": 10.0}
-    assert ratios(rows, rows[0]) == {}
+    assert ratios(rows, rows[0]) == {"package": 15.0, "package, Eq. 8": 150.0}
+    assert ratios(rows, rows[3]) == {"package": 10.0, "package, Eq. 8": 100.0}
+    assert ratios(rows, rows[1]) == ratios(rows, rows[4]) == {}
 
 
 def test_the_worker_does_all_steps_of_the_package_and_counts_them(
@@ -266,6 +270,20 @@ def test_plausible_sets_of_34_million_poses_are_measured() -> None:
     assert poses == [15**3 * 10_101] * 3
 
 
+def test_an_effort_of_a_method_has_its_time_and_its_diversity(monkeypatch) -> None:
+    monkeypatch.setattr("runners.benchmarks.pd_over_time._TRIALS", (Trial(10, "box"),))
+    monkeypatch.setattr("runners.benchmarks.pd_over_time._STEPS", "8")
+    efforts = {"gradient_descent@paper": {f"{n}": {"descent": {"restarts": n}} for n in (1, 12)}}
+    monkeypatch.setattr("runners.benchmarks.pd_over_time.EFFORTS", efforts)
+    rows = list(pd_over_time(scope(repeats=1)))
+    assert [row.case for row in rows] == ["1", "1", "12", "12"]
+    times, diversity = rows[::2], rows[1::2]
+    assert all(len(row.samples) == 1 and min(row.samples) > 0.0 for row in times)
+    assert [row.at for row in diversity] == [row.median for row in times]
+    assert times[0].median < times[1].median
+    assert diversity[0].median > diversity[1].median > 0.0
+
+
 def test_every_policy_decides_about_200_actions() -> None:
     rows = list(decisions(scope(repeats=2)))
     assert [row.case.split(",")[0] for row in rows] == [*POLICIES] * 2
@@ -284,8 +302,9 @@ def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> 
     assert names == {"benchmark.json", "benchmark.png", "benchmark.csv", "config.yaml", "speed.md"}
     assert (folder / "benchmark.png").read_bytes().startswith(b"\x89PNG")
     who = [row["who"] for row in report["comparison"]]
-    assert who == [f"ours, {preset}" for preset in PRESETS]
-    measures = ["stage", "threads", "hypotheses", "recording", "peak memory"]
+    assert who == [*(f"ours, {preset}" for preset in PRESETS), *SIZES]
+    measures = ["stage", "threads", "speed-up", "hypotheses"]
+    measures += ["recording", "recording, added", "peak memory"]
     assert list(dict.fromkeys(row["measure"] for row in report["alone"])) == measures
     lines = done.stdout.splitlines()
     for row in report["comparison"] + report["alone"]:
@@ -293,9 +312,12 @@ def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> 
         shown = [row["case"], row["who"], number(row["median"])]
         assert any(all(text in line for text in shown) for line in lines), shown
     steps = report["settings"]["steps"]
-    for did in report["problems"]["real_20"]["did"].values():
+    did = report["problems"]["real_20"]["did"]
+    for preset in EQUAL_STEPS:
         done_steps = {"descent": steps["restarts"] * steps["adam"], "cma_mega": steps["search"]}
-        assert did["iterations"] == done_steps
+        assert did[f"ours, {preset}"]["iterations"] == done_steps
+        assert did[f"ours, {preset}"]["poses_descended"] == 30 * done_steps["descent"]
+    assert f"paper {30 * done_steps['descent']}, default " in done.stdout
     assert report["machine"]["load_after"] is not None
     assert str(folder) in done.stdout
 
@@ -304,19 +326,18 @@ def test_with_the_package_it_is_measured_in_the_same_run(stand_in: Path, tmp_pat
     done = run(tmp_path, f"package.python={stand_in}", "alone=[]")
     assert done.returncode == 0, done.stderr
     _, report = found(tmp_path)
-    _, ours, default, package = report["comparison"]
+    _, ours, default, *_, package = report["comparison"]
     assert (ours["who"], package["who"]) == ("ours, paper", "package")
     assert len(package["samples"]) == len(ours["samples"]) == 2
-    times = package["times_ours"]
-    assert times["paper"] == package["median"] / ours["median"]
-    assert times["default"] == package["median"] / default["median"]
-    assert number(times["default"]) in done.stdout
+    for row in (ours, default):
+        assert row["faster"] == {"package": package["median"] / row["median"]}
+        assert number(row["faster"]["package"]) in done.stdout
     assert report["machine"]["published"]["chsel"] == "0.2.1"
     did = report["problems"]["real_20"]["did"]["package"]
     steps = report["settings"]["steps"]
     calls = steps["restarts"] * steps["adam"] + 2 * steps["search"]
     assert did["cost_calls"] == calls
-    assert f"cost calls of the package, counted: real_20 {calls}" in done.stdout
+    assert f"; cost calls of the package {calls}" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -382,7 +403,7 @@ def test_bars_are_medians_with_their_quartiles_and_times_ours() -> None:
             "median": value,
             "lower_quartile": 0.75 * value,
             "upper_quartile": 1.5 * value,
-            "times_ours": {"reference": 50.0} if who == "package" else {},
+            "faster": {} if who == "package" else {"package": 50.0},
         }
         for who, values in medians.items()
         for case, value in zip(("real_5", "real_20"), values, strict=True)
@@ -390,15 +411,19 @@ def test_bars_are_medians_with_their_quartiles_and_times_ours() -> None:
     machine = dict.fromkeys(
         ("processor", "python", "package torch", "load_before", "load_after"), "-"
     )
-    picture = picture_of_benchmark({"comparison": rows, "alone": [], "machine": machine})
+    efforts = [("icp", 8.0, 90.0), ("icp", 2.0, 400.0), ("svgd", 5.0, 50.0)]
+    alone = [{"measure": PD, "who": who, "at": at, "median": value} for who, at, value in efforts]
+    picture = picture_of_benchmark({"comparison": rows, "alone": alone, "machine": machine})
     assert picture is not None
-    (axes,) = picture.figure.axes
+    axes, curves = picture.figure.axes
+    assert [line.get_label() for line in curves.lines] == ["icp", "svgd"]
+    assert curves.lines[0].get_xydata().tolist() == [[2.0, 400.0], [8.0, 90.0]]
     bars = [one for one in axes.containers if isinstance(one, BarContainer)]
     assert [one.get_label() for one in bars] == list(medians)
     for one, values in zip(bars, medians.values(), strict=True):
         assert [bar.get_height() for bar in one] == list(values)
         ends = [part[:, 1].tolist() for part in one.errorbar[2][0].get_segments()]
         assert ends == [[0.75 * value, 1.5 * value] for value in values]
-    assert [text.get_text() for text in axes.texts] == ["10.0", "40.0", "500\n50.0x", "1600\n50.0x"]
-    assert picture.data["median"].tolist() == [10.0, 40.0, 500.0, 1600.0]
+    assert [text.get_text() for text in axes.texts] == ["10.0\n50.0x", "40.0\n50.0x", "500", "1600"]
+    assert picture.data["median"].tolist() == [10.0, 40.0, 500.0, 1600.0, 90.0, 400.0, 50.0]
     assert picture_of_benchmark({"comparison": [], "alone": [], "machine": machine}) is None

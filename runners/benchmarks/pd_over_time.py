@@ -1,0 +1,155 @@
+"""Plausible diversity over time: what every method gets for its milliseconds, effort by effort."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from chsel.methods.method import Method
+from chsel.numerics.threads import threads
+from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.plausible_settings import plausible_settings
+from chsel.problem.settings import settings_mapping
+from runners.benchmarks.registrations import Scope
+from runners.benchmarks.timing import Row
+from runners.evaluation.contenders import chosen_contenders
+from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
+from runners.evaluation.plan import OWN, Plan, Trial
+from runners.evaluation.trial_session import load_members, make_session, open_recorded
+
+PD, TIME = "PD over time", "PD over time, time"
+"""Measures: rows of the former have the median time, milliseconds, as their place."""
+_TRIALS = tuple(Trial(10, name) for name in ("drill", "mustard_fallen", "clamp_sideways"))
+_STEPS = "8,19"
+_DEFINITION = "default"
+_LEAST = 1e-3  # mm^2: below it, a PD is as good as 0
+_SHARES = {"a fifth": 0.2, "half": 0.5, "all": 1.0, "3 x": 3.0}
+"""Of the steps that a method does by default."""
+
+
+def _chsel(share: float) -> dict[str, Any]:
+    return {"descent": _restarts(share), "emitter": {"iterations": round(100 * share)}}
+
+
+def _restarts(share: float) -> dict[str, Any]:
+    return {"restarts": round(10 * share)}
+
+
+def _shares(setting: str, usual: int) -> dict[str, Any]:
+    return {name: {setting: round(usual * share)} for name, share in _SHARES.items()}
+
+
+_CHSEL = {name: _chsel(share) for name, share in _SHARES.items()}
+EFFORTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "chsel@reference": _CHSEL,
+    "chsel@paper": _CHSEL,
+    "chsel": _CHSEL,
+    "anchored": {size: {"size": size} for size in ("small", "medium", "large", "adaptive")},
+    "gradient_descent": {name: {"descent": _restarts(share)} for name, share in _SHARES.items()},
+    "icp": {f"{most} iterations": {"iterations": most} for most in (1, 3, 10, 100)},
+    "svgd": _shares("iterations", 300),
+    "cvo": _shares("max_iterations", 100),
+    "medial_constraint": {
+        f"{most} generations": {"cma_es": {"generations": most}} for most in (50, 100, 200, 10_000)
+    },
+}
+"""Settings by effort, of each method in a preset, the default one where none is named."""
+
+
+@dataclass
+class _Found:
+    """What one effort of a method takes and gives, problem by problem."""
+
+    method: Method
+    milliseconds: list[float] = field(default_factory=list)
+    diversity: list[float] = field(default_factory=list)  # mm^2
+
+
+def pd_over_time(scope: Scope) -> Iterator[Row]:
+    """The time of a registration, and the geometric mean of its PD, on development sessions.
+
+    Every method gets the problems of probed sessions, each without a result before it. Times are
+    those of the processor, on one thread.
+    """
+    found = {
+        curve: {name: _Found(_method(curve, changes)) for name, changes in efforts.items()}
+        for curve, efforts in EFFORTS.items()
+    }
+    with TemporaryDirectory() as folder, threads(1):
+        plan = _plan(Path(folder))
+        for trial in _TRIALS:
+            session = _Session(plan, trial)
+            for efforts in found.values():
+                for one in efforts.values():
+                    session.register(one)
+    for curve, efforts in found.items():
+        for name, one in efforts.items():
+            taken = Row(TIME, name, curve, "ms", tuple(one.milliseconds))
+            mean = float(np.exp(np.log(np.maximum(one.diversity, _LEAST)).mean()))
+            yield taken
+            yield Row(PD, name, curve, "mm²", (mean,), taken.median)
+
+
+class _Session:
+    """A probed session with its plausible sets."""
+
+    def __init__(self, plan: Plan, trial: Trial) -> None:
+        trial.folder(plan).mkdir(parents=True)
+        make_session(plan, trial)
+        self._session = session = open_recorded(plan, trial)
+        self._seed, self._only = trial.seed, plan.steps_of(trial.configuration)
+        self._members = partial(load_members, plan, trial, session)
+        self._loaded: dict[int, PlausibleSet] = {}  # by step
+        assert session.world_from_object is not None
+        mesh, truth = session.recorded.mesh, session.world_from_object
+        self._metrics = HypothesisMetrics(plan.metrics, mesh, truth)
+
+    def register(self, one: _Found) -> None:
+        """Time the chosen steps, and measure what is found."""
+        online = self._session.online(one.method.online, self._seed, only=self._only)
+        for step in online.steps(self._session.perceived()):
+            if (problem := step.problem) is None:
+                continue
+            if not one.milliseconds:
+                one.method.register(problem)  # loads what is compiled
+            begun = time.thread_time()
+            hypotheses = one.method.register(problem)
+            one.milliseconds.append(1000.0 * (time.thread_time() - begun))
+            if step.step not in self._loaded:
+                self._loaded[step.step] = self._members(problem)
+            members = self._loaded[step.step]
+            measured = self._metrics.compute(problem, members, hypotheses, ranked=False)
+            one.diversity.append(measured.get("diversity", np.inf))
+
+
+def _method(curve: str, changes: Mapping[str, Any]) -> Method:
+    name, _, preset = curve.partition("@")
+    entry = {"name": name, "settings": changes}
+    (contender,) = chosen_contenders([entry], {}, preset or "default")
+    return contender.method()
+
+
+def _plan(folder: Path) -> Plan:
+    values = settings_mapping(plausible_settings(_DEFINITION, 1.0))
+    return Plan(
+        folder=folder,
+        preset="default",
+        session={"kind": "kinematic"},
+        objects="models",
+        definition={"name": _DEFINITION, **values, "epsilon": None},
+        metrics=MetricsConfig(),
+        steps=_STEPS,
+        starts=OWN,
+        every=None,
+        recordings=False,
+        assets=folder,
+        contenders={},
+        outside={},
+    )
