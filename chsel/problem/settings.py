@@ -80,12 +80,6 @@ def _checks_of(cls: type) -> dict[str, tuple[bool, tuple[Check, ...]]]:
     }
 
 
-@cache
-def _hints_of(cls: type) -> dict[str, Any]:
-    """The types of fields, by name."""
-    return typing.get_type_hints(cls)
-
-
 def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) -> Settings:
     """Make the dataclass `cls` from a plain mapping; nested mappings make nested dataclasses.
 
@@ -135,8 +129,7 @@ def _built(
     for name in mapping:
         if name not in fields:
             raise SettingError(_unknown(where, str(name), list(fields)))
-    kind: Any = cls
-    hints = _hints_of(kind)
+    hints = typing.get_type_hints(cls)
     if base is None:
         before = {name: _default(field) for name, field in fields.items()}
     else:

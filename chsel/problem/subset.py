@@ -52,7 +52,7 @@ def representative_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
     size = len(poses)
     chosen = np.zeros(min(count, size), dtype=np.int64)
     descriptors = np.ascontiguousarray(surface_descriptors(sdf, poses).T)
-    located = locate_facilities(descriptors, chosen, np.empty(size), np.empty((size, size)))
+    located = locate_facilities(descriptors, chosen, np.empty((2, size)), np.empty((size, size)))
     return chosen[:located]
 
 
@@ -88,14 +88,15 @@ def distances_from_surface(
 
 
 @compiled
-def locate_facilities(points: Any, chosen: Any, nearest: Any, apart: Any) -> Any:
+def locate_facilities(points: Any, chosen: Any, rows: Any, apart: Any) -> Any:
     """Greedily choose points (d, C) so that the sum of squared distances to them is least.
 
     The first point, then always the one that lowers the sum the most. chosen (B,): indices to
-    fill. nearest (C,), apart (C, C): scratch. Returns the number of chosen points, less than B if
+    fill. rows (2, C), apart (C, C): scratch. Returns the number of chosen points, less than B if
     all others equal chosen ones.
     """
     dimension, count = points.shape
+    nearest, totals = rows[0], rows[1]
     apart[:] = 0.0
     for i in range(count):
         nearest[i] = np.inf
@@ -106,18 +107,19 @@ def locate_facilities(points: Any, chosen: Any, nearest: Any, apart: Any) -> Any
                 row[j] += (value - values[j]) * (value - values[j])
     for n in range(len(chosen)):
         if n > 0:
+            totals[:] = 0.0
+            for j in range(count):  # the sum of every candidate i in one vectorised loop
+                row, most = apart[j], nearest[j]
+                for i in range(count):
+                    totals[i] += min(most, row[i])
             best, least = -1, np.inf
             for i in range(count):
-                if nearest[i] == 0.0:
-                    continue
-                total = 0.0
-                for j in range(count):
-                    total += min(nearest[j], apart[i, j])
-                if total < least:
-                    best, least = i, total
+                if nearest[i] != 0.0 and totals[i] < least:
+                    best, least = i, totals[i]
             if best < 0:  # every other point equals a chosen one
                 return n
             chosen[n] = best
+        row = apart[chosen[n]]
         for j in range(count):
-            nearest[j] = min(nearest[j], apart[chosen[n], j])
+            nearest[j] = min(nearest[j], row[j])
     return len(chosen)

@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError, require_choice
-from chsel.methods.anchored.anchor_sampling import anchored_poses, most_informative_first
+from chsel.methods.anchored.anchor_sampling import AnchorSampler, most_informative_first
 from chsel.methods.anchored.anchored import Anchored, Search
 from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
 from chsel.numerics.arrays import FloatArray
@@ -65,9 +65,7 @@ def stages_of(problem: RegistrationProblem, settings: AnchoredSettings) -> list[
     effort = settings.effort or EFFORTS[settings.size]
     space = search_space(settings.plane, problem.sdf)
     known, anchors = most_informative_first(problem.points), settings.anchors
-    sampled = anchored_poses(
-        problem, known, space, anchors, samples=effort.samples, most=effort.kept
-    )
+    sampled = AnchorSampler(problem, known, space, anchors).best(effort.samples, effort.kept)
     energy = Search(problem, settings, NullObserver()).energy
     traces = _LastTraces()
     found = Anchored(settings).register(problem, traces)

@@ -41,7 +41,15 @@ ENOUGH = ("chsel default", "contacts alone", "chsel reference", "plane_angle", "
 ENOUGH += ("icp default", "svgd default", "SVGD, median", "cvo default", "cvo reference")
 ENOUGH += ("anchored default", "anchored on a plane")
 ENOUGH += ("medial_constraint default", "medial_constraint_cma_me default", "medial, one start")
-EXACT = {"sqrt", "floor", "rint", "memset", "memcpy", "memmove"}  # by IEEE 754, or not of numbers
+EXACT = {
+    "sqrt",
+    "sqrtf",
+    "floor",
+    "rint",
+    "memset",
+    "memcpy",
+    "memmove",
+}  # by IEEE 754, or not of numbers
 OTHERS = {
     "Haswell": ("x86_64-unknown-linux-gnu", "haswell", "+avx2,+fma"),
     "ARM": ("aarch64-unknown-linux-gnu", "generic", ""),

@@ -3,101 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.methods.anchored.sampling_kernels import (
-    DRAWS,
-    Anchors,
-    Best,
-    Coarse,
-    DrawnRows,
-    best_for,
-    sample,
-)
+from chsel.methods.anchored.coarse_score import coarse_of, in_32_bits
+from chsel.methods.anchored.placing_kernels import DRAWS, Anchors
+from chsel.methods.anchored.sampling_kernels import Best, best_for, sample
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.cell_set import box_of
 from chsel.numerics.threads import spread
-from chsel.problem.points import KnownPoints, VoxelGrid, voxels_spanned
-from chsel.problem.poses import Poses
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import Poses, rotated
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.search_space import SE2Space, SearchSpace, origin_bounds
+from chsel.problem.search_space import SE2Space, SE3Space, SearchSpace, origin_bounds
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.subset import farthest_points
 from chsel.problem.surface import has_surface, surface_points
 
 SURFACE_POINTS = 400
-MOST_CONTACTS = 32  # that poses are scored by
 MOST_ANCHORS = 48  # contacts that the surface is put onto
-MOST_INSIDE = 150
 MOST_SAMPLES = 100_000_000
 MOST_KEPT = 100_000
-_DEEP = 0.3  # of the greatest depth: points inside are at least so deep
-_MOST_NODES = 4000  # of which they are chosen
-_WEIGHT = 90.0  # of the mean depth of the points inside that are in free space
-_TOLERANT_WEIGHT = 9.0  # the same where free points may be wrong
-_MOST_VOXELS = 20_000_000
-_REACH = 0.06  # metres beyond which known points cost no more
 _MOST_ORDERED = 64  # known points that are put in order
 _BLOCK = 65_536  # poses that are drawn at a time
 _SAMPLES_PER_THREAD = 5_000
 _LENGTHS_ALIKE = 0.004  # metres
+_ROUNDING = 2e-6  # of coordinates in 32 bits, generously
 _LEAST_LENGTH = 0.01  # metres between two contacts that give a direction
-
-
-def coarse_of(
-    problem: RegistrationProblem, known: KnownPoints, margin: float, tolerance: float = 0.0
-) -> Coarse:
-    """The score of poses: mean contact distance, and the depths of points inside in free space.
-
-    known: the problem's points, see most_informative_first. margin: metres by which the object's
-    origin may be beside the workspace; free space beyond its reach is left out, and all of it if
-    it needs too many voxels. tolerance: depth (m) that free points may have at no cost.
-    """
-    sdf, resolution = problem.sdf, problem.free_resolution
-    values, inside, depth = sdf.derived(
-        ("coarse", tolerance), lambda: _values_and_depths(sdf, tolerance)
-    )
-    weight = _WEIGHT if tolerance == 0.0 else _TOLERANT_WEIGHT
-    count = min(len(known.known), MOST_CONTACTS)
-    free, (lower, upper) = problem.points.free, problem.workspace.bounds
-    reach = margin + sdf.diameter
-    free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]
-    box = voxels = box_of(sdf.origin, sdf.resolution, sdf.shape)
-    flags = np.zeros(1, dtype=bool)
-    if len(free) and voxels_spanned(free, resolution) < _MOST_VOXELS:
-        grid = VoxelGrid.around(free, resolution)
-        voxels = box_of(grid.origin, resolution, grid.flags.shape)
-        flags = grid.flags.reshape(-1)
-    else:
-        inside, depth = inside[:0], depth[:0]
-    return Coarse(
-        box=box,
-        values=values,
-        contacts=known.known[:count].T.copy(),
-        known_sdf=known.sdf[:count].copy(),
-        scale=1.0 / max(count, 1),
-        reach=_REACH,
-        inside=inside.T.copy(),
-        weights=depth * (weight / max(len(depth), 1)),
-        voxels=voxels,
-        flags=flags,
-    )
-
-
-def _values_and_depths(sdf: SdfGrid, tolerance: float) -> tuple[Any, FloatArray, FloatArray]:
-    """All signed distances, and points (P, 3) inside of the object with their depths (P,)."""
-    level = min(_DEEP * min(float(sdf.values.min()), 0.0), -tolerance)
-    deep = np.argwhere(sdf.values <= level)
-    if len(deep) > _MOST_NODES:
-        deep = deep[np.arange(_MOST_NODES) * len(deep) // _MOST_NODES]
-    nodes = deep[farthest_points(deep.astype(np.float64), MOST_INSIDE)]
-    depth = -sdf.values[tuple(nodes.T)]
-    return sdf.values.astype(np.float32).reshape(-1), sdf.origin + nodes * sdf.resolution, depth
 
 
 @dataclass(frozen=True)
@@ -117,43 +52,66 @@ class AnchorSettings(CheckedSettings):
             )
 
 
-def anchored_poses(
-    problem: RegistrationProblem,
-    known: KnownPoints,
-    space: SearchSpace,
-    settings: AnchorSettings,
-    *,
-    samples: int,
-    most: int,
-    index: int = 0,
-    tolerance: float = 0.0,
-) -> Poses:
-    """The best of so many random poses by their coarse score: K poses, best first.
+class AnchorSampler:
+    """Draws poses for one problem."""
 
-    known: the problem's points, see most_informative_first. most: K at most; fewer where the
-    object is out of its bounds too often. index: of the stream. tolerance: see coarse_of.
-    """
-    anchors = _anchors(problem, known, space, settings)
-    coarse = coarse_of(problem, known, settings.margin, tolerance)
-    stream = problem.key.stream(Purpose.ANCHORS, index)
-    bests: list[Best] = []
+    def __init__(
+        self,
+        problem: RegistrationProblem,
+        known: KnownPoints,
+        space: SearchSpace,
+        settings: AnchorSettings,
+    ) -> None:
+        """known: the problem's points, see most_informative_first."""
+        self._problem, self._known, self._space, self._settings = problem, known, space, settings
+        lower, upper = problem.workspace.bounds
+        middle = 0.5 * (lower + upper)
+        if len(known.known):  # the median of contacts, so that 32 bits are enough around it
+            median = np.sort(known.known, axis=0)[len(known.known) // 2]
+            middle = np.minimum(np.maximum(median, lower), upper)
+        self._middle = middle
+        self._anchors = _anchors(problem, known, space, settings, middle)
 
-    def scratch() -> Best:
-        bests.append(best_for(most))
-        return bests[-1]
+    def best(self, samples: int, most: int, *, index: int = 0, tolerance: float = 0.0) -> Poses:
+        """The best of so many random poses by their coarse score: K poses, best first.
 
-    def run(first: int, last: int, best: Best) -> None:
-        sample(coarse, space.arrays, anchors, rows, first, last, best)
+        most: K at most; fewer where the object is out of its bounds too often. index: of the
+        stream. tolerance: see coarse_of.
+        """
+        coarse = coarse_of(
+            self._problem, self._known, self._middle, self._settings.margin, tolerance
+        )
+        anchors, stream = self._placed(samples), self._problem.key.stream(Purpose.ANCHORS, index)
+        bests: list[Best] = []
 
-    for before in range(0, samples, _BLOCK):
-        draws = stream.random((min(_BLOCK, samples - before), DRAWS), dtype=np.float32)
-        rows = DrawnRows(draws, before)
-        spread(run, len(draws), scratch, least=_SAMPLES_PER_THREAD)
-    scores, numbers, poses = (
-        np.concatenate([getattr(best, name)[: best.size[0]] for best in bests])
-        for name in ("scores", "numbers", "poses")
-    )
-    return Poses(poses[np.lexsort([numbers, scores])[:most]])
+        def scratch() -> Best:
+            bests.append(best_for(min(most, samples)))
+            return bests[-1]
+
+        def run(first: int, last: int, best: Best) -> None:
+            sample(coarse, anchors, draws, before, first, last, best)
+
+        for before in range(0, samples, _BLOCK):
+            draws = stream.random((DRAWS, min(_BLOCK, samples - before)), dtype=np.float32)
+            spread(run, draws.shape[1], scratch, least=_SAMPLES_PER_THREAD)
+        keys = np.concatenate([best.keys[: best.size[0]] for best in bests])
+        poses = np.concatenate([best.poses[best.slots[: best.size[0]]] for best in bests])
+        return self._exact(poses[np.argsort(keys)[:most]].astype(np.float64))
+
+    def _placed(self, samples: int) -> Anchors:
+        """The anchors, with how many poses are placed by them."""
+        settings, anchors = self._settings, self._anchors
+        pairs = round(settings.pairs * samples) if len(anchors.frames) else 0
+        anchored = round((settings.pairs + settings.contacts) * samples)
+        return anchors._replace(kinds=(pairs, anchored if len(anchors.singles) else pairs))
+
+    def _exact(self, numbers: FloatArray) -> Poses:
+        """Poses in the world from those (K, 12) that kernels found around its middle."""
+        rigid = SE3Space()
+        turned = rigid.poses(rigid.encode(Poses(numbers)))
+        shift = turned.translations - rotated(turned.rotations, self._middle)
+        poses = Poses(np.concatenate([turned.numbers[:, :9], shift], axis=1))
+        return self._space.poses(self._space.encode(poses))
 
 
 def most_informative_first(points: KnownPoints) -> KnownPoints:
@@ -167,35 +125,56 @@ def most_informative_first(points: KnownPoints) -> KnownPoints:
 
 
 def _anchors(
-    problem: RegistrationProblem, known: KnownPoints, space: SearchSpace, settings: AnchorSettings
+    problem: RegistrationProblem,
+    known: KnownPoints,
+    space: SearchSpace,
+    settings: AnchorSettings,
+    middle: FloatArray,
 ) -> Anchors:
     sdf = problem.sdf
     surface, normals, lengths, by_distance = sdf.derived("anchors", lambda: _pairs_of(sdf))
     contacts, values = known.known[:MOST_ANCHORS], known.sdf[:MOST_ANCHORS]
     if isinstance(space, SE2Space):
-        by_height, singles, single_spans = _at_heights(space, surface, contacts, values)
+        by_height, met, single_spans = _at_heights(space, surface, contacts, values)
         pairs = pair_spans = np.zeros((0, 2), dtype=np.int64)
+        offset = space.offset + float((space.upward * middle).sum())
+        turns = [space.arrays.resting, space.arrays.turning, space.arrays.turning_squared]
+        plane = np.concatenate([space.axis, [offset], *turns])
     else:
-        by_height, singles = np.arange(len(surface)), np.arange(len(contacts))
+        by_height, met = np.arange(len(surface)), np.arange(len(contacts))
         single_spans = np.tile([0, len(surface)], (len(contacts), 1))
         pairs, pair_spans = _matching(contacts, values, lengths)
+        plane = np.zeros(0)
     lower, upper = origin_bounds(problem.workspace, space, settings.margin)
+    inset = _ROUNDING * (1.0 + np.abs([lower - middle, upper - middle]).max(axis=0))
+    inset = np.minimum(inset, 0.25 * (upper - lower))
+    bounds = in_32_bits(np.stack([lower + inset, upper - inset]) - middle)
     return Anchors(
-        contacts=contacts.T.copy(),
-        values=values.copy(),
-        surface=surface.T.copy(),
-        normals=normals.T.copy(),
-        by_distance=by_distance,
-        pairs=pairs,
-        pair_spans=pair_spans,
-        singles=singles,
-        single_spans=single_spans,
-        by_height=by_height,
-        pair_share=float(settings.pairs) if len(pairs) else 0.0,
-        anchored_share=float(settings.pairs + settings.contacts),
-        lower=lower,
-        upper=upper,
+        kinds=(0, 0),
+        surface=in_32_bits(surface),
+        normals=in_32_bits(normals),
+        by_distance=by_distance.astype(np.int16),
+        frames=in_32_bits(_frames(contacts[pairs] - middle)),
+        pair_spans=pair_spans.astype(np.int32),
+        singles=in_32_bits(np.concatenate([contacts - middle, values[:, None]], axis=1)[met]),
+        single_spans=single_spans.astype(np.int32),
+        by_height=by_height.astype(np.int16),
+        lower=bounds[0],
+        upper=bounds[1],
+        planar=isinstance(space, SE2Space),
+        plane=in_32_bits(plane),
     )
+
+
+def _frames(pairs: FloatArray) -> FloatArray:
+    """Of pairs of points (C, 2, 3): a frame along their line, row by row, then their middle."""
+    along = pairs[:, 1] - pairs[:, 0]
+    along = along / np.sqrt((along**2).sum(axis=1, keepdims=True))
+    axis = np.eye(3)[np.argmin(np.abs(along), axis=1)]
+    across = np.cross(along, axis)
+    across = across / np.sqrt((across**2).sum(axis=1, keepdims=True))
+    middle = 0.5 * (pairs[:, 0] + pairs[:, 1])
+    return np.concatenate([along, across, np.cross(along, across), middle], axis=1)
 
 
 def _pairs_of(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
@@ -218,7 +197,7 @@ def _matching(
     pairs = touching[np.stack(np.triu_indices(len(touching), 1), axis=1)]
     apart = np.sqrt(((contacts[pairs[:, 0]] - contacts[pairs[:, 1]]) ** 2).sum(axis=1))
     spans = _spans(lengths, apart, _LENGTHS_ALIKE)
-    good = (apart >= _LEAST_LENGTH) & (spans[:, 1] > spans[:, 0])
+    good = (apart >= _LEAST_LENGTH) & (spans[:, 1] > 0)
     return pairs[good], spans[good]
 
 
@@ -233,15 +212,15 @@ def _at_heights(
     order = np.argsort(heights, kind="stable")
     wanted = (contacts * space.upward).sum(axis=1) + space.offset
     spans = _spans(heights[order], wanted, _LENGTHS_ALIKE + np.abs(values))
-    met = np.flatnonzero(spans[:, 1] > spans[:, 0])
+    met = np.flatnonzero(spans[:, 1] > 0)
     return order, met, spans[met]
 
 
 def _spans(ascending: FloatArray, wanted: FloatArray, reach: FloatArray | float) -> IntArray:
-    """First and last + 1 (N, 2) of the ascending values that are near to wanted ones (N,)."""
+    """First, and how many (N, 2) of the ascending values are near to wanted ones (N,)."""
     first = np.searchsorted(ascending, wanted - reach)
     last = np.searchsorted(ascending, wanted + reach, side="right")
-    return np.stack([first, last], axis=1)
+    return np.stack([first, last - first], axis=1)
 
 
 @dataclass(frozen=True)
@@ -262,13 +241,7 @@ def anchored_starts(
     """
     if not has_surface(problem.sdf):
         return Poses(np.zeros((0, 12)))
-    poses = anchored_poses(
-        problem,
-        most_informative_first(problem.points),
-        space,
-        settings.anchors,
-        samples=settings.samples,
-        most=settings.kept,
-        index=index,
+    sampler = AnchorSampler(
+        problem, most_informative_first(problem.points), space, settings.anchors
     )
-    return space.poses(space.encode(poses))
+    return sampler.best(settings.samples, settings.kept, index=index)

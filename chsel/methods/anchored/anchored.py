@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.cost.cost_settings import uncertain_depth
 from chsel.methods.anchored.anchor_sampling import (
-    anchored_poses,
+    AnchorSampler,
     most_informative_first,
 )
 from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
 from chsel.methods.anchored.energy import Energy, NoiseLevel
 from chsel.methods.anchored.fit_kernels import Loss
+from chsel.methods.anchored.modes import has_new_mode
+from chsel.methods.anchored.rated_poses import RatedPoses
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import Poses
@@ -27,9 +28,7 @@ from chsel.problem.registration_problem import (
 from chsel.problem.search_space import origin_bounds, search_space
 from chsel.problem.subset import (
     evenly_spaced,
-    farthest_points,
     farthest_poses,
-    surface_descriptors,
 )
 from chsel.qd.archive import Evaluated
 from chsel.qd.measures import measure_named
@@ -46,30 +45,9 @@ _REACH = 0.03  # metres beyond which a known point costs no more while minima ar
 _OUTLYING, _ALL_OUTLYING = 0.01, 0.2  # and then, at least: the second by their number, if less
 _COARSE, _FINE = Loss(0.01, 0.06, 0.0), Loss(0.002, 0.03, 0.0)  # of fits
 _AS_WELL = 1.5  # a tolerance explains points as well if its energy is at most so much higher
-_FAR = 0.01  # metres between outlines of different modes, at least
+_LOWEST = 0.02  # noise levels: an energy that is not worth lowering
 _KEPT = 6  # states of a chain
 _MOST_GIVEN = 60  # of E_0 and E_l that are fitted
-
-
-class RatedPoses(NamedTuple):
-    """Poses with their energies."""
-
-    poses: Poses
-    energies: FloatArray  # (B,), metres
-
-    @classmethod
-    def joined(cls, *parts: RatedPoses) -> RatedPoses:
-        """Those of all parts, in their order."""
-        energies = np.concatenate([part.energies for part in parts])
-        return cls(Poses.joined([part.poses for part in parts]), energies)
-
-    def chosen(self, which: Any) -> RatedPoses:
-        """Some of them: a slice, flags (B,) or indices."""
-        return RatedPoses(self.poses[which], self.energies[which])
-
-    def ordered(self) -> RatedPoses:
-        """The lowest first."""
-        return self.chosen(np.argsort(self.energies, kind="stable"))
 
 
 class Anchored(ConfiguredMethod[AnchoredSettings]):
@@ -95,12 +73,6 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         search = Search(problem, self.settings, NullObserver())
         best = Poses.of(hypotheses.object_from_world[:1])
         return search.holds(best, Poses.of(object_from_world))
-
-
-def _apart(outlines: FloatArray, others: FloatArray) -> float:
-    """The largest distance (m) of other outlines (M, D) from the nearest of outlines (N, D)."""
-    nearest = [((outlines - other) ** 2).mean(axis=1).min() for other in others]
-    return float(np.sqrt(max(nearest)))
 
 
 def _tolerances(problem: RegistrationProblem, fixed: float | None) -> tuple[float, ...]:
@@ -143,18 +115,13 @@ class Search:
         given = Poses.of(np.concatenate([problem.initial_set, problem.low_cost_set]))
         if self._settings.plane is not None:  # moves keep to the plane, but do not lead onto it
             given = self._space.poses(self._space.encode(given))
-        given = self._costed(given).ordered().poses[:_MOST_GIVEN]
-        found, spent, raised = given, 0, 0
+        if len(given) > _MOST_GIVEN:
+            given = self._costed(given).ordered().poses[:_MOST_GIVEN]
+        sampler = AnchorSampler(problem, self._known, self._space, self._settings.anchors)
+        found, spent, raised, lowest = given, 0, 0, np.inf
         for index in range(_MOST_ROUNDS):
-            starts = anchored_poses(
-                problem,
-                self._known,
-                self._space,
-                self._settings.anchors,
-                samples=effort.samples,
-                most=effort.kept,
-                index=index,
-                tolerance=self._tolerances[raised],
+            starts = sampler.best(
+                effort.samples, effort.kept, index=index, tolerance=self._tolerances[raised]
             )
             self._observer.progress("sample", effort.samples, effort.samples)
             fitted = self._fitted(starts if index else Poses.joined([starts, given]))
@@ -163,7 +130,7 @@ class Search:
             spent += effort.samples + effort.kept * effort.first_steps
             spent += effort.refined * effort.steps + effort.descents * effort.descent_moves
             self._observer.progress("search", min(spent, effort.evaluations), effort.evaluations)
-            lowest = float(descended.energies.min())
+            lowest = min(lowest, float(descended.energies.min()))
             if lowest > effort.enough * self._settings.noise and raised + 1 < len(self._tolerances):
                 raised += 1
                 self.energy = self.energy.at(self._wide(raised))
@@ -173,8 +140,7 @@ class Search:
             self.energy = self.energy.at(self._wide(raised))
         self._settle(found, raised)
         polished = self._polished(self._costed(found).ordered())
-        self._estimate(polished)
-        polished = self._costed(polished.poses).ordered()
+        polished = self._estimated(polished)
         self._show("descend", polished)
         return polished
 
@@ -185,7 +151,8 @@ class Search:
         candidates = rated.energies <= self._limit(rated.energies)
         apart = farthest_poses(self._problem.sdf, rated.poses[candidates], effort.polished)
         which = np.union1d(apart, np.arange(min(effort.polished, len(rated.energies))))
-        walked = self._walked_down(rated, which, 0.0, effort.polish_moves, index=3).ordered()
+        floor = _LOWEST * self.energy.level.sigma
+        walked = self._walked_down(rated, which, floor, effort.polish_moves, index=3).ordered()
         return self._refined(walked, self.energy.loss)
 
     def holds(self, best: Poses, poses: Poses) -> BoolArray:
@@ -196,20 +163,11 @@ class Search:
         return self.energy.of(poses) <= limit
 
     def _new_modes(self, before: Poses, last: RatedPoses) -> bool:
-        """Whether candidates of the last round are far from all before.
-
-        Far is farther apart than as many hypotheses as are wanted would be.
-        """
+        """Whether candidates of the last round are far from all before."""
         limit = self._limit(last.energies)
         new = last.chosen(last.energies <= limit).poses
         old = before[self.energy.of(before) <= limit]
-        if len(old) == 0:
-            return True
-        outlines = surface_descriptors(self._problem.sdf, Poses.joined([old, new]))
-        outlines, new_outlines = outlines[: len(old)], outlines[len(old) :]
-        chosen = farthest_points(outlines, len(self._problem.initial_set))
-        spacing = _apart(outlines[chosen[:-1]], outlines[chosen[-1:]]) if len(chosen) > 1 else 0.0
-        return _apart(outlines, new_outlines) > max(spacing, _FAR)
+        return has_new_mode(self._problem.sdf, old, new, len(self._problem.initial_set))
 
     def _settle(self, found: Poses, raised: int) -> None:
         """Take the least tolerance of free points that explains them about as well as the last.
@@ -235,6 +193,12 @@ class Search:
         cap = min(_OUTLYING, _ALL_OUTLYING / max(len(self._known.known), 1))
         self.energy = self.energy.at(NoiseLevel(sigma, self.energy.level.tolerance, cap))
 
+    def _estimated(self, rated: RatedPoses) -> RatedPoses:
+        """The poses by the noise at the lowest of them, the lowest first."""
+        before = self.energy.level
+        self._estimate(rated)
+        return rated if self.energy.level == before else self._costed(rated.poses).ordered()
+
     def _fitted(self, poses: Poses) -> RatedPoses:
         """All fitted by a few steps, and the better part of them by more; the lowest first."""
         effort, energy = self._effort, self.energy
@@ -252,10 +216,9 @@ class Search:
         return RatedPoses.joined(after.chosen(lower), before.chosen(~lower), others).ordered()
 
     def _descended(self, fitted: RatedPoses, index: int) -> RatedPoses:
-        """The lowest walk down to the limit that holds so far."""
+        """The better part of them, of which the lowest walk down to the limit that holds so far."""
         effort = self._effort
-        self._estimate(fitted)
-        fitted = self._costed(fitted.poses).ordered()
+        fitted = self._estimated(fitted.chosen(slice(max(effort.refined, effort.descents))))
         limit = self._limit(fitted.energies)
         lowest = np.arange(min(effort.descents, len(fitted.energies)))
         return self._walked_down(fitted, lowest, limit, effort.descent_moves, index=2 + 2 * index)

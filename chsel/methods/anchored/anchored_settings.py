@@ -25,7 +25,7 @@ _ONLINE = OnlineSettings(update="own")
 class Effort(CheckedSettings):
     """How much is computed."""
 
-    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 60_000  # poses drawn
+    samples: Annotated[int, positive, at_most(MOST_SAMPLES)] = 120_000  # poses drawn
     kept: Annotated[int, positive, at_most(MOST_POSES)] = 200  # the best of them, which are fitted
     first_steps: Annotated[int, not_negative, at_most(MOST_MOVES)] = 6  # of these fits
     refined: Annotated[int, positive, at_most(MOST_POSES)] = 100  # of these, fitted further
@@ -51,7 +51,7 @@ class Effort(CheckedSettings):
 
 
 _SMALL = Effort(
-    samples=40_000,
+    samples=60_000,
     kept=64,
     first_steps=12,
     refined=40,
@@ -62,7 +62,7 @@ _SMALL = Effort(
     polished=8,
 )
 _LARGE = Effort(
-    samples=250_000,
+    samples=400_000,
     kept=504,
     refined=150,
     descents=120,
@@ -76,7 +76,7 @@ EFFORTS = {
     "small": _SMALL,
     "medium": Effort(),
     "large": _LARGE,
-    "adaptive": replace(_SMALL, chains=96, moves=300, evaluations=600_000),
+    "adaptive": replace(_SMALL, chains=96, moves=300, evaluations=800_000),
 }
 
 

@@ -54,22 +54,26 @@ class Fit(NamedTuple):
     """Scratch of one thread. Only the lower triangles of matrices are used."""
 
     near: Surrounding
-    normal: FloatArray  # (d, d), of the normal equations
-    right: FloatArray  # (d,)
+    sums: FloatArray  # (8, 6): over residuals, of products of their rates of change by twists, of
+    # these rates times the residuals; and the rates of one
+    normal: FloatArray  # (2, d, d), of the normal equations at a pose and at one that is tried
+    right: FloatArray  # (2, d)
     factor: FloatArray  # (d, d), of Cholesky
-    row: FloatArray  # (d,), of the Jacobian, then the solution
+    row: FloatArray  # (d,), the solution
     twist: FloatArray  # (6,)
 
 
 def surrounding_for(model: Model) -> Surrounding:
     """Scratch for one thread."""
-    return Surrounding(candidates_for(max(model.free.tree.spheres.shape[1], 1)), np.empty(12))
+    size = max(model.free.tree.spheres.shape[1], model.known.shape[1], 1)
+    return Surrounding(candidates_for(size), np.empty(12))
 
 
 def fit_for(model: Model, d: int) -> Fit:
     """Scratch for one thread, for twists of d dimensions."""
-    normal, factor = np.empty((d, d)), np.empty((d, d))
-    return Fit(surrounding_for(model), normal, np.empty(d), factor, np.empty(d), np.empty(6))
+    normal, right, factor = np.empty((2, d, d)), np.empty((2, d)), np.empty((d, d))
+    sums, row, twist = np.empty((8, 6)), np.empty(d), np.empty(6)
+    return Fit(surrounding_for(model), sums, normal, right, factor, row, twist)
 
 
 @spliced
@@ -114,24 +118,23 @@ def fit_poses(model, loss, twists, poses, iterations, first, last, fit):
 def _fitted(model, loss, twists, pose, iterations, fit):
     dimension = len(twists.basis)
     count = gather(model, pose, _SLACK, fit.near)
-    losses = _losses(model, loss, twists, pose, count, fit, True)
-    damping = _FIRST_DAMPING
+    at, damping = 0, _FIRST_DAMPING
+    losses = _losses(model, loss, twists, pose, count, fit, at)
     for _ in range(iterations):
         if losses == 0.0:
             break
         trace = 0.0
         for i in range(dimension):
-            trace += fit.normal[i, i]
-        if not _solve(fit, damping * trace / dimension + 1e-12):
+            trace += fit.normal[at, i, i]
+        if not _solve(fit, at, damping * trace / dimension + 1e-12):
             break
         trial = _moved_by(twists, pose, fit)
         if travel_since_gathering(model, trial, fit.near) > _SLACK:
             count = gather(model, trial, _SLACK, fit.near)
-        tried = _losses(model, loss, twists, trial, count, fit, False)
+        tried = _losses(model, loss, twists, trial, count, fit, 1 - at)
         if tried < losses:
             gain = losses - tried
-            pose = trial
-            losses = _losses(model, loss, twists, pose, count, fit, True)
+            pose, losses, at = trial, tried, 1 - at
             damping *= _LESS
             if gain < _ENOUGH * tried:
                 break
@@ -143,14 +146,12 @@ def _fitted(model, loss, twists, pose, iterations, fit):
 
 
 @inner
-def _losses(model, loss, twists, pose, count, fit, with_normal):
-    """The sum of the losses; fills the normal equations, if wanted."""
-    field, total, dimension = model.field, 0.0, len(twists.basis)
-    if with_normal:
-        for i in range(dimension):
-            fit.right[i] = 0.0
-            for j in range(i + 1):
-                fit.normal[i, j] = 0.0
+def _losses(model, loss, twists, pose, count, fit, at):
+    """The sum of the losses; fills the normal equations at a place, 0 or 1."""
+    field, sums, total = model.field, fit.sums, 0.0
+    for i in range(7):
+        for j in range(6):
+            sums[i, j] = 0.0
     candidates = fit.near.candidates
     clearance, places = model.free.region.clearance, candidates.places
     locate(pose, model.free.region.box, candidates.x, candidates.y, candidates.z, places, count)
@@ -160,56 +161,72 @@ def _losses(model, loss, twists, pose, count, fit, with_normal):
             residual = looked_up[0] - model.alpha
             if residual < 0.0:
                 total += cost_of_residual(loss, residual)
-                if with_normal:
-                    point = candidates.x[n], candidates.y[n], candidates.z[n]
-                    weight = _weight(loss, residual)
-                    _add(fit, twists, pose, point, looked_up[1:], residual, weight)
+                point = candidates.x[n], candidates.y[n], candidates.z[n]
+                _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
     for n in range(model.known.shape[1]):
         point = model.known[0, n], model.known[1, n], model.known[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         residual = looked_up[0] - model.known_sdf[n]
         total += cost_of_residual(loss, residual)
-        if with_normal:
-            weight = _weight(loss, residual)
-            _add(fit, twists, pose, point, looked_up[1:], residual, weight)
+        _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
     for n in range(model.occupied.shape[1]):
         point = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         residual = looked_up[0] + model.alpha
         if residual > 0.0:
             total += cost_of_residual(loss, residual)
-            if with_normal:
-                weight = _weight(loss, residual)
-                _add(fit, twists, pose, point, looked_up[1:], residual, weight)
+            _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
+    _restrict(twists, fit, at)
     return total
 
 
-@inner
-def _add(fit, twists, pose, point, gradient, residual, weight):
-    """Add a residual at a world point, with its gradient by the point in the object frame."""
+@leaf
+def _add(sums, pivot, pose, point, looked_up, residual, weight):
+    """Add a residual at a world point, where a distance and its gradient were looked up."""
     u, v, w = moved(pose, point[0], point[1], point[2])
-    u, v, w = u - twists.pivot[0], v - twists.pivot[1], w - twists.pivot[2]
-    nx, ny, nz = gradient
-    a, b, c = v * nz - w * ny, w * nx - u * nz, u * ny - v * nx
-    basis, row = twists.basis, fit.row
-    for i in range(len(basis)):
-        turn = a * basis[i, 0] + b * basis[i, 1] + c * basis[i, 2]
-        row[i] = turn + nx * basis[i, 3] + ny * basis[i, 4] + nz * basis[i, 5]
-    for i in range(len(basis)):
-        weighted = weight * row[i]
-        fit.right[i] += weighted * residual
+    u, v, w = u - pivot[0], v - pivot[1], w - pivot[2]
+    _, nx, ny, nz = looked_up
+    rates = sums[7]
+    rates[0], rates[1], rates[2] = v * nz - w * ny, w * nx - u * nz, u * ny - v * nx
+    rates[3], rates[4], rates[5] = nx, ny, nz
+    for i in range(6):
+        weighted = weight * rates[i]
+        sums[6, i] += weighted * residual
         for j in range(i + 1):
-            fit.normal[i, j] += weighted * row[j]
+            sums[i, j] += weighted * rates[j]
 
 
 @inner
-def _solve(fit, damping):
+def _restrict(twists, fit, at):
+    """Fill the normal equations from sums over all twists: B N B^T and B r."""
+    basis, sums, product = twists.basis, fit.sums, fit.sums[7]
+    for i in range(6):
+        for j in range(i):
+            sums[j, i] = sums[i, j]
+    for i in range(len(basis)):
+        for k in range(6):
+            product[k] = 0.0
+            for m in range(6):
+                product[k] += basis[i, m] * sums[m, k]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(6):
+                total += product[k] * basis[j, k]
+            fit.normal[at, i, j] = total
+        total = 0.0
+        for k in range(6):
+            total += basis[i, k] * sums[6, k]
+        fit.right[at, i] = total
+
+
+@inner
+def _solve(fit, at, damping):
     """Fill row with -(N + damping I)^-1 r by Cholesky; False if N is not positive definite so."""
-    count = len(fit.right)
+    count = len(fit.row)
     lower, row = fit.factor, fit.row
     for i in range(count):
         for j in range(i + 1):
-            total = fit.normal[i, j] + (damping if i == j else 0.0)
+            total = fit.normal[at, i, j] + (damping if i == j else 0.0)
             for k in range(j):
                 total -= lower[i, k] * lower[j, k]
             if i == j:
@@ -219,7 +236,7 @@ def _solve(fit, damping):
             else:
                 lower[i, j] = total / lower[j, j]
     for i in range(count):
-        total = -fit.right[i]
+        total = -fit.right[at, i]
         for k in range(i):
             total -= lower[i, k] * row[k]
         row[i] = total / lower[i, i]

@@ -1,4 +1,8 @@
-"""Poses that put points of the object's surface onto contacts, and the best of many such poses."""
+"""The best of many poses by a coarse score.
+
+Blocks of poses are scored by some contacts together, one in each lane of vector instructions; those
+that may be among the best go on alone, with contacts and points of the object in lanes.
+"""
 
 from __future__ import annotations
 
@@ -6,311 +10,283 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.cell_set import Box
-from chsel.numerics.compiler import compiled, inner, leaf, spliced
-from chsel.numerics.elementary import sine_cosine
-from chsel.numerics.pose_tuples import decode, moved, origin_within, turned, turned_back
+from chsel.methods.anchored.placing_kernels import (
+    FURTHER,
+    HALF,
+    LANES,
+    ONE,
+    ROWS,
+    SHIFT,
+    ZERO,
+    place,
+)
+from chsel.numerics.arrays import IntArray
+from chsel.numerics.compiler import compiled, inner, leaf
 
-DRAWS = 8  # random numbers that a pose takes
-_TURN = 2.0 * np.pi
-_ALIKE = 1e-9  # squared lengths below which a vector has no direction
+UNIT = 2.0**-14  # metres: what scores and the signed distances of a table count in
+_CHUNK = 4  # contacts that a block is scored by at a time
+_PART = 32  # points inside that a pose is scored by at a time
+_FEW = 8  # poses go on alone when at most the eighth part of a block is left
+HIGHEST = 2**30  # above all scores of poses that are within bounds
+
+
+class Box32(NamedTuple):
+    """The nodes of a grid, in steps: cells lie around nodes."""
+
+    first: Any  # (3,), corner node, metres
+    inverse: Any  # nodes per metre
+    most: Any  # (3,), the greatest index per axis
+    across: Any  # steps in a flat array to the next node on the first axis,
+    along: Any  # and on the second
 
 
 class Coarse(NamedTuple):
     """What poses are scored by: some known points, and points inside of the object."""
 
-    box: Box  # of the signed distance grid
-    values: Any  # (nodes,), read at the nearest node
-    contacts: FloatArray  # (3, A), world
-    known_sdf: FloatArray  # (A,)
-    scale: float  # cost of a metre of distance
-    reach: float  # metres beyond which a known point costs no more
-    inside: FloatArray  # (3, P), object frame
-    weights: FloatArray  # (P,), cost of each in free space
-    voxels: Box  # of the free space
-    flags: Any  # (voxels,), whether free
-
-
-class Anchors(NamedTuple):
-    """Contacts, and the points of the object's surface that can be put onto them.
-
-    A span is the first index and the last + 1.
-    """
-
-    contacts: FloatArray  # (3, A), world
-    values: FloatArray  # (A,), signed distances at the contacts
-    surface: FloatArray  # (3, Q), object frame
-    normals: FloatArray  # (3, Q)
-    by_distance: IntArray  # (P, 2), pairs of surface points by their distance
-    pairs: IntArray  # (C, 2), two contacts
-    pair_spans: IntArray  # (C, 2), in by_distance, of the surface pairs as far apart
-    singles: IntArray  # (S,), a contact
-    single_spans: IntArray  # (S, 2), in by_height, of the surface points that can meet it
-    by_height: IntArray  # (Q,), surface points in the order of their heights over a plane
-    pair_share: float  # of all poses, those that are placed by pairs
-    anchored_share: float  # those that are placed by pairs or single contacts
-    lower: FloatArray  # (3,), where the object's origin may be in the world
-    upper: FloatArray  # (3,)
-
-
-class DrawnRows(NamedTuple):
-    """Random numbers of some of the poses."""
-
-    draws: Any  # (n, DRAWS), uniform
-    before: int  # how many poses were drawn before
+    box: Box32  # of the signed distance grid
+    values: Any  # (nodes,) in UNITs, read at the nearest node
+    contacts: Any  # (3, A), world
+    known_sdf: Any  # (A,), in UNITs
+    reach: Any  # UNITs beyond which a known point costs no more
+    inside: Any  # (3, P), object frame
+    weights: Any  # (P,), cost of each in free space, in UNITs of the sum over contacts
+    voxels: Box32  # of the free space
+    flags: Any  # (voxels,), 1 for free ones
 
 
 class Best(NamedTuple):
-    """The best poses so far, a heap with the worst first, and scratch of one thread."""
+    """The best poses so far, and scratch of one thread."""
 
     size: IntArray  # (1,), how many there are
-    scores: FloatArray  # (K,)
-    numbers: IntArray  # (K,), of each among all poses drawn
-    poses: FloatArray  # (K, 12)
-    vector: FloatArray  # (9,), scratch
+    keys: IntArray  # (K,), a heap with the worst first: 2^32 x score + number among all drawn
+    slots: IntArray  # (K,), where the pose of each is
+    poses: Any  # (K, 12)
+    lanes: Any  # rows of a block, one after the other
+    cells: Any  # (LANES,), indices in a table
+    found: Any  # (LANES,), what was read there
+    scores: Any  # (LANES,)
 
 
 def best_for(most: int) -> Best:
     """No poses yet, and room for `most`."""
-    size, numbers = np.zeros(1, dtype=np.int64), np.empty(most, dtype=np.int64)
-    return Best(size, np.empty(most), numbers, np.empty((most, 12)), np.zeros(9))
+    cells, found, scores = (np.zeros(LANES, dtype=np.int32) for _ in range(3))
+    keys, slots = (np.zeros(most, dtype=np.int64) for _ in range(2))
+    lanes, poses = np.zeros(ROWS * LANES, dtype=np.float32), np.empty((most, 12), np.float32)
+    return Best(np.zeros(1, dtype=np.int64), keys, slots, poses, lanes, cells, found, scores)
 
 
 @compiled
-def sample(coarse, space, anchors, rows, first, last, best):
-    """Keep the best of the poses that rows from `first` to `last` make.
+def sample(coarse, anchors, draws, before, first, last, best):
+    """Keep the best of the poses that columns of draws (DRAWS, n) make, from `first` to `last`.
 
-    Those of the lowest scores, and of equal ones the first, so that the result does not depend on
-    how the rows are split.
+    before: how many poses were drawn before column 0. Kept are those of the lowest scores, and of
+    equal ones the first, so that the result does not depend on how the columns are split.
     """
-    most = len(best.scores)
-    for n in range(first, last):
-        pose, fits = _pose_of(space, anchors, rows.draws[n], best.vector)
-        if fits:
-            full, number = best.size[0] == most, rows.before + n
-            limit = best.scores[0] if full else np.inf
-            score = score_below(coarse, pose, limit)
-            if score < limit or (full and score == limit and number < best.numbers[0]):
-                _put(best, score, number, pose, full)
+    start = first
+    while start < last:
+        number, count = before + start, min(last - start, LANES)
+        for until in anchors.kinds:
+            if number < until:
+                count = min(count, until - number)
+        place(anchors, draws, start, count, number, best.lanes)
+        _keep_best(coarse, anchors, number, count, best)
+        start += count
 
 
 @inner
-def score_below(coarse, pose, limit):
-    """The score of a pose, lower for a better fit; infinite if it is above the limit."""
-    box, contacts = coarse.box, coarse.contacts
-    first, inverse = box.first, box.inverse
-    x, y, z = pose[9], pose[10], pose[11]
-    offset = (x - first[0]) * inverse, (y - first[1]) * inverse, (z - first[2]) * inverse
-    scaled = pose[:9] + offset
-    total = 0.0
-    for n in range(contacts.shape[1]):
-        p, q, r = contacts[0, n] * inverse, contacts[1, n] * inverse, contacts[2, n] * inverse
-        u, v, w = moved(scaled, p, q, r)
-        k, m, o = _clamped(box, u, v, w)
-        away = (abs(u - k) + abs(v - m) + abs(w - o)) / inverse
-        s = coarse.values[_nearest_node(box, k, m, o)]
-        total += coarse.scale * min(abs(s + away - coarse.known_sdf[n]), coarse.reach)
-        if not total <= limit:
-            return np.inf
-    inside, voxels = coarse.inside, coarse.voxels
-    first, inverse = voxels.first, voxels.inverse
-    for n in range(inside.shape[1]):
-        u, v, w = turned_back(pose, inside[0, n] - x, inside[1, n] - y, inside[2, n] - z)
-        u, v, w = (u - first[0]) * inverse, (v - first[1]) * inverse, (w - first[2]) * inverse
-        k, m, o = _clamped(voxels, u, v, w)
-        if coarse.flags[_nearest_node(voxels, k, m, o)]:
-            total += coarse.weights[n]
-            if not total <= limit:
-                return np.inf
+def _keep_best(coarse, anchors, number, count, best):
+    """Score a block of poses, and keep those that are among the best so far."""
+    most, lanes, scores = len(best.keys), best.lanes, best.scores
+    _check_origins(anchors, lanes, scores, count)
+    limit = _limit(best)
+    done, left = 0, count
+    while done < coarse.contacts.shape[1] and left * _FEW > count:
+        until = min(done + _CHUNK, coarse.contacts.shape[1])
+        for n in range(done, until):
+            _add_contact(coarse, n, best, count)
+        left = 0
+        for i in range(count):
+            left += 1 if scores[i] <= limit else 0
+        done = until
+    for i in range(count):
+        if scores[i] <= limit:
+            total = _score_below(coarse, i, done, np.int64(scores[i]), limit, best)
+            key = (total << 32) + (number + i)
+            if total <= limit and (best.size[0] < most or key < best.keys[0]):
+                _put(best, key, i)
+                limit = _limit(best)
+
+
+@leaf
+def _limit(best):
+    """The score that a pose must not exceed to be among the best."""
+    return best.keys[0] >> 32 if best.size[0] == len(best.keys) else np.int64(HIGHEST - 1)
+
+
+@inner
+def _check_origins(anchors, lanes, scores, count):
+    """Scores of 0, and too high ones where the object's origin, -R^T t, is out of its bounds."""
+    a, b, c = anchors.lower
+    d, e, f = anchors.upper
+    for i in range(count):
+        u, v, w = lanes[SHIFT + i], lanes[SHIFT + LANES + i], lanes[SHIFT + 2 * LANES + i]
+        x = -(lanes[i] * u + lanes[3 * LANES + i] * v + lanes[6 * LANES + i] * w)
+        y = -(lanes[LANES + i] * u + lanes[4 * LANES + i] * v + lanes[7 * LANES + i] * w)
+        z = -(lanes[2 * LANES + i] * u + lanes[5 * LANES + i] * v + lanes[8 * LANES + i] * w)
+        off = max(max(a - x, x - d), max(max(b - y, y - e), max(c - z, z - f)))
+        scores[i] = np.int32(0) if off <= ZERO else np.int32(HIGHEST)
+
+
+@inner
+def _add_contact(coarse, n, best, count):
+    """Add what a contact costs to the scores of a block."""
+    lanes, cells, found, scores = best.lanes, best.cells, best.found, best.scores
+    x, y, z = coarse.contacts[0, n], coarse.contacts[1, n], coarse.contacts[2, n]
+    box, level, reach = coarse.box, coarse.known_sdf[n], coarse.reach
+    fx, fy, fz = box.first
+    inverse = box.inverse
+    mx, my, mz = box.most
+    step = ONE / inverse / np.float32(UNIT)
+    for i in range(count):
+        u = lanes[i] * x + lanes[LANES + i] * y + lanes[2 * LANES + i] * z + lanes[SHIFT + i]
+        v = lanes[3 * LANES + i] * x + lanes[4 * LANES + i] * y + lanes[5 * LANES + i] * z
+        w = lanes[6 * LANES + i] * x + lanes[7 * LANES + i] * y + lanes[8 * LANES + i] * z
+        u = (u - fx) * inverse
+        v = (v + lanes[SHIFT + LANES + i] - fy) * inverse
+        w = (w + lanes[SHIFT + 2 * LANES + i] - fz) * inverse
+        k, m, o = min(max(u, ZERO), mx), min(max(v, ZERO), my), min(max(w, ZERO), mz)
+        lanes[FURTHER + i] = (abs(u - k) + abs(v - m) + abs(w - o)) * step - level
+        at = np.int32(k + HALF) * box.across + np.int32(m + HALF) * box.along
+        cells[i] = np.int32(at + np.int32(o + HALF))
+    for i in range(count):
+        found[i] = coarse.values[cells[i]]
+    for i in range(count):
+        off = min(abs(np.float32(found[i]) + lanes[FURTHER + i]), reach)
+        scores[i] += np.int32(off)
+
+
+@inner
+def _score_below(coarse, i, done, total, limit, best):
+    """The score of the i-th pose from that by contacts before `done`, or a part above the limit."""
+    lanes, cells = best.lanes, best.cells
+    r = lanes[i], lanes[LANES + i], lanes[2 * LANES + i]
+    s = lanes[3 * LANES + i], lanes[4 * LANES + i], lanes[5 * LANES + i]
+    t = lanes[6 * LANES + i], lanes[7 * LANES + i], lanes[8 * LANES + i]
+    p, q, o = lanes[SHIFT + i], lanes[SHIFT + LANES + i], lanes[SHIFT + 2 * LANES + i]
+    count = coarse.contacts.shape[1]
+    if done < count:
+        total += _contacts_cost(coarse, r, s, t, (p, q, o), done, best)
+    points = coarse.inside
+    box = coarse.voxels
+    inverse = box.inverse
+    a, b, c = r[0] * inverse, s[0] * inverse, t[0] * inverse  # R^T
+    d, e, f = r[1] * inverse, s[1] * inverse, t[1] * inverse
+    g, h, k = r[2] * inverse, s[2] * inverse, t[2] * inverse
+    x = -(a * p + b * q + c * o) - box.first[0] * inverse
+    y = -(d * p + e * q + f * o) - box.first[1] * inverse
+    z = -(g * p + h * q + k * o) - box.first[2] * inverse
+    mx, my, mz = box.most
+    before, size = 0, points.shape[1]
+    while before < size and total <= limit:
+        part = min(_PART, size - before)
+        for n in range(part):
+            u = a * points[0, before + n] + b * points[1, before + n] + c * points[2, before + n]
+            v = d * points[0, before + n] + e * points[1, before + n] + f * points[2, before + n]
+            w = g * points[0, before + n] + h * points[1, before + n] + k * points[2, before + n]
+            u = min(max(u + x, ZERO), mx) + HALF
+            v = min(max(v + y, ZERO), my) + HALF
+            w = min(max(w + z, ZERO), mz) + HALF
+            at = np.int32(u) * box.across + np.int32(v) * box.along
+            cells[n] = np.int32(at + np.int32(w))
+        for n in range(part):
+            total += coarse.flags[cells[n]] * coarse.weights[before + n]
+        before += part
     return total
 
 
-@leaf
-def _clamped(box, u, v, w):
-    """Grid coordinates within the grid."""
-    most = box.most
-    return min(max(0.0, u), most[0]), min(max(0.0, v), most[1]), min(max(0.0, w), most[2])
-
-
-@leaf
-def _nearest_node(box, u, v, w):
-    """Flat index of the node nearest to grid coordinates within the grid."""
-    return int(np.rint(u) * box.across + np.rint(v) * box.along + np.rint(w))
+@inner
+def _contacts_cost(coarse, r, s, t, shift, done, best):
+    """What the contacts from `done` on cost a pose."""
+    lanes, cells, contacts, box = best.lanes, best.cells, coarse.contacts, coarse.box
+    inverse = box.inverse
+    mx, my, mz = box.most
+    step = ONE / inverse / np.float32(UNIT)
+    x, y, z = shift[0] - box.first[0], shift[1] - box.first[1], shift[2] - box.first[2]
+    count = contacts.shape[1] - done
+    for n in range(count):
+        p, q, o = contacts[0, done + n], contacts[1, done + n], contacts[2, done + n]
+        u = (r[0] * p + r[1] * q + r[2] * o + x) * inverse
+        v = (s[0] * p + s[1] * q + s[2] * o + y) * inverse
+        w = (t[0] * p + t[1] * q + t[2] * o + z) * inverse
+        k, m, j = min(max(u, ZERO), mx), min(max(v, ZERO), my), min(max(w, ZERO), mz)
+        lanes[FURTHER + n] = (abs(u - k) + abs(v - m) + abs(w - j)) * step
+        at = np.int32(k + HALF) * box.across + np.int32(m + HALF) * box.along
+        cells[n] = np.int32(at + np.int32(j + HALF))
+    total = np.int64(0)
+    for n in range(count):
+        off = np.float32(coarse.values[cells[n]]) + lanes[FURTHER + n] - coarse.known_sdf[done + n]
+        total += np.int32(min(abs(off), coarse.reach))
+    return total
 
 
 @inner
-def _put(best, score, number, pose, full):
-    """Add a pose, in place of the worst if there is no room."""
-    scores, numbers = best.scores, best.numbers
-    if full:
-        count, at = len(scores), 0
+def _put(best, key, i):
+    """Add the pose in lane i, in place of the worst if there is no room."""
+    keys, slots, most = best.keys, best.slots, len(best.keys)
+    if best.size[0] == most:
+        slot, at = slots[0], 0
         while True:  # down, past worse ones
             child = 2 * at + 1
-            if child >= count:
+            if child >= most:
                 break
-            if child + 1 < count and _precedes(
-                scores[child], numbers[child], scores[child + 1], numbers[child + 1]
-            ):
+            if child + 1 < most and keys[child + 1] > keys[child]:
                 child += 1
-            if not _precedes(score, number, scores[child], numbers[child]):
+            if key >= keys[child]:
                 break
-            _copy(best, child, at)
+            keys[at], slots[at] = keys[child], slots[child]
             at = child
     else:
-        at = best.size[0]
+        slot = at = best.size[0]
         best.size[0] += 1
         while at > 0:
             parent = (at - 1) // 2
-            if _precedes(score, number, scores[parent], numbers[parent]):
+            if keys[parent] >= key:
                 break
-            _copy(best, parent, at)
+            keys[at], slots[at] = keys[parent], slots[parent]
             at = parent
-    scores[at], numbers[at] = score, number
-    for i in range(12):
-        best.poses[at, i] = pose[i]
+    keys[at], slots[at] = key, slot
+    for j in range(12):
+        best.poses[slot, j] = best.lanes[j * LANES + i]
+
+
+@compiled
+def bounds_of_points(points, lower, upper, bounds):
+    """Fill bounds (2, 3) of those of points (N, 3) that are in a box; returns how many are."""
+    count = 0
+    bounds[0], bounds[1] = np.inf, -np.inf
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if _within((x, y, z), lower, upper):
+            count += 1
+            bounds[0, 0], bounds[1, 0] = min(bounds[0, 0], x), max(bounds[1, 0], x)
+            bounds[0, 1], bounds[1, 1] = min(bounds[0, 1], y), max(bounds[1, 1], y)
+            bounds[0, 2], bounds[1, 2] = min(bounds[0, 2], z), max(bounds[1, 2], z)
+    return count
+
+
+@compiled
+def mark_voxels(points, lower, upper, first, side, flags):
+    """Set the flags (nx, ny, nz) of the voxels that hold one of the points that are in a box."""
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if _within((x, y, z), lower, upper):
+            i = int(np.rint((x - first[0]) / side))
+            j = int(np.rint((y - first[1]) / side))
+            flags[i, j, int(np.rint((z - first[2]) / side))] = 1
 
 
 @leaf
-def _precedes(score, number, other, other_number):
-    return score < other or (score == other and number < other_number)
-
-
-@spliced
-def _copy(best, source, target):
-    best.scores[target], best.numbers[target] = best.scores[source], best.numbers[source]
-    for i in range(12):
-        best.poses[target, i] = best.poses[source, i]
-
-
-@inner
-def _pose_of(space, anchors, draw, vector):
-    """The pose of a row of draws, and whether the object is where it may be."""
-    kind = draw[0]
-    if kind < anchors.pair_share and len(anchors.pairs) > 0:
-        pose = _on_pair(anchors, draw)
-    else:
-        r = _random_rotation(space, draw, vector)
-        if kind < anchors.anchored_share and len(anchors.singles) > 0:
-            pose = _on_contact(anchors, draw, r)
-        else:
-            pose = _in_workspace(anchors, draw, r)
-        if space.planar:
-            pose = _on_plane(space, pose)
-    return pose, origin_within(pose, anchors.lower, anchors.upper)
-
-
-@leaf
-def _random_rotation(space, draw, vector):
-    """A rotation, uniform on SO(3) (Shoemake, 1992), or about the plane's axis."""
-    if space.planar:
-        vector[0], vector[1], vector[2] = _TURN * draw[5], 0.0, 0.0
-        return decode(space, vector)[:9]
-    s, c = sine_cosine(_TURN * draw[5])
-    sine, cosine = sine_cosine(_TURN * draw[6])
-    inner_root, outer_root = np.sqrt(1.0 - draw[7]), np.sqrt(1.0 * draw[7])
-    return _rotation_of(inner_root * s, inner_root * c, outer_root * sine, outer_root * cosine)
-
-
-@leaf
-def _rotation_of(w, x, y, z):
-    """The rotation of a unit quaternion, row by row."""
-    return (
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
-    )  # fmt: skip
-
-
-@leaf
-def _in_workspace(anchors, draw, r):
-    """A pose with the object's origin p uniform in the box: t = -R p."""
-    low, high = anchors.lower, anchors.upper
-    x = low[0] + draw[1] * (high[0] - low[0])
-    y = low[1] + draw[2] * (high[1] - low[1])
-    z = low[2] + draw[3] * (high[2] - low[2])
-    u, v, w = turned(r, x, y, z)
-    translation = -u, -v, -w
-    return r + translation
-
-
-@leaf
-def _on_contact(anchors, draw, r):
-    """A pose that puts a surface point, or one at the known distance from it, onto a contact."""
-    single = int(draw[1] * len(anchors.singles))
-    contact = anchors.singles[single]
-    first, last = anchors.single_spans[single, 0], anchors.single_spans[single, 1]
-    q = anchors.by_height[first + int(draw[2] * (last - first))]
-    away, (a, b, c) = anchors.values[contact], _column(anchors.normals, q)
-    x, y, z = _column(anchors.surface, q)
-    onto = x + away * a, y + away * b, z + away * c
-    return _moving(r, _column(anchors.contacts, contact), onto)
-
-
-@leaf
-def _on_plane(space, pose):
-    """The pose moved along the plane's axis onto the plane: a . t = o."""
-    a, b, c = space.axis
-    off = space.offset - (a * pose[9] + b * pose[10] + c * pose[11])
-    translation = pose[9] + off * a, pose[10] + off * b, pose[11] + off * c
-    return pose[:9] + translation
-
-
-@leaf
-def _on_pair(anchors, draw):
-    """A pose that puts two surface points onto the line of two contacts, turned about it."""
-    pair = int(draw[1] * len(anchors.pairs))
-    first, last = anchors.pair_spans[pair, 0], anchors.pair_spans[pair, 1]
-    at = first + int(draw[2] * (last - first))
-    k, m = anchors.by_distance[at, 0], anchors.by_distance[at, 1]
-    if draw[3] < 0.5:
-        k, m = m, k
-    start = _column(anchors.contacts, anchors.pairs[pair, 0])
-    end = _column(anchors.contacts, anchors.pairs[pair, 1])
-    surface_start, surface_end = _column(anchors.surface, k), _column(anchors.surface, m)
-    sine, cosine = sine_cosine(_TURN * draw[4])
-    f = _frame(start, end, 1.0, 0.0)
-    g = _frame(surface_start, surface_end, cosine, sine)
-    a, d, u = turned_back(g, f[0], f[3], f[6])  # R = G^T F, with frames as rows
-    b, e, v = turned_back(g, f[1], f[4], f[7])
-    c, h, w = turned_back(g, f[2], f[5], f[8])
-    r = (a, b, c, d, e, h, u, v, w)
-    return _moving(r, _middle(start, end), _middle(surface_start, surface_end))
-
-
-@leaf
-def _column(points, n):
-    return points[0, n], points[1, n], points[2, n]
-
-
-@leaf
-def _middle(p, q):
-    return 0.5 * (p[0] + q[0]), 0.5 * (p[1] + q[1]), 0.5 * (p[2] + q[2])
-
-
-@leaf
-def _moving(r, point, onto):
-    """The pose with rotation R that moves a point p onto another: t = q - R p."""
-    u, v, w = turned(r, point[0], point[1], point[2])
-    translation = onto[0] - u, onto[1] - v, onto[2] - w
-    return r + translation
-
-
-@leaf
-def _frame(start, end, cosine, sine):
-    """Three orthonormal vectors, one after the other: from start to end, others turned about it."""
-    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
-    length = np.sqrt(max(x * x + y * y + z * z, _ALIKE))
-    x, y, z = x / length, y / length, z / length
-    if abs(x) < 0.6:  # cross product with an axis that it is far from
-        a, b, c = 0.0, -z, y
-    else:
-        a, b, c = z, 0.0, -x
-    length = np.sqrt(max(a * a + b * b + c * c, _ALIKE))
-    a, b, c = a / length, b / length, c / length
-    d, e, f = y * c - z * b, z * a - x * c, x * b - y * a
-    return (
-        x, y, z,
-        cosine * a + sine * d, cosine * b + sine * e, cosine * c + sine * f,
-        cosine * d - sine * a, cosine * e - sine * b, cosine * f - sine * c,
-    )  # fmt: skip
+def _within(point, lower, upper):
+    x, y, z = point
+    inside = lower[0] <= x <= upper[0] and lower[1] <= y <= upper[1]
+    return inside and lower[2] <= z <= upper[2]

@@ -18,11 +18,11 @@ from chsel.methods.anchored.fit_kernels import (
 )
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import locate
-from chsel.numerics.compiler import compiled, inner
+from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp
 from chsel.numerics.octree import walk
 from chsel.numerics.pose_tuples import moved, origin_within, pose_at
-from chsel.problem.sdf_lookup import distance_at, value_between_nodes
+from chsel.problem.sdf_lookup import distance_at, distance_in_place, value_between_nodes
 
 DRAWS = 9  # random numbers that a move takes
 _FIRST, _LEAST, _MOST = 0.01, 0.00005, 0.03  # metres: the size of moves
@@ -33,6 +33,7 @@ _ABOUT_CONTACT = 0.6  # share of the turns that are about a contact
 _DEVIATION = 3.4641016151377544  # uniform numbers of [-1/2, 1/2] times it have a deviation of 1
 _SLACKS = 6.0  # sizes of a step that gathered points should last
 _LEAST_SLACK, _MOST_SLACK = 0.004, 0.04  # metres
+_PART = 16  # known points that are located at a time
 
 
 class Stride(NamedTuple):
@@ -68,15 +69,20 @@ def chains_from(poses: FloatArray, energies: FloatArray, kept: int) -> Chains:
 
 
 @inner
-def _known_below(model, loss, pose, limit):
+def _known_below(model, loss, pose, limit, places):
     """The cost of known and occupied points; infinite if it is above the limit."""
-    total = 0.0
-    known, field = model.known, model.field
-    for n in range(known.shape[1]):
-        s = distance_at(field, pose, known[0, n], known[1, n], known[2, n])
-        total += model.known_scale * cost_of_residual(loss, s - model.known_sdf[n])
-        if not total <= limit:
-            return np.inf
+    total, first = 0.0, 0
+    known, field, count = model.known, model.field, model.known.shape[1]
+    while first < count:
+        last = min(first + _PART, count)
+        x, y, z = known[0, first:last], known[1, first:last], known[2, first:last]
+        locate(pose, field.box, x, y, z, places, last - first)
+        for n in range(last - first):
+            s = _distance(field, pose, x[n], y[n], z[n], places, n)
+            total += model.known_scale * cost_of_residual(loss, s - model.known_sdf[first + n])
+            if not total <= limit:
+                return np.inf
+        first = last
     occupied = model.occupied
     for n in range(occupied.shape[1]):
         s = distance_at(field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
@@ -84,6 +90,16 @@ def _known_below(model, loss, pose, limit):
         if not total <= limit:
             return np.inf
     return total
+
+
+@leaf
+def _distance(field, pose, x, y, z, places, n):
+    """Interpolated signed distance at a world point, whose place is the n-th."""
+    if places.beyond[n] > 0.0:
+        return distance_in_place(field, pose, x, y, z, places, n)[0]
+    across, along = int(field.box.across), int(field.box.along)
+    u, v, w = places.u[n], places.v[n], places.w[n]
+    return value_between_nodes(field.table, places.cell[n], across, along, u, v, w)
 
 
 @inner
@@ -106,7 +122,7 @@ def _with_free(model, loss, pose, total, limit, candidates, count):
 @inner
 def _energy_below(model, loss, pose, limit, candidates):
     """The energy of a rigid pose; infinite if it is above the limit."""
-    total = _known_below(model, loss, pose, limit)
+    total = _known_below(model, loss, pose, limit, candidates.places)
     if not total <= limit:
         return np.inf
     count = walk(model.free.tree, model.free.region, pose, 0.0, candidates)
@@ -125,18 +141,21 @@ def walk_below(model, loss, stride, floor, chains, draws, first, last, near):
     """Move the chains from `first` to before `last` once for each of their draws (C, M, 9).
 
     A move is accepted if its energy is at most the limit of its chain: the energy of the chain
-    where that is above the floor, so that the limit comes down with it, else the floor.
+    where that is above the floor, so that the limit comes down with it, else the floor. Chains of
+    which no states are kept stop there.
     """
     moves, keep = draws.shape[1], chains.kept.shape[1]
     for n in range(first, last):
         pose, energy, size = pose_at(chains.poses, n), chains.energies[n], _FIRST
         slack, count, done = -1.0, 0, 0
         for m in range(moves):
+            if keep == 0 and energy <= floor:
+                break
             limit = max(energy, floor)
             trial = _proposed(model, stride, pose, size, draws[n, m])
             accepted = False
             if origin_within(trial, stride.lower, stride.upper):
-                total = _known_below(model, loss, trial, limit)
+                total = _known_below(model, loss, trial, limit, near.candidates.places)
                 if total <= limit:
                     if slack < 0.0 or travel_since_gathering(model, trial, near) > slack:
                         slack = min(max(_SLACKS * size, _LEAST_SLACK), _MOST_SLACK)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from chsel.methods.anchored.anchor_sampling import (
+    AnchorSampler,
     AnchorSettings,
-    anchored_poses,
     most_informative_first,
 )
 from chsel.numerics.arrays import FloatArray
@@ -37,16 +37,15 @@ def drawn(
         BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2)
     )
     space, known = search_space(plane, BOX_GRID), most_informative_first(points)
-    return anchored_poses(
-        problem, known, space, settings, samples=samples, most=most, index=index
-    ).numbers
+    sampler = AnchorSampler(problem, known, space, settings)
+    return sampler.best(samples, most, index=index).numbers
 
 
-def distances(poses: FloatArray, points: FloatArray) -> FloatArray:
+def distances(poses: FloatArray, points: FloatArray, lookup: str = "trilinear") -> FloatArray:
     """Signed distances (B, M) at world points."""
     rotations = poses[:, :9].reshape(-1, 3, 3)
     moved = np.einsum("nij,mj->nmi", rotations, points) + poses[:, None, 9:]
-    s = BOX_GRID.query(moved.reshape(-1, 3), lookup="trilinear")[0].numpy()
+    s = BOX_GRID.query(moved.reshape(-1, 3), lookup=lookup)[0].numpy()
     return s.reshape(len(poses), len(points))
 
 
@@ -132,3 +131,23 @@ def test_known_points_come_far_apart_first_and_none_is_lost() -> None:
     first = ordered.known[:8]
     gaps = np.sqrt(((first[:, None] - first[None]) ** 2).sum(axis=2)) + 9.0 * np.eye(8)
     assert gaps.min() > 2.0
+
+
+def test_poses_come_in_the_order_of_their_plain_scores() -> None:
+    """Mean distance of contacts up to 60 mm, and depths of nodes inside that are in free voxels."""
+    lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.7, 0.03)] * 3, indexing="ij"), -1)
+    free = lattice.reshape(-1, 3)
+    free = free[free[:, 0] < 0.18]
+    poses = drawn(KnownPoints(free=free, known=CONTACTS), AnchorSettings())
+    contacts = np.minimum(np.abs(distances(poses, CONTACTS, "nearest")), 0.06).mean(axis=1)
+    nodes = np.argwhere(BOX_GRID.values <= 0.3 * BOX_GRID.values.min())
+    depths = -BOX_GRID.values[tuple(nodes.T)]
+    costs = 5.0 * depths + 20.0 * np.maximum(depths - min(0.015, 0.5 * depths.max()), 0.0)
+    inside = BOX_GRID.origin + nodes * BOX_GRID.resolution
+    back = inside - poses[:, None, 9:]
+    world = np.einsum("nji,nmj->nmi", poses[:, :9].reshape(-1, 3, 3), back)
+    taken = (world[..., 0] < 0.185) & (world > -0.115).all(axis=2) & (world < 0.695).all(axis=2)
+    scores = contacts + (taken * costs).mean(axis=1)
+    assert np.ptp(scores) > 0.05
+    assert np.corrcoef(scores, np.sort(scores))[0, 1] > 0.97  # the kernel takes some nodes
+    assert (scores[:30] < np.quantile(scores, 0.1)).all()
