@@ -11,6 +11,7 @@ from chsel.cost.cost_kernels import Model, costs_of_poses, work_of
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.free_kernels import FreeTerm
 from chsel.cost.interior_points import InteriorPoints, interior_points
+from chsel.cost.pose_lanes import LANES
 from chsel.errors import require_choice
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import CellSet, Region, box_of, cell_set_of, triple
@@ -18,6 +19,7 @@ from chsel.numerics.near_points import rough_tree
 from chsel.numerics.octree import Tree, octree, rounding_margin
 from chsel.numerics.pose_tuples import Triple
 from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.numerics.voxels import bounds_of
 from chsel.problem.points import KnownPoints, VoxelGrid
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
@@ -25,6 +27,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import cells_below, distance_field
 
 CULLINGS = ("octree", "none")
+_NO_BOX = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 _NOWHERE = np.zeros(0, dtype=np.float32)
 _POSES_PER_THREAD = 200  # fewer are evaluated faster than a thread wakes up
 
@@ -94,7 +97,9 @@ class CompiledCost:
         def run(first: int, last: int, work: Any) -> None:
             costs_of_poses(self.model, poses.numbers, costs, first, last, work)
 
-        spread(run, len(poses), lambda: work_of(self.model), least=_POSES_PER_THREAD)
+        spread(
+            run, len(poses), lambda: work_of(self.model), least=_POSES_PER_THREAD, multiple=LANES
+        )
         return costs
 
 
@@ -122,8 +127,7 @@ def _free_term(
                 "use a smaller penetration_tolerance",
                 stacklevel=4,
             )
-        points = free if len(free) else np.zeros((1, 3))
-        lower, upper = triple(points.min(axis=0)), triple(points.max(axis=0))
+        lower, upper = (triple(corner) for corner in bounds_of(free)) if len(free) else _NO_BOX
     return FreeTerm(
         interior=is_interior,
         exhaustive=culling == "none",

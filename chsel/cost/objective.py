@@ -69,8 +69,15 @@ def cost_and_gradient_of(model, space, vector, gradient, work):
 @compiled
 def costs_and_gradients(model, space, vectors, costs, gradients, first, last, work):
     """Fill costs (B,) and gradients (B, d) at search vectors (B, d), from `first` to `last`."""
-    for n in range(first, last):
-        costs[n] = cost_and_gradient_of(model, space, vectors[n], gradients[n], work)
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
+        for lane in range(count):
+            put_pose(work.lanes, lane, decode(space, vectors[start + lane]))
+        evaluate(model, work, 0, count, 0.0)
+        for lane in range(count):
+            costs[start + lane] = work.lanes[SUMS + lane]
+            by_pose = gradient_of(work.lanes, lane)
+            pull_back(space, vectors[start + lane], by_pose, gradients[start + lane])
 
 
 @compiled
@@ -126,7 +133,7 @@ class Objective:
             space = self.space_arrays
             costs_and_gradients(self.model, space, vectors, costs, gradients, first, last, work)
 
-        spread(run, len(vectors), self.work)
+        spread(run, len(vectors), self.work, multiple=LANES)
         return costs, gradients
 
     def descended(
@@ -139,5 +146,5 @@ class Objective:
             space = self.space_arrays
             descend(self.model, space, moved, rate, divisor, iterations, first, last, work)
 
-        spread(run, len(moved), self.work)
+        spread(run, len(moved), self.work, multiple=LANES)
         return moved

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import IntArray
-from chsel.numerics.compiler import inner, leaf, spliced
+from chsel.numerics.compiler import compiled, inner, leaf, spliced
 from chsel.numerics.octree import Tree
 from chsel.numerics.pose_tuples import Triple
 
@@ -51,14 +51,24 @@ def rough_tree(tree: Tree) -> RoughTree:
     nodes = len(tree.starts) - 1
     uppermost = tree.spheres[:3, : tree.levels[min(1, len(tree.levels) - 1)]]
     low, high = (uppermost.min(axis=1), uppermost.max(axis=1)) if nodes else (np.zeros(3),) * 2
-    origin = 0.5 * (low + high)
-    rows = np.empty((tree.spheres.shape[1], 4), dtype=np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # reach is infinite then
-        rows[:, :3] = (tree.spheres[:3] - origin[:, None]).T
-    rows[:, 3] = tree.spheres[3] * (1.0 + 1e-6)
-    reach = float(np.abs(rows[:, :3]).max(initial=0.0)) * (1.0 + 1e-6)
+    origin = 0.5 * low + 0.5 * high
+    rows = np.empty(4 * tree.spheres.shape[1], dtype=np.float32)
+    reach = _fill_rows(tree.spheres, origin, rows) * (1.0 + 1e-6)
     x, y, z = origin.tolist()
-    return RoughTree(rows.reshape(-1), (x, y, z), reach, tree.starts, tree.levels)
+    return RoughTree(rows, (x, y, z), reach, tree.starts, tree.levels)
+
+
+@compiled
+def _fill_rows(spheres, origin, rows):
+    """Fill rows from spheres (4, M + N); returns the greatest coordinate, which may be infinite."""
+    reach = 0.0
+    for n in range(spheres.shape[1]):
+        for axis in range(3):
+            coordinate = spheres[axis, n] - origin[axis]
+            reach = max(reach, abs(coordinate))
+            rows[4 * n + axis] = np.float32(coordinate)
+        rows[4 * n + 3] = np.float32(spheres[3, n] * (1.0 + 1e-6))
+    return reach
 
 
 def near_points_for(tree: RoughTree, lists: int) -> NearPoints:

@@ -52,18 +52,19 @@ def spread(
     scratch: Callable[[], Any],
     *,
     least: int = 1,
+    multiple: int = 1,
 ) -> None:
     """Call run(first, last, scratch) on pieces of range(count), on `thread_count()` threads.
 
     scratch: makes the scratch of one thread. The pieces must not depend on each other. least: the
-    smallest number that is worth another thread.
+    smallest number that is worth another thread. multiple: of which the size of pieces is one.
     """
     most = min(thread_count(), count // least)
     if most <= 1 or hasattr(_thread, "is_worker"):  # it must not wait for workers
         if count:
             run(0, count, scratch())
         return
-    size = -(-count // (most * _PIECES_PER_THREAD))
+    size = -(-count // (most * _PIECES_PER_THREAD * multiple)) * multiple
     pieces = iter(range(0, count, size))
 
     def work() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from chsel.errors import PointsError, SettingError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, digest, frozen, same_bits
+from chsel.numerics.voxels import bounds_of, set_voxels
 
 _CLASSES = ("free", "occupied", "known", "known_sdf")
 
@@ -178,17 +179,17 @@ class VoxelGrid:
     @classmethod
     def around(cls, free: FloatArray, resolution: float, most: int = 100_000_000) -> VoxelGrid:
         """The voxels of free points (N, 3), N > 0. Raises SettingError for too many voxels."""
-        lattice = Lattice(tuple(free.min(axis=0).tolist()), resolution)
-        count = voxels_spanned(free, resolution)
+        bounds = bounds_of(free)
+        count = voxels_spanned(bounds, resolution)
         if not count <= most:
             raise SettingError(
                 f"free points span {count:.1e} voxels of {resolution} m; "
                 f"accepted: at most {most:.0e}, so a coarser free_resolution"
             )
-        voxels = lattice.voxels(free)
-        flags = np.zeros(voxels.max(axis=0) + 3, dtype=bool)
-        flags[tuple((voxels + 1).T)] = True
-        return cls(np.array(lattice.origin) - resolution, resolution, flags)
+        lattice = Lattice(tuple(bounds[0].tolist()), resolution)
+        flags = np.zeros(lattice.voxels(bounds[1]) + 3, dtype=bool)
+        set_voxels(np.array(free, dtype=np.float64, order="C"), bounds[0], resolution, flags)
+        return cls(bounds[0] - resolution, resolution, flags)
 
 
 class FreeVoxels:

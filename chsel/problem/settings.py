@@ -80,6 +80,12 @@ def _checks_of(cls: type) -> dict[str, tuple[bool, tuple[Check, ...]]]:
     }
 
 
+@cache
+def _hints_of(cls: type) -> dict[str, Any]:
+    """The types of fields, by name."""
+    return typing.get_type_hints(cls)
+
+
 def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) -> Settings:
     """Make the dataclass `cls` from a plain mapping; nested mappings make nested dataclasses.
 
@@ -129,7 +135,8 @@ def _built(
     for name in mapping:
         if name not in fields:
             raise SettingError(_unknown(where, str(name), list(fields)))
-    hints = typing.get_type_hints(cls)
+    kind: Any = cls
+    hints = _hints_of(kind)
     if base is None:
         before = {name: _default(field) for name, field in fields.items()}
     else:
