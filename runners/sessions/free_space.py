@@ -33,8 +33,16 @@ def swept_voxels(lattice: Lattice, interior: FloatArray, positions: FloatArray) 
     bounds += [interior.min(axis=0), interior.max(axis=0)]
     low, high = lattice.voxels(bounds)
     met = np.zeros(high - low + 1, dtype=bool)
-    for position in positions:
-        met[tuple((lattice.voxels(interior + position) - low).T)] = True
+    _, width, height = met.shape
+    flags, points = met.reshape(-1), np.ascontiguousarray(interior.T)  # (3, M)
+    origin, first = np.array(lattice.origin)[:, None], low.astype(np.float64)[:, None]
+    for position in np.unique(positions, axis=0):
+        # As Lattice.voxels, in place: these are ten thousands of positions.
+        at = points + position[:, None]
+        at -= origin
+        at /= lattice.spacing
+        x, y, z = np.subtract(np.rint(at, out=at), first, out=at)
+        flags[((x * width + y) * height + z).astype(np.int64)] = True
     return lattice.centres(low + np.argwhere(met))
 
 

@@ -67,6 +67,8 @@ class PyBulletEngine:
         self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
         self._began: _Reading | None = None
         self._world: Any = _new_world()
+        # Every access to a function of the client makes it anew; these are called most.
+        self._step, self._contacts = self._world.stepSimulation, self._world.getContactPoints
         try:
             with tempfile.TemporaryDirectory() as folder:
                 self.world_from_object = _settle(self._world, mesh, laid_down(mesh, configuration))
@@ -88,7 +90,7 @@ class PyBulletEngine:
         world.changeConstraint(self._holder, target.tolist(), maxForce=self._max_force)
         force = 0.0
         for step in range(MINI_STEP):
-            world.stepSimulation()
+            self._step()
             reading = self._read()
             if reading is not None and not any(self._readings):
                 self._began = reading
@@ -121,7 +123,7 @@ class PyBulletEngine:
 
     def _read(self) -> _Reading | None:
         """The contact between hand and object after a step: where it presses hardest."""
-        records = self._world.getContactPoints(self._hand, self._object)
+        records = self._contacts(self._hand, self._object)
         records = [record for record in records if record[_FORCE] > 0.0]
         if not records:
             return None
