@@ -21,8 +21,8 @@ from chsel.methods.cvo.cvo_kernels import (
     climb,
     climbers_at,
     products,
-    scratch,
 )
+from chsel.methods.cvo.field_kernels import scratch
 from chsel.methods.cvo.gaussian_blur import Kernel
 from chsel.methods.cvo.rkhs_fields import (
     cloud_norm,

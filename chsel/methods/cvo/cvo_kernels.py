@@ -5,31 +5,20 @@ Of the cloud in the object frame only its fields are left: f(p) = sum_j a(p, z_j
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from chsel.methods.cvo.field_kernels import ClassTerm, moments_at, sum_at
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.cell_set import Box, Places, locate, places_for
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import sine_cosine
-from chsel.numerics.pose_tuples import composed, moved, pose_at, turned_back
-from chsel.problem.sdf_lookup import distance_between_nodes
+from chsel.numerics.pose_tuples import composed, pose_at, turned_back
 
-BLOCK = 512  # points that are located at once
 STEPS = 16
 _PATIENCE = 5
 _REFINEMENTS = 3
 _NEAR = 0.05  # steps count as equally long if they differ by less than this fraction
-
-
-class ClassTerm(NamedTuple):
-    """One class of points and its field."""
-
-    points: FloatArray  # (3, N), world, metres
-    box: Box
-    table: Any  # (nodes, 4), f and its gradient at the nodes of the box
-    weight: float  # W of the class
 
 
 class Product(NamedTuple):
@@ -67,39 +56,34 @@ def climbers_at(poses: FloatArray, value: FloatArray) -> Climbers:
     return Climbers(poses.copy(), value.copy(), *counts, *flags)
 
 
-def scratch() -> Places:
-    """Scratch of one thread."""
-    return places_for(BLOCK)
-
-
 @compiled
-def products(product, poses, out, first, last, places):
+def products(product, poses, out, first, last, scratch):
     """Fill out (B,) with F at poses (B, 12), from `first` to before `last`."""
     for n in range(first, last):
-        out[n] = _product_at(product, pose_at(poses, n), places)
+        out[n] = _product_at(product, pose_at(poses, n), scratch)
 
 
 @compiled
-def climb(product, ascent, climbers, iterations, first, last, places):
+def climb(product, ascent, climbers, iterations, first, last, scratch):
     """Move climbers uphill for some iterations, those from `first` to before `last`."""
     for n in range(first, last):
         for _ in range(iterations):
             if not climbers.done[n]:
                 pose = pose_at(climbers.poses, n)
-                xi, slope = _direction(product, ascent, pose, places)
+                xi, slope = _direction(product, ascent, pose, scratch)
                 if slope > 0.0:
-                    _step(product, ascent, pose, xi, slope, climbers, n, places)
+                    _step(product, ascent, pose, xi, slope, climbers, n, scratch)
                 else:
                     climbers.done[n] = True
 
 
 @inner
-def _direction(product, ascent, pose, places):
+def _direction(product, ascent, pose, scratch):
     """The flow xi = (omega, u) as a unit vector, and the slope of F along it; 0 without overlap.
 
     omega = 1/c sum x_i x h_i, u = 1/d sum h_i.
     """
-    flow = flow_at(product, pose, places)
+    flow = flow_at(product, pose, scratch)
     a, b, c = flow[1] / ascent.c, flow[2] / ascent.c, flow[3] / ascent.c
     d, e, f = flow[4] / ascent.d, flow[5] / ascent.d, flow[6] / ascent.d
     size = np.sqrt(a * a + b * b + c * c + d * d + e * e + f * f)
@@ -113,7 +97,7 @@ def _direction(product, ascent, pose, places):
 
 
 @inner
-def _step(product, ascent, pose, xi, slope, climbers, n, places):
+def _step(product, ascent, pose, xi, slope, climbers, n, scratch):
     """Move climber n by the best step found along the flow, if any is uphill.
 
     From the last step's length on: longer while F rises, or shorter until it has risen; then where
@@ -123,10 +107,10 @@ def _step(product, ascent, pose, xi, slope, climbers, n, places):
     least, most = steps[0] / 1024.0, steps[STEPS - 1]
     k = climbers.step[n]
     tau, other, at_other = steps[k], 0.0, 0.0
-    value = _product_at(product, _moved_along(pose, xi, tau), places)
+    value = _product_at(product, _moved_along(pose, xi, tau), scratch)
     vertex = _vertex(tau, value - before, slope)
     while value > before and vertex > tau and k + 1 < STEPS:
-        beyond = _product_at(product, _moved_along(pose, xi, steps[k + 1]), places)
+        beyond = _product_at(product, _moved_along(pose, xi, steps[k + 1]), scratch)
         if not beyond > value:
             other, at_other = steps[k + 1], beyond
             break
@@ -136,7 +120,7 @@ def _step(product, ascent, pose, xi, slope, climbers, n, places):
     while value <= before and tau > least:
         other, at_other = tau, value
         tau = max(min(vertex, 0.5 * tau), 0.1 * tau)
-        value = _product_at(product, _moved_along(pose, xi, tau), places)
+        value = _product_at(product, _moved_along(pose, xi, tau), scratch)
         vertex = _vertex(tau, value - before, slope)
     if value <= before:
         climbers.done[n] = True
@@ -147,7 +131,7 @@ def _step(product, ascent, pose, xi, slope, climbers, n, places):
     for _ in range(_REFINEMENTS):
         if not (ahead <= most and abs(ahead - tau) > _NEAR * tau):
             break
-        at_ahead = _product_at(product, _moved_along(pose, xi, ahead), places)
+        at_ahead = _product_at(product, _moved_along(pose, xi, ahead), scratch)
         if at_ahead > value:
             tau, value, other, at_other = ahead, at_ahead, tau, value
         else:
@@ -228,20 +212,20 @@ def _rest_of_sine(angle, sine):
 
 
 @inner
-def _product_at(product, pose, places):
+def _product_at(product, pose, scratch):
     """F at a pose."""
     total = 0.0
     for term in product:
-        total += _sum_at(term, pose, places)
+        total += sum_at(term, pose, scratch)
     return total
 
 
 @inner
-def flow_at(product, pose, places):
+def flow_at(product, pose, scratch):
     """F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), in the world."""
     value = x = y = z = p = q = r = 0.0
     for term in product:
-        f, gx, gy, gz, a, b, c = _moments_at(term, pose, places)
+        f, gx, gy, gz, a, b, c = moments_at(term, pose, scratch)
         value, x, y, z = value + f, x + gx, y + gy, z + gz
         p, q, r = p + a, q + b, r + c
     # R (x_i x h_i) = (p_i - t) x grad f(p_i)
@@ -249,58 +233,3 @@ def flow_at(product, pose, places):
     q -= pose[11] * x - pose[9] * z
     r -= pose[9] * y - pose[10] * x
     return (value, *turned_back(pose, p, q, r), *turned_back(pose, x, y, z))
-
-
-@inner
-def _sum_at(term, pose, places):
-    """W times the sum of f(p_i), p_i = R x_i + t; 0 beyond the field."""
-    box, table, points = term.box, term.table, term.points
-    across, along = int(box.across), int(box.along)
-    beyond, cell, u, v, w = places.beyond, places.cell, places.u, places.v, places.w
-    total = 0.0
-    for start in range(0, points.shape[1], BLOCK):
-        end = min(start + BLOCK, points.shape[1])
-        xs, ys, zs = points[0, start:end], points[1, start:end], points[2, start:end]
-        locate(pose, box, xs, ys, zs, places, end - start)
-        for n in range(end - start):
-            if beyond[n] == 0.0:
-                at = cell[n]
-                near = _along(table, at, along, v[n], w[n])
-                far = _along(table, at + across, along, v[n], w[n])
-                total += _between(near, far, u[n])
-    return term.weight * total
-
-
-@leaf
-def _along(table, at, along, v, w):
-    """f between the four nodes around, of those that share the first index."""
-    near = _between(table[at, 0], table[at + 1, 0], w)
-    return _between(near, _between(table[at + along, 0], table[at + along + 1, 0], w), v)
-
-
-@leaf
-def _between(near, far, share):
-    return np.float64(near) + share * (np.float64(far) - np.float64(near))
-
-
-@inner
-def _moments_at(term, pose, places):
-    """W times sums of f, grad f and p x grad f at p_i = R x_i + t, in the object frame."""
-    box, points, u, v, w = term.box, term.points, places.u, places.v, places.w
-    value = gx = gy = gz = p = q = r = 0.0
-    for start in range(0, points.shape[1], BLOCK):
-        end = min(start + BLOCK, points.shape[1])
-        xs, ys, zs = points[0, start:end], points[1, start:end], points[2, start:end]
-        locate(pose, box, xs, ys, zs, places, end - start)
-        for n in range(end - start):
-            if places.beyond[n] == 0.0:
-                at = places.cell[n]
-                s, nx, ny, nz = distance_between_nodes(box, term.table, at, u[n], v[n], w[n])
-                a, b, c = moved(pose, xs[n], ys[n], zs[n])
-                value += s
-                gx, gy, gz = gx + nx, gy + ny, gz + nz
-                p += b * nz - c * ny
-                q += c * nx - a * nz
-                r += a * ny - b * nx
-    m = term.weight
-    return m * value, m * gx, m * gy, m * gz, m * p, m * q, m * r

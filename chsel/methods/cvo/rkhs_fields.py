@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.methods.cvo.cvo_kernels import ClassTerm, Product, products, scratch
+from chsel.methods.cvo.cvo_kernels import Product, products
+from chsel.methods.cvo.field_kernels import ClassTerm, scratch
 from chsel.methods.cvo.gaussian_blur import (
     Kernel,
     blurred,
@@ -39,11 +40,12 @@ class ClassField:
 
     box: Box
     table: Any  # (nodes, 4), f and its gradient at the nodes of the box, 32 bit
+    values: Any  # (nodes,), f alone, 32 bit
     norm: float  # <f, f>
 
     def term(self, points: FloatArray, weight: float) -> ClassTerm:
         """Its part of F, for points (N, 3) of the same class in the world."""
-        return ClassTerm(points.T.copy(), self.box, self.table, weight)
+        return ClassTerm(points.T.copy(), self.box, self.table, self.values, weight)
 
 
 def surface_field(sdf: SdfGrid, kernel: Kernel, band: float) -> ClassField:
@@ -76,7 +78,9 @@ def _class_field(sdf: SdfGrid, members: BoolArray, kernel: Kernel) -> ClassField
     first = sdf.origin - weights.reach * sdf.resolution
     box = box_of(first, stride * sdf.resolution, shape, between=True)
     nodes = sdf.origin + np.argwhere(members) * sdf.resolution
-    return ClassField(box, table, _sum_over(ClassField(box, table, 0.0), nodes))
+    values = table[:, 0].copy()
+    norm = _sum_over(ClassField(box, table, values, 0.0), nodes)
+    return ClassField(box, table, values, norm)
 
 
 def _sum_over(field: ClassField, points: FloatArray) -> float:

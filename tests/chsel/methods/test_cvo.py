@@ -17,8 +17,8 @@ from chsel.methods.cvo.cvo_kernels import (
     climb,
     climbers_at,
     products,
-    scratch,
 )
+from chsel.methods.cvo.field_kernels import scratch
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads

@@ -7,7 +7,8 @@ import trimesh
 from chsel import KnownPoints, SdfGrid
 from chsel.errors import SettingError
 from chsel.methods.cvo import rkhs_fields
-from chsel.methods.cvo.cvo_kernels import Product, products, scratch
+from chsel.methods.cvo.cvo_kernels import Product, products
+from chsel.methods.cvo.field_kernels import scratch
 from chsel.methods.cvo.gaussian_blur import Kernel
 from chsel.methods.cvo.rkhs_fields import (
     cloud_norm,
