@@ -90,11 +90,14 @@ class EvaluationCost:
 
     def evaluate(self, object_from_world: FloatArray, *, limit: float = np.inf) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for those not below `limit`."""
-        poses = Poses.of(object_from_world).numbers
+        return self.of_poses(Poses.of(object_from_world), limit=limit)
+
+    def of_poses(self, poses: Poses, *, limit: float = np.inf) -> FloatArray:
+        """Costs (B,) of poses; infinite for those not below `limit`."""
         costs = np.empty(len(poses))
 
         def run(first: int, last: int, scratch: Candidates) -> None:
-            costs_below(self.model, poses, limit, costs, first, last, scratch)
+            costs_below(self.model, poses.numbers, limit, costs, first, last, scratch)
 
         spread(run, len(poses), lambda: scratch_for(self.model), least=_POSES_PER_THREAD)
         return costs

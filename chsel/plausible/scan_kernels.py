@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.compiler import compiled, inner, spliced
+from chsel.numerics.compiler import compiled, inner, leaf, spliced
 from chsel.numerics.octree import Candidates
 from chsel.numerics.pose_tuples import turned
 from chsel.plausible.evaluation_cost import EvaluationModel, cost_below, scratch_for
@@ -164,7 +164,7 @@ def _sieve(scan, bounds, buffer, count):
     return count
 
 
-@inner
+@leaf
 def _look_up(bounds, buffer, start, first, last):
     """Fill buffer.cell for the blocks from `start` on and points from `first` to before `last`."""
     cell, points, unsure = buffer.cell, buffer.points, bounds.unsure
@@ -195,7 +195,7 @@ def _look_up(bounds, buffer, start, first, last):
         place += LANES
 
 
-@inner
+@leaf
 def _add(scan, buffer, start, first, last):
     """Add the bounds in buffer.cell to the totals of the blocks from `start` on."""
     table, cell, total, values = scan.bounds.table, buffer.cell, buffer.total, scan.known_sdf
