@@ -55,7 +55,7 @@ EFFORTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "gradient_descent": {name: {"descent": _restarts(share)} for name, share in _SHARES.items()},
     "icp": {f"{most} iterations": {"iterations": most} for most in (1, 3, 10, 100)},
     "svgd": _shares("iterations", 300),
-    "cvo": _shares("max_iterations", 100),
+    "cvo": {f"{most} iterations": {"max_iterations": most} for most in (10, 30, 100)},
     "medial_constraint": {
         f"{most} generations": {"cma_es": {"generations": most}} for most in (50, 100, 200, 10_000)
     },
