@@ -22,7 +22,8 @@ from chsel.numerics.octree import Tree
 from chsel.numerics.pose_tuples import Pose, Triple, inverted, rigid, turned_back
 from chsel.problem.sdf_lookup import distance_between_nodes
 
-MOST_SLACK = 0.03  # metres
+MOST_SLACK = 0.03  # metres, in a descent
+SEARCH_SLACK = 0.02  # metres, among the branches of a search, which scatter
 STEPS_AHEAD = 3.0  # that gathered neighbours should last
 
 
@@ -92,8 +93,8 @@ def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
 def free_sums(model, pose, near, n, most_slack):
     """The free term of a finite pose, whose neighbours are the n-th.
 
-    most_slack: MOST_SLACK in a sequence of poses close to each other, which is faster then; 0.0
-    otherwise. The result is the same to the bit.
+    most_slack: MOST_SLACK or SEARCH_SLACK in a sequence of poses close to each other, which is
+    faster then; 0.0 otherwise. The result is the same to the bit.
     """
     free, points = model.free, near.points
     total = len(free.tree.order)

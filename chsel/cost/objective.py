@@ -8,7 +8,7 @@ import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import Model, Work, evaluate, forget, gradient_of, put_pose, work_of
-from chsel.cost.free_kernels import MOST_SLACK
+from chsel.cost.free_kernels import MOST_SLACK, SEARCH_SLACK
 from chsel.cost.pose_lanes import LANES, SUMS
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, implements, leaf, spliced
@@ -52,7 +52,7 @@ def _relaxed_costs_of(model, space, vectors, costs, work):
                 put_pose(work.lanes, lane, decode(space, vector))
             else:
                 work.lanes[lane] = np.inf
-        evaluate(model, work, 0, count, 0.0)
+        evaluate(model, work, 0, count, SEARCH_SLACK)
         for lane in range(count):
             costs[first + lane] = work.lanes[SUMS + lane]
 
@@ -61,7 +61,7 @@ def _relaxed_costs_of(model, space, vectors, costs, work):
 def cost_and_gradient_of(model, space, vector, gradient, work):
     """The cost of a search vector (d,); fills its gradient (d,)."""
     put_pose(work.lanes, 0, decode(space, vector))
-    evaluate(model, work, 0, 1, 0.0)
+    evaluate(model, work, 0, 1, SEARCH_SLACK)
     pull_back(space, vector, gradient_of(work.lanes, 0), gradient)
     return work.lanes[SUMS]
 
