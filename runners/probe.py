@@ -36,6 +36,7 @@ def main(config: DictConfig) -> None:
     method = build_method(method_name, method_config)
     with ExitStack() as stack:
         with Compiling() as kernels:
+            kernels.begin(method)
             with reading_bar() as bar:
                 scene = open_scene(checked, bar.show)
             stack.callback(scene.session.close)

@@ -98,6 +98,18 @@ class Chsel(ConfiguredMethod[ChselSettings]):
         return hypotheses
 
 
+def search_alone(problem: RegistrationProblem, settings: ChselSettings) -> None:
+    """Line 6 from the first pose of E_0, as a rehearsal: its kernels are compiled, or loaded."""
+    algorithm = _Algorithm1(problem, settings, NullObserver())
+    measure, dimension = algorithm.measure, algorithm.space.dimension
+    first = Poses.of(problem.initial_set[:1])
+    mean, deviation = np.zeros(measure.count), np.ones(measure.count)
+    archive = sized_archive(measure, mean, deviation, settings.archive, dimension)
+    vectors, costs = algorithm.space.encode(first), np.zeros(1)
+    archive.update_cells(evaluated(algorithm.objective, measure, vectors, costs))
+    algorithm.cma_mega(archive, first, 0)
+
+
 class _Algorithm1:
     """Algorithm 1 of the paper on one problem. index: of the pass."""
 

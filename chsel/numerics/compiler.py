@@ -129,6 +129,10 @@ class _CompilerWatch(event.Listener):
 
     def on_end(self, event: Any) -> None:
         """The compilation of a function has ended."""
+        kernel = event.data["dispatcher"]
+        has_failed = tuple(event.data["args"]) not in kernel.overloads
+        if has_failed and isinstance(kernel._cache, KernelCache):
+            kernel._cache.release()
         if not _is_kernel(event):
             return
         self._depth -= 1

@@ -25,6 +25,7 @@ from typing import Any
 import llvmlite
 import llvmlite.binding
 import numba
+from filelock import FileLock, Timeout
 from numba.core import sigutils, types
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
@@ -41,6 +42,8 @@ KEPT_VERSIONS = 8  # of the code of a kernel for the same types of arguments
 _OTHERS_WRITE = 0o022
 _DAY = 86400.0
 _CHECK_SIZE = 16  # bytes of the digest before the code in a file
+_LOCK = ".lock"
+_PATIENCE = 120.0  # seconds, after which another process is taken to hang
 _config: Any = numba.core.config
 _log = logging.getLogger(__name__)
 
@@ -50,6 +53,7 @@ class KernelCache(NullCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
+        self._claims: dict[str, FileLock] = {}
         loaded(function)
 
     @property
@@ -58,19 +62,21 @@ class KernelCache(NullCache):
         return str(cache_directory())
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        """The code for types of arguments, or None if it must be compiled."""
+        """The code for types of arguments, or None if it must be compiled.
+
+        While another process compiles it, waits for that.
+        """
         target_context.refresh()
         name = self._file_name(sig)
         if name is None:
             return None
-        path = cache_directory() / name
-        payload = _checked(_contents(path))
+        payload = _kept(name) or _checked(packaged_code(name))
         if payload is None:
-            payload = _checked(packaged_code(name))
-        else:
-            _touch(path)
-        if payload is None:
-            return None
+            self._claim(name)
+            payload = _kept(name)  # by the process that had claimed it
+            if payload is None:
+                return None
+            self.release()
         return CompileResult._rebuild(target_context, *pickle.loads(payload))
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -86,6 +92,24 @@ class KernelCache(NullCache):
             _prune(path)
         except OSError as error:
             _log.warning("machine code cannot be kept in %s: %s", path.parent, error)
+        finally:
+            self.release()
+
+    def release(self) -> None:
+        """Let other processes compile what this one does not: it has, or it has failed to."""
+        while self._claims:
+            name, lock = self._claims.popitem()
+            lock.release()
+            (cache_directory() / name).with_suffix(_LOCK).unlink(missing_ok=True)
+
+    def _claim(self, name: str) -> None:
+        """Wait until no other process compiles the code of that name, and let none begin to."""
+        lock = FileLock((cache_directory() / name).with_suffix(_LOCK))
+        try:
+            lock.acquire(timeout=_PATIENCE, poll_interval=0.05)
+        except (Timeout, OSError, NotImplementedError):  # a folder that cannot be locked
+            return
+        self._claims[name] = lock
 
     def _file_name(self, sig: Any) -> str | None:
         arguments: tuple[types.Type, ...] = sigutils.normalize_signature(sig)[0]
@@ -141,11 +165,15 @@ def _digest(payload: bytes) -> bytes:
     return hashlib.blake2b(payload, digest_size=_CHECK_SIZE).digest()
 
 
-def _contents(path: Path) -> bytes | None:
+def _kept(name: str) -> bytes | None:
+    """What the cache holds by that name, or None."""
+    path = cache_directory() / name
     try:
-        return path.read_bytes()
+        payload = _checked(path.read_bytes())
     except OSError:
         return None
+    _touch(path)
+    return payload
 
 
 def _checked(whole: bytes | None) -> bytes | None:

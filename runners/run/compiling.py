@@ -7,6 +7,7 @@ from typing import Self
 
 from rich.progress import TaskID, TimeElapsedColumn
 
+from chsel.background_rehearsal import rehearse_search_beside
 from chsel.methods.method import Method
 from chsel.numerics.compiler import watched
 from chsel.numerics.kernel_cache import has_kernels
@@ -41,6 +42,11 @@ class Compiling:
             self._progress.stop_task(self._task)
             self._progress.start()
             self._progress.stop()
+
+    def begin(self, method: Method) -> None:
+        """Where nothing was compiled yet, compile the search on another core from now on."""
+        if not has_kernels():
+            rehearse_search_beside(method)
 
     def rehearse(self, method: Method, policy: Policy | None = None, *, sensing: bool) -> None:
         """Compile what `method` needs, and `policy`; with `sensing` what turns images to points."""

@@ -7,12 +7,17 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from filelock import FileLock
+from numba import TypingError
 
 from chsel.numerics import kernel_cache, kernel_sources
+from chsel.numerics.compiler import compiled
 from chsel.numerics.kernel_sources import kernel_sources as compiler_sources
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -257,6 +262,37 @@ def test_imports_are_found_as_python_finds_them() -> None:
     text = b"from . import a\nfrom ..b import (\n    c,\n)\nimport d.e as f, g\n"
     relative = kernel_sources.SourceFile("x.y.z", Path("z.py"), Path(), text)
     assert relative.imported >= {"x.y", "x.y.a", "x.b", "x.b.c", "d.e", "g"}
+
+
+def halves(value: float) -> float:
+    return 0.5 * value
+
+
+def wrong(value: float) -> Any:
+    return value.nothing  # type: ignore[attr-defined]
+
+
+def test_a_kernel_that_another_process_compiles_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_cache, "cache_directory", lambda: tmp_path)
+    compiled(halves)(1.0)
+    (code,) = tmp_path.iterdir()
+    away = code.rename(tmp_path / "away")
+    lock = FileLock(code.with_suffix(".lock"), thread_local=False)
+    lock.acquire()
+
+    def finish() -> None:
+        away.rename(code)
+        lock.release()
+
+    threading.Timer(0.3, finish).start()
+    kernel: Any = compiled(halves)
+    assert kernel(3.0) == 1.5
+    assert kernel.stats.cache_hits
+    with pytest.raises(TypingError):
+        compiled(wrong)(1.0)
+    assert [path.suffix for path in tmp_path.iterdir()] == [".nbc"]  # and no claim
 
 
 def test_code_that_nobody_uses_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
