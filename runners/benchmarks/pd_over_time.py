@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from chsel.methods import preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.threads import threads
 from chsel.plausible.plausible_set import PlausibleSet
@@ -34,25 +35,29 @@ _SHARES = {"a fifth": 0.2, "half": 0.5, "all": 1.0, "3 x": 3.0}
 """Of the steps that a method does by default."""
 
 
-def _chsel(share: float) -> dict[str, Any]:
-    return {"descent": _restarts(share), "emitter": {"iterations": round(100 * share)}}
-
-
-def _restarts(share: float) -> dict[str, Any]:
-    return {"restarts": round(10 * share)}
+def _chsel(preset: str) -> dict[str, Any]:
+    settings = preset_settings("chsel", preset)
+    return {
+        name: {
+            "descent": {"restarts": max(1, round(settings.descent.restarts * share))},
+            "emitter": {"iterations": round(settings.emitter.iterations * share)},
+        }
+        for name, share in _SHARES.items()
+    }
 
 
 def _shares(setting: str, usual: int) -> dict[str, Any]:
     return {name: {setting: round(usual * share)} for name, share in _SHARES.items()}
 
 
-_CHSEL = {name: _chsel(share) for name, share in _SHARES.items()}
 EFFORTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
-    "chsel@reference": _CHSEL,
-    "chsel@paper": _CHSEL,
-    "chsel": _CHSEL,
+    "chsel@reference": _chsel("reference"),
+    "chsel@paper": _chsel("paper"),
+    "chsel": _chsel("default"),
     "anchored": {size: {"size": size} for size in ("small", "medium", "large", "adaptive")},
-    "gradient_descent": {name: {"descent": _restarts(share)} for name, share in _SHARES.items()},
+    "gradient_descent": {
+        f"{most} restarts": {"descent": {"restarts": most}} for most in (2, 5, 10)
+    },
     "icp": {f"{most} iterations": {"iterations": most} for most in (1, 3, 10, 100)},
     "svgd": _shares("iterations", 300),
     "cvo": {f"{most} iterations": {"max_iterations": most} for most in (10, 30, 100)},

@@ -49,12 +49,13 @@ class Steps:
 
 
 def method(name: str, steps: Steps, search: int) -> Method:
-    """One of OURS: with all steps done, or as it ships but for the iterations of its search."""
+    """One of OURS: with all steps done, or as it ships but for a search that is longer."""
     if name in SIZES:
         settings = replace(preset_settings("anchored"), size=name.removeprefix("anchored, "))
         return build_method("anchored", settings)
     settings = preset_settings("chsel", name)
-    settings = replace(settings, emitter=replace(settings.emitter, iterations=search))
+    if name in EQUAL_STEPS or search != steps.search:
+        settings = replace(settings, emitter=replace(settings.emitter, iterations=search))
     if name in EQUAL_STEPS:
         descent = replace(
             settings.descent, restarts=steps.restarts, iterations=steps.adam, stop_below=None
