@@ -17,7 +17,8 @@ def bounds_of(points: FloatArray) -> FloatArray:
 
 @compiled
 def _fill_bounds(points: FloatArray, bounds: FloatArray) -> None:
-    bounds[0], bounds[1] = points[0], points[0]
+    for axis in range(3):
+        bounds[0, axis] = bounds[1, axis] = points[0, axis]
     for n in range(len(points)):
         for axis in range(3):
             bounds[0, axis] = min(bounds[0, axis], points[n, axis])

@@ -1,14 +1,11 @@
-"""Measurements that need a process of their own: memory, and the time to start.
-
-As a program: `python -m runners.benchmarks.fresh JSON` imports the library, registers once if JSON
-names a preset, and prints its peak memory. It imports torch first if JSON says so.
-"""
+"""Measurements that need a process of their own: memory, and the time to start."""
 
 from __future__ import annotations
 
-import dataclasses
+import base64
 import json
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
@@ -18,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from runners.benchmarks.registrations import Steps, method
-from runners.published_package.problem_file import load_problem
 
 _CACHE = "CHSEL_CACHE_DIR"
 
@@ -62,7 +58,8 @@ def first_and_later_start(
 def _task(problem: Path, preset: str | None, steps: Steps) -> dict[str, Any]:
     if preset is None:
         return {}
-    return {"problem": str(problem), "preset": preset, "steps": dataclasses.asdict(steps)}
+    made = pickle.dumps(method(preset, steps, steps.search))
+    return {"problem": str(problem), "method": base64.b64encode(made).decode()}
 
 
 def _run(task: dict[str, Any], cache: str | None = None) -> tuple[float, dict[str, Any]]:
@@ -70,37 +67,9 @@ def _run(task: dict[str, Any], cache: str | None = None) -> tuple[float, dict[st
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     if cache is not None:
         environment[_CACHE] = cache
-    command = [sys.executable, "-m", "runners.benchmarks.fresh", json.dumps(task)]
+    command = [sys.executable, "-m", "runners.benchmarks.fresh_process", json.dumps(task)]
     begun = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     seconds = time.perf_counter() - begun
     answer: dict[str, Any] = json.loads(done.stdout)
     return seconds, answer
-
-
-def main(task: dict[str, Any]) -> None:
-    """Do the task of one such process."""
-    if task.get("torch"):
-        import torch  # noqa: F401
-    if task:
-        steps = Steps(**task["steps"])
-        problem = load_problem(Path(task["problem"]))
-        method(task["preset"], steps, steps.search).register(problem)
-    sys.stdout.write(json.dumps({"bytes": peak_memory()}) + "\n")
-
-
-def peak_memory() -> int:
-    """Peak memory of this process in bytes."""
-    # Not getrusage where there is another way: a new process inherits its parent's peak there.
-    try:
-        status = Path("/proc/self/status").read_text()
-        return 1024 * int(status.split("VmHWM:")[1].split()[0])
-    except (OSError, IndexError):
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else 1024 * peak
-
-
-if __name__ == "__main__":
-    main(json.loads(sys.argv[1]))

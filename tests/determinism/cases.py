@@ -117,6 +117,7 @@ _ANCHORED = {
     "anchored, in full": Case("anchored", classes=ALL_CLASSES, steps=2, long=True),
 }
 _SESSIONS = {
+    "race": Case(changes={"descent": {"restarts": 4, "iterations": 10, "race": [1.0, 0.5, 0.2]}}),
     "two passes": Case(changes={"passes": 2}, body="mallet", place="mallet", steps=2),
     "two passes of CMA-ME": Case("chsel_cma_me", changes={"passes": 2}, body="mallet"),
     "three steps": Case(
