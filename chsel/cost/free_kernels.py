@@ -110,7 +110,7 @@ def free_sums(model, pose, near, n, most_slack):
     rounding += free.margin
     slack = _slack_to_gather(free, pose, near, n, most_slack)
     if slack >= 0.0:
-        if _is_apart(free, pose, slack + free.margin):
+        if is_apart(free, pose, slack + free.margin):
             points.number[n] = 0
         else:
             gather(free.rough, free.cells, to_cell, slack + rounding, points, n)
@@ -137,7 +137,7 @@ def _slack_to_gather(free, pose, near, n, most_slack):
 
 
 @leaf
-def _is_apart(free, pose, slack):
+def is_apart(free, pose, slack):
     """Whether the object is further than `slack` metres from where anything costs."""
     x, y, z = _centre_in_world(free, pose)
     lower, upper = free.lower, free.upper

@@ -9,7 +9,8 @@ import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
-from chsel.methods.anchored.fit_kernels import Loss, Twists, fit_for, fit_poses, surrounding_for
+from chsel.methods.anchored.fit_kernels import Loss, Twists, fit_for, fit_poses
+from chsel.methods.anchored.surrounding_kernels import surrounding_for
 from chsel.methods.anchored.walk_kernels import (
     DRAWS,
     Chains,

@@ -12,16 +12,20 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.cost.cost_kernels import Model
-from chsel.cost.free_kernels import remember, travel
+from chsel.methods.anchored.surrounding_kernels import (
+    Surrounding,
+    gather,
+    look_around,
+    surrounding_for,
+    travel_since_gathering,
+)
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import locate
-from chsel.numerics.compiler import compiled, inner, leaf, spliced
-from chsel.numerics.octree import Candidates, candidates_for, walk
+from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
 from chsel.problem.sdf_lookup import distance_in_box, distance_with_gradient
 
 _MOST_SHIFT, _MOST_TURN = 0.08, 0.5  # of a step, metres and radians
-_SLACK = 0.04  # metres that a pose may move before they are gathered again
+_SLACK = 0.02  # metres that a pose may move before they are gathered again
 _FIRST_DAMPING = 1e-2  # of the mean of the diagonal
 _LESS, _MORE = 0.3, 5.0  # factors of the damping, after a step that was good or bad
 _MOST_DAMPING = 1e6
@@ -43,13 +47,6 @@ class Loss(NamedTuple):
     most_wrong: float  # what a free or occupied point costs an energy at most, metres
 
 
-class Surrounding(NamedTuple):
-    """The free points that can matter while a pose moves little: scratch of one thread."""
-
-    candidates: Candidates
-    memory: FloatArray  # (12,), where the object was when they were gathered, see remember
-
-
 class Fit(NamedTuple):
     """Scratch of one thread. Only the lower triangles of matrices are used."""
 
@@ -63,32 +60,11 @@ class Fit(NamedTuple):
     twist: FloatArray  # (6,)
 
 
-def surrounding_for(model: Model) -> Surrounding:
-    """Scratch for one thread."""
-    size = max(model.free.tree.spheres.shape[1], model.known.shape[1], 1)
-    return Surrounding(candidates_for(size), np.empty(12))
-
-
 def fit_for(model: Model, d: int) -> Fit:
     """Scratch for one thread, for twists of d dimensions."""
     normal, right, factor = np.empty((2, d, d)), np.empty((2, d)), np.empty((d, d))
     sums, row, twist = np.empty((8, 6)), np.empty(d), np.empty(6)
     return Fit(surrounding_for(model), sums, normal, right, factor, row, twist)
-
-
-@spliced
-def gather(model, pose, slack, near):
-    """Gather the free points that can matter until the object moves by a slack; how many."""
-    remember(model.free, pose, near.memory)
-    return walk(
-        model.free.tree, model.free.region, pose, slack + model.free.margin, near.candidates
-    )
-
-
-@spliced
-def travel_since_gathering(model, pose, near):
-    """How far in the world any point of the object moved at most, metres."""
-    return travel(model.free, pose, near.memory)
 
 
 @leaf
@@ -117,9 +93,9 @@ def fit_poses(model, loss, twists, poses, iterations, first, last, fit):
 @inner
 def _fitted(model, loss, twists, pose, iterations, fit):
     dimension = len(twists.basis)
-    count = gather(model, pose, _SLACK, fit.near)
+    gather(model, pose, _SLACK, fit.near)
     at, damping = 0, _FIRST_DAMPING
-    losses = _losses(model, loss, twists, pose, count, fit, at)
+    losses = _losses(model, loss, twists, pose, fit, at)
     for _ in range(iterations):
         if losses == 0.0:
             break
@@ -130,8 +106,8 @@ def _fitted(model, loss, twists, pose, iterations, fit):
             break
         trial = _moved_by(twists, pose, fit)
         if travel_since_gathering(model, trial, fit.near) > _SLACK:
-            count = gather(model, trial, _SLACK, fit.near)
-        tried = _losses(model, loss, twists, trial, count, fit, 1 - at)
+            gather(model, trial, _SLACK, fit.near)
+        tried = _losses(model, loss, twists, trial, fit, 1 - at)
         if tried < losses:
             gain = losses - tried
             pose, losses, at = trial, tried, 1 - at
@@ -146,22 +122,21 @@ def _fitted(model, loss, twists, pose, iterations, fit):
 
 
 @inner
-def _losses(model, loss, twists, pose, count, fit, at):
+def _losses(model, loss, twists, pose, fit, at):
     """The sum of the losses; fills the normal equations at a place, 0 or 1."""
     field, sums, total = model.field, fit.sums, 0.0
     for i in range(7):
         for j in range(6):
             sums[i, j] = 0.0
-    candidates = fit.near.candidates
-    clearance, places = model.free.region.clearance, candidates.places
-    locate(pose, model.free.region.box, candidates.x, candidates.y, candidates.z, places, count)
-    for n in range(count):
+    near, clearance = fit.near, model.free.region.clearance
+    places = near.places
+    for n in range(look_around(model, pose, near)):
         if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
             looked_up = distance_in_box(field, places, n)
             residual = looked_up[0] - model.alpha
             if residual < 0.0:
                 total += cost_of_residual(loss, residual)
-                point = candidates.x[n], candidates.y[n], candidates.z[n]
+                point = near.x[n], near.y[n], near.z[n]
                 _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
     for n in range(model.known.shape[1]):
         point = model.known[0, n], model.known[1, n], model.known[2, n]

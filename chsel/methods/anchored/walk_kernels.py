@@ -10,17 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.methods.anchored.fit_kernels import (
-    cost_of_residual,
+from chsel.methods.anchored.fit_kernels import cost_of_residual, moved_about
+from chsel.methods.anchored.surrounding_kernels import (
     gather,
-    moved_about,
+    look_around,
     travel_since_gathering,
 )
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import locate
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp
-from chsel.numerics.octree import walk
 from chsel.numerics.pose_tuples import moved, origin_within, pose_at
 from chsel.problem.sdf_lookup import distance_at, distance_in_place, value_between_nodes
 
@@ -31,8 +30,8 @@ _SMALLEST, _RANGE = 0.12589254117941673, 2.763102111592855  # a move's factor: 1
 _PER_METRE = 6.0  # radians that go with a metre
 _ABOUT_CONTACT = 0.6  # share of the turns that are about a contact
 _DEVIATION = 3.4641016151377544  # uniform numbers of [-1/2, 1/2] times it have a deviation of 1
-_SLACKS = 6.0  # sizes of a step that gathered points should last
-_LEAST_SLACK, _MOST_SLACK = 0.004, 0.04  # metres
+_SLACKS = 3.0  # sizes of a step that gathered points should last
+_LEAST_SLACK, _MOST_SLACK = 0.004, 0.02  # metres
 _PART = 16  # known points that are located at a time
 
 
@@ -103,13 +102,12 @@ def _distance(field, pose, x, y, z, places, n):
 
 
 @inner
-def _with_free(model, loss, pose, total, limit, candidates, count):
-    """A sum plus the cost of `count` free points; infinite if it is above the limit."""
+def _with_free(model, loss, pose, total, limit, near):
+    """A sum plus the cost of the free points gathered; infinite if it is above the limit."""
     free, box, table = model.free, model.field.box, model.field.table
     across, along = int(box.across), int(box.along)
-    clearance, places = free.region.clearance, candidates.places
-    locate(pose, free.region.box, candidates.x, candidates.y, candidates.z, places, count)
-    for n in range(count):
+    clearance, places = free.region.clearance, near.places
+    for n in range(look_around(model, pose, near)):
         at = places.cell[n]
         if clearance[at] < 0.0 and places.beyond[n] == 0.0:
             s = value_between_nodes(table, at, across, along, places.u[n], places.v[n], places.w[n])
@@ -120,20 +118,20 @@ def _with_free(model, loss, pose, total, limit, candidates, count):
 
 
 @inner
-def _energy_below(model, loss, pose, limit, candidates):
+def _energy_below(model, loss, pose, limit, near):
     """The energy of a rigid pose; infinite if it is above the limit."""
-    total = _known_below(model, loss, pose, limit, candidates.places)
+    total = _known_below(model, loss, pose, limit, near.places)
     if not total <= limit:
         return np.inf
-    count = walk(model.free.tree, model.free.region, pose, 0.0, candidates)
-    return _with_free(model, loss, pose, total, limit, candidates, count)
+    gather(model, pose, 0.0, near)
+    return _with_free(model, loss, pose, total, limit, near)
 
 
 @compiled
 def energies_below(model, loss, poses, limit, out, first, last, near):
     """Fill out (B,) with the energies of poses (B, 12) up to a limit, from `first` to `last`."""
     for n in range(first, last):
-        out[n] = _energy_below(model, loss, pose_at(poses, n), limit, near.candidates)
+        out[n] = _energy_below(model, loss, pose_at(poses, n), limit, near)
 
 
 @compiled
@@ -147,7 +145,7 @@ def walk_below(model, loss, stride, floor, chains, draws, first, last, near):
     moves, keep = draws.shape[1], chains.kept.shape[1]
     for n in range(first, last):
         pose, energy, size = pose_at(chains.poses, n), chains.energies[n], _FIRST
-        slack, count, done = -1.0, 0, 0
+        slack, done = -1.0, 0
         for m in range(moves):
             if keep == 0 and energy <= floor:
                 break
@@ -155,12 +153,12 @@ def walk_below(model, loss, stride, floor, chains, draws, first, last, near):
             trial = _proposed(model, stride, pose, size, draws[n, m])
             accepted = False
             if origin_within(trial, stride.lower, stride.upper):
-                total = _known_below(model, loss, trial, limit, near.candidates.places)
+                total = _known_below(model, loss, trial, limit, near.places)
                 if total <= limit:
                     if slack < 0.0 or travel_since_gathering(model, trial, near) > slack:
                         slack = min(max(_SLACKS * size, _LEAST_SLACK), _MOST_SLACK)
-                        count = gather(model, trial, slack, near)
-                    total = _with_free(model, loss, trial, total, limit, near.candidates, count)
+                        gather(model, trial, slack, near)
+                    total = _with_free(model, loss, trial, total, limit, near)
                     accepted = total <= limit
             if accepted:
                 pose, energy = trial, total

@@ -7,7 +7,8 @@ import pytest
 
 from chsel.methods.anchored.anchor_sampling import most_informative_first
 from chsel.methods.anchored.energy import Energy, NoiseLevel
-from chsel.methods.anchored.fit_kernels import Loss, surrounding_for
+from chsel.methods.anchored.fit_kernels import Loss
+from chsel.methods.anchored.surrounding_kernels import surrounding_for
 from chsel.methods.anchored.walk_kernels import Chains, energies_below
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
