@@ -40,7 +40,10 @@ class Case:
         quick["effort"] = {"samples": 3000, "kept": 24, "refined": 12, "steps": 8, "descents": 8}
         quick["effort"] |= {"descent_moves": 40, "chains": 8, "moves": 60, "polish_moves": 40}
         if self.long:
-            quick = {"descent": {"stop_below": None}}
+            quick = {
+                "descent": {"stop_below": None, "restarts": 10},
+                "emitter": {"iterations": 100},
+            }
         for changes in (quick, self.changes):
             for name, value in changes.items():
                 if name in settings:
