@@ -16,12 +16,13 @@ from chsel.problem.sdf_lookup import distance_between_nodes
 LANES = 8
 POSE = 0  # the first of 12 rows
 SUMS = 12 * LANES  # the first of 13 rows: costs, and their gradients by the poses
-_AWAY = 25 * LANES  # the first of 3 rows: from the nearest point of the grid's box
-_BEYOND = 28 * LANES  # its square
-_PLACE = 29 * LANES  # the first of 3 rows: from the node of the cell, in cells
-_CELL = 32 * LANES
-_READ = 33 * LANES  # the first of 4 rows: signed distance and gradient
-SIZE = 37 * LANES
+_LENGTH = 25 * LANES  # of what follows
+_AWAY = 26 * LANES  # the first of 3 rows: from the nearest point of the grid's box
+_BEYOND = 29 * LANES  # its square
+_PLACE = 30 * LANES  # the first of 3 rows: from the node of the cell, in cells
+_CELL = 33 * LANES
+_READ = 34 * LANES  # the first of 4 rows: signed distance and gradient
+SIZE = 38 * LANES
 _SHORTEST = 1e-12
 
 
@@ -98,7 +99,7 @@ def _add(lanes, at, value, size, x, y, z):
     lanes[SUMS + 12 * LANES + at] += gz
 
 
-@inner
+@leaf
 def _read(field, lanes, x, y, z):
     """Read signed distance and gradient at a world point, which is elsewhere for each pose."""
     _locate(field.box, lanes, x, y, z)
@@ -120,7 +121,7 @@ def _read(field, lanes, x, y, z):
         _go_beyond(field.box_distance, lanes)
 
 
-@inner
+@leaf
 def _locate(box, lanes, x, y, z):
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     for at in range(LANES):
@@ -144,22 +145,29 @@ def _locate(box, lanes, x, y, z):
         lanes[_CELL + at] = d * box.across + e * box.along + f
 
 
-@inner
+@leaf
 def _go_beyond(box_distance, lanes):
-    """What is read outside of the box, from what was read at its nearest point; see SdfGrid."""
+    """What is read outside of the box, from what was read at its nearest point; see SdfGrid.
+
+    Quotients have a loop of their own: where a choice follows, LLVM divides in a branch, lane by
+    lane.
+    """
+    if not box_distance:
+        for at in range(LANES):
+            s, nx = lanes[_READ + at], lanes[_READ + LANES + at]
+            ny, nz = lanes[_READ + 2 * LANES + at], lanes[_READ + 3 * LANES + at]
+            length = max(np.sqrt(nx * nx + ny * ny + nz * nz), _SHORTEST)
+            lanes[_AWAY + at] += s * (nx / length)
+            lanes[_AWAY + LANES + at] += s * (ny / length)
+            lanes[_AWAY + 2 * LANES + at] += s * (nz / length)
     for at in range(LANES):
-        s, nx = lanes[_READ + at], lanes[_READ + LANES + at]
-        ny, nz = lanes[_READ + 2 * LANES + at], lanes[_READ + 3 * LANES + at]
         ax, ay = lanes[_AWAY + at], lanes[_AWAY + LANES + at]
         az = lanes[_AWAY + 2 * LANES + at]
-        if not box_distance:
-            length = max(np.sqrt(nx * nx + ny * ny + nz * nz), _SHORTEST)
-            ax += s * (nx / length)
-            ay += s * (ny / length)
-            az += s * (nz / length)
         length = max(np.sqrt(ax * ax + ay * ay + az * az), _SHORTEST)
-        outside = lanes[_BEYOND + at] > 0.0
-        lanes[_READ + at] = length if outside else s
-        lanes[_READ + LANES + at] = ax / length if outside else nx
-        lanes[_READ + 2 * LANES + at] = ay / length if outside else ny
-        lanes[_READ + 3 * LANES + at] = az / length if outside else nz
+        lanes[_LENGTH + at], lanes[_AWAY + at] = length, ax / length
+        lanes[_AWAY + LANES + at], lanes[_AWAY + 2 * LANES + at] = ay / length, az / length
+    for row in range(4):
+        for at in range(LANES):
+            inside = lanes[_READ + row * LANES + at]
+            outside = lanes[_LENGTH + row * LANES + at]
+            lanes[_READ + row * LANES + at] = outside if lanes[_BEYOND + at] > 0.0 else inside
