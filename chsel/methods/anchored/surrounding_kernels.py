@@ -12,11 +12,11 @@ import numpy as np
 
 from chsel.cost.cost_kernels import Model
 from chsel.cost.free_kernels import is_apart, remember, travel
-from chsel.numerics import near_points
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import inner, spliced
 from chsel.numerics.near_points import NearPoints, near_points_for, select, to_cells
+from chsel.numerics.near_points import gather as gather_near
 from chsel.numerics.pose_tuples import rigid
 
 _ALL = -1  # instead of the number of points that were gathered
@@ -55,7 +55,7 @@ def gather(model, pose, slack, near):
         points.number[0] = 0
     else:
         reach = slack + free.margin + rounding
-        near_points.gather(free.rough, free.cells, to_cell, reach, points, 0)
+        gather_near(free.rough, free.cells, to_cell, reach, points, 0)
 
 
 @inner
