@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.compiler import compiled
+from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses, rotated
@@ -30,12 +30,8 @@ def farthest_points(points: FloatArray, most: int, *, given: int = 0) -> IntArra
     The first `given` points come first, in their order.
     """
     chosen = np.zeros(min(most, len(points)), dtype=np.int64)
-    squared = np.full(len(points), np.inf)
-    for n in range(len(chosen)):
-        chosen[n] = n if n < given else int(np.argmax(squared))
-        difference = points - points[chosen[n]]
-        squared = np.minimum(squared, (difference * difference).sum(axis=1))
-        squared[chosen[n]] = -1.0
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    choose_farthest(points, given, chosen, np.full(len(points), np.inf))
     return chosen
 
 
@@ -88,6 +84,43 @@ def distances_from_surface(
 
 
 @compiled
+def choose_farthest(points: Any, given: Any, chosen: Any, squared: Any) -> None:
+    """Fill `chosen` with indices of points (N, d). squared (N,): infinite, then scratch."""
+    for n in range(len(chosen)):
+        best = n
+        if n >= given:
+            best = 0
+            for i in range(1, len(points)):
+                best = i if squared[i] > squared[best] else best
+        chosen[n] = best
+        for i in range(len(points)):
+            squared[i] = min(squared[i], _squared_distance(points[i], points[best]))
+        squared[best] = -1.0
+
+
+@leaf
+def _squared_distance(one, other):
+    """The squared distance of two points (d,), in eight sums side by side, and what is left."""
+    size, total = len(one), 0.0
+    whole = size // 8 * 8
+    if whole > 0:
+        a = b = c = d = e = f = g = h = 0.0
+        for k in range(0, whole, 8):
+            a += (one[k] - other[k]) * (one[k] - other[k])
+            b += (one[k + 1] - other[k + 1]) * (one[k + 1] - other[k + 1])
+            c += (one[k + 2] - other[k + 2]) * (one[k + 2] - other[k + 2])
+            d += (one[k + 3] - other[k + 3]) * (one[k + 3] - other[k + 3])
+            e += (one[k + 4] - other[k + 4]) * (one[k + 4] - other[k + 4])
+            f += (one[k + 5] - other[k + 5]) * (one[k + 5] - other[k + 5])
+            g += (one[k + 6] - other[k + 6]) * (one[k + 6] - other[k + 6])
+            h += (one[k + 7] - other[k + 7]) * (one[k + 7] - other[k + 7])
+        total = ((a + b) + (c + d)) + ((e + f) + (g + h))
+    for k in range(whole, size):
+        total += (one[k] - other[k]) * (one[k] - other[k])
+    return total
+
+
+@compiled
 def locate_facilities(points: Any, chosen: Any, rows: Any, apart: Any) -> Any:
     """Greedily choose points (d, C) so that the sum of squared distances to them is least.
 
@@ -95,23 +128,14 @@ def locate_facilities(points: Any, chosen: Any, rows: Any, apart: Any) -> Any:
     fill. rows (2, C), apart (C, C): scratch. Returns the number of chosen points, less than B if
     all others equal chosen ones.
     """
-    dimension, count = points.shape
+    count = points.shape[1]
     nearest, totals = rows[0], rows[1]
-    apart[:] = 0.0
+    _fill_apart(points, apart)
     for i in range(count):
         nearest[i] = np.inf
-        row = apart[i]
-        for d in range(dimension):
-            values, value = points[d], points[d, i]
-            for j in range(count):
-                row[j] += (value - values[j]) * (value - values[j])
     for n in range(len(chosen)):
         if n > 0:
-            totals[:] = 0.0
-            for j in range(count):  # the sum of every candidate i in one vectorised loop
-                row, most = apart[j], nearest[j]
-                for i in range(count):
-                    totals[i] += min(most, row[i])
+            _fill_totals(nearest, apart, totals)
             best, least = -1, np.inf
             for i in range(count):
                 if nearest[i] != 0.0 and totals[i] < least:
@@ -123,3 +147,45 @@ def locate_facilities(points: Any, chosen: Any, rows: Any, apart: Any) -> Any:
         for j in range(count):
             nearest[j] = min(nearest[j], row[j])
     return len(chosen)
+
+
+@inner
+def _fill_apart(points, apart):
+    """Squared distances of points (d, C) from each other; four dimensions in a pass."""
+    dimension, count = points.shape
+    for i in range(count):
+        for j in range(i):
+            apart[i, j] = apart[j, i]
+        row = apart[i, i:]
+        for j in range(count - i):
+            row[j] = 0.0
+        fours = dimension // 4 * 4
+        for k in range(0, fours, 4):
+            p, q, r, s = points[k, i:], points[k + 1, i:], points[k + 2, i:], points[k + 3, i:]
+            a, b, c, d = p[0], q[0], r[0], s[0]
+            for j in range(count - i):
+                x, y, z, w = a - p[j], b - q[j], c - r[j], d - s[j]
+                row[j] = (((row[j] + x * x) + y * y) + z * z) + w * w
+        for k in range(fours, dimension):
+            p = points[k, i:]
+            for j in range(count - i):
+                row[j] += (p[0] - p[j]) * (p[0] - p[j])
+
+
+@inner
+def _fill_totals(nearest, apart, totals):
+    """What the sum of squared distances becomes with each point (C,); four rows in a pass."""
+    count = len(totals)
+    fours = count // 4 * 4
+    for i in range(count):
+        totals[i] = 0.0
+    for j in range(0, fours, 4):
+        p, q, r, s = apart[j], apart[j + 1], apart[j + 2], apart[j + 3]
+        a, b, c, d = nearest[j], nearest[j + 1], nearest[j + 2], nearest[j + 3]
+        for i in range(count):
+            total = (totals[i] + min(a, p[i])) + min(b, q[i])
+            totals[i] = (total + min(c, r[i])) + min(d, s[i])
+    for j in range(fours, count):
+        row, most = apart[j], nearest[j]
+        for i in range(count):
+            totals[i] += min(most, row[i])

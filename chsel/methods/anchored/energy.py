@@ -150,6 +150,8 @@ class Energy:
         index: of the stream.
         """
         chains = chains_from(poses.numbers, energies, kept)
+        if kept == 0 and (energies <= floor).all():
+            return chains
         stream = self._key.stream(Purpose.WALKS, index)
 
         def run(first: int, last: int, near: Any) -> None:
