@@ -14,6 +14,7 @@ from chsel.numerics.near_points import (
     NearPoints,
     RoughTree,
     gather,
+    is_kept,
     near_points_for,
     select,
     to_cells,
@@ -114,6 +115,7 @@ def free_sums(model, pose, near, n, most_slack):
             points.number[n] = 0
         else:
             gather(free.rough, free.cells, to_cell, slack + rounding, points, n)
+            near.slack[n] = near.slack[n] if is_kept(points, n) else -1.0
     count = 0
     if points.number[n] > 0:
         count = select(free.cells, to_cell, rounding, points, n)

@@ -19,6 +19,7 @@ _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 _UNIT = 2.0**-20  # 16 roundings of 32-bit numbers: more than are on the way to any coordinate
 _COARSEST = 0.25  # cells: if rounding moves a point further, 32 bits are not enough
 _MOST_LIMIT = 1e6  # of squared distances, in cells
+LONGEST = 16_000  # points, of lists that are kept
 
 
 class RoughTree(NamedTuple):
@@ -34,10 +35,11 @@ class RoughTree(NamedTuple):
 class NearPoints(NamedTuple):
     """Scratch for P lists of the points that are near a set of cells."""
 
-    x: Any  # (P, S) float32, relative to the tree's origin
+    x: Any  # (P C + S,) float32, relative to the tree's origin
     y: Any
     z: Any
-    kept: Any  # (P, S) which points they are, ascending, int32
+    kept: Any  # (P C + S,) which points they are, ascending, int32
+    begin: IntArray  # (P,) where each list begins: in its C places, or in the S for a longer one
     number: IntArray  # (P,) how many each has
     rows: Any  # (4 S,) nodes that a walk looks at, as in RoughTree
     nodes: Any  # (S,) which they are, int32
@@ -72,13 +74,24 @@ def _fill_rows(spheres, origin, rows):
 
 
 def near_points_for(tree: RoughTree, lists: int) -> NearPoints:
-    """Scratch for so many lists of the points of a tree."""
-    size = len(tree.rows) // 4 + 8
-    x, y, z = (np.empty((lists, size), dtype=np.float32) for _ in range(3))
-    kept, number = np.empty((lists, size), dtype=np.int32), np.zeros(lists, dtype=np.int64)
+    """Scratch for so many lists of the points of a tree.
+
+    Each has little room, as it takes longer to get much memory than to use a little of it.
+    """
+    size = len(tree.rows) // 4 - len(tree.starts) + 9  # no level has more nodes than points
+    room = lists * min(size, LONGEST) + size
+    x, y, z = (np.empty(room, dtype=np.float32) for _ in range(3))
+    kept = np.empty(room, dtype=np.int32)
+    begin, number = (np.zeros(lists, dtype=np.int64) for _ in range(2))
     rows = np.empty(4 * size, dtype=np.float32)
     nodes, cells, limits, hits = (np.empty(size, dtype=np.int32) for _ in range(4))
-    return NearPoints(x, y, z, kept, number, rows, nodes, cells, limits, hits)
+    return NearPoints(x, y, z, kept, begin, number, rows, nodes, cells, limits, hits)
+
+
+@leaf
+def is_kept(near, n):
+    """Whether the n-th list stays while others are filled: a long one lies where others may."""
+    return near.begin[n] < len(near.x) - len(near.hits)
 
 
 @leaf
@@ -109,11 +122,11 @@ def to_cells(tree, box, move):
 def gather(tree, cells, to_cell, slack, near, n):
     """Fill the n-th list with the points within `slack` metres of the set, and some more.
 
-    to_cell: as to_cells makes it; slack includes its rounding.
+    to_cell: as to_cells makes it; slack includes its rounding. See is_kept.
     """
     rows, nodes, limits, where = near.rows, near.nodes, near.limits, near.cells
     squares, levels, source = cells.squares, tree.levels, tree.rows
-    x, y, z, kept = near.x[n], near.y[n], near.z[n], near.kept[n]
+    x, y, z, kept = near.x, near.y, near.z, near.kept
     scale = np.float32(cells.box.inverse * (1.0 + 1e-6))
     slack = np.float32(slack)
     count, last = levels[1], len(levels) - 1
@@ -127,15 +140,16 @@ def gather(tree, cells, to_cell, slack, near, n):
             for at in range(count):
                 nodes[total] = nodes[at]
                 total += 1 if squares[np.uint64(where[at])] <= limits[at] else 0
-            count = _expand(tree, total, nodes, kept, rows)
+            count = _expand(tree, total, nodes, near.hits, rows)
         else:
-            first = levels[last]
+            first, most = levels[last], (len(x) - len(near.hits)) // len(near.number)
+            begin = np.uint64(n * most if count <= most else len(near.number) * most)
             for at in range(count):
-                kept[total] = nodes[at] - first
-                a, b, c = rows[4 * at], rows[4 * at + 1], rows[4 * at + 2]
-                x[total], y[total], z[total] = a, b, c
+                to = begin + np.uint64(total)
+                kept[to] = nodes[at] - first
+                x[to], y[to], z[to] = rows[4 * at], rows[4 * at + 1], rows[4 * at + 2]
                 total += 1 if squares[np.uint64(where[at])] <= limits[at] else 0
-    near.number[n] = total
+            near.begin[n], near.number[n] = begin, total
 
 
 @inner
@@ -208,28 +222,32 @@ def select(cells, to_cell, rounding, near, n):
 
     rounding: by how many metres it may move a point.
     """
-    where, bits, count, kept = near.cells, cells.bits, near.number[n], near.kept[n]
+    where, bits, kept = near.cells, cells.bits, near.kept
+    begin, count = np.uint64(near.begin[n]), near.number[n]
     unsure = np.int32(len(cells.squares))  # the index of the bit that is always set
     edge = np.float32(0.5 - rounding * cells.box.inverse)
-    _locate_points(near.x[n], near.y[n], near.z[n], count, to_cell, cells.box, edge, unsure, where)
+    _locate_points(near, begin, count, to_cell, cells.box, edge, unsure)
     total = 0
     for at in range(count):
         cell = np.uint32(where[at])
-        near.hits[total] = kept[at]
+        near.hits[total] = kept[begin + np.uint64(at)]
         word = bits[np.uint64(cell >> np.uint32(5))] >> (cell & np.uint32(31))
         total += 1 if word & np.uint32(1) else 0
     return total
 
 
 @inner
-def _locate_points(x, y, z, count, move, box, edge, unsure, where):
+def _locate_points(near, begin, count, move, box, edge, unsure):
     """Fill the cells of points, or `unsure` where rounding may put one in another; vectorised."""
     across, along = np.int32(box.across), np.int32(box.along)
     p, q, r = _last_centres(box)
+    xs, ys, zs, where = near.x, near.y, near.z, near.cells
     for n in range(count):
-        a = move[0] * x[n] + move[1] * y[n] + move[2] * z[n] + move[9]
-        b = move[3] * x[n] + move[4] * y[n] + move[5] * z[n] + move[10]
-        c = move[6] * x[n] + move[7] * y[n] + move[8] * z[n] + move[11]
+        at = begin + np.uint64(n)
+        x, y, z = xs[at], ys[at], zs[at]
+        a = move[0] * x + move[1] * y + move[2] * z + move[9]
+        b = move[3] * x + move[4] * y + move[5] * z + move[10]
+        c = move[6] * x + move[7] * y + move[8] * z + move[11]
         a, b, c = min(max(_HALF, a), p), min(max(_HALF, b), q), min(max(_HALF, c), r)
         i, j, k = np.int32(a), np.int32(b), np.int32(c)
         d, e, f = (

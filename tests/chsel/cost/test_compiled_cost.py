@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective
 from chsel.errors import EngineError, PointsError, PoseError, SettingError
+from chsel.numerics import near_points
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.poses import Poses, compose, random_rotations
@@ -178,17 +180,21 @@ def descended_plainly(
 
 
 @settings(max_examples=100, deadline=None)
-@given(case=cases(), rate=st.sampled_from([1e-4, 1e-3, 0.01, 0.1, 1.0]))
+@given(
+    case=cases(),
+    rate=st.sampled_from([1e-4, 1e-3, 0.01, 0.1, 1.0]),
+    longest=st.sampled_from([3, near_points.LONGEST]),
+)
 def test_descent_with_neighbour_lists_is_to_the_bit_descent_over_all_points(
-    case: Case, rate: float
+    case: Case, rate: float, longest: int
 ) -> None:
     plain = descended_plainly(case.objective("none"), case.vectors, 3.0, rate, 40)
     for other in case.other_cullings():
         assert_same_bits(other.descended(case.vectors, 3.0, rate, 40), plain)
     objective = case.objective()
-    with threads(2):
+    with threads(2), patch.object(near_points, "LONGEST", longest):
         assert_same_bits(objective.descended(case.vectors, 3.0, rate, 40), plain)
-    assert_same_bits(objective.descended(case.vectors[:1].copy(), 3.0, rate, 40), plain[:1])
+        assert_same_bits(objective.descended(case.vectors[:1].copy(), 3.0, rate, 40), plain[:1])
 
 
 class Turntable(SE2Space):
