@@ -99,7 +99,7 @@ def choose_farthest(points: Any, given: Any, chosen: Any, squared: Any) -> None:
 
 
 @leaf
-def _squared_distance(one, other):
+def _squared_distance(one: Any, other: Any) -> Any:
     """The squared distance of two points (d,), in eight sums side by side, and what is left."""
     size, total = len(one), 0.0
     whole = size // 8 * 8
@@ -150,7 +150,7 @@ def locate_facilities(points: Any, chosen: Any, rows: Any, apart: Any) -> Any:
 
 
 @inner
-def _fill_apart(points, apart):
+def _fill_apart(points: Any, apart: Any) -> None:
     """Squared distances of points (d, C) from each other; four dimensions in a pass."""
     dimension, count = points.shape
     for i in range(count):
@@ -173,7 +173,7 @@ def _fill_apart(points, apart):
 
 
 @inner
-def _fill_totals(nearest, apart, totals):
+def _fill_totals(nearest: Any, apart: Any, totals: Any) -> None:
     """What the sum of squared distances becomes with each point (C,); four rows in a pass."""
     count = len(totals)
     fours = count // 4 * 4
