@@ -49,6 +49,13 @@ def frozen(
     return array
 
 
+def read_only(points: FloatArray) -> FloatArray:
+    """The same numbers as C-ordered float64 that cannot be written, copied only if they must be."""
+    array = np.ascontiguousarray(points, dtype=np.float64).view()
+    array.setflags(write=False)
+    return array
+
+
 def digest(*arrays: NDArray[Any]) -> str:
     """BLAKE2b (128 bit, hexadecimal) of the types, shapes and bytes of arrays, in order."""
     state = hashlib.blake2b(digest_size=16)

@@ -8,10 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.numerics.clearance import squared_clearances
+from chsel.numerics.clearance import squared_clearances, squared_gaps
 from chsel.numerics.compiler import inner, leaf
-
-_FARTHEST = 15  # cells, the greatest distance that a byte holds squared
 
 
 class Box(NamedTuple):
@@ -41,7 +39,7 @@ class CellSet(NamedTuple):
 
     box: Box
     bits: Any  # (words,) one bit for each cell, and a last one that is set; uint32
-    squares: Any  # (nodes,) squared distance to the set, at most 225; uint8
+    squares: Any  # (nodes,) squared distance to the set, at most 225, see squared_gaps; uint8
 
 
 def box_of(
@@ -79,9 +77,8 @@ def cell_set_of(box: Box, cells: BoolArray) -> CellSet:
     flags[: cells.size] = cells.reshape(-1)
     flags[cells.size] = True
     words = np.packbits(flags, bitorder="little").view("<u4").astype(np.uint32)
-    squares = np.empty(cells.shape, dtype=np.int64)
-    squared_clearances(~cells, squares, 2)
-    squares = np.minimum(squares // 4, _FARTHEST * _FARTHEST).astype(np.uint8)
+    squares = np.empty(cells.shape, dtype=np.uint8)
+    squared_gaps(~cells, squares)
     return CellSet(box, words, squares.reshape(-1))
 
 

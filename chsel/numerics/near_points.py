@@ -51,26 +51,25 @@ class NearPoints(NamedTuple):
 def rough_tree(tree: Tree) -> RoughTree:
     """The same tree in 32 bits."""
     nodes = len(tree.starts) - 1
-    uppermost = tree.spheres[:3, : tree.levels[min(1, len(tree.levels) - 1)]]
-    low, high = (uppermost.min(axis=1), uppermost.max(axis=1)) if nodes else (np.zeros(3),) * 2
+    top = tree.spheres[:, : tree.levels[min(1, len(tree.levels) - 1)]]
+    low, high = (top[:3].min(axis=1), top[:3].max(axis=1)) if nodes else (np.zeros(3),) * 2
     origin = 0.5 * low + 0.5 * high
-    rows = np.empty(4 * tree.spheres.shape[1], dtype=np.float32)
-    reach = _fill_rows(tree.spheres, origin, rows) * (1.0 + 1e-6)
+    away = np.abs(top[:3] - origin[:, None]) + top[3]  # of any point, at most
     x, y, z = origin.tolist()
+    rows = np.empty(4 * tree.spheres.shape[1], dtype=np.float32)
+    _fill_rows(tree.spheres, x, y, z, rows)
+    reach = float(away.max(initial=0.0)) * (1.0 + 1e-6)
     return RoughTree(rows, (x, y, z), reach, tree.starts, tree.levels)
 
 
 @compiled
-def _fill_rows(spheres, origin, rows):
-    """Fill rows from spheres (4, M + N); returns the greatest coordinate, which may be infinite."""
-    reach = 0.0
+def _fill_rows(spheres, x, y, z, rows):
+    """Fill rows from spheres (4, M + N)."""
     for n in range(spheres.shape[1]):
-        for axis in range(3):
-            coordinate = spheres[axis, n] - origin[axis]
-            reach = max(reach, abs(coordinate))
-            rows[4 * n + axis] = np.float32(coordinate)
+        rows[4 * n] = np.float32(spheres[0, n] - x)
+        rows[4 * n + 1] = np.float32(spheres[1, n] - y)
+        rows[4 * n + 2] = np.float32(spheres[2, n] - z)
         rows[4 * n + 3] = np.float32(spheres[3, n] * (1.0 + 1e-6))
-    return reach
 
 
 def near_points_for(tree: RoughTree, lists: int) -> NearPoints:

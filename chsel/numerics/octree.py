@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.errors import PointsError
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray, IntArray, read_only
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled, leaf, spliced
+from chsel.numerics.voxels import bounds_of
 
 _LEAF_SIZE = 4  # points in a leaf on average, at least
 _TOP_SIZE = 64  # nodes of the uppermost level at most
@@ -58,9 +59,8 @@ def octree(points: FloatArray, spacing: float) -> Tree:
     if count == 0:
         none = np.zeros(0, dtype=np.int64)
         return Tree(np.zeros((4, 0)), np.zeros(1, np.int64), np.zeros(1, np.int64), none)
-    points = np.array(points)
-    bounds = np.array([[column.min(), column.max()] for column in points.T])  # (3, 2)
-    extent = max(high - low for low, high in bounds.tolist())
+    points, bounds = read_only(points), bounds_of(points)
+    extent = max(high - low for low, high in bounds.T.tolist())
     if not extent < np.inf:
         raise PointsError(f"points span {extent} m; accepted: a finite extent")
     index_bits = count.bit_length()
@@ -69,17 +69,17 @@ def octree(points: FloatArray, spacing: float) -> Tree:
     while extent / quantum >= most:
         quantum *= 2.0
     keys = np.empty(count, dtype=np.int64)
-    _morton_keys(points, bounds[:, 0].copy(), 1.0 / quantum, index_bits, keys)
+    _fill_keys(points, bounds[0], 1.0 / quantum, extent, index_bits, keys)
     keys.sort()
-    order = keys & ((1 << index_bits) - 1)
     levels = np.zeros(24, dtype=np.int64)
     depth, finest = _count_levels(keys, index_bits, levels)
     levels = levels[: depth + 1]
     spheres = np.empty((4, levels[-1] + count))
     starts = np.empty(levels[-1] + 1, dtype=np.int64)
     margin = rounding_margin(bounds)
-    _build(points, keys, order, index_bits + 3 * finest, margin, spheres, starts, levels)
-    return Tree(spheres, starts, levels, order)
+    tree = Tree(spheres, starts, levels, keys)
+    _build(points, index_bits, finest, margin, tree)
+    return tree
 
 
 def rounding_margin(coordinates: FloatArray) -> float:
@@ -88,14 +88,17 @@ def rounding_margin(coordinates: FloatArray) -> float:
 
 
 @compiled
-def _morton_keys(points, lower, inverse, index_bits, keys):
+def _fill_keys(points, lower, inverse, extent, index_bits, keys):
     """Interleaved bits of the points' cells on the finest level, then the points' indices."""
+    spread = np.empty(int(np.rint(extent * inverse)) + 1, dtype=np.int64)
+    for cell in range(len(spread)):
+        spread[cell] = _spread_bits(cell) << index_bits
+    x, y, z = lower[0], lower[1], lower[2]
     for n in range(len(points)):
-        key = 0
-        for axis in range(3):
-            cell = int(np.rint((points[n, axis] - lower[axis]) * inverse))
-            key |= _spread_bits(cell) << axis
-        keys[n] = key << index_bits | n
+        i = np.uint64(np.int32(np.rint((points[n, 0] - x) * inverse)))
+        j = np.uint64(np.int32(np.rint((points[n, 1] - y) * inverse)))
+        k = np.uint64(np.int32(np.rint((points[n, 2] - z) * inverse)))
+        keys[n] = spread[i] | spread[j] << 1 | spread[k] << 2 | n
 
 
 @leaf
@@ -140,47 +143,50 @@ def _count_levels(keys, index_bits, levels):
 
 
 @compiled
-def _build(points, keys, order, shift, margin, spheres, starts, levels):
-    """Fill spheres and starts from the points upwards. shift: bits of a key below a leaf's."""
-    nodes, count = levels[-1], len(points)
-    low, high = np.empty((3, nodes)), np.empty((3, nodes))
-    for n in range(count):
-        for axis in range(3):
-            spheres[axis, nodes + n] = points[order[n], axis]
+def _build(points, index_bits, finest, margin, tree):
+    """Fill the tree from its levels and, in place of the order, its keys, the points first.
+
+    finest: how coarse the leaves are.
+    """
+    spheres, starts, levels, keys = tree
+    nodes, depth = levels[-1], len(levels) - 1
+    low, high = np.empty((nodes, 3)), np.empty((nodes, 3))
+    inner = np.empty(nodes, dtype=np.int64)
+    node, last = levels[depth - 1] - 1, -1
+    x = y = z = a = b = c = 0.0
+    for n in range(len(points)):
+        key, at = keys[n] >> (index_bits + 3 * finest), keys[n] & ((1 << index_bits) - 1)
+        p, q, r = points[at, 0], points[at, 1], points[at, 2]
+        keys[n] = at
+        spheres[0, nodes + n], spheres[1, nodes + n], spheres[2, nodes + n] = p, q, r
         spheres[3, nodes + n] = 0.0
-    starts[nodes] = nodes + count
-    inner, depth = np.empty(nodes, dtype=np.int64), len(levels) - 1
-    for level in range(depth - 1, -1, -1):
-        below, until = levels[level + 1], levels[level + 2] if level < depth - 1 else nodes + count
-        node = levels[level] - 1
-        last = -1
-        for child in range(below, until):
-            key = keys[child - nodes] >> shift if level == depth - 1 else inner[child] >> 3
+        if key != last:
+            last, node = key, node + 1
+            starts[node], inner[node] = nodes + n, key
+            x, y, z, a, b, c = p, q, r, p, q, r
+        x, y, z = min(x, p), min(y, q), min(z, r)
+        a, b, c = max(a, p), max(b, q), max(c, r)
+        low[node, 0], low[node, 1], low[node, 2] = x, y, z
+        high[node, 0], high[node, 1], high[node, 2] = a, b, c
+    starts[nodes] = nodes + len(points)
+    for level in range(depth - 2, -1, -1):
+        node, last = levels[level] - 1, -1
+        for child in range(levels[level + 1], levels[level + 2]):
+            key = inner[child] >> 3
             if key != last:
-                last = key
-                node += 1
-                starts[node] = child
-                inner[node] = key
-            _widen(low, high, node, child, starts[node] == child, nodes, spheres)
+                last, node = key, node + 1
+                starts[node], inner[node] = child, key
+                low[node], high[node] = low[child], high[child]
+            for axis in range(3):
+                low[node, axis] = min(low[node, axis], low[child, axis])
+                high[node, axis] = max(high[node, axis], high[child, axis])
     for node in range(nodes):
         squared = 0.0
         for axis in range(3):
-            spheres[axis, node] = 0.5 * (low[axis, node] + high[axis, node])
-            half = 0.5 * (high[axis, node] - low[axis, node])
+            spheres[axis, node] = 0.5 * (low[node, axis] + high[node, axis])
+            half = 0.5 * (high[node, axis] - low[node, axis])
             squared += half * half
         spheres[3, node] = np.sqrt(squared) * (1.0 + 1e-12) + margin
-
-
-@spliced
-def _widen(low, high, node, child, is_first, nodes, spheres):
-    """Make the box of a node hold a child's: another node's box, or a point."""
-    for axis in range(3):
-        if child >= nodes:
-            a = b = spheres[axis, child]
-        else:
-            a, b = low[axis, child], high[axis, child]
-        low[axis, node] = a if is_first else min(low[axis, node], a)
-        high[axis, node] = b if is_first else max(high[axis, node], b)
 
 
 @spliced

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import PointsError, SettingError, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, digest, frozen, same_bits
+from chsel.numerics.arrays import BoolArray, FloatArray, digest, frozen, read_only, same_bits
 from chsel.numerics.voxels import bounds_of, set_voxels
 
 _CLASSES = ("free", "occupied", "known", "known_sdf")
@@ -188,7 +188,7 @@ class VoxelGrid:
             )
         lattice = Lattice(tuple(bounds[0].tolist()), resolution)
         flags = np.zeros(lattice.voxels(bounds[1]) + 3, dtype=bool)
-        set_voxels(np.array(free, dtype=np.float64, order="C"), bounds[0], resolution, flags)
+        set_voxels(read_only(free), bounds[0], resolution, flags)
         return cls(bounds[0] - resolution, resolution, flags)
 
 
