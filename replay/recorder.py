@@ -67,6 +67,7 @@ class BackgroundRecorder(Recorder):
         most: int = 16,
         patient: bool = True,
         behind: BackgroundRecorder | None = None,
+        until: type | tuple[type, ...] = object,
         optional: str = "",
     ) -> None:
         """A recorder in front of another one.
@@ -74,9 +75,10 @@ class BackgroundRecorder(Recorder):
         most: events that may wait; the caller who records one more waits for its place. patient:
         False lets `flush` only ask for it. behind: one that gets the same events first, and that
         callers wait for; this one works only while it has nothing to do, as threads of Python take
-        turns, and each turn can take 5 ms. optional: what to do about a recording that is not
-        written; where this is given, a RecordingError is a warning that ends with it, and no more
-        is recorded.
+        turns, and each turn can take 5 ms. until: events are kept until one of these types comes,
+        or a flush, or `most` are kept, so that what the caller does in between has the processor
+        for itself. optional: what to do about a recording that is not written; where this is given,
+        a RecordingError is a warning that ends with it, and no more is recorded.
         """
         self._recorder = recorder
         self._behind = behind
@@ -84,6 +86,8 @@ class BackgroundRecorder(Recorder):
         self._error: BaseException | None = None
         self._closed = False
         self._patient = patient
+        self._most, self._until = most, until
+        self._kept: list[Event] = []
         self._optional = optional
         self._ended = False  # by an error of what is optional
         # A daemon, so that a run that ends without closing its recorder does end.
@@ -96,13 +100,16 @@ class BackgroundRecorder(Recorder):
             self._recorder.record(event)
         else:
             self._raise_error()
-            self._jobs.put(partial(self._recorder.record, event))
+            self._kept.append(event)
+            if isinstance(event, self._until) or len(self._kept) >= self._most:
+                self._hand_over()
 
     def flush(self) -> None:
         """Wait until all events so far are recorded and flushed, or only have it done soon."""
         if self._closed:
             self._recorder.flush()
         else:
+            self._hand_over()
             self._jobs.put(self._recorder.flush)
             if self._patient:
                 self.wait()
@@ -116,12 +123,19 @@ class BackgroundRecorder(Recorder):
         """Record what waits, and close the other recorder, also after an error."""
         if not self._closed:
             self._closed = True
+            self._hand_over()
             self._jobs.put(None)
             self._thread.join()
             try:
                 self._run(self._recorder.close)
             finally:
                 self._raise_error()
+
+    def _hand_over(self) -> None:
+        """Let the events that were kept be recorded soon."""
+        kept, self._kept = self._kept, []
+        for event in kept:
+            self._jobs.put(partial(self._recorder.record, event))
 
     def _work(self) -> None:
         """What the thread does: one job after the other, none after an error."""
@@ -153,5 +167,6 @@ class BackgroundRecorder(Recorder):
         if self._error is not None:
             if not self._closed:
                 self.wait()
+            self._kept.clear()
             error, self._error = self._error, None
             raise error

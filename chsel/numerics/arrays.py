@@ -63,7 +63,7 @@ def digest(*arrays: NDArray[Any]) -> str:
         array = np.ascontiguousarray(array)
         array = array.astype(array.dtype.newbyteorder("<"), copy=False)
         state.update(f"{array.dtype.str}{array.shape};".encode())
-        state.update(array.tobytes())
+        state.update(array.data)
     return state.hexdigest()
 
 

@@ -65,11 +65,6 @@ class KnownPoints:
         """Digest of all points, in their order."""
         return digest(*(getattr(self, name) for name in _CLASSES))
 
-    def same(self, other: KnownPoints) -> bool:
-        """Whether these are the other points in their order, to the bit; faster than digests."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in _CLASSES)
-        return self is other or all(same_bits(a, b) for a, b in pairs)
-
     def merged(self, new: KnownPoints) -> KnownPoints:
         """These points followed by new ones, class by class."""
         return KnownPoints.joined([self, new])
@@ -108,6 +103,20 @@ class GrowingPoints:
         if len(self._parts) > 1:
             self._parts = [KnownPoints.joined(self._parts)]
         return self._parts[0]
+
+    def same(self, points: KnownPoints) -> bool:
+        """Whether these are all points so far in their order, to the bit; faster than digests."""
+        for name in _CLASSES:
+            whole, parts = getattr(points, name), [getattr(part, name) for part in self._parts]
+            if len(whole) != sum(map(len, parts)):
+                return False
+            first = 0
+            for part in parts:
+                if not same_bits(whole[first : first + len(part)], part):
+                    return False
+                first += len(part)
+        self._parts = [points]  # joined, without another copy
+        return True
 
     @property
     def count(self) -> int:

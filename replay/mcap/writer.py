@@ -62,7 +62,7 @@ class McapRecorder(Recorder):
         self._points: GrowingPoints | None = None  # all that is known, once a session has started
         self._start: SessionStarted | None = None
         self._offered: ActionsOffered | None = None
-        self._last_snapshot = b""
+        self._last_snapshot: SnapshotTaken | None = None
         self._last_elites: FloatArray | None = None
 
     @property
@@ -125,8 +125,8 @@ class McapRecorder(Recorder):
             case Decided():
                 self._write_decision(event)
             case SnapshotTaken():
-                values = event_values(event)
-                self._last_snapshot = self._record(event.topic, event.step, values)
+                self._record(event.topic, event.step, event_values(event))
+                self._last_snapshot = event
             case HypothesesFound():
                 self._write_hypotheses(event)
             case Logged():
@@ -204,15 +204,16 @@ class McapRecorder(Recorder):
         """Whether points and grid of a problem are those of the events before."""
         assert self._points is not None
         assert self._start is not None
-        same_points = problem.points.same(self._points.all())
+        same_points = self._points.same(problem.points)
         return same_points and problem.sdf.digest == self._start.sdf.digest
 
     def _write_hypotheses(self, event: HypothesesFound) -> None:
-        found = event.hypotheses
+        found, last = event.hypotheses, self._last_snapshot
         archive, repeats = None, False
-        if found.archive is not None:
-            archive = archive_values(event.step, found.archive)
-            repeats = encode("ArchiveSnapshot", archive) == self._last_snapshot
+        if (final := found.archive) is not None:
+            if last is not None and last.step == event.step and final.same(last.archive):
+                final, repeats = last.archive, True  # it has its digest
+            archive = archive_values(event.step, final)
         values = shared_values("Hypotheses", found) | {
             "step": event.step,
             "archive": None if repeats else archive,
@@ -221,12 +222,11 @@ class McapRecorder(Recorder):
         self._record(event.topic, event.step, values, archive=archive)
         self._last_elites = found.elites
 
-    def _record(self, topic: str, step: int, values: dict[str, Any], **repeated: Any) -> bytes:
-        """Write a message of the project's own; its bytes.
+    def _record(self, topic: str, step: int, values: dict[str, Any], **repeated: Any) -> None:
+        """Write a message of the project's own.
 
         repeated: values that it leaves out, as they stand in a message before it.
         """
         check_message(RECORDS[topic], values | repeated)
         data = encode(RECORDS[topic], values)
         self._file.add(topic, step, lambda time: data)
-        return data

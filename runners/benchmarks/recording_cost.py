@@ -1,4 +1,4 @@
-"""Registrations as a session does them, with and without its recordings."""
+"""Steps of a session, with and without its recordings."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 
 from chsel.problem.points import KnownPoints
 from replay.environment import environment
-from replay.events import HypothesesFound, Probe, ProblemPosed, Recorder, SessionStarted
-from replay.registration import StepObserver
+from replay.events import Probe, ProblemPosed, Recorder, SessionStarted
+from replay.registration import register_recorded, symmetry_for_errors
 from runners.benchmarks.problems import PosedProblem, drill
 from runners.benchmarks.registrations import Steps, method
 from runners.benchmarks.timing import in_turn
@@ -29,7 +29,7 @@ _FILES = {
 def recorded_registrations(
     posed: PosedProblem, preset: str, steps: Steps, repeats: int
 ) -> dict[str, tuple[float, ...]]:
-    """Milliseconds of registrations by what is recorded, in turn: "none", "mcap", "both"."""
+    """Milliseconds of steps by what is recorded, in turn: "none", "mcap", "both"."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         sessions: dict[str, Callable[[], float]] = {}
@@ -44,33 +44,36 @@ def recorded_registrations(
 def _session(
     recorder: Recorder, posed: PosedProblem, preset: str, steps: Steps, snapshot_interval: int
 ) -> Callable[[], float]:
-    """Opens a recording, and returns what registers its next step in milliseconds."""
-    problem = posed.registration_problem()
-    recorder.record(_started(posed, preset))
+    """Opens a recording, and returns what takes its next step in milliseconds.
+
+    A step is that of `runners.probe` behind its probe: registered, judged, and in the file.
+    """
+    started = _started(posed, preset)
+    recorder.record(started)
+    problem, symmetry = posed.registration_problem(), symmetry_for_errors(started)
     step = 0
 
-    def register_once() -> float:
+    def take_step() -> float:
         nonlocal step
         points = problem.points if step == 0 else KnownPoints()
         recorder.record(Probe(step, "points", points))
         recorder.flush()
         begun = time.perf_counter()
-        posed_again = posed.registration_problem()
-        recorder.record(ProblemPosed(step, posed_again))
-        observer = StepObserver(recorder, step, snapshot_interval, _show)
-        hypotheses = method(preset, steps, steps.search).register(posed_again, observer)
-        recorder.record(HypothesesFound(step, hypotheses))
+        register_recorded(
+            ProblemPosed(step, posed.registration_problem()),
+            method(preset, steps, steps.search),
+            recorder,
+            started.world_from_object,
+            symmetry,
+            snapshot_interval=snapshot_interval,
+        )
         recorder.flush()
         step += 1
         taken = 1000.0 * (time.perf_counter() - begun)
         time.sleep(_PROBE)
         return taken
 
-    return register_once
-
-
-def _show(stage: str, iteration: int, total: int) -> None:
-    """Nothing."""
+    return take_step
 
 
 def _started(posed: PosedProblem, preset: str) -> SessionStarted:

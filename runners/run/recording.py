@@ -9,14 +9,14 @@ from datetime import datetime
 from pathlib import Path
 
 from chsel.errors import RecordingError, require_positive
-from replay.events import Recorder
+from replay.events import HypothesesFound, Recorder
 from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
 from replay.recorder import BackgroundRecorder, TeeRecorder
 
 IN_RUN_FOLDER = "a logs=DIR that can be written"
 """What is accepted where a file of a run cannot be written."""
-_PICTURES = 64  # events that may wait to be drawn: those of a registration, mostly
+_WAITING = 64  # events that may wait to be recorded: those of a registration, mostly
 # What Rerun itself would print of a failing disk, over several lines; one line of ours says it.
 _LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
@@ -64,13 +64,16 @@ def write_in_run_folder(path: Path, text: str) -> None:
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
     """A recorder to all files that `config` asks for, each written by a thread of its own.
 
-    After every step the run waits for the MCAP file, the full record, and not for the pictures,
-    which are drawn while that file has all events. Beside it, pictures that cannot be written are a
-    warning.
+    A registration has the processor for itself: its events are written from its result on, while
+    the run judges that. After every step the run waits for the MCAP file, the full record, and not
+    for the pictures, which are drawn from then on, while the next probe is taken; those of a live
+    view at once. Beside that file, pictures that cannot be written are a warning.
     """
     recorders: list[Recorder] = []
-    record = BackgroundRecorder(McapRecorder(folder / "recording.mcap")) if config.mcap else None
-    if record is not None:
+    record = None
+    if config.mcap:
+        file = McapRecorder(folder / "recording.mcap")
+        record = BackgroundRecorder(file, most=_WAITING, until=HypothesesFound)
         recorders.append(record)
     if config.rerun or config.live:
         os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
@@ -81,7 +84,12 @@ def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
         optional = "`replay view` makes it anew" if config.mcap else ""
         recorders.append(
             BackgroundRecorder(
-                pictures, most=_PICTURES, patient=False, behind=record, optional=optional
+                pictures,
+                most=_WAITING,
+                patient=False,
+                behind=record,
+                until=object if config.live else (),
+                optional=optional,
             )
         )
     return TeeRecorder(recorders)

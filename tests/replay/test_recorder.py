@@ -134,6 +134,26 @@ def test_who_comes_behind_another_works_only_while_that_has_nothing_to_do():
     assert first.calls == second.calls == ["event", "flush", "close"]
 
 
+def test_events_are_kept_until_one_of_some_type_a_flush_or_too_many():
+    gate = Gate()
+    recorder = BackgroundRecorder(gate, most=3, until=str)
+    recorder.record(0)
+    recorder.record(1)
+    assert not gate.entered.wait(0.05)
+    recorder.record("result")
+    recorder.wait()
+    assert gate.calls == [0, 1, "result"]
+    recorder.record(2)
+    recorder.flush()
+    assert gate.calls[3:] == [2, "flush"]
+    for event in range(4):
+        recorder.record(event)
+    recorder.wait()
+    assert gate.calls[5:] == [0, 1, 2]
+    recorder.close()
+    assert gate.calls[8:] == [3, "close"]
+
+
 def test_equal_events_give_the_bytes_of_a_recorder_without_a_thread(tmp_path, events, write):
     path = tmp_path / "background.mcap"
     recorder = BackgroundRecorder(McapRecorder(path))

@@ -8,7 +8,7 @@ import torch
 
 from chsel import KnownPoints, Workspace
 from chsel.errors import PointsError
-from chsel.problem.points import FreeVoxels, Lattice
+from chsel.problem.points import FreeVoxels, GrowingPoints, Lattice
 
 
 def test_points_are_copied_and_can_not_be_changed() -> None:
@@ -62,7 +62,11 @@ def test_the_same_points_are_those_of_the_same_digest() -> None:
     arrays = ({"free": [[0, 1, 2]]}, {"free": [[-0.0, 1, 2]]}, {"known": [[0, 1, 2]]})
     points = [KnownPoints(**arrays[n]) for n in (0, 0, 1, 2)]
     for a, b in itertools.product(points, points):
-        assert a.same(b) == (a.digest == b.digest)
+        assert GrowingPoints(a).same(b) == (a.digest == b.digest)
+        growing = GrowingPoints(a)
+        growing.add(b)
+        for c, d in itertools.product(points, points):
+            assert growing.same(c.merged(d)) == (a.merged(b).digest == c.merged(d).digest)
 
 
 def test_voxels_keep_one_point_each_at_their_centres() -> None:
