@@ -1,35 +1,23 @@
-"""The relaxed cost as a function of search vectors, its gradient, and its descent by Adam."""
+"""The relaxed cost as a function of search vectors, and its gradient."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_kernels import Model, Work, evaluate, forget, gradient_of, put_pose, work_of
-from chsel.cost.free_kernels import MOST_SLACK, SEARCH_SLACK
+from chsel.cost.cost_kernels import Model, Work, evaluate, gradient_of, put_pose, work_of
+from chsel.cost.descent import Course, abandon, course_from, descend
+from chsel.cost.free_kernels import SEARCH_SLACK
 from chsel.cost.pose_lanes import LANES, SUMS
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.compiler import compiled, implements, leaf, spliced
+from chsel.numerics.compiler import compiled, implements, spliced
 from chsel.numerics.pose_tuples import all_finite, decode, pull_back
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import helped, spread
 from chsel.problem.search_space import SearchSpace
-
-BETA1, BETA2 = 0.9, 0.999
-EPSILON = 1e-8
-
-
-@leaf
-def adam_step(slope, moments, j, powers, rate, epsilon):
-    """The step down a slope along coordinate j (Kingma and Ba, 2015); updates moments (2, d).
-
-    powers: beta_1 and beta_2 to the power of the number of steps, this one included.
-    """
-    moments[0, j] = BETA1 * moments[0, j] + (1.0 - BETA1) * slope
-    moments[1, j] = BETA2 * moments[1, j] + (1.0 - BETA2) * slope * slope
-    step = rate * (moments[0, j] / (1.0 - powers[0]))
-    return step / (np.sqrt(moments[1, j] / (1.0 - powers[1])) + epsilon)
 
 
 def cost_of(model, space, vector, work):
@@ -80,34 +68,6 @@ def costs_and_gradients(model, space, vectors, costs, gradients, first, last, wo
             pull_back(space, vectors[start + lane], by_pose, gradients[start + lane])
 
 
-@compiled
-def descend(model, space, vectors, rate, divisor, iterations, first, last, work):
-    """Move search vectors (B, d), from `first` to before `last`, by Adam, LANES at a time.
-
-    divisor: what gradients are divided by.
-    """
-    dimension = vectors.shape[1]
-    gradient, moments = np.empty(dimension), np.empty((LANES, 2, dimension))
-    for start in range(first, last, LANES):
-        count = min(LANES, last - start)
-        moments[:] = 0.0
-        power1 = power2 = 1.0
-        forget(work)
-        for _ in range(iterations):
-            for lane in range(count):
-                put_pose(work.lanes, lane, decode(space, vectors[start + lane]))
-            evaluate(model, work, 0, count, MOST_SLACK)
-            power1 *= BETA1
-            power2 *= BETA2
-            for lane in range(count):
-                vector = vectors[start + lane]
-                pull_back(space, vector, gradient_of(work.lanes, lane), gradient)
-                for j in range(dimension):
-                    slope = gradient[j] / divisor
-                    step = adam_step(slope, moments[lane], j, (power1, power2), rate, EPSILON)
-                    vector[j] -= step
-
-
 class Objective:
     """The relaxed cost, and its gradients, over the vectors of a search space."""
 
@@ -140,11 +100,32 @@ class Objective:
         self, vectors: FloatArray, divisor: float, rate: float, iterations: int
     ) -> FloatArray:
         """Vectors (B, d) after some iterations of Adam; gradients are divided by `divisor`."""
-        moved = np.array(vectors)
+        course = course_from(
+            vectors, np.zeros(len(vectors)), 1, iterations=iterations, rate=rate, divisor=divisor
+        )
+        with self.descents(len(vectors)) as run:
+            run(course)
+        return course.vectors[1]
 
-        def run(first: int, last: int, work: Any) -> None:
-            space = self.space_arrays
-            descend(self.model, space, moved, rate, divisor, iterations, first, last, work)
+    @contextmanager
+    def descents(self, starts: int) -> Iterator[Callable[[Course], None]]:
+        """Within this context, what takes one course after the other to its end, on all threads.
 
-        spread(run, len(moved), self.work, multiple=LANES)
-        return moved
+        starts: of the largest course.
+        """
+        current: list[Course] = []
+
+        def assist(work: Work) -> None:
+            descend(self.model, self.space_arrays, current[-1], work, False)
+
+        def run(course: Course) -> None:
+            current.append(course)
+            descend(self.model, self.space_arrays, course, work, True)
+
+        def end() -> None:
+            abandon(current[-1])
+
+        current.append(course_from(np.zeros((0, self.space.dimension)), np.zeros(0), 0))
+        work = self.work()
+        with helped(assist, self.work, -(-starts // LANES) - 1, end):
+            yield run

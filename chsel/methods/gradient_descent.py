@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
+from chsel.cost.descent import Course, blocks_done, course_from
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most
 from chsel.methods.method import ConfiguredMethod
@@ -28,6 +30,7 @@ from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negati
 from chsel.qd.selection import ranked_hypotheses
 
 MOST_ITERATIONS = 1_000_000
+_AT_ONCE = 1_000  # iterations after which an observer hears of them
 
 
 @dataclass(frozen=True)
@@ -64,10 +67,57 @@ class DescentSettings(CheckedSettings):
             return starts
         return math.ceil(self.race[min(block, len(self.race) - 1)] * starts)
 
+    def blocks_alike(self, block: int, starts: int) -> int:
+        """How many blocks, from one on, the same starts descend in; only some at once."""
+        most = max(1, _AT_ONCE // self.iterations)
+        following = range(block, min(self.restarts, block + most))
+        runners = self.runners(block, starts)
+        return sum(1 for _ in takewhile(lambda n: self.runners(n, starts) == runners, following))
+
+    def ends_after(self, gain: float) -> bool:
+        """Whether no block follows one of such a mean gain."""
+        return self.stop_below is not None and gain <= self.stop_below
+
 
 def _falls_from_1(shares: tuple[float, ...]) -> bool:
     falling = all(share <= before for before, share in pairwise((1.0, *shares)))
     return bool(shares) and falling and shares[-1] > 0.0
+
+
+def _course(
+    objective: Objective,
+    vectors: FloatArray,
+    costs: FloatArray,
+    settings: DescentSettings,
+    block: int,
+    starts: int,
+) -> Course:
+    """As many of the next blocks as are for the same of so many starts, vectors (S, d)."""
+    is_planar = objective.space.arrays.planar
+    return course_from(
+        vectors,
+        costs,
+        blocks=1 if is_planar else settings.blocks_alike(block, starts),
+        iterations=settings.iterations,
+        rate=settings.rate,
+        divisor=starts,
+        ends_on_poses=not is_planar,
+        stop_below=settings.stop_below,
+    )
+
+
+def _blocks(
+    objective: Objective, course: Course, run: Callable[[Course], None]
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Vectors (S, d) and costs (S,) after each block of a course, at least one."""
+    space = objective.space
+    run(course)
+    for block in range(1, blocks_done(course) + 1):
+        vectors, costs = course.vectors[block], course.costs[block]
+        if not course.ends_on_poses:
+            vectors = space.encode(space.poses(vectors))
+            costs = objective.costs(vectors)
+        yield vectors, costs
 
 
 def descend(
@@ -81,22 +131,23 @@ def descend(
     vectors = space.encode(starts)
     costs = objective.costs(vectors)
     observer.trace("descent", 0, vectors.copy(), costs.copy())
-    running = np.arange(len(starts))
-    for restart in range(settings.restarts):
-        lowest = np.argsort(costs[running], kind="stable")
-        running = np.sort(running[lowest[: settings.runners(restart, len(starts))]])
-        before = costs[running]
-        moved = objective.descended(
-            vectors[running], len(starts), settings.rate, settings.iterations
-        )
-        vectors[running] = space.encode(space.poses(moved))
-        costs[running] = objective.costs(vectors[running])
-        done = (restart + 1) * settings.iterations
-        observer.trace("descent", done, vectors.copy(), costs.copy())
-        observer.progress("descent", done, total)
-        gain = _mean_gain(before, costs[running])
-        if settings.stop_below is not None and gain <= settings.stop_below:
-            break
+    running, block, gain = np.arange(len(starts)), 0, np.inf
+    with objective.descents(len(starts)) as run:
+        while block < settings.restarts and not settings.ends_after(gain):
+            lowest = np.argsort(costs[running], kind="stable")
+            running = np.sort(running[lowest[: settings.runners(block, len(starts))]])
+            course = _course(
+                objective, vectors[running], costs[running], settings, block, len(starts)
+            )
+            for after in _blocks(objective, course, run):
+                gain = _mean_gain(costs[running], after[1])
+                vectors[running], costs[running] = after
+                block += 1
+                done = block * settings.iterations
+                observer.trace("descent", done, vectors.copy(), costs.copy())
+                observer.progress("descent", done, total)
+                if settings.ends_after(gain):
+                    break
     return space.poses(vectors), costs
 
 

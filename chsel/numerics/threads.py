@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -82,6 +83,47 @@ def spread(
         other.result()
 
 
+@contextmanager
+def helped(
+    assist: Callable[[Any], None],
+    scratch: Callable[[], Any],
+    most: int,
+    end: Callable[[], None],
+) -> Iterator[None]:
+    """Within this context, call assist(scratch) again and again on up to `most` other threads.
+
+    Of `thread_count()`, and no more than there are processors, as such threads do not sleep.
+    assist: returns where there is nothing to do, and soon after end() was called; its last call may
+    outlast the context. scratch: makes the scratch of one thread.
+    """
+    failures: list[BaseException] = []
+    is_open = True
+
+    def work() -> None:
+        try:
+            require_ieee_arithmetic()
+            mine = scratch()
+            while is_open:
+                assist(mine)
+                time.sleep(0.0)  # whoever waits for this processor goes first
+        except BaseException as error:
+            failures.append(error)
+
+    count = min(most, thread_count() - 1, _processors() - 1)
+    if hasattr(_thread, "is_worker"):  # all threads have work
+        count = 0
+    helpers = [_pool(count).submit(work) for _ in range(count)]
+    try:
+        yield
+    finally:
+        is_open = False
+        end()
+        for helper in helpers:
+            helper.cancel()
+    if failures:
+        raise failures[0]
+
+
 def require_threads(name: str, count: object) -> None:
     """Raise SettingError unless `count` is a sensible number of threads or processes."""
     if type(count) is not int or not 1 <= count <= MOST_THREADS:
@@ -101,8 +143,13 @@ def thread_count() -> int:
     named = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
     if named.isdecimal() and int(named) >= 1:
         return min(int(named), MOST_THREADS)
-    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count()
-    return min(cores or 1, MOST_THREADS)
+    return min(_processors(), MOST_THREADS)
+
+
+def _processors() -> int:
+    """How many of them this process may use."""
+    count = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count()
+    return count or 1
 
 
 def set_threads(count: int) -> None:

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
 
-from chsel.cost.objective import EPSILON, Objective
+from chsel.cost.descent import EPSILON
+from chsel.cost.objective import Objective
+from chsel.cost.pose_lanes import LANES
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.registration_problem import Observer
+from chsel.numerics.team import close, new_team, piece_size
+from chsel.numerics.threads import helped
+from chsel.problem.registration_problem import NullObserver, Observer
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd import emitter_kernels as kernels
 from chsel.qd.archive import GridArchive, SearchObjective, batch_of
-from chsel.qd.emitter_kernels import Adam, Landscape, MegaSearch, MeSearch, SearchDraws
+from chsel.qd.emitter_kernels import Adam, BatchShare, Landscape, MegaSearch, MeSearch, SearchDraws
 from chsel.qd.evolution_kernels import strategy_around
 
 MOST_ITERATIONS = 1_000_000
@@ -143,17 +148,32 @@ def _iterate(
 ) -> None:
     """Run the iterations of a kernel, segment by segment."""
     batch, dimension = search.strategy.batch, len(search.strategy.mean)
-    measure = archive.measure.code
-    landscape = Landscape(objective.model, objective.space_arrays, measure, objective.work())
+    measure, team = archive.measure, new_team()
+    size = piece_size(batch, LANES)
+
+    def thread(leads: bool) -> tuple[Landscape, BatchShare]:
+        scratch = np.zeros(size), np.zeros((size, measure.count))
+        landscape = Landscape(
+            objective.model, objective.space_arrays, measure.code, objective.work()
+        )
+        return landscape, BatchShare(team, leads, *scratch)
+
+    def assist(thread: tuple[Landscape, BatchShare]) -> None:
+        landscape, share = thread
+        kernel(landscape, archive.cells, search, block, 0, 0, share)
+
+    landscape, share = thread(leads=True)
     normals, elites = draws.blocks(iterations, batch, dimension), draws.elites(iterations)
-    size = draws.block(batch, dimension)
+    drawn = draws.block(batch, dimension)
+    block = SearchDraws(next(normals, np.zeros((0, batch, dimension))), elites[:drawn])
     watch.start(archive)
-    for first, last in watch.segments(iterations):
-        if first % size == 0:
-            block = SearchDraws(next(normals), elites[first : first + size])
-        before = first - first % size
-        kernel(landscape, archive.cells, search, block, first - before, last - before)
-        watch.after(last, iterations, archive)
+    with helped(assist, lambda: thread(leads=False), -(-batch // size) - 1, partial(close, team)):
+        for first, last in watch.segments(iterations, drawn):
+            if first > 0 and first % drawn == 0:
+                block = SearchDraws(next(normals), elites[first : first + drawn])
+            before = first - first % drawn
+            kernel(landscape, archive.cells, search, block, first - before, last - before, share)
+            watch.after(last, iterations, archive)
 
 
 class ArchiveWatch:
@@ -165,17 +185,23 @@ class ArchiveWatch:
         self._observer = observer
         self._refinement = refinement
         self._stage = stage
+        self._nobody_watches = type(observer) is NullObserver
 
     def start(self, archive: GridArchive) -> None:
         """Show the archive before the first iteration."""
+        if self._nobody_watches:
+            return
         self._observer.trace(self._stage, 0, archive.solutions, archive.costs)
         self._observer.snapshot(archive.snapshot(0, self._refinement))
 
-    def segments(self, total: int) -> Iterator[tuple[int, int]]:
-        """The iterations (first, last), of `total`, between two calls of the observer."""
-        first = 0
+    def segments(self, total: int, most: int = trace_interval) -> Iterator[tuple[int, int]]:
+        """The iterations (first, last), of `total`, between two calls of the observer.
+
+        most: of a segment if nobody watches.
+        """
+        first, interval = 0, most if self._nobody_watches else self.trace_interval
         while first < total:
-            last = min(self._next(first, self.trace_interval), total)
+            last = min(self._next(first, interval), total)
             if self._observer.snapshot_interval:
                 last = min(last, self._next(first, self._observer.snapshot_interval))
             yield first, last
@@ -188,6 +214,8 @@ class ArchiveWatch:
 
     def after(self, iteration: int, total: int, archive: GridArchive) -> None:
         """Show the archive after an iteration, where it is due."""
+        if self._nobody_watches:
+            return
         interval = self._observer.snapshot_interval
         if iteration % self.trace_interval == 0 or iteration == total:
             self._observer.trace(self._stage, iteration, archive.solutions, archive.costs)

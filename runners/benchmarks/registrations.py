@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 from chsel.cost.cost_settings import CostSettings
+from chsel.cost.descent import Course, blocks_done
 from chsel.cost.objective import Objective
 from chsel.errors import require_positive
 from chsel.methods import build_method, preset_settings
@@ -68,15 +68,20 @@ def method(name: str, steps: Steps, search: int) -> Method:
 def descents_counted() -> Iterator[list[int]]:
     """Collects how many poses each call of Adam evaluates with their gradients."""
     counts: list[int] = []
-    descended = Objective.descended
-    bound = inspect.signature(descended).bind
+    descents = Objective.descents
 
-    def counted(*given: Any, **named: Any) -> FloatArray:
-        values = bound(*given, **named).arguments
-        counts.append(len(values["vectors"]) * values["iterations"])
-        return descended(*given, **named)
+    @contextmanager
+    def counted(objective: Objective, starts: int) -> Iterator[Callable[[Course], None]]:
+        with descents(objective, starts) as run:
 
-    with patch.object(Objective, "descended", counted):
+            def count(course: Course) -> None:
+                run(course)
+                poses = course.vectors.shape[1]
+                counts.append(poses * course.iterations * blocks_done(course))
+
+            yield count
+
+    with patch.object(Objective, "descents", counted):
         yield counts
 
 

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective
+from chsel.cost.descent import BETA1, BETA2, EPSILON
+from chsel.cost.objective import Objective
 from chsel.errors import EngineError, PointsError, PoseError, SettingError
 from chsel.numerics import near_points
 from chsel.numerics.arrays import FloatArray
