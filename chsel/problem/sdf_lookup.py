@@ -126,9 +126,10 @@ def distance_with_gradient(field, pose, x, y, z):
 def value_between_nodes(table, at, across, along, u, v, w):
     """Signed distance in the cell whose lowest node is `at`, at fractions u, v, w of its sides."""
     low, high = 1.0 - w, w
-    a = low * table[at, 0] + high * table[at + 1, 0]
-    b = low * table[at + along, 0] + high * table[at + along + 1, 0]
-    at += across
-    c = low * table[at, 0] + high * table[at + 1, 0]
-    d = low * table[at + along, 0] + high * table[at + along + 1, 0]
+    at, one, along = np.uint64(at), np.uint64(1), np.uint64(along)
+    a = low * table[at, 0] + high * table[at + one, 0]
+    b = low * table[at + along, 0] + high * table[at + along + one, 0]
+    at += np.uint64(across)
+    c = low * table[at, 0] + high * table[at + one, 0]
+    d = low * table[at + along, 0] + high * table[at + along + one, 0]
     return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * d)

@@ -9,15 +9,17 @@ import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
+from chsel.methods.anchored.fine_cells import fine_cells_below
 from chsel.methods.anchored.fit_kernels import Loss, Twists, fit_for, fit_poses
-from chsel.methods.anchored.surrounding_kernels import surrounding_for
 from chsel.methods.anchored.walk_kernels import (
     DRAWS,
     Chains,
     Stride,
+    Walk,
     chains_from,
     energies_below,
     walk_below,
+    walk_for,
 )
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import triple
@@ -95,6 +97,8 @@ class Energy:
         self.level = level
         self._model = self._cost.at_level(self._sdf, -level.tolerance)
         self._fitting = self._cost.at_level(self._sdf, _FIT_LEVEL - level.tolerance)
+        self._fine = fine_cells_below(self._sdf, self._model.alpha)
+        self._fine_of_fits = fine_cells_below(self._sdf, self._fitting.alpha)
         cap = max(_FOREIGN * level.sigma, level.least_cap)
         self.loss = Loss(level.sigma, cap, _WRONG * level.sigma / max(len(self._known.known), 1))
 
@@ -103,6 +107,10 @@ class Energy:
         energy = copy(self)
         energy._set(level)
         return energy
+
+    def walk(self) -> Walk:
+        """Scratch of one thread for kernels of energies and walks."""
+        return walk_for(self._model, self._sdf.values.reshape(-1), self._fine)
 
     def noise(self, pose: Poses, sensor_noise: float) -> Noise:
         """What known points are off at a pose."""
@@ -115,12 +123,12 @@ class Energy:
         """Energies (B,) of poses."""
         energies = np.empty(len(poses))
 
-        def run(first: int, last: int, near: Any) -> None:
+        def run(first: int, last: int, walk: Any) -> None:
             energies_below(
-                self._model, self.loss, poses.numbers, np.inf, energies, first, last, near
+                self._model, self.loss, poses.numbers, np.inf, energies, first, last, walk
             )
 
-        spread(run, len(poses), lambda: surrounding_for(self._model), least=50)
+        spread(run, len(poses), self.walk, least=50)
         return energies
 
     def fitted(self, poses: Poses, steps: int, loss: Loss) -> Poses:
@@ -131,7 +139,9 @@ class Energy:
             fit_poses(self._fitting, loss, self._twists, moved, steps, first, last, fit)
 
         dimension = len(self._twists.basis)
-        spread(run, len(moved), lambda: fit_for(self._fitting, dimension), least=8)
+        spread(
+            run, len(moved), lambda: fit_for(self._fitting, self._fine_of_fits, dimension), least=8
+        )
         return Poses(moved)
 
     def walked(
@@ -154,11 +164,11 @@ class Energy:
             return chains
         stream = self._key.stream(Purpose.WALKS, index)
 
-        def run(first: int, last: int, near: Any) -> None:
-            walk_below(self._model, self.loss, self._stride, floor, block, draws, first, last, near)
+        def run(first: int, last: int, walk: Any) -> None:
+            walk_below(self._model, self.loss, self._stride, floor, block, draws, first, last, walk)
 
         for before in range(0, len(poses), _BLOCK):
             block = Chains._make(part[before : before + _BLOCK] for part in chains)
             draws = stream.random((len(block.poses), moves, DRAWS), dtype=np.float32)
-            spread(run, len(draws), lambda: surrounding_for(self._model), least=2)
+            spread(run, len(draws), self.walk, least=2)
         return chains

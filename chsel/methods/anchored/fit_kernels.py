@@ -15,14 +15,17 @@ from chsel.cost.cost_kernels import Model
 from chsel.methods.anchored.surrounding_kernels import (
     Surrounding,
     gather,
+    hit,
     look_around,
+    place_of,
     surrounding_for,
     travel_since_gathering,
 )
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.cell_set import CellSet
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
-from chsel.problem.sdf_lookup import distance_in_box, distance_with_gradient
+from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
 
 _MOST_SHIFT, _MOST_TURN = 0.08, 0.5  # of a step, metres and radians
 _SLACK = 0.02  # metres that a pose may move before they are gathered again
@@ -60,11 +63,11 @@ class Fit(NamedTuple):
     twist: FloatArray  # (6,)
 
 
-def fit_for(model: Model, d: int) -> Fit:
-    """Scratch for one thread, for twists of d dimensions."""
+def fit_for(model: Model, fine: CellSet, d: int) -> Fit:
+    """Scratch for one thread, for twists of d dimensions. fine: see surrounding_for."""
     normal, right, factor = np.empty((2, d, d)), np.empty((2, d)), np.empty((d, d))
     sums, row, twist = np.empty((8, 6)), np.empty(d), np.empty(6)
-    return Fit(surrounding_for(model), sums, normal, right, factor, row, twist)
+    return Fit(surrounding_for(model, fine), sums, normal, right, factor, row, twist)
 
 
 @leaf
@@ -128,15 +131,14 @@ def _losses(model, loss, twists, pose, fit, at):
     for i in range(7):
         for j in range(6):
             sums[i, j] = 0.0
-    near, clearance = fit.near, model.free.region.clearance
-    places = near.places
-    for n in range(look_around(model, pose, near)):
-        if clearance[places.cell[n]] < 0.0 and places.beyond[n] == 0.0:
-            looked_up = distance_in_box(field, places, n)
+    for n in range(look_around(model, pose, fit.near)):
+        point = hit(model, fit.near, n)
+        cell, u, v, w = place_of(model, pose, point)
+        if cell >= 0:
+            looked_up = distance_between_nodes(field.box, field.table, cell, u, v, w)
             residual = looked_up[0] - model.alpha
             if residual < 0.0:
                 total += cost_of_residual(loss, residual)
-                point = near.x[n], near.y[n], near.z[n]
                 _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
     for n in range(model.known.shape[1]):
         point = model.known[0, n], model.known[1, n], model.known[2, n]

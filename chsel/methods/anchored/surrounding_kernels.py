@@ -13,12 +13,13 @@ import numpy as np
 from chsel.cost.cost_kernels import Model
 from chsel.cost.free_kernels import is_apart, remember, travel
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Places, locate, places_for
-from chsel.numerics.compiler import inner, spliced
-from chsel.numerics.near_points import NearPoints, near_points_for, select, to_cells
+from chsel.numerics.cell_set import CellSet
+from chsel.numerics.compiler import inner, leaf, spliced
+from chsel.numerics.near_points import NearPoints, near_points_for, to_cells
 from chsel.numerics.near_points import gather as gather_near
-from chsel.numerics.pose_tuples import rigid
+from chsel.numerics.pose_tuples import moved, rigid
 
+_HALF = np.float32(0.5)
 _ALL = -1  # instead of the number of points that were gathered
 
 
@@ -27,18 +28,12 @@ class Surrounding(NamedTuple):
 
     points: NearPoints  # one list
     memory: FloatArray  # (12,), where the object was when they were gathered, see remember
-    x: FloatArray  # (S,), those that are looked up, in the world
-    y: FloatArray
-    z: FloatArray
-    places: Places  # theirs, or those of known points
+    fine: CellSet  # parts of the grid's cells, see fine_cells_below
 
 
-def surrounding_for(model: Model) -> Surrounding:
-    """Scratch for one thread."""
-    size = max(len(model.free.tree.order), model.known.shape[1], 1)
-    x, y, z = (np.empty(size) for _ in range(3))
-    near = near_points_for(model.free.rough, 1)
-    return Surrounding(near, np.empty(12), x, y, z, places_for(size))
+def surrounding_for(model: Model, fine: CellSet) -> Surrounding:
+    """Scratch for one thread. fine: where free points cost something."""
+    return Surrounding(near_points_for(model.free.rough, 1), np.empty(12), fine)
 
 
 @inner
@@ -58,25 +53,86 @@ def gather(model, pose, slack, near):
         gather_near(free.rough, free.cells, to_cell, reach, points, 0)
 
 
-@inner
+@leaf
 def look_around(model, pose, near):
-    """Fill the places of those gathered that may cost something at a pose; returns how many."""
-    free, points = model.free, near.points
+    """Fill hits with those gathered that may cost something at a pose; returns how many."""
+    free, points, fine = model.free, near.points, near.fine
     if points.number[0] == 0:
         return 0
-    to_cell, rounding = to_cells(free.rough, free.cells.box, pose)
-    if points.number[0] == _ALL or rounding < 0.0:
-        count = len(free.tree.order)
-        for at in range(count):
-            points.hits[at] = at
-    else:
-        count = select(free.cells, to_cell, rounding + free.margin, points, 0)
-    spheres, nodes = free.tree.spheres, len(free.tree.starts) - 1
-    for n in range(count):
-        at = nodes + points.hits[n]
-        near.x[n], near.y[n], near.z[n] = spheres[0, at], spheres[1, at], spheres[2, at]
-    locate(pose, free.region.box, near.x, near.y, near.z, near.places, count)
+    to_cell, rounding = to_cells(free.rough, fine.box, pose)
+    if points.number[0] != _ALL and rounding >= 0.0:
+        _locate(to_cell, fine, rounding + free.margin, points)
+        return _select(fine.bits, points)
+    count = len(free.tree.order)
+    for at in range(count):
+        points.hits[at] = at
     return count
+
+
+@leaf
+def _locate(move, fine, rounding, points):
+    """Fill the cells of the points gathered, or that of the last bit where rounding may matter."""
+    box, begin = fine.box, np.uint64(points.begin[0])
+    across, along = np.int32(box.across), np.int32(box.along)
+    most, edge = box.most, np.float32(0.5 - rounding * box.inverse)
+    p, q, r = np.float32(most[0] + 0.5), np.float32(most[1] + 0.5), np.float32(most[2] + 0.5)
+    unsure = np.int32(len(fine.squares))
+    xs, ys, zs, cells = points.x, points.y, points.z, points.cells
+    for n in range(points.number[0]):
+        at = begin + np.uint64(n)
+        x, y, z = xs[at], ys[at], zs[at]
+        a = move[0] * x + move[1] * y + move[2] * z + move[9]
+        b = move[3] * x + move[4] * y + move[5] * z + move[10]
+        c = move[6] * x + move[7] * y + move[8] * z + move[11]
+        a, b, c = min(max(_HALF, a), p), min(max(_HALF, b), q), min(max(_HALF, c), r)
+        i, j, k = np.int32(a), np.int32(b), np.int32(c)
+        off = max(abs(a - np.float32(i) - _HALF), abs(b - np.float32(j) - _HALF))
+        off = max(off, abs(c - np.float32(k) - _HALF))
+        cell = np.int32(np.int32(np.int32(i * across) + np.int32(j * along)) + k)
+        cells[n] = unsure if off > edge else cell
+
+
+@leaf
+def _select(bits, points):
+    """Fill hits with the points gathered whose bits are set; returns how many."""
+    cells, kept, hits, begin = points.cells, points.kept, points.hits, np.uint64(points.begin[0])
+    total = np.uint64(0)
+    for n in range(points.number[0]):
+        cell = np.uint32(cells[n])
+        word = bits[np.uint64(cell >> np.uint32(5))] >> (cell & np.uint32(31))
+        hits[total] = kept[begin + np.uint64(n)]
+        total += np.uint64(word & np.uint32(1))
+    return np.int64(total)
+
+
+@leaf
+def hit(model, near, n):
+    """The n-th of the hits: a point of the world."""
+    free = model.free
+    at, spheres = np.uint64(len(free.tree.starts) - 1 + near.points.hits[n]), free.tree.spheres
+    return spheres[0, at], spheres[1, at], spheres[2, at]
+
+
+@leaf
+def place_of(model, pose, point):
+    """Where a point of the world lies in the grid: the lowest node of its cell, or -1.
+
+    With the fractions u, v, w of the cell's sides. -1: where free points cost nothing.
+    """
+    box = model.field.box
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    x, y, z = moved(pose, point[0], point[1], point[2])
+    a, b, c = (
+        min(max(first[0], x), last[0]),
+        min(max(first[1], y), last[1]),
+        min(max(first[2], z), last[2]),
+    )
+    u, v, w = (a - first[0]) * inverse, (b - first[1]) * inverse, (c - first[2]) * inverse
+    i, j, k = min(np.floor(u), most[0]), min(np.floor(v), most[1]), min(np.floor(w), most[2])
+    cell = int(i * box.across + j * box.along + k)
+    if a != x or b != y or c != z or model.free.region.clearance[np.uint64(cell)] >= 0.0:
+        cell = -1
+    return cell, u - i, v - j, w - k
 
 
 @spliced

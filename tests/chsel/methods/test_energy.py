@@ -7,8 +7,8 @@ import pytest
 
 from chsel.methods.anchored.anchor_sampling import most_informative_first
 from chsel.methods.anchored.energy import Energy, NoiseLevel
+from chsel.methods.anchored.fine_cells import fine_cells_below
 from chsel.methods.anchored.fit_kernels import Loss
-from chsel.methods.anchored.surrounding_kernels import surrounding_for
 from chsel.methods.anchored.walk_kernels import Chains, energies_below
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
@@ -116,8 +116,8 @@ def test_energies_above_a_limit_are_infinite_and_others_as_they_are() -> None:
     model, poses = energy._model, Poses.joined([around(40, 0.02, 0.3), far_poses()])
     energies, limited = energy.of(poses), np.empty(len(poses))
     limit = float(np.sort(energies)[30])
-    near = surrounding_for(model)
-    energies_below(model, energy.loss, poses.numbers, limit, limited, 0, len(poses), near)
+    scratch = energy.walk()
+    energies_below(model, energy.loss, poses.numbers, limit, limited, 0, len(poses), scratch)
     np.testing.assert_array_equal(limited, np.where(energies <= limit, energies, np.inf))
 
 
@@ -211,3 +211,19 @@ def test_on_a_plane_fits_and_walks_stay_on_it() -> None:
     again = space.poses(space.encode(Poses(chains.poses)))
     np.testing.assert_allclose(again.numbers, chains.poses, atol=1e-9)
     assert np.abs(chains.poses - poses.numbers).max() > 1e-3
+
+
+@pytest.mark.parametrize("level", [0.0, -0.003])
+def test_the_fine_cells_hold_all_points_below_a_level_and_few_others(level: float) -> None:
+    fine = fine_cells_below(BOX_GRID, level)
+    lower, upper = BOX_GRID.bounds
+    points = lower + np.random.default_rng(3).random((40_000, 3)) * (upper - lower)
+    values = BOX_GRID.at(points, lookup="trilinear")[0]
+    index = np.floor((points - lower) * fine.box.inverse)
+    at = (index @ [fine.box.across, fine.box.along, 1.0]).astype(np.int64)
+    held = (fine.bits[at // 32] >> (at % 32).astype(np.uint32)) & 1 == 1
+    assert held[values < level].all()
+    side = 1.0 / fine.box.inverse
+    assert 100 < held.sum() < len(held) / 2
+    assert values[held].max() < level + np.sqrt(3.0) * side
+    assert fine.bits[-1] >> np.uint32(len(fine.squares) % 32) == 1  # that of unsure points
