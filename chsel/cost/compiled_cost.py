@@ -15,6 +15,7 @@ from chsel.cost.pose_lanes import LANES
 from chsel.errors import require_choice
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import CellSet, Region, box_of, cell_set_of, triple
+from chsel.numerics.clearance import squared_gaps
 from chsel.numerics.near_points import rough_tree
 from chsel.numerics.octree import Tree, octree, rounding_margin
 from chsel.numerics.pose_tuples import Triple
@@ -29,6 +30,7 @@ from chsel.problem.sdf_lookup import cells_below, distance_field
 CULLINGS = ("octree", "none")
 _NO_BOX = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 _NOWHERE = np.zeros(0, dtype=np.float32)
+_NO_DEPTHS = np.zeros(0, dtype=np.uint8)
 _POSES_PER_THREAD = 200  # fewer are evaluated faster than a thread wakes up
 
 
@@ -114,12 +116,14 @@ def _free_term(
         voxels = VoxelGrid.around(free, free_resolution)
         box = box_of(voxels.origin, free_resolution, voxels.flags.shape)
         region, cells = Region(box, _NOWHERE), cell_set_of(box, voxels.flags)
+        depths: Any = np.empty(voxels.flags.shape, dtype=np.uint8)
+        squared_gaps(voxels.flags, depths)
         centre, radius = _sphere_around(interior.points, 0.0)
         lower, upper = box.first, box.last
     else:
         alpha, lookup, weights = settings.alpha, settings.lookup, np.zeros((0, 4))
         tree, region = octree(free, free_resolution), cells_below(sdf, alpha, lookup)
-        cells = _cell_set_below(sdf, alpha, lookup)
+        cells, depths = _cell_set_below(sdf, alpha, lookup), _NO_DEPTHS
         centre, radius = _sphere_around_cells(sdf, alpha, lookup)
         if len(free) and not (region.clearance < 0.0).any():
             warnings.warn(
@@ -135,6 +139,7 @@ def _free_term(
         rough=rough_tree(tree),
         region=region,
         cells=cells,
+        depths=depths.reshape(-1),
         weights=weights,
         centre=centre,
         radius=radius,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from chsel.numerics.near_points import (
     RoughTree,
     gather,
     is_kept,
+    is_within,
     near_points_for,
     select,
     to_cells,
@@ -26,6 +27,7 @@ from chsel.problem.sdf_lookup import distance_between_nodes
 MOST_SLACK = 0.03  # metres, in a descent
 SEARCH_SLACK = 0.02  # metres, among the branches of a search, which scatter
 STEPS_AHEAD = 3.0  # that gathered neighbours should last
+_ALL = -1  # instead of the number of points that were gathered
 
 
 class FreeTerm(NamedTuple):
@@ -40,6 +42,7 @@ class FreeTerm(NamedTuple):
     rough: RoughTree  # the same
     region: Region  # cells of the object that read values below alpha; empty for interior points
     cells: CellSet  # the same cells, or the free voxels of the world
+    depths: Any  # (nodes,) squared gaps from free voxels to others; empty for free points; uint8
     weights: FloatArray  # (N, 4) weight of interior points, and it times the normal
     centre: Triple  # of a sphere around the object, in its frame
     radius: float
@@ -111,12 +114,17 @@ def free_sums(model, pose, near, n, most_slack):
     rounding += free.margin
     slack = _slack_to_gather(free, pose, near, n, most_slack)
     if slack >= 0.0:
+        reach = slack + rounding
         if is_apart(free, pose, slack + free.margin):
             points.number[n] = 0
+        elif free.interior and is_within(free.rough, free.cells, free.depths, to_cell, reach):
+            points.number[n] = _ALL
         else:
-            gather(free.rough, free.cells, to_cell, slack + rounding, points, n)
+            gather(free.rough, free.cells, to_cell, reach, points, n)
             near.slack[n] = near.slack[n] if is_kept(points, n) else -1.0
     count = 0
+    if points.number[n] == _ALL:
+        return _sums_of_all(free, pose, near.block)
     if points.number[n] > 0:
         count = select(free.cells, to_cell, rounding, points, n)
     return _sums(model, pose, move, points.hits, count, near.block)
@@ -199,6 +207,28 @@ def _sums(model, pose, move, numbers, count, block):
         else:
             _read_distances(model, block, size)
             _multiply_violations(model, block, whole)
+        sums = _added(sums, block, size)
+    return sums
+
+
+@inner
+def _sums_of_all(free, pose, block):
+    """The sums over all interior points, which are all in free voxels."""
+    weights, spheres, sums = free.weights, free.tree.spheres, NOTHING
+    for first in range(0, len(weights), _MOST):
+        size = min(_MOST, len(weights) - first)
+        at = len(free.tree.starts) - 1 + first
+        for n in range(size):
+            block[_POINT + n], block[_POINT + _MOST + n] = spheres[0, at + n], spheres[1, at + n]
+            block[_POINT + 2 * _MOST + n] = spheres[2, at + n]
+        for n in range(size):
+            block[_READ + n], block[_READ + _MOST + n] = (
+                weights[first + n, 0],
+                weights[first + n, 1],
+            )
+            block[_READ + 2 * _MOST + n] = weights[first + n, 2]
+            block[_READ + 3 * _MOST + n] = weights[first + n, 3]
+        _multiply_weights(pose, block, (size + 3) // 4 * 4)
         sums = _added(sums, block, size)
     return sums
 

@@ -152,6 +152,32 @@ def gather(tree, cells, to_cell, slack, near, n):
 
 
 @inner
+def is_within(tree, cells, depths, to_cell, slack):
+    """Whether all points of a tree stay in cells of a set while they move by `slack` metres.
+
+    depths: squared gaps (nodes,) from cells of the set to others, among which is every cell at a
+    border of the box; see gather.
+    """
+    box, rows = cells.box, tree.rows
+    scale, slack = np.float32(box.inverse * (1.0 + 1e-6)), np.float32(slack)
+    across, along = np.int32(box.across), np.int32(box.along)
+    p, q, r = _last_centres(box)
+    for node in range(tree.levels[1]):
+        x, y, z = rows[4 * node], rows[4 * node + 1], rows[4 * node + 2]
+        a = to_cell[0] * x + to_cell[1] * y + to_cell[2] * z + to_cell[9]
+        b = to_cell[3] * x + to_cell[4] * y + to_cell[5] * z + to_cell[10]
+        c = to_cell[6] * x + to_cell[7] * y + to_cell[8] * z + to_cell[11]
+        i = np.int32(min(max(_HALF, a), p))
+        j = np.int32(min(max(_HALF, b), q))
+        k = np.int32(min(max(_HALF, c), r))
+        reach = (rows[4 * node + 3] + slack) * scale
+        cell = np.uint64(np.int32(np.int32(i * across) + np.int32(j * along)) + k)
+        if not np.float32(depths[cell]) > reach * reach:
+            return False
+    return True
+
+
+@inner
 def _locate_nodes(rows, count, move, box, scale, slack, where, limits):
     """Fill the cells of nodes, and the greatest square at which each is near enough; vectorised."""
     shift = np.float32(0.5 - 0.5 * box.between)

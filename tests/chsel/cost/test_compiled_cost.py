@@ -344,6 +344,31 @@ def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them() ->
     assert_equals_torch(case)
 
 
+def test_an_object_that_leaves_free_space_step_by_step_costs_the_same_bits() -> None:
+    """Where all of it is in free voxels, none of its interior points is looked up."""
+    side = 0.01
+    free = np.stack(np.meshgrid(*[np.arange(-15.0, 16.0) * side] * 3), axis=-1).reshape(-1, 3)
+    free = free[np.abs(free - [0.0, 0.08, 0.0]).max(axis=1) > 1.5 * side]  # with a hole
+    stream = np.random.default_rng(15)
+    way = np.linspace(0.0, 0.25, 1500)[:, None] * [[0.0, 1.0, 0.1]]
+    poses = Poses.of(compose(np.repeat(random_rotations(stream, 3), 500, axis=0), way))
+    changes = CostSettings(free_term="interior")
+    vectors = SE3Space().encode(poses)
+    case = Case("box", KnownPoints(free), changes, side, vectors, SE3Space())
+    plain, fast = case.objective("none"), case.objective()
+    for one, other in zip(
+        plain.costs_and_gradients(vectors), fast.costs_and_gradients(vectors), strict=True
+    ):
+        assert_same_bits(one, other)
+    whole = float(fast.model.free.weights[:, 0].sum())
+    assert (plain.costs(vectors) < 0.999 * whole).any()
+    known = KnownPoints(free, known=[[0.0, 0.3, 0.0], [0.05, 0.3, 0.0]])
+    case = replace(case, points=known, vectors=vectors[::100])
+    for rate in (1e-4, 1e-3):
+        moved = descended_plainly(case.objective("none"), case.vectors, 1.0, rate, 100)
+        assert_same_bits(case.objective().descended(case.vectors, 1.0, rate, 100), moved)
+
+
 def edge_points(name: str) -> KnownPoints:
     stream = np.random.default_rng(6)
     near, none = stream.uniform(-0.08, 0.08, (60, 3)), np.zeros((0, 3))
