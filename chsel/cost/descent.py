@@ -1,7 +1,7 @@
 """Descents by Adam, block by block, of several threads on several groups of poses.
 
-A group is of LANES poses, which descend together. A thread takes whichever group has the fewest
-blocks behind it, so that none waits for another until the end.
+A group is of up to LANES poses, which descend together. A thread takes whichever group has the
+fewest blocks behind it, so that none waits for another until the end.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ BETA1, BETA2 = 0.9, 0.999
 EPSILON = 1e-8
 _LIMIT = 0  # word: blocks that may begin
 _GROUPS = APART  # of the first group: STATES times the blocks that it has behind it, and its state
+_FEWEST = 3  # poses that are worth a group, on average
 _PATIENCE = 2_000  # polls for a claimed group before the leader computes its block, too
 
 
@@ -55,13 +56,17 @@ def course_from(
     costs: FloatArray,
     blocks: int,
     *,
+    groups: int,
     iterations: int = 0,
     rate: float = 0.0,
     divisor: float = 1.0,
     ends_on_poses: bool = False,
     stop_below: float | None = None,
 ) -> Course:
-    """The course before its first block, from vectors (S, d) with costs (S,)."""
+    """The course before its first block, from vectors (S, d) with costs (S,).
+
+    groups: of at most LANES each, see groups_for.
+    """
     count, dimension = vectors.shape
     course = Course(
         np.empty((blocks + 1, count, dimension)),
@@ -71,10 +76,17 @@ def course_from(
         float(divisor),
         ends_on_poses,
         -np.inf if stop_below is None else float(stop_below),
-        np.zeros(_GROUPS + -(-count // LANES) * APART, dtype=np.int64),
+        np.zeros(_GROUPS + groups * APART, dtype=np.int64),
     )
     course.vectors[0], course.costs[0], course.words[_LIMIT] = vectors, costs, blocks
     return course
+
+
+def groups_for(count: int, threads: int) -> int:
+    """How many groups so many poses are in: as many for each thread, where they are few."""
+    least = -(-count // LANES)
+    even = -(-least // threads) * threads
+    return even if _FEWEST * even <= count else least
 
 
 def blocks_done(course: Course) -> int:
@@ -123,16 +135,23 @@ def descend(model, space, course, work, leads):
         if is_open and not replace(words, at, state + OPEN, state + CLAIMED):
             continue
         polls = 0
-        block, first = state // STATES, group * LANES
+        block, (first, last) = state // STATES, _members(course, group)
         if not _descend_block(model, space, course, group, block, work, moved, moments, gradient):
             continue
         if replace(words, at, state + CLAIMED, state + WRITTEN):
-            for lane in range(min(LANES, course.vectors.shape[1] - first)):
+            for lane in range(last - first):
                 course.costs[block + 1, first + lane] = work.lanes[SUMS + lane]
                 for j in range(dimension):
                     course.vectors[block + 1, first + lane, j] = moved[lane, j]
             store(words, at, state + STATES + OPEN)
             _stop_if_converged(course, block)
+
+
+@leaf
+def _members(course, group):
+    """The first pose of a group, and that after its last."""
+    count, groups = course.vectors.shape[1], len(course.words) // APART - 1
+    return group * count // groups, (group + 1) * count // groups
 
 
 @inner
@@ -143,7 +162,7 @@ def _least_advanced(course, is_open):
     """
     words, found = course.words, NONE
     least = load(words, _LIMIT)
-    for group in range(-(-course.vectors.shape[1] // LANES)):
+    for group in range(len(words) // APART - 1):
         word = load(words, _GROUPS + group * APART)
         if word // STATES < least and (word % STATES == OPEN) == is_open:
             found, least = group, word // STATES
@@ -157,8 +176,8 @@ def _descend_block(model, space, course, group, block, work, moved, moments, gra
     Fills the vectors moved (LANES, d), and the costs in `work` if the block ends on poses.
     """
     words, at, claimed = course.words, _GROUPS + group * APART, block * STATES + CLAIMED
-    first, dimension = group * LANES, course.vectors.shape[2]
-    count = min(LANES, course.vectors.shape[1] - first)
+    first, last = _members(course, group)
+    count, dimension = last - first, course.vectors.shape[2]
     for lane in range(count):
         for j in range(dimension):
             moved[lane, j] = course.vectors[block, first + lane, j]
@@ -198,7 +217,7 @@ def _stop_if_converged(course, block):
     """
     words, costs, total = course.words, course.costs, 0.0
     count = costs.shape[1]
-    for group in range(-(-count // LANES)):
+    for group in range(len(words) // APART - 1):
         if load(words, _GROUPS + group * APART) // STATES <= block:
             return
     for n in range(count):

@@ -10,13 +10,13 @@ import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import Model, Work, evaluate, gradient_of, put_pose, work_of
-from chsel.cost.descent import Course, abandon, course_from, descend
+from chsel.cost.descent import Course, abandon, course_from, descend, groups_for
 from chsel.cost.free_kernels import SEARCH_SLACK
 from chsel.cost.pose_lanes import LANES, SUMS
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, implements, spliced
 from chsel.numerics.pose_tuples import all_finite, decode, pull_back
-from chsel.numerics.threads import helped, spread
+from chsel.numerics.threads import helped, spread, team_size
 from chsel.problem.search_space import SearchSpace
 
 
@@ -101,7 +101,13 @@ class Objective:
     ) -> FloatArray:
         """Vectors (B, d) after some iterations of Adam; gradients are divided by `divisor`."""
         course = course_from(
-            vectors, np.zeros(len(vectors)), 1, iterations=iterations, rate=rate, divisor=divisor
+            vectors,
+            np.zeros(len(vectors)),
+            1,
+            groups=groups_for(len(vectors), team_size()),
+            iterations=iterations,
+            rate=rate,
+            divisor=divisor,
         )
         with self.descents(len(vectors)) as run:
             run(course)
@@ -125,7 +131,7 @@ class Objective:
         def end() -> None:
             abandon(current[-1])
 
-        current.append(course_from(np.zeros((0, self.space.dimension)), np.zeros(0), 0))
+        current.append(course_from(np.zeros((0, self.space.dimension)), np.zeros(0), 0, groups=0))
         work = self.work()
-        with helped(assist, self.work, -(-starts // LANES) - 1, end):
+        with helped(assist, self.work, groups_for(starts, team_size()) - 1, end):
             yield run

@@ -12,11 +12,12 @@ import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.descent import Course, blocks_done, course_from
+from chsel.cost.descent import Course, blocks_done, course_from, groups_for
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.threads import team_size
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
@@ -98,6 +99,7 @@ def _course(
         vectors,
         costs,
         blocks=1 if is_planar else settings.blocks_alike(block, starts),
+        groups=groups_for(len(vectors), team_size()),
         iterations=settings.iterations,
         rate=settings.rate,
         divisor=starts,

@@ -83,6 +83,13 @@ def spread(
         other.result()
 
 
+def team_size() -> int:
+    """How many threads `helped` has at most, the calling one included."""
+    if hasattr(_thread, "is_worker"):  # all threads have work
+        return 1
+    return min(thread_count(), _processors())
+
+
 @contextmanager
 def helped(
     assist: Callable[[Any], None],
@@ -109,9 +116,7 @@ def helped(
         except BaseException as error:
             failures.append(error)
 
-    count = min(most, thread_count() - 1, _processors() - 1)
-    if hasattr(_thread, "is_worker"):  # all threads have work
-        count = 0
+    count = min(most, team_size() - 1)
     helpers = [_pool(count).submit(work) for _ in range(count)]
     try:
         yield

@@ -175,10 +175,10 @@ def _evaluate_pieces(
     """Evaluate pieces that nobody else does; a vector that is not finite is looked up nowhere."""
     model, space, measure, work = landscape
     team, leads, objectives, measures = share
-    size, total = len(objectives), len(batch.objectives)
+    total = len(batch.objectives)
     piece = claimed(team, number, pieces, leads)
     while piece != NONE:
-        first, last = piece * size, min(piece * size + size, total)
+        first, last = piece * total // pieces, (piece + 1) * total // pieces
         vectors = batch.vectors[first:last]
         costs_of(model, space, vectors, objectives, work)
         for i in range(len(vectors)):
