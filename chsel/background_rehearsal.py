@@ -1,6 +1,6 @@
-"""The search of CHSEL is compiled in a process of its own, beside all other kernels in this one.
+"""Kernels are compiled in processes of their own, while this one does something else.
 
-`python -m chsel.background_rehearsal` is that process.
+`python -m chsel.background_rehearsal PART` is one of them.
 """
 
 from __future__ import annotations
@@ -10,42 +10,53 @@ import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
-from chsel.methods.chsel import ChselSettings
-from chsel.methods.method import Method
-from chsel.numerics.threads import thread_count
-from chsel.rehearsal import warm_up_search
+from chsel.methods.method import ConfiguredMethod, Method
+from chsel.numerics.threads import core_count
+from chsel.rehearsal import warm_up, warm_up_longest
+
+_PARTS: dict[str, Callable[[Method], None]] = {  # of CHSEL, they take about the same time
+    "longest_stage": warm_up_longest,
+    "registration": warm_up,
+}
 
 
-def rehearse_search_beside(method: Method) -> None:
-    """Begin to compile the search of `method`, if it is CHSEL's, on another core.
+def rehearse_beside(method: Method) -> list[subprocess.Popen[bytes]]:
+    """Begin to compile what registrations by `method` need, in other processes; returns these.
 
-    Its kernel is that which takes longest to compile. A registration in this process waits for it
-    where it needs it. If this process ends before the other one, it ends that, too.
+    Two, or one if the method names no longest stage; none on a single core. This process
+    waits for each kernel where it needs it. If it ends before the others, it ends them, too.
     """
-    if thread_count() < 2 or not isinstance(getattr(method, "settings", None), ChselSettings):
-        return
+    if core_count() < 2:
+        return []
+    parts, none = list(_PARTS), ConfiguredMethod.longest_stage
+    if getattr(type(method), "longest_stage", none) is none:
+        parts = ["registration"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    task = pickle.dumps(method)
-    with suppress(OSError):  # without that process, all is compiled in this one
-        process: Any = subprocess.Popen(
-            [sys.executable, "-m", "chsel.background_rehearsal"],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        atexit.register(process.terminate)
-        process.stdin.write(task)
-        process.stdin.close()
+    task, processes = pickle.dumps(method), []
+    with suppress(OSError):  # without a process, this one compiles
+        for part in parts:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "chsel.background_rehearsal", part],
+                env=environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            atexit.register(process.terminate)
+            processes.append(process)
+            assert process.stdin is not None
+            process.stdin.write(task)
+            process.stdin.close()
+    return processes
 
 
 def main() -> None:
-    """Rehearse the search of the method on standard input."""
+    """Rehearse a part of the method on standard input."""
     method: Method = pickle.loads(sys.stdin.buffer.read())
-    warm_up_search(method)
+    _PARTS[sys.argv[1]](method)
 
 
 if __name__ == "__main__":

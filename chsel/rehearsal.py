@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from chsel.methods.chsel import ChselSettings, search_alone
-from chsel.methods.method import Method
+from chsel.methods.method import ConfiguredMethod, Method
 from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.hand_shape import HandShape
 from chsel.plausible.plausible_set import plausible_set
@@ -53,15 +52,11 @@ def warm_up(method: Method) -> None:
         return
 
 
-def warm_up_search(method: Method) -> None:
-    """Compile the search of `method` without what a registration does before it, or load it.
-
-    Of CHSEL alone, whose search takes a third of the time of all kernels. See `warm_up`.
-    """
+def warm_up_longest(method: Method) -> None:
+    """Compile the stage of `method` whose kernels take longest, or load it. See `warm_up`."""
     try:
-        settings = _brief(method.settings)
-        if isinstance(settings, ChselSettings):
-            search_alone(_problem(), settings)
+        if isinstance(method, ConfiguredMethod):
+            type(method)(_brief(method.settings)).longest_stage(_problem())
     except Exception:  # as above
         return
 

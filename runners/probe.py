@@ -35,18 +35,18 @@ def main(config: DictConfig) -> None:
     method_name = str(method_config.pop("name", None))
     method = build_method(method_name, method_config)
     with ExitStack() as stack:
-        with Compiling() as kernels:
-            kernels.begin(method)
-            with reading_bar() as bar:
-                scene = open_scene(checked, bar.show)
-            stack.callback(scene.session.close)
-            policy = None if scene.steering is None else scene.steering.policy
-            kernels.rehearse(method, policy, sensing=checked.session["kind"] == "sensors")
+        kernels = stack.enter_context(Compiling())
+        kernels.begin(method)
+        with reading_bar() as bar:
+            scene = open_scene(checked, bar.show)
+        stack.callback(scene.session.close)
+        policy = None if scene.steering is None else scene.steering.policy
+        kernels.rehearse_probing(policy, sensing=checked.session["kind"] == "sensors")
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name, scene)
         with Interrupt() as interrupt:
-            interrupted = run(folder, checked, method, scene, started, interrupt, display)
+            interrupted = run(folder, checked, method, scene, started, kernels, interrupt, display)
     if interrupted:
         sys.exit(130)
 

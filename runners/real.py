@@ -103,8 +103,7 @@ def main(config: DictConfig) -> None:
     with threads(checked.threads):
         with Compiling() as kernels:
             opened = [RealCase(checked, name) for name in cases]
-            for method in methods.values():
-                kernels.rehearse(method, sensing=False)
+            kernels.rehearse(*methods.values())
         waiting = Console(stderr=True)
         with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as bar:
             for case in bar.track(opened, description="cases"):

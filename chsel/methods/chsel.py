@@ -25,7 +25,7 @@ from chsel.problem.registration_problem import (
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import CheckedSettings, Presets, at_most, one_of, positive
 from chsel.problem.streams import Purpose, normals
-from chsel.qd.archive import GridArchive, evaluated
+from chsel.qd.archive import Evaluated, GridArchive, evaluated
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
@@ -97,17 +97,16 @@ class Chsel(ConfiguredMethod[ChselSettings]):
             hypotheses = algorithm.run(initial_set, Poses.of(hypotheses.elites), index)
         return hypotheses
 
-
-def search_alone(problem: RegistrationProblem, settings: ChselSettings) -> None:
-    """Line 6 from the first pose of E_0, as a rehearsal: its kernels are compiled, or loaded."""
-    algorithm = _Algorithm1(problem, settings, NullObserver())
-    measure, dimension = algorithm.measure, algorithm.space.dimension
-    first = Poses.of(problem.initial_set[:1])
-    mean, deviation = np.zeros(measure.count), np.ones(measure.count)
-    archive = sized_archive(measure, mean, deviation, settings.archive, dimension)
-    vectors, costs = algorithm.space.encode(first), np.zeros(1)
-    archive.update_cells(evaluated(algorithm.objective, measure, vectors, costs))
-    algorithm.cma_mega(archive, first, 0)
+    def longest_stage(self, problem: RegistrationProblem) -> None:
+        """Line 6 from the first pose of E_0."""
+        settings = self.settings
+        space, first = search_space(settings.plane, problem.sdf), Poses.of(problem.initial_set[:1])
+        measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
+        mean, deviation = np.zeros(measure.count), np.ones(measure.count)
+        archive = sized_archive(measure, mean, deviation, settings.archive, space.dimension)
+        vectors = space.encode(first)
+        archive.update_cells(Evaluated(vectors, np.zeros(1), measure.values(space, vectors)))
+        _Algorithm1(problem, settings, NullObserver()).cma_mega(archive, first, 0)
 
 
 class _Algorithm1:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core import event, types
 from numba.extending import overload
 
 from chsel.numerics.kernel_cache import KernelCache, cache_directory, has_kernels
@@ -26,7 +26,7 @@ def compiled(function: Function) -> Function:
 
     Without fast-math and contraction, so that a * b + c is rounded twice on every CPU.
     """
-    kernel: Any = _njit(nogil=True, error_model="numpy")(function)
+    kernel: Any = _njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     kernel._cache = KernelCache(function)
     return kernel
 
@@ -39,6 +39,22 @@ def inner(function: Function) -> Function:
     loaded(function)
     kernel: Function = _njit(**_INNER)(function)
     return kernel
+
+
+def kept(function: Function) -> Function:
+    """Like `inner`, and its code is kept on disk: it is compiled once for all that call it.
+
+    For functions that take seconds to compile.
+    """
+    kernel: Any = inner(function)
+    kernel._cache = KernelCache(function)
+    template = kernel.get_call_template  # for numbers that are written in the call, too
+
+    def call_template(arguments: Any, named: Any) -> Any:
+        return template(tuple(map(types.unliteral, arguments)), named)
+
+    kernel.get_call_template = call_template
+    return cast("Function", kernel)
 
 
 def leaf(function: Function) -> Function:
@@ -95,7 +111,7 @@ _INNER = {
 def watched(show: Callable[[int], None]) -> Iterator[None]:
     """Within this context, call `show` with the number of kernels compiled, instead of the notice.
 
-    It is called with 0 when the first compilation begins, and after each.
+    It is called before each compilation, and after it.
     """
     _watch.count, _watch.show = 0, show
     try:
@@ -145,8 +161,7 @@ class _CompilerWatch(event.Listener):
     def _report(self) -> None:
         """Tell who watches; without a watcher, log a single line per process."""
         if self.show is not None:
-            if self.count == 0:
-                self.show(0)
+            self.show(self.count)
         elif not self._noticed:
             place = cache_directory().parent
             if has_kernels():

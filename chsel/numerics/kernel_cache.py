@@ -148,7 +148,12 @@ def cache_directory() -> Path:
 
 def has_kernels() -> bool:
     """Whether any kernel was compiled and kept earlier, or came with the package."""
-    return has_packaged_code() or any(cache_directory().glob("*.nbc"))
+    return has_packaged_code() or kept_count() > 0
+
+
+def kept_count() -> int:
+    """How many kernels were compiled and kept, those included that other processes compile now."""
+    return sum(1 for _ in cache_directory().glob("*.nbc"))
 
 
 def _environment() -> str:

@@ -143,8 +143,11 @@ def thread_count() -> int:
     if _setting.count is not None:
         return _setting.count
     torch = _imported_torch()
-    if torch is not None:
-        return int(torch.get_num_threads())
+    return core_count() if torch is None else int(torch.get_num_threads())
+
+
+def core_count() -> int:
+    """OMP_NUM_THREADS, or how many cores this process may use."""
     named = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
     if named.isdecimal() and int(named) >= 1:
         return min(int(named), MOST_THREADS)

@@ -1,7 +1,8 @@
-"""All kernels are there before the first probe, and a line says so."""
+"""All kernels are there before the first registration, and a line says so."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -16,6 +17,7 @@ import trimesh
 
 from chsel.methods import build_method
 from chsel.methods.method import Method
+from chsel.numerics import kernel_cache
 from chsel.numerics.compiler import watched
 from chsel.problem.poses import apply, axis_angle, compose
 from runners import probe
@@ -108,7 +110,7 @@ def test_a_session_needs_no_kernel_that_the_rehearsal_did_not(
 
 
 @pytest.fixture
-def two_kernels(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+def two_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[], None]:
     """Compiles two kernels that nobody has, whenever a method is rehearsed."""
 
     def compile_two(_: Method | None = None) -> None:
@@ -119,8 +121,10 @@ def two_kernels(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
             kernel.__module__ = "chsel.made_up"
             numba.njit(kernel)(1.0)
+            (tmp_path / f"{len(list(tmp_path.iterdir()))}.nbc").touch()
 
     monkeypatch.setattr(compiling, "warm_up", compile_two)
+    monkeypatch.setattr(kernel_cache, "cache_directory", lambda: tmp_path)
     return compile_two
 
 
@@ -136,7 +140,7 @@ def test_the_line_counts_and_stays_and_says_once_the_first_time_alone(
     with Compiling() as kernels:
         two_kernels()  # while the session is opened
         assert capsys.readouterr().out == ""
-        kernels.rehearse(build_method("icp"), sensing=False)
+        kernels.rehearse(build_method("icp"))
     said = capsys.readouterr()
     which = text or "further kernels for this CPU"
     assert re.fullmatch(rf"compiling {which}: 4 compiled, 0:00:0\d *\n", said.out)
@@ -146,10 +150,13 @@ def test_the_line_counts_and_stays_and_says_once_the_first_time_alone(
 def test_nothing_is_said_where_nothing_is_compiled(capsys: pytest.CaptureFixture[str]) -> None:
     counts: list[int] = []
     with watched(counts.append):
-        Compiling().rehearse(build_method("icp"), sensing=True)
+        Compiling().rehearse(build_method("icp"))
+        Compiling().rehearse_probing(None, sensing=True)
     counts.clear()
     with Compiling() as kernels:
-        kernels.rehearse(build_method("icp"), sensing=True)
+        kernels.begin(build_method("icp"))
+        kernels.rehearse_probing(None, sensing=True)
+        kernels.rehearse(build_method("icp"))
     assert counts == []
     assert capsys.readouterr() == ("", "")
 
@@ -169,3 +176,24 @@ def test_the_console_numbers_probes_as_the_recording_on_eighty_columns(
     assert len(paths) == 2
     assert all(len(line) <= 80 for line in lines if line not in paths)
     assert all(line.startswith(("/", "rerun", ".venv")) for line in paths)
+
+
+def test_a_first_session_begins_at_once_and_its_times_hold_no_compiling(
+    points: tuple[str, ...], tmp_path: Path
+) -> None:
+    """The first two probes come before the line; no registration takes as long as a kernel does."""
+    command = [sys.executable, "-m", "runners.probe", *points, "method=icp", f"logs={tmp_path}"]
+    environment = {**os.environ, "CHSEL_CACHE_DIR": str(tmp_path / "kept"), "OMP_NUM_THREADS": "2"}
+    environment["PYTHONPATH"] = str(REPOSITORY)
+    start = ("session.start_contacts=0", "session.start_probe=2")
+    done = subprocess.run([*command, *start], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = [line.split()[0] for line in done.stdout.splitlines() if line.strip()]
+    begun = lines.index("compiling")
+    assert lines[begun - 2 : begun + 2] == ["probe", "probe", "compiling", "probe"]
+    (summary,) = tmp_path.glob("probe/*/summary.json")
+    (registered,) = [
+        step for step in json.loads(summary.read_text())["steps"] if "best_cost" in step
+    ]
+    assert registered["seconds"] < 0.5
+    assert len(list(tmp_path.glob("kept/*/*.nbc"))) > 10

@@ -62,6 +62,11 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         search = Search(problem, self.settings, observer or NullObserver())
         return search.hypotheses(search.spread(search.minima()))
 
+    def longest_stage(self, problem: RegistrationProblem) -> None:
+        """A step of fitting, from the first pose of E_0."""
+        energy = Search(problem, self.settings, NullObserver()).energy
+        energy.fitted(Poses.of(problem.initial_set[:1]), 1, _COARSE)
+
     def holds(
         self, problem: RegistrationProblem, hypotheses: Hypotheses, object_from_world: FloatArray
     ) -> BoolArray:
