@@ -9,13 +9,8 @@ from typing import Any
 import numpy as np
 
 from chsel.cost.cost_settings import uncertain_depth
-from chsel.methods.anchored.sampling_kernels import (
-    UNIT,
-    Box32,
-    Coarse,
-    bounds_of_points,
-    mark_voxels,
-)
+from chsel.methods.anchored.scoring_kernels import UNIT, Box32, Coarse
+from chsel.methods.anchored.voxel_kernels import bounds_of_points, mark_voxels
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem

@@ -16,6 +16,7 @@ DRAWS = 6  # random numbers that a pose takes
 LANES = 256  # poses of a block
 # Rows of a block: rotations, translations, two points, and a frame with a third point.
 ROTATION, SHIFT, _FROM, _ONTO, _FRAME = 0, 9 * LANES, 12 * LANES, 15 * LANES, 18 * LANES
+PLACED = 12 * LANES  # from here on, rows are free once poses are placed
 FURTHER = 30 * LANES  # a row that placing leaves to others
 ROWS = 31
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
