@@ -1,7 +1,6 @@
-"""Sums of a field over points that a pose moves: terms first, then their sums in order.
+"""Sums of a field over points that a pose moves, block by block: first which are in it, then those.
 
-So the memory that terms are read from is waited for once. Numbers of a field are of 32 bits, sums
-of 64.
+Numbers of a field are of 32 bits, sums of 64.
 """
 
 from __future__ import annotations
@@ -33,13 +32,21 @@ class CvoScratch(NamedTuple):
 
     places: Places
     within: Any  # (_BLOCK,) points within a field; int32
-    terms: FloatArray  # (_BLOCK, 8), f, its gradient and their moments, of each
 
 
 def scratch() -> CvoScratch:
     """Scratch of one thread."""
-    within = np.empty(_BLOCK, dtype=np.int32)
-    return CvoScratch(places_for(_BLOCK), within, np.empty((_BLOCK, 8)))
+    return CvoScratch(places_for(_BLOCK), np.empty(_BLOCK, dtype=np.int32))
+
+
+@inner
+def _find_within(scratch, count):
+    """Fill scratch.within with those of the first located points that are in the field."""
+    within, beyond, total = scratch.within, scratch.places.beyond, np.uint64(0)
+    for n in range(count):
+        within[total] = n
+        total += np.uint64(beyond[n] == 0.0)
+    return np.int64(total)
 
 
 @inner
@@ -47,20 +54,18 @@ def sum_at(term, pose, scratch):
     """W times the sum of f(p_i), p_i = R x_i + t; 0 beyond the field."""
     box, values, points, places = term.box, term.values, term.points, scratch.places
     across, along = np.uint64(box.across), np.uint64(box.along)
-    beyond, cell, u, v, w = places.beyond, places.cell, places.u, places.v, places.w
+    cell, u, v, w, within = places.cell, places.u, places.v, places.w, scratch.within
     total = 0.0
     for start in range(0, points.shape[1], _BLOCK):
         end = min(start + _BLOCK, points.shape[1])
         xs, ys, zs = points[0, start:end], points[1, start:end], points[2, start:end]
         locate(pose, box, xs, ys, zs, places, end - start)
-        for n in range(end - start):
+        for i in range(_find_within(scratch, end - start)):
+            n = np.uint64(within[i])
             at = np.uint64(cell[n])
             near = _along(values, at, along, v[n], w[n])
             far = _along(values, at + across, along, v[n], w[n])
-            value = _between(near, far, u[n])
-            beyond[n] = value if beyond[n] == 0.0 else 0.0
-        for n in range(end - start):
-            total += beyond[n]
+            total += _between(near, far, u[n])
     return term.weight * total
 
 
@@ -80,7 +85,7 @@ def _between(near, far, share):
 @inner
 def moments_at(term, pose, scratch):
     """W times sums of f, grad f and p x grad f at p_i = R x_i + t, in the object frame."""
-    box, points, places, terms = term.box, term.points, scratch.places, scratch.terms
+    box, points, places = term.box, term.points, scratch.places
     u, v, w, within = places.u, places.v, places.w, scratch.within
     across, along = np.uint64(box.across), np.uint64(box.along)
     value = gx = gy = gz = p = q = r = 0.0
@@ -88,23 +93,14 @@ def moments_at(term, pose, scratch):
         end = min(start + _BLOCK, points.shape[1])
         xs, ys, zs = points[0, start:end], points[1, start:end], points[2, start:end]
         locate(pose, box, xs, ys, zs, places, end - start)
-        count = 0
-        for n in range(end - start):
-            within[count] = n
-            count += 1 if places.beyond[n] == 0.0 else 0
-        for i in range(count):
-            n = within[i]
+        for i in range(_find_within(scratch, end - start)):
+            n = np.uint64(within[i])
             at = np.uint64(places.cell[n])
             s, nx, ny, nz = _row_between(term.table, at, across, along, u[n], v[n], w[n])
             a, b, c = moved(pose, xs[n], ys[n], zs[n])
-            row = terms[i]
-            row[0], row[1], row[2], row[3] = s, nx, ny, nz
-            row[4], row[5], row[6] = b * nz - c * ny, c * nx - a * nz, a * ny - b * nx
-        for i in range(count):
-            row = terms[i]
-            value += row[0]
-            gx, gy, gz = gx + row[1], gy + row[2], gz + row[3]
-            p, q, r = p + row[4], q + row[5], r + row[6]
+            value += s
+            gx, gy, gz = gx + nx, gy + ny, gz + nz
+            p, q, r = p + (b * nz - c * ny), q + (c * nx - a * nz), r + (a * ny - b * nx)
     m = term.weight
     return m * value, m * gx, m * gy, m * gz, m * p, m * q, m * r
 
