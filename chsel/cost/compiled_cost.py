@@ -16,9 +16,9 @@ from chsel.errors import require_choice
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import CellSet, Region, box_of, cell_set_of, triple
 from chsel.numerics.clearance import squared_gaps
-from chsel.numerics.near_points import rough_tree
 from chsel.numerics.octree import Tree, octree, rounding_margin
 from chsel.numerics.pose_tuples import Triple
+from chsel.numerics.rough_tree import rough_tree
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.numerics.voxels import bounds_of
 from chsel.problem.points import KnownPoints, VoxelGrid

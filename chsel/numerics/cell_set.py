@@ -32,14 +32,15 @@ class Region(NamedTuple):
 
 
 class CellSet(NamedTuple):
-    """A set of grid cells in two small tables: which cells it has, and how far others are from it.
+    """A set of grid cells in a small table: which cells it has, and how far others are from it.
 
     Distances are those between cells as boxes, in sides of a cell: 0 for neighbours, too.
     """
 
     box: Box
-    bits: Any  # (words,) one bit for each cell, and a last one that is set; uint32
-    squares: Any  # (nodes,) squared distance to the set, at most 225, see squared_gaps; uint8
+    # (nodes + 2,) 0 in the set, else 1 + the squared distance to it, see squared_gaps; then 0 for
+    # points that may be in the set, and 255 for none; uint8
+    steps: Any
 
 
 def box_of(
@@ -73,13 +74,13 @@ def clearance_of(cells: BoolArray, resolution: float) -> Any:
 
 def cell_set_of(box: Box, cells: BoolArray) -> CellSet:
     """The set of the flagged cells (nx, ny, nz) of a box."""
-    flags = np.zeros((cells.size // 32 + 1) * 32, dtype=bool)
-    flags[: cells.size] = cells.reshape(-1)
-    flags[cells.size] = True
-    words = np.packbits(flags, bitorder="little").view("<u4").astype(np.uint32)
-    squares = np.empty(cells.shape, dtype=np.uint8)
-    squared_gaps(~cells, squares)
-    return CellSet(box, words, squares.reshape(-1))
+    gaps = np.empty(cells.shape, dtype=np.uint8)
+    squared_gaps(~cells, gaps)
+    steps = np.empty(cells.size + 2, dtype=np.uint8)
+    steps[:-2] = gaps.reshape(-1) + np.uint8(1)
+    steps[:-2][cells.reshape(-1)] = 0
+    steps[-2:] = 0, 255
+    return CellSet(box, steps)
 
 
 class Places(NamedTuple):

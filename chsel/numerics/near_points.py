@@ -1,7 +1,8 @@
 """The points of a tree that may lie in a set of cells, found in 32-bit arithmetic.
 
 Distances are rounded so that no point is left out: whether a point lies in the set, and what it
-adds to a sum, is then decided in 64 bits for the few that are left.
+adds to a sum, is then decided in 64 bits for the few that are left. Eight nodes or points, the
+lanes of a vector instruction, are tested at a time.
 """
 
 from __future__ import annotations
@@ -11,65 +12,34 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import IntArray
-from chsel.numerics.compiler import compiled, inner, leaf, spliced
-from chsel.numerics.octree import Tree
-from chsel.numerics.pose_tuples import Triple
+from chsel.numerics.compiler import inner, leaf
+from chsel.numerics.rough_tree import LANES, RoughTree
 
-_HALF, _ZERO = np.float32(0.5), np.float32(0.0)
+_HALF, _ONE = np.float32(0.5), np.float32(1.0)
+_ROW = np.uint64(LANES)
+_U1, _U2, _U3, _U4, _U5, _U6, _U7 = (np.uint64(n) for n in range(1, 8))
 _UNIT = 2.0**-20  # 16 roundings of 32-bit numbers: more than are on the way to any coordinate
 _COARSEST = 0.25  # cells: if rounding moves a point further, 32 bits are not enough
 _MOST_LIMIT = 1e6  # of squared distances, in cells
 LONGEST = 16_000  # points, of lists that are kept
 
 
-class RoughTree(NamedTuple):
-    """A tree with its nodes and points as 32-bit numbers, near to zero."""
-
-    rows: Any  # (4 (M + N),) centre - origin and radius of each, which is 0 for points; float32
-    origin: Triple  # metres
-    reach: float  # the greatest coordinate, metres
-    starts: IntArray  # (M + 1,) as in Tree
-    levels: IntArray  # (L + 1,) as in Tree
-
-
 class NearPoints(NamedTuple):
-    """Scratch for P lists of the points that are near a set of cells."""
+    """Scratch for P lists of the packets of points that are near a set of cells."""
 
-    x: Any  # (P C + S,) float32, relative to the tree's origin
+    x: Any  # (P C + S,) of spheres around packets, as in RoughTree.blocks; float32
     y: Any
     z: Any
-    kept: Any  # (P C + S,) which points they are, ascending, int32
+    radius: Any
+    kept: Any  # (P C + S,) which packets they are, ascending, int32
+    own: int  # C, the places of each list
     begin: IntArray  # (P,) where each list begins: in its C places, or in the S for a longer one
-    number: IntArray  # (P,) how many each has
-    rows: Any  # (4 S,) nodes that a walk looks at, as in RoughTree
-    nodes: Any  # (S,) which they are, int32
-    cells: Any  # (S,) where they lie, int32
-    limits: Any  # (S,) how far the set may be, int32
-    hits: Any  # (S,) those of a list that may lie in the set, int32
-
-
-def rough_tree(tree: Tree) -> RoughTree:
-    """The same tree in 32 bits."""
-    nodes = len(tree.starts) - 1
-    top = tree.spheres[:, : tree.levels[min(1, len(tree.levels) - 1)]]
-    low, high = (top[:3].min(axis=1), top[:3].max(axis=1)) if nodes else (np.zeros(3),) * 2
-    origin = 0.5 * low + 0.5 * high
-    away = np.abs(top[:3] - origin[:, None]) + top[3]  # of any point, at most
-    x, y, z = origin.tolist()
-    rows = np.empty(4 * tree.spheres.shape[1], dtype=np.float32)
-    _fill_rows(tree.spheres, x, y, z, rows)
-    reach = float(away.max(initial=0.0)) * (1.0 + 1e-6)
-    return RoughTree(rows, (x, y, z), reach, tree.starts, tree.levels)
-
-
-@compiled
-def _fill_rows(spheres, x, y, z, rows):
-    """Fill rows from spheres (4, M + N)."""
-    for n in range(spheres.shape[1]):
-        rows[4 * n] = np.float32(spheres[0, n] - x)
-        rows[4 * n + 1] = np.float32(spheres[1, n] - y)
-        rows[4 * n + 2] = np.float32(spheres[2, n] - z)
-        rows[4 * n + 3] = np.float32(spheres[3, n] * (1.0 + 1e-6))
+    number: IntArray  # (P,) how many packets each has
+    rows: Any  # (4, S') nodes, or points, that are looked at: x, y, z, radius; float32
+    nodes: Any  # (S',) nodes or packets, int32
+    cells: Any  # (S',) where they lie, int32
+    limits: Any  # (S',) which of CellSet.steps is near enough, int32
+    hits: Any  # (S',) points of a list that may lie in the set, int32
 
 
 def near_points_for(tree: RoughTree, lists: int) -> NearPoints:
@@ -77,20 +47,24 @@ def near_points_for(tree: RoughTree, lists: int) -> NearPoints:
 
     Each has little room, as it takes longer to get much memory than to use a little of it.
     """
-    size = len(tree.rows) // 4 - len(tree.starts) + 9  # no level has more nodes than points
-    room = lists * min(size, LONGEST) + size
-    x, y, z = (np.empty(room, dtype=np.float32) for _ in range(3))
+    packets = len(tree.places)
+    own = min(packets, LONGEST // LANES)
+    room = lists * own + packets + LANES  # vectors reach beyond the last list
+    x, y, z, radius = (np.empty(room, dtype=np.float32) for _ in range(4))
     kept = np.empty(room, dtype=np.int32)
     begin, number = (np.zeros(lists, dtype=np.int64) for _ in range(2))
-    rows = np.empty(4 * size, dtype=np.float32)
-    nodes, cells, limits, hits = (np.empty(size, dtype=np.int32) for _ in range(4))
-    return NearPoints(x, y, z, kept, begin, number, rows, nodes, cells, limits, hits)
+    most = LANES * (max(packets, len(tree.first), len(tree.starts)) + 1)
+    rows = np.empty((4, most), dtype=np.float32)
+    nodes, cells, limits, hits = (np.empty(most, dtype=np.int32) for _ in range(4))
+    return NearPoints(
+        x, y, z, radius, kept, own, begin, number, rows, nodes, cells, limits, hits
+    )  # fmt: skip
 
 
 @leaf
 def is_kept(near, n):
     """Whether the n-th list stays while others are filled: a long one lies where others may."""
-    return near.begin[n] < len(near.x) - len(near.hits)
+    return near.begin[n] < len(near.number) * near.own
 
 
 @leaf
@@ -119,36 +93,26 @@ def to_cells(tree, box, move):
 
 @inner
 def gather(tree, cells, to_cell, slack, near, n):
-    """Fill the n-th list with the points within `slack` metres of the set, and some more.
+    """Fill the n-th list with the packets that have points within `slack` metres of the set.
 
     to_cell: as to_cells makes it; slack includes its rounding. See is_kept.
     """
-    rows, nodes, limits, where = near.rows, near.nodes, near.limits, near.cells
-    squares, levels, source = cells.squares, tree.levels, tree.rows
-    x, y, z, kept = near.x, near.y, near.z, near.kept
-    scale = np.float32(cells.box.inverse * (1.0 + 1e-6))
-    slack = np.float32(slack)
-    count, last = levels[1], len(levels) - 1
-    for node in range(count):
-        _copy(source, node, rows, node)
-        nodes[node] = node
-    for level in range(last + 1):
-        _locate_nodes(rows, count, to_cell, cells.box, scale, slack, where, limits)
-        total = 0
-        if level < last:
-            for at in range(count):
-                nodes[total] = nodes[at]
-                total += 1 if squares[np.uint64(where[at])] <= limits[at] else 0
-            count = _expand(tree, total, nodes, near.hits, rows)
-        else:
-            first, most = levels[last], (len(x) - len(near.hits)) // len(near.number)
-            begin = np.uint64(n * most if count <= most else len(near.number) * most)
-            for at in range(count):
-                to = begin + np.uint64(total)
-                kept[to] = nodes[at] - first
-                x[to], y[to], z[to] = rows[4 * at], rows[4 * at + 1], rows[4 * at + 2]
-                total += 1 if squares[np.uint64(where[at])] <= limits[at] else 0
-            near.begin[n], near.number[n] = begin, total
+    x, y, z, radius = near.rows[0], near.rows[1], near.rows[2], near.rows[3]
+    nodes, count, none = near.nodes, 1, np.uint64(0)
+    nodes[0] = 0
+    for _ in range(tree.depth):
+        count = _expand(tree, nodes, count, near)
+        _locate_spheres(x, y, z, radius, none, count, to_cell, cells.box, slack, near)
+        count = _keep(nodes, none, count, cells.steps, near)
+    begin = n * near.own if count <= near.own else len(near.number) * near.own
+    for at in range(np.uint64(count)):
+        packet, to = nodes[at], np.uint64(begin) + at
+        place = np.uint64(tree.places[np.uint64(packet)])
+        near.kept[to] = packet
+        near.x[to], near.y[to] = tree.blocks[place], tree.blocks[place + _ROW]
+        near.z[to] = tree.blocks[place + np.uint64(2) * _ROW]
+        near.radius[to] = tree.blocks[place + np.uint64(3) * _ROW]
+    near.begin[n], near.number[n] = begin, count
 
 
 @inner
@@ -158,29 +122,104 @@ def is_within(tree, cells, depths, to_cell, slack):
     depths: squared gaps (nodes,) from cells of the set to others, among which is every cell at a
     border of the box; see gather.
     """
-    box, rows = cells.box, tree.rows
+    box, blocks = cells.box, tree.blocks
     scale, slack = np.float32(box.inverse * (1.0 + 1e-6)), np.float32(slack)
     across, along = np.int32(box.across), np.int32(box.along)
     p, q, r = _last_centres(box)
-    for node in range(tree.levels[1]):
-        x, y, z = rows[4 * node], rows[4 * node + 1], rows[4 * node + 2]
+    for child in range(LANES * tree.starts[1]):
+        at = np.uint64(child // LANES * 4 * LANES + child % LANES)
+        x, y, z = blocks[at], blocks[at + _ROW], blocks[at + np.uint64(2) * _ROW]
+        radius = blocks[at + np.uint64(3) * _ROW]
         a = to_cell[0] * x + to_cell[1] * y + to_cell[2] * z + to_cell[9]
         b = to_cell[3] * x + to_cell[4] * y + to_cell[5] * z + to_cell[10]
         c = to_cell[6] * x + to_cell[7] * y + to_cell[8] * z + to_cell[11]
         i = np.int32(min(max(_HALF, a), p))
         j = np.int32(min(max(_HALF, b), q))
         k = np.int32(min(max(_HALF, c), r))
-        reach = (rows[4 * node + 3] + slack) * scale
+        reach = (radius + slack) * scale
         cell = np.uint64(np.int32(np.int32(i * across) + np.int32(j * along)) + k)
-        if not np.float32(depths[cell]) > reach * reach:
+        if np.float32(depths[cell]) <= reach * reach:  # never where the radius is NaN
             return False
     return True
 
 
 @inner
-def _locate_nodes(rows, count, move, box, scale, slack, where, limits):
-    """Fill the cells of nodes, and the greatest square at which each is near enough; vectorised."""
+def gather_points(tree, cells, to_cell, slack, near):
+    """Fill rows and nodes with the points themselves, number[0] with how many; see gather."""
+    gather(tree, cells, to_cell, slack, near, 0)
+    x, y, z, radius = near.rows[0], near.rows[1], near.rows[2], near.rows[3]
+    nodes, begin, packets = near.nodes, np.uint64(near.begin[0]), near.number[0]
+    for at in range(np.uint64(packets)):
+        packet = np.uint64(near.kept[begin + at])
+        _copy_points(tree, packet, at, x, y, z)
+        for lane in range(_ROW):
+            nodes[at * _ROW + lane] = tree.begins[packet] + np.int32(lane)
+    for n in range(np.uint64(packets) * _ROW):
+        radius[n] = x[n] - x[n]  # 0, or NaN where there is no point
+    count, none, total = LANES * packets, np.uint64(0), np.uint64(0)
+    _locate_spheres(x, y, z, radius, none, count, to_cell, cells.box, slack, near)
+    for n in range(np.uint64(count)):
+        x[total], y[total], z[total], nodes[total] = x[n], y[n], z[n], nodes[n]
+        total += np.uint64(np.int32(cells.steps[np.uint64(near.cells[n])]) <= near.limits[n])
+    near.number[0] = np.int64(total)
+
+
+@leaf
+def _copy_points(tree, packet, at, x, y, z):
+    """Copy the points of a packet to the at-th place for packets."""
+    place, to = packet * np.uint64(3) * _ROW, at * _ROW
+    _copy(tree.points, place, x, to)
+    _copy(tree.points, place + _ROW, y, to)
+    _copy(tree.points, place + np.uint64(2) * _ROW, z, to)
+
+
+@leaf
+def _expand(tree, nodes, count, near):
+    """Replace nodes by their children, block by block; returns how many lanes these have."""
+    starts, first, parents, one = tree.starts, tree.first, near.cells, np.uint64(1)
+    for n in range(np.uint64(count)):
+        parents[n] = nodes[n]
+    total = np.uint64(0)
+    for n in range(np.uint64(count)):
+        node = np.uint64(parents[n])
+        for block in range(np.uint64(starts[node]), np.uint64(starts[node + one])):
+            for row in range(4):
+                step = np.uint64(row)
+                _copy(tree.blocks, (np.uint64(4) * block + step) * _ROW, near.rows[row], total)
+            for lane in range(_ROW):
+                nodes[total + lane] = first[block] + np.int32(lane)
+            total += _ROW
+    return np.int64(total)
+
+
+@leaf
+def _copy(source, at, out, to):
+    """Copy as many numbers as a block has lanes."""
+    a, b, c, d = source[at], source[at + _U1], source[at + _U2], source[at + _U3]
+    e, f, g, h = source[at + _U4], source[at + _U5], source[at + _U6], source[at + _U7]
+    out[to], out[to + _U1], out[to + _U2], out[to + _U3] = a, b, c, d
+    out[to + _U4], out[to + _U5], out[to + _U6], out[to + _U7] = e, f, g, h
+
+
+@leaf
+def _keep(nodes, begin, count, steps, near):
+    """Keep those of some nodes that are near enough, in their order; returns how many."""
+    where, limits, kept, total = near.cells, near.limits, near.nodes, np.uint64(0)
+    for n in range(np.uint64(count)):
+        kept[total] = nodes[begin + n]
+        total += np.uint64(np.int32(steps[np.uint64(where[n])]) <= limits[n])
+    return np.int64(total)
+
+
+@inner
+def _locate_spheres(xs, ys, zs, radii, begin, count, move, box, slack, near):
+    """Fill the cells of spheres, and which of CellSet.steps is near enough to each; vectorised.
+
+    Where the radius is NaN, nothing is.
+    """
+    where, limits = near.cells, near.limits
     shift = np.float32(0.5 - 0.5 * box.between)
+    scale, slack = np.float32(box.inverse * (1.0 + 1e-6)), np.float32(slack)
     across, along = np.int32(box.across), np.int32(box.along)
     p, q, r = _last_centres(box)
     last = (
@@ -188,9 +227,10 @@ def _locate_nodes(rows, count, move, box, scale, slack, where, limits):
         np.float32((box.last[1] - box.first[1]) * box.inverse) + shift,
         np.float32((box.last[2] - box.first[2]) * box.inverse) + shift,
     )
-    for n in range(count):
-        x, y, z = rows[4 * n], rows[4 * n + 1], rows[4 * n + 2]
-        reach = (rows[4 * n + 3] + slack) * scale
+    whole = (np.uint64(count) + np.uint64(LANES - 1)) // _ROW * _ROW  # the rest is scratch
+    for n in range(whole):
+        x, y, z = xs[begin + n], ys[begin + n], zs[begin + n]
+        reach = (radii[begin + n] + slack) * scale
         a = move[0] * x + move[1] * y + move[2] * z + move[9]
         b = move[3] * x + move[4] * y + move[5] * z + move[10]
         c = move[6] * x + move[7] * y + move[8] * z + move[11]
@@ -198,7 +238,7 @@ def _locate_nodes(rows, count, move, box, scale, slack, where, limits):
         e = b - min(max(shift, b), last[1])
         f = c - min(max(shift, c), last[2])
         # The set lies within its box, which is convex: at least this far, by Pythagoras.
-        limit = reach * reach - (d * d + e * e + f * f)
+        limit = reach * reach - (d * d + e * e + f * f) + _ONE
         limits[n] = np.int32(min(max(np.float32(-1.0), limit), np.float32(_MOST_LIMIT)))
         i = np.int32(min(max(_HALF, a), p))
         j = np.int32(min(max(_HALF, b), q))
@@ -217,62 +257,46 @@ def _last_centres(box):
     )
 
 
-@leaf
-def _copy(source, node, rows, n):
-    """Copy the row of a node."""
-    at, to = np.uint64(4 * node), np.uint64(4 * n)
-    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    a, b, c, d = source[at], source[at + one], source[at + two], source[at + three]
-    rows[to], rows[to + one], rows[to + two], rows[to + three] = a, b, c, d
-
-
-@spliced
-def _expand(tree, count, nodes, parents, rows):
-    """Replace nodes by their children; returns how many these are."""
-    starts, total = tree.starts, 0
-    for n in range(count):
-        parents[n] = nodes[n]
-    for n in range(count):
-        parent = np.uint64(parents[n])
-        for child in range(starts[parent], starts[parent + np.uint64(1)]):
-            nodes[np.uint64(total)] = child
-            _copy(tree.rows, child, rows, total)
-            total += 1
-    return total
-
-
 @inner
-def select(cells, to_cell, rounding, near, n):
-    """Fill hits with those of the n-th list that may lie in the set; returns how many.
+def select(tree, cells, to_cell, rounding, near, n):
+    """Fill hits with the points of the n-th list that may lie in the set; returns how many.
 
     rounding: by how many metres it may move a point.
     """
-    where, bits, kept = near.cells, cells.bits, near.kept
+    steps, where, nodes, hits, begins = cells.steps, near.cells, near.nodes, near.hits, tree.begins
     begin, count = np.uint64(near.begin[n]), near.number[n]
-    unsure = np.int32(len(cells.squares))  # the index of the bit that is always set
-    edge = np.float32(0.5 - rounding * cells.box.inverse)
-    _locate_points(near, begin, count, to_cell, cells.box, edge, unsure)
-    total = 0
-    for at in range(count):
-        cell = np.uint32(where[at])
-        near.hits[total] = kept[begin + np.uint64(at)]
-        word = bits[np.uint64(cell >> np.uint32(5))] >> (cell & np.uint32(31))
-        total += 1 if word & np.uint32(1) else 0
-    return total
+    _locate_spheres(
+        near.x, near.y, near.z, near.radius, begin, count, to_cell, cells.box, rounding, near
+    )
+    packets = _keep(near.kept, begin, count, steps, near)
+    x, y, z = near.rows[0], near.rows[1], near.rows[2]
+    for at in range(np.uint64(packets)):
+        _copy_points(tree, np.uint64(nodes[at]), at, x, y, z)
+    _locate_points(x, y, z, packets, to_cell, cells, rounding, where)
+    total = np.uint64(0)
+    for at in range(np.uint64(packets)):
+        point = begins[np.uint64(nodes[at])]
+        for lane in range(_ROW):
+            hits[total] = point + np.int32(lane)
+            total += np.uint64(steps[np.uint64(where[at * _ROW + lane])] == 0)
+    return np.int64(total)
 
 
 @inner
-def _locate_points(near, begin, count, move, box, edge, unsure):
-    """Fill the cells of points, or `unsure` where rounding may put one in another; vectorised."""
+def _locate_points(x, y, z, packets, move, cells, rounding, where):
+    """Fill the cells of the points of packets; vectorised.
+
+    That of a step of 0 where rounding may put a point in another, that of 255 where x is NaN.
+    """
+    box = cells.box
+    unsure, nothing = np.int32(len(cells.steps) - 2), np.int32(len(cells.steps) - 1)
+    edge = np.float32(0.5 - rounding * box.inverse)
     across, along = np.int32(box.across), np.int32(box.along)
     p, q, r = _last_centres(box)
-    xs, ys, zs, where = near.x, near.y, near.z, near.cells
-    for n in range(count):
-        at = begin + np.uint64(n)
-        x, y, z = xs[at], ys[at], zs[at]
-        a = move[0] * x + move[1] * y + move[2] * z + move[9]
-        b = move[3] * x + move[4] * y + move[5] * z + move[10]
-        c = move[6] * x + move[7] * y + move[8] * z + move[11]
+    for n in range(np.uint64(packets) * _ROW):
+        a = move[0] * x[n] + move[1] * y[n] + move[2] * z[n] + move[9]
+        b = move[3] * x[n] + move[4] * y[n] + move[5] * z[n] + move[10]
+        c = move[6] * x[n] + move[7] * y[n] + move[8] * z[n] + move[11]
         a, b, c = min(max(_HALF, a), p), min(max(_HALF, b), q), min(max(_HALF, c), r)
         i, j, k = np.int32(a), np.int32(b), np.int32(c)
         d, e, f = (
@@ -281,4 +305,5 @@ def _locate_points(near, begin, count, move, box, edge, unsure):
             abs(c - np.float32(k) - _HALF),
         )
         cell = np.int32(np.int32(np.int32(i * across) + np.int32(j * along)) + k)
-        where[n] = unsure if max(d, max(e, f)) > edge else cell
+        cell = unsure if max(d, max(e, f)) > edge else cell
+        where[n] = cell if x[n] == x[n] else nothing

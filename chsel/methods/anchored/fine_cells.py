@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, IntArray
-from chsel.numerics.cell_set import Box, CellSet
+from chsel.numerics.cell_set import Box
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import cells_below
 
@@ -14,14 +16,21 @@ _MOST_PARTS = 50_000_000  # of all cells; of larger grids, cells are taken whole
 _ROUNDING = 1e-9  # of values, generously
 
 
-def fine_cells_below(sdf: SdfGrid, level: float) -> CellSet:
+class FineCells(NamedTuple):
+    """A set of parts of grid cells."""
+
+    box: Box
+    bits: Any  # (words,) one bit for each part, and a last one that is set; uint32
+    unsure: int  # the index of the last bit
+
+
+def fine_cells_below(sdf: SdfGrid, level: float) -> FineCells:
     """The parts of a grid's cells that hold a point whose interpolated value is below a level.
 
-    And perhaps parts where values are higher by less than rounding. Distances to them are not in
-    the set: squares has their number, and zeros. Derived once.
+    And perhaps parts where values are higher by less than rounding. Derived once.
     """
 
-    def make() -> CellSet:
+    def make() -> FineCells:
         region = cells_below(sdf, level, "trilinear")
         cells = (region.clearance < 0.0).reshape(sdf.shape)
         parts = _PARTS if cells.size * _PARTS**3 <= _MOST_PARTS else 1
@@ -46,7 +55,7 @@ def fine_cells_below(sdf: SdfGrid, level: float) -> CellSet:
             across=float(shape[1] * shape[2]),
             along=float(shape[2]),
         )
-        return CellSet(fine, words, np.zeros(int(shape.prod()), dtype=np.uint8))
+        return FineCells(fine, words, int(shape.prod()))
 
     return sdf.derived(("fine cells below", level), make)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.cost.cost_kernels import Model
+from chsel.methods.anchored.fine_cells import FineCells
 from chsel.methods.anchored.surrounding_kernels import (
     Surrounding,
     gather,
@@ -22,7 +23,6 @@ from chsel.methods.anchored.surrounding_kernels import (
     travel_since_gathering,
 )
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import CellSet
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
 from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
@@ -63,7 +63,7 @@ class Fit(NamedTuple):
     twist: FloatArray  # (6,)
 
 
-def fit_for(model: Model, fine: CellSet, d: int) -> Fit:
+def fit_for(model: Model, fine: FineCells, d: int) -> Fit:
     """Scratch for one thread, for twists of d dimensions. fine: see surrounding_for."""
     normal, right, factor = np.empty((2, d, d)), np.empty((2, d)), np.empty((d, d))
     sums, row, twist = np.empty((8, 6)), np.empty(d), np.empty(6)

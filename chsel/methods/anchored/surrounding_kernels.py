@@ -12,11 +12,10 @@ import numpy as np
 
 from chsel.cost.cost_kernels import Model
 from chsel.cost.free_kernels import is_apart, remember, travel
+from chsel.methods.anchored.fine_cells import FineCells
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import CellSet
 from chsel.numerics.compiler import inner, leaf, spliced
-from chsel.numerics.near_points import NearPoints, near_points_for, to_cells
-from chsel.numerics.near_points import gather as gather_near
+from chsel.numerics.near_points import NearPoints, gather_points, near_points_for, to_cells
 from chsel.numerics.pose_tuples import moved, rigid
 
 _HALF = np.float32(0.5)
@@ -28,10 +27,10 @@ class Surrounding(NamedTuple):
 
     points: NearPoints  # one list
     memory: FloatArray  # (12,), where the object was when they were gathered, see remember
-    fine: CellSet  # parts of the grid's cells, see fine_cells_below
+    fine: FineCells  # parts of the grid's cells, see fine_cells_below
 
 
-def surrounding_for(model: Model, fine: CellSet) -> Surrounding:
+def surrounding_for(model: Model, fine: FineCells) -> Surrounding:
     """Scratch for one thread. fine: where free points cost something."""
     return Surrounding(near_points_for(model.free.rough, 1), np.empty(12), fine)
 
@@ -50,7 +49,7 @@ def gather(model, pose, slack, near):
         points.number[0] = 0
     else:
         reach = slack + free.margin + rounding
-        gather_near(free.rough, free.cells, to_cell, reach, points, 0)
+        gather_points(free.rough, free.cells, to_cell, reach, points)
 
 
 @leaf
@@ -72,15 +71,14 @@ def look_around(model, pose, near):
 @leaf
 def _locate(move, fine, rounding, points):
     """Fill the cells of the points gathered, or that of the last bit where rounding may matter."""
-    box, begin = fine.box, np.uint64(points.begin[0])
+    box = fine.box
     across, along = np.int32(box.across), np.int32(box.along)
     most, edge = box.most, np.float32(0.5 - rounding * box.inverse)
     p, q, r = np.float32(most[0] + 0.5), np.float32(most[1] + 0.5), np.float32(most[2] + 0.5)
-    unsure = np.int32(len(fine.squares))
-    xs, ys, zs, cells = points.x, points.y, points.z, points.cells
+    unsure, cells = np.int32(fine.unsure), points.cells
+    xs, ys, zs = points.rows[0], points.rows[1], points.rows[2]
     for n in range(points.number[0]):
-        at = begin + np.uint64(n)
-        x, y, z = xs[at], ys[at], zs[at]
+        x, y, z = xs[n], ys[n], zs[n]
         a = move[0] * x + move[1] * y + move[2] * z + move[9]
         b = move[3] * x + move[4] * y + move[5] * z + move[10]
         c = move[6] * x + move[7] * y + move[8] * z + move[11]
@@ -95,12 +93,12 @@ def _locate(move, fine, rounding, points):
 @leaf
 def _select(bits, points):
     """Fill hits with the points gathered whose bits are set; returns how many."""
-    cells, kept, hits, begin = points.cells, points.kept, points.hits, np.uint64(points.begin[0])
+    cells, kept, hits = points.cells, points.nodes, points.hits
     total = np.uint64(0)
     for n in range(points.number[0]):
         cell = np.uint32(cells[n])
         word = bits[np.uint64(cell >> np.uint32(5))] >> (cell & np.uint32(31))
-        hits[total] = kept[begin + np.uint64(n)]
+        hits[total] = kept[n]
         total += np.uint64(word & np.uint32(1))
     return np.int64(total)
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.cost.cost_kernels import Model
+from chsel.methods.anchored.fine_cells import FineCells
 from chsel.methods.anchored.fit_kernels import cost_of_residual, moved_about
 from chsel.methods.anchored.surrounding_kernels import (
     Surrounding,
@@ -22,7 +23,6 @@ from chsel.methods.anchored.surrounding_kernels import (
     travel_since_gathering,
 )
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.cell_set import CellSet
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp
 from chsel.numerics.pose_tuples import moved, origin_within, pose_at
@@ -91,7 +91,7 @@ class Walk(NamedTuple):
     lanes: FloatArray  # (6 LANES,), rows of what is known about some of them
 
 
-def walk_for(model: Model, table: FloatArray, fine: CellSet) -> Walk:
+def walk_for(model: Model, table: FloatArray, fine: FineCells) -> Walk:
     """Scratch for one thread. table: the values of the grid. fine: see surrounding_for."""
     count = model.known.shape[1]
     known = np.zeros((4, -(-count // LANES) * LANES))

@@ -20,6 +20,7 @@ from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.descent import BETA1, BETA2, EPSILON
 from chsel.cost.objective import Objective
+from chsel.cost.pose_lanes import LANES
 from chsel.errors import EngineError, PointsError, PoseError, SettingError
 from chsel.numerics import near_points
 from chsel.numerics.arrays import FloatArray
@@ -467,6 +468,35 @@ def test_poses_beyond_all_numbers_cost_infinitely_much_and_harm_no_other(
     assert 0.0 < costs[13] < np.inf
     vectors = SE3Space().encode(Poses.of(transforms))
     Objective(cost, SE3Space()).descended(vectors, 1.0, 0.01, 3)
+
+
+@pytest.mark.parametrize("free_term", ["direct", "interior"])
+@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e300])
+def test_a_pose_that_is_not_finite_leaves_the_lanes_beside_it_to_the_bit_as_they_are(
+    bad: float, free_term: str
+) -> None:
+    stream = np.random.default_rng(16)
+    near = stream.uniform(-0.1, 0.1, (900, 3))
+    points = KnownPoints(near, near[:3], near[:9])
+    vectors = SE3Space().encode(Poses.of(random_poses(stream, LANES, 0.02)))
+    changes = CostSettings(free_term=free_term, lookup="nearest")
+    case = Case("l_shape", points, changes, 0.02, vectors, SE3Space())
+    objective = case.objective()
+    costs, slopes = objective.costs_and_gradients(vectors)
+    moved = objective.descended(vectors, 3.0, 0.01, 20)
+    assert (costs > 0.0).all()
+    assert (moved != vectors).any(axis=1).all()
+    for lane in range(LANES):
+        others = np.arange(LANES) != lane
+        spoiled = vectors.copy()
+        spoiled[lane, 6 + lane % 3] = bad
+        found, gradients = objective.costs_and_gradients(spoiled)
+        assert found[lane] == np.inf
+        assert not gradients[lane].any()
+        assert_same_bits(found[others], costs[others])
+        assert_same_bits(gradients[others], slopes[others])
+        assert_same_bits(objective.costs(spoiled)[others], costs[others])
+        assert_same_bits(objective.descended(spoiled, 3.0, 0.01, 20)[others], moved[others])
 
 
 @pytest.mark.parametrize("name", ["free", "occupied", "known"])

@@ -226,4 +226,4 @@ def test_the_fine_cells_hold_all_points_below_a_level_and_few_others(level: floa
     side = 1.0 / fine.box.inverse
     assert 100 < held.sum() < len(held) / 2
     assert values[held].max() < level + np.sqrt(3.0) * side
-    assert fine.bits[-1] >> np.uint32(len(fine.squares) % 32) == 1  # that of unsure points
+    assert fine.bits[-1] >> np.uint32(fine.unsure % 32) == 1  # that of unsure points
