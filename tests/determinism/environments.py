@@ -13,6 +13,8 @@ from pathlib import Path
 import llvmlite.binding as llvm
 import numpy as np
 
+from chsel.numerics.kernel_cache import CACHE_VARIABLE
+from chsel.numerics.packaged_code import target_folder
 from tests.determinism.record import read_record
 from tests.determinism.stages import Stages
 
@@ -89,6 +91,13 @@ _FMA = _x86() and _host_has("avx2", "fma")
 _HASWELL_BLAS = {"OPENBLAS_CORETYPE": "Haswell"} if _FMA and _openblas() else {}
 _GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 _HASWELL = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": HASWELL}
+
+
+def packaged(target: str, kept: Path) -> Environment:
+    """Code of `python -m chsel.kernel_build` for a target, and a folder for what it lacks."""
+    missing = None if target_folder(target).is_dir() else f"there is no packaged code for {target}"
+    return Environment({CACHE_VARIABLE: str(kept)}, ("--packaged", target), missing)
+
 
 # Each CPU's machine code is kept apart in the kernels' cache. Several changes in one setting save
 # processes: a difference shows for any of them.

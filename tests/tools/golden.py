@@ -1,7 +1,8 @@
-"""The golden digests: `python -m tests.tools.golden [--write] [--all]`.
+"""The golden digests: `python -m tests.tools.golden [--write] [--all] [--packaged]`.
 
 Without options: what differs from golden.json here. --write: make it anew, and say what changed.
 --all: compare every setting of the matrix, and say which libraries each setting changes.
+--packaged: compare the code that `make kernels` made, for each target that this CPU can run.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
+from chsel.numerics.packaged_code import usable_targets
 from tests.determinism.comparison import (
     GOLDEN_FILE,
     Golden,
@@ -20,7 +23,7 @@ from tests.determinism.comparison import (
     read_golden,
     write_golden,
 )
-from tests.determinism.environments import ENVIRONMENTS
+from tests.determinism.environments import ENVIRONMENTS, Environment, packaged
 from tests.determinism.stages import Stages
 
 
@@ -29,6 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write golden.json")
     parser.add_argument("--all", action="store_true", help="every setting, not the default alone")
+    parser.add_argument("--packaged", action="store_true", help="code that make kernels made, too")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
         record, libraries = ENVIRONMENTS["default"].record(Path(directory))
@@ -43,7 +47,9 @@ def main() -> None:
             print(f"{GOLDEN_FILE.name} written: {GOLDEN_FILE.stat().st_size} bytes")
         unequal = bool(lines) and not arguments.write
         if arguments.all:
-            unequal |= _matrix(golden, record, libraries, Path(directory))
+            unequal |= _matrix(ENVIRONMENTS, golden, record, libraries, Path(directory))
+        if arguments.packaged:
+            unequal |= _packaged(golden, record, libraries, Path(directory))
     sys.exit(int(unequal))
 
 
@@ -56,12 +62,30 @@ def _changes(golden: Golden, record: dict[str, Stages]) -> list[str]:
     return lines
 
 
-def _matrix(
+def _packaged(
     golden: Golden, usual: dict[str, Stages], libraries: dict[str, str], directory: Path
+) -> bool:
+    """Likewise for packaged code of each target, and how many kernels it lacks."""
+    unequal = False
+    for target in usable_targets():
+        kept = directory / "kept" / target
+        matrix = {f"packaged code for {target}": packaged(target, kept)}
+        unequal |= _matrix(matrix, golden, usual, libraries, directory)
+        if compiled := len(list(kept.rglob("*.nbc"))):
+            print(f"  {compiled} kernels of the cases were compiled, as it lacks them")
+    return unequal
+
+
+def _matrix(
+    matrix: Mapping[str, Environment],
+    golden: Golden,
+    usual: dict[str, Stages],
+    libraries: dict[str, str],
+    directory: Path,
 ) -> bool:
     """Print a line or more for each setting; whether any differs."""
     unequal = False
-    for name, environment in ENVIRONMENTS.items():
+    for name, environment in matrix.items():
         if environment.impossible:
             print(f"{name}: left out, as {environment.impossible}", flush=True)
             continue
