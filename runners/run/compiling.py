@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Self
 
-from rich.progress import ProgressColumn, Task, TimeElapsedColumn
-from rich.text import Text
+from rich.progress import TimeElapsedColumn
 
 from chsel.background_rehearsal import rehearse_beside
 from chsel.methods.method import Method
@@ -16,7 +15,7 @@ from chsel.numerics.compiler import watched
 from chsel.numerics.kernel_cache import has_kernels, kept_count
 from chsel.policies.policy import Policy
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
-from replay.console import Console, Progress, TextColumn
+from replay.console import Console, LiveTextColumn, Progress, TextColumn
 
 
 class Compiling:
@@ -28,7 +27,8 @@ class Compiling:
     def __init__(self) -> None:
         which = "further kernels for this CPU" if has_kernels() else "kernels for this CPU, once"
         self._text = f"compiling {which}"
-        self._count = _KernelCount(kept_count())
+        before = kept_count()
+        self._count = LiveTextColumn(lambda: f"{kept_count() - before} compiled,")
         self._progress: Progress | None = None
         self._method: Method | None = None
         self._processes: list[subprocess.Popen[bytes]] = []
@@ -89,15 +89,3 @@ class Compiling:
     def _begin(self) -> None:
         if self._method is not None:
             self._processes, self._method = rehearse_beside(self._method), None
-
-
-class _KernelCount(ProgressColumn):
-    """How many kernels were compiled since there were so many, by whatever process."""
-
-    def __init__(self, before: int) -> None:
-        super().__init__()
-        self._before = before
-
-    def render(self, task: Task) -> Text:
-        """The number as it is when the line is drawn."""
-        return Text(f"{kept_count() - self._before} compiled,")
