@@ -15,10 +15,17 @@ import torch
 from chsel import KnownPoints, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import EngineError, SettingError
+from chsel.numerics import threads as numerics_threads
 from chsel.numerics.threads import require_threads, spread
 from chsel.numerics.threads import threads as use_threads
 
 PATIENCE = 20.0  # seconds until what should have ended long ago counts as stuck
+
+
+@pytest.fixture(autouse=True)
+def no_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No number of threads is set, as a command that ran in this process may have done."""
+    monkeypatch.setattr(numerics_threads._setting, "count", None)
 
 
 def no_scratch() -> None:
