@@ -34,6 +34,7 @@ _OF_POINTS = ["object.scale=1", "session=points", f"session.path={_POINTS}", *_B
 _FEW = [*_OF_POINTS, "session.object_resolution=0.015", "session.start_probe=2"]  # the last two
 _QUICK = ["method.archive.bins=10", "method.emitter.iterations=30"]
 _CHSEL = ("chsel", "chsel_cma_me")
+_MEDIAL = ("medial_constraint", "medial_constraint_cma_me")
 _BASELINES: dict[str, list[str]] = {  # with what keeps those brief that take long
     "icp": [],
     "svgd": [],
@@ -51,14 +52,11 @@ _OBJECTS = {  # with the preset of CHSEL, CHSEL with CMA-ME, gradient descent
     "spam_can": ("paper", "default", "reference"),
     "clamp": ("default", "reference", "paper"),
 }
-# Not stored, as the meshes and grids of these objects are large.
+# Not stored, as the meshes and grids of these objects are large; two are.
 _LARGE = {f"{name}_{method}" for name in ("drill", "hammer") for method in _BASELINES}
-_LARGE -= {
-    "drill_svgd",
-    "hammer_icp",
-}  # are not stored, as their objects' meshes and grids are large
+_LARGE -= {"drill_svgd", "hammer_icp"}
 _FULL = ("chsel", "chsel_cma_me", "gradient_descent", "svgd", "cvo", "cvo_no_free_space")
-_FULL += ("medial_constraint", "medial_constraint_cma_me", "anchored")  # not brief in any other
+_FULL += (*_MEDIAL, "anchored")  # not brief in any other
 
 
 def cases() -> dict[str, list[str]]:
@@ -76,6 +74,9 @@ def cases() -> dict[str, list[str]]:
         for index, (method, brief) in enumerate(_BASELINES.items()):
             if f"{name}_{method}" in _LARGE:
                 continue
+            start = 25 if name == "drill" else 10
+            if method in _MEDIAL and name != "clamp":  # one step, for its size
+                start = 15 if name == "mustard" else 11
             found[f"{name}_{method}"] = [
                 f"object={name}",
                 f"session={('kinematic', 'simulated')[index % 2]}",
@@ -83,12 +84,12 @@ def cases() -> dict[str, list[str]]:
                 f"method={method}",
                 *_BRIEF,
                 *_SMALL,
-                f"session.start_probe={25 if name == 'drill' else 10}",
+                f"session.start_probe={start}",
                 *brief,
             ]
     for method in _FULL:
         found[f"points_default_{method}"] = ["object=spam_can", f"method={method}", *_FEW]
-    for method in _CHSEL:
+    for method in (*_CHSEL, *_MEDIAL, "svgd", "cvo_no_free_space"):
         found[f"points_default_{method}"].append("session.start_probe=3")  # one step, for its size
     points = [*_OF_POINTS, "session.object_resolution=0.01"]
     plane = "method.plane={plane_height: 0.0}"

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from chsel.methods.medial_constraint.least_distances import least_distances
+from chsel.methods.medial_constraint.least_distances import LeastDistances, least_distances
 from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls
 from chsel.methods.medial_constraint.medial_kernels import (
     MedialModel,
-    MedialScratch,
     medial_costs_of_poses,
-    medial_scratch,
+    places_of,
 )
+from chsel.methods.medial_constraint.medial_search_kernels import (
+    MedialSearch,
+    SearchScratch,
+    search_scratch,
+)
+from chsel.methods.medial_constraint.narrow_field_kernels import NarrowField
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import triple
+from chsel.numerics.cell_set import Places, triple
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
@@ -68,7 +73,8 @@ class MedialCost:
         self.space = space or SE3Space()
         self.space_arrays = self.space.arrays
         self.balls = _balls_of(problem, settings) if balls is None else balls
-        self.model = _model(problem, self.balls, settings)
+        self._exact = _exact_model(problem, self.balls, settings)
+        self.model = _search_model(problem, self.balls, settings)
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d) of the search space."""
@@ -77,37 +83,75 @@ class MedialCost:
     def evaluate(self, poses: Poses) -> FloatArray:
         """Costs (B,) of poses; infinite for one that is not finite."""
         costs = np.empty(len(poses))
-        run = partial(medial_costs_of_poses, self.model, poses.numbers, costs)
-        spread(run, len(poses), self.work, least=_POSES_PER_THREAD)
+        run = partial(medial_costs_of_poses, self._exact, poses.numbers, costs)
+        spread(run, len(poses), self._places, least=_POSES_PER_THREAD)
         return costs
 
-    def work(self) -> MedialScratch:
-        """Scratch for one thread."""
-        return medial_scratch(self.model)
+    def work(self) -> SearchScratch:
+        """Scratch for one thread of a search, which looks up `model`."""
+        return search_scratch(self.model)
+
+    def _places(self) -> Places:
+        return places_of(self._exact)
 
 
-def _model(problem: RegistrationProblem, balls: Balls, settings: MedialCostSettings) -> MedialModel:
-    sdf, centres, radii = problem.sdf, balls.centres.T, balls.radii
-    middle = np.zeros(3)
-    if len(balls):
-        middle = (centres.min(axis=1) + centres.max(axis=1)) / 2.0
-    from_middle = np.empty((4, len(radii)), dtype=np.float32)
-    from_middle[:3], from_middle[3] = centres - middle[:, None], radii
-    from_middle[3] = np.nextafter(from_middle[3], np.float32(np.inf))
+def _exact_model(
+    problem: RegistrationProblem, balls: Balls, settings: MedialCostSettings
+) -> MedialModel:
     return MedialModel(
-        field=distance_field(sdf, settings.lookup, settings.outside),
-        values=sdf.values.reshape(-1),
-        least=_least_values(sdf, settings.lookup),
-        bounds=least_distances(sdf, settings.outside, float(radii.max(initial=0.0))),
-        centres=centres.copy(),
-        radii=radii,
-        middle=triple(middle),
-        span=float(np.abs(from_middle[:3]).max(initial=0.0)),
-        balls=from_middle,
+        field=distance_field(problem.sdf, settings.lookup, settings.outside),
+        centres=balls.centres.T.copy(),
+        radii=balls.radii,
         known=problem.points.known.T.copy(),
         known_sdf=problem.points.sdf.copy(),
         ball_scale=settings.ball_scale,
         known_scale=settings.known_scale,
+    )
+
+
+def _search_model(
+    problem: RegistrationProblem, balls: Balls, settings: MedialCostSettings
+) -> MedialSearch:
+    sdf, radii, known = problem.sdf, balls.radii, problem.points.known
+    both = np.concatenate([balls.centres, known])
+    middle = (both.min(axis=0) + both.max(axis=0)) / 2.0 if len(both) else np.zeros(3)
+    bounds = least_distances(sdf, settings.outside, float(radii.max(initial=0.0)))
+    square = sdf.resolution * sdf.resolution
+    return MedialSearch(
+        field=_narrow_field(sdf, settings, bounds),
+        bounds=bounds,
+        middle=triple(middle),
+        span=float(np.abs(both - middle).max(initial=0.0)),
+        centres=(balls.centres - middle).T.astype(np.float32, order="C"),
+        radii=(radii / sdf.resolution).astype(np.float32),
+        steps=np.ceil(radii / bounds.step).astype(np.uint8),
+        known=(known - middle).T.astype(np.float32, order="C"),
+        known_sdf=(problem.points.sdf / sdf.resolution).astype(np.float32),
+        ball_scale=settings.ball_scale * square / max(len(radii), 1),
+        known_scale=settings.known_scale * square / max(len(known), 1),
+    )
+
+
+def _narrow_field(
+    sdf: SdfGrid, settings: MedialCostSettings, bounds: LeastDistances
+) -> NarrowField:
+    """An SDF grid in 32 bits, for points in cells of the bounds."""
+
+    def rows() -> Any:
+        return (sdf.table / np.array([sdf.resolution, 1.0, 1.0, 1.0])).astype(np.float32)
+
+    in_cells = sdf.derived("rows in cells", rows)
+    _, ny, nz = sdf.shape
+    return NarrowField(
+        rows=in_cells,
+        values=sdf.derived("values in cells", lambda: in_cells[:, 0].copy()),
+        last=triple(np.array(sdf.shape) - 1.0),
+        across=ny * nz,
+        along=nz,
+        nearest=settings.lookup == "nearest",
+        surface=0.0 if settings.outside == "bounding_box" else 1.0,
+        side=1.0 / (bounds.inverse * sdf.resolution),
+        margin=float(np.rint((sdf.origin[0] - bounds.first[0]) * bounds.inverse)),
     )
 
 
@@ -116,17 +160,3 @@ def _balls_of(problem: RegistrationProblem, settings: MedialCostSettings) -> Bal
         return Balls(np.zeros((0, 3)), np.zeros(0))
     free, resolution = problem.points.free, problem.free_resolution
     return medial_balls(free, problem.workspace, resolution, settings.inflation)
-
-
-def _least_values(sdf: SdfGrid, lookup: str) -> FloatArray:
-    """The least value (nodes,) that is read in each cell of a grid, less a margin for rounding."""
-
-    def least_values() -> FloatArray:
-        least = sdf.values.copy()
-        if lookup == "trilinear":  # a cell is named after the lowest of its eight nodes
-            for axis in range(3):
-                nodes = np.moveaxis(least, axis, 0)
-                nodes[:-1] = np.minimum(nodes[:-1], nodes[1:])
-        return (least - 1e-9 * (1.0 + np.abs(least))).reshape(-1)
-
-    return sdf.derived(("least values", lookup), least_values)

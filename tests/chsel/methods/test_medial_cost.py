@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
+from chsel.cost.objective import costs_of
 from chsel.methods.medial_constraint.medial_balls import Balls
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.numerics.arrays import FloatArray
@@ -84,6 +86,24 @@ def test_costs_are_those_of_the_equation(lookup: str, outside: str) -> None:
     assert (depth > 0.0).any()
     assert (depth == 0.0).any()
     np.testing.assert_allclose(cost.evaluate(Poses.of(poses())), expected, rtol=1e-9)
+
+
+@numba.njit
+def search(model, space, vectors, costs, work):  # type: ignore[no-untyped-def]
+    costs_of(model, space, vectors, costs, work)
+
+
+@pytest.mark.parametrize("outside", OUTSIDE)
+@pytest.mark.parametrize("lookup", LOOKUPS)
+def test_searches_go_by_the_same_costs_in_32_bits(lookup: str, outside: str) -> None:
+    settings = MedialCostSettings(lookup=lookup, outside=outside)
+    for balls in (some_balls(), some_balls(600), Balls(np.zeros((0, 3)), np.zeros(0))):
+        cost = MedialCost(problem(contacts(70)), settings, balls=balls)
+        vectors = cost.space.encode(Poses.of(poses(80)))
+        vectors[-2:, 8] = 40.0, np.nan  # too far away for the bounds, and not finite
+        found = np.empty(len(vectors))
+        search(cost.model, cost.space_arrays, vectors, found, cost.work())
+        np.testing.assert_allclose(found, cost.costs(vectors), rtol=2e-5)
 
 
 def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() -> None:
