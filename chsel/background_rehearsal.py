@@ -1,6 +1,7 @@
 """Kernels are compiled in processes of their own, while this one does something else.
 
-`python -m chsel.background_rehearsal PART` is one of them.
+`python -m chsel.background_rehearsal PART` is one of them. Without a part, it compiles what
+method=chsel needs, for an installation.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 
+from chsel.methods import build_method
 from chsel.methods.method import ConfiguredMethod, Method
 from chsel.numerics.threads import core_count
 from chsel.rehearsal import warm_up, warm_up_longest
@@ -54,9 +56,11 @@ def rehearse_beside(method: Method) -> list[subprocess.Popen[bytes]]:
 
 
 def main() -> None:
-    """Rehearse a part of the method on standard input."""
-    method: Method = pickle.loads(sys.stdin.buffer.read())
-    _PARTS[sys.argv[1]](method)
+    """Rehearse a part of the method on standard input, or all of CHSEL."""
+    if len(sys.argv) == 1:
+        warm_up(build_method("chsel"))
+    else:
+        _PARTS[sys.argv[1]](pickle.loads(sys.stdin.buffer.read()))
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ def _free_term(
     if is_interior:
         tree, interior = sdf.derived(("interior", settings), lambda: _interior_tree(sdf, settings))
         weights = interior.weights(settings, free_resolution)[:, None]
-        weights = np.concatenate([weights, weights * interior.normals], axis=1)
+        weights = np.concatenate([weights, -weights * interior.normals], axis=1).reshape(-1)
         voxels = VoxelGrid.around(free, free_resolution)
         box = box_of(voxels.origin, free_resolution, voxels.flags.shape)
         region, cells = Region(box, _NOWHERE), cell_set_of(box, voxels.flags)
@@ -121,7 +121,7 @@ def _free_term(
         centre, radius = _sphere_around(interior.points, 0.0)
         lower, upper = box.first, box.last
     else:
-        alpha, lookup, weights = settings.alpha, settings.lookup, np.zeros((0, 4))
+        alpha, lookup, weights = settings.alpha, settings.lookup, np.zeros(0)
         tree, region = octree(free, free_resolution), cells_below(sdf, alpha, lookup)
         cells, depths = _cell_set_below(sdf, alpha, lookup), _NO_DEPTHS
         centre, radius = _sphere_around_cells(sdf, alpha, lookup)

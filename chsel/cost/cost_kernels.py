@@ -11,7 +11,7 @@ import numpy as np
 
 from chsel.cost.free_kernels import FreeTerm, Neighbours, free_sums, neighbours_of
 from chsel.cost.pose_lanes import LANES, SIZE, SUMS, add_known, add_occupied
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.compiler import compiled, kept, leaf
 from chsel.numerics.pose_tuples import finite, pose_at
 from chsel.problem.sdf_lookup import DistanceField
@@ -42,7 +42,7 @@ class Work(NamedTuple):
 
 def work_of(model: Model, poses: int = LANES) -> Work:
     """Scratch of one thread; it remembers what is near to so many poses, at least LANES."""
-    return Work(np.zeros(SIZE), neighbours_of(model.free, max(poses, LANES)))
+    return Work(scratch(SIZE), neighbours_of(model.free, max(poses, LANES)))
 
 
 @compiled

@@ -13,7 +13,7 @@ import numpy as np
 from chsel.cost.cost_kernels import evaluate, forget, gradient_of, put_pose
 from chsel.cost.free_kernels import MOST_SLACK
 from chsel.cost.pose_lanes import LANES, SUMS
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray, IntArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import decode, pull_back
 from chsel.numerics.team import (
@@ -46,8 +46,10 @@ class Course(NamedTuple):
     iterations: int  # of a block; Adam starts anew in each
     rate: float
     divisor: float  # of gradients
-    ends_on_poses: bool  # a block: rotations are orthonormal again, and costs are known
+    # A block: costs are known, and unless it is of no iterations, rotations are orthonormal again.
+    ends_on_poses: bool
     stop_below: float  # mean relative gain of a block below which none of the next begins
+    firsts: IntArray  # (G + 1,), the first vector of each group, then S
     words: IntArray  # what threads agree by
 
 
@@ -56,7 +58,7 @@ def course_from(
     costs: FloatArray,
     blocks: int,
     *,
-    groups: int,
+    threads: int = 1,
     iterations: int = 0,
     rate: float = 0.0,
     divisor: float = 1.0,
@@ -65,9 +67,10 @@ def course_from(
 ) -> Course:
     """The course before its first block, from vectors (S, d) with costs (S,).
 
-    groups: of at most LANES each, see groups_for.
+    threads: that share it.
     """
     count, dimension = vectors.shape
+    firsts = groups_for(count, threads)
     course = Course(
         np.empty((blocks + 1, count, dimension)),
         np.empty((blocks + 1, count)),
@@ -76,17 +79,22 @@ def course_from(
         float(divisor),
         ends_on_poses,
         -np.inf if stop_below is None else float(stop_below),
-        np.zeros(_GROUPS + groups * APART, dtype=np.int64),
+        firsts,
+        scratch(_GROUPS + (len(firsts) - 1) * APART, dtype=np.int64),
     )
     course.vectors[0], course.costs[0], course.words[_LIMIT] = vectors, costs, blocks
     return course
 
 
-def groups_for(count: int, threads: int) -> int:
-    """How many groups so many poses are in: as many for each thread, where they are few."""
-    least = -(-count // LANES)
-    even = -(-least // threads) * threads
-    return even if _FEWEST * even <= count else least
+def groups_for(count: int, threads: int) -> IntArray:
+    """The first of so many poses in each group, then their number.
+
+    As many whole groups for each thread as there can be; the rest in one for each, unless too few.
+    """
+    rest = count % (LANES * threads)
+    last = threads if _FEWEST * threads <= rest else -(-rest // LANES)
+    whole = np.arange(0, count - rest, LANES)
+    return np.concatenate([whole, count - rest + rest * np.arange(last + 1) // max(last, 1)])
 
 
 def blocks_done(course: Course) -> int:
@@ -150,8 +158,7 @@ def descend(model, space, course, work, leads):
 @leaf
 def _members(course, group):
     """The first pose of a group, and that after its last."""
-    count, groups = course.vectors.shape[1], len(course.words) // APART - 1
-    return group * count // groups, (group + 1) * count // groups
+    return course.firsts[group], course.firsts[group + 1]
 
 
 @inner
@@ -201,9 +208,10 @@ def _descend_block(model, space, course, group, block, work, moved, moments, gra
                 moved[lane, j] -= step
     if course.ends_on_poses:
         for lane in range(count):
-            pose = decode(space, moved[lane])
-            for j in range(6):
-                moved[lane, j] = pose[j]
+            if course.iterations > 0:
+                pose = decode(space, moved[lane])
+                for j in range(6):
+                    moved[lane, j] = pose[j]
             put_pose(work.lanes, lane, decode(space, moved[lane]))
         evaluate(model, work, 0, count, 0.0)
     return True

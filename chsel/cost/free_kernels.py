@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.cost.point_sums import NOTHING, SIZE, sums_over, sums_over_all
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.cell_set import CellSet, Region
-from chsel.numerics.compiler import inner, leaf, spliced
+from chsel.numerics.compiler import leaf, spliced
 from chsel.numerics.near_points import (
     NearPoints,
     gather,
@@ -42,7 +42,7 @@ class FreeTerm(NamedTuple):
     region: Region  # cells of the object that read values below alpha; empty for interior points
     cells: CellSet  # the same cells, or the free voxels of the world
     depths: Any  # (nodes,) squared gaps from free voxels to others; empty for free points; uint8
-    weights: FloatArray  # (N, 4) weight of interior points, and it times the normal
+    weights: FloatArray  # (4 N,) weight of interior points, and it times the inward normal
     centre: Triple  # of a sphere around the object, in its frame
     radius: float
     lower: Triple  # corners of a box of the world: where the object is beyond, nothing costs
@@ -62,16 +62,13 @@ class Neighbours(NamedTuple):
 
 def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
     """Scratch of one thread, for so many poses."""
-    return Neighbours(
-        near_points_for(free.rough, poses),
-        np.full(poses, -1.0),
-        np.zeros((poses, 12)),
-        np.zeros((poses, 12)),
-        np.zeros(SIZE),
-    )
+    slack = scratch(poses)
+    slack[:] = -1.0
+    gathered, last = scratch(poses, 12), scratch(poses, 12)
+    return Neighbours(near_points_for(free.rough, poses), slack, gathered, last, scratch(SIZE))
 
 
-@inner
+@leaf
 def free_sums(model, pose, near, n, most_slack):
     """The free term of a finite pose, whose neighbours are the n-th.
 
@@ -84,28 +81,35 @@ def free_sums(model, pose, near, n, most_slack):
         return NOTHING
     move = inverted(pose) if free.interior else pose
     to_cell, rounding = to_cells(free.rough, free.cells.box, move)
+    count = 0
     if free.exhaustive or rounding < 0.0 or not rigid(pose):
         near.slack[n] = -1.0
         for at in range(total):
             points.hits[at] = at
-        return sums_over(model, pose, move, points.hits, total, near.block)
-    rounding += free.margin
-    slack = _slack_to_gather(free, pose, near, n, most_slack)
-    if slack >= 0.0:
-        reach = slack + rounding
-        if is_apart(free, pose, slack + free.margin):
-            points.number[n] = 0
-        elif free.interior and is_within(free.rough, free.cells, free.depths, to_cell, reach):
-            points.number[n] = _ALL
-        else:
-            gather(free.rough, free.cells, to_cell, reach, points, n)
-            near.slack[n] = near.slack[n] if is_kept(points, n) else -1.0
-    count = 0
-    if points.number[n] == _ALL:
-        return sums_over_all(free, pose, near.block)
-    if points.number[n] > 0:
-        count = select(free.rough, free.cells, to_cell, rounding, points, n)
+        count = total
+    else:
+        rounding += free.margin
+        slack = _slack_to_gather(free, pose, near, n, most_slack)
+        if slack >= 0.0:
+            _gather_within(free, pose, near, n, to_cell, slack, rounding)
+        if points.number[n] == _ALL:
+            return sums_over_all(free, pose, near.block)
+        if points.number[n] > 0:
+            count = select(free.rough, free.cells, to_cell, rounding, points, n)
     return sums_over(model, pose, move, points.hits, count, near.block)
+
+
+@leaf
+def _gather_within(free, pose, near, n, to_cell, slack, rounding):
+    """Gather the points that can matter until the object has moved by `slack` metres."""
+    points, reach = near.points, slack + rounding
+    if is_apart(free, pose, slack + free.margin):
+        points.number[n] = 0
+    elif free.interior and is_within(free.rough, free.cells, free.depths, to_cell, reach):
+        points.number[n] = _ALL
+    else:
+        gather(free.rough, free.cells, to_cell, reach, points, n)
+        near.slack[n] = near.slack[n] if is_kept(points, n) else -1.0
 
 
 @leaf

@@ -104,7 +104,7 @@ class Objective:
             vectors,
             np.zeros(len(vectors)),
             1,
-            groups=groups_for(len(vectors), team_size()),
+            threads=team_size(),
             iterations=iterations,
             rate=rate,
             divisor=divisor,
@@ -131,7 +131,8 @@ class Objective:
         def end() -> None:
             abandon(current[-1])
 
-        current.append(course_from(np.zeros((0, self.space.dimension)), np.zeros(0), 0, groups=0))
+        current.append(course_from(np.zeros((0, self.space.dimension)), np.zeros(0), 0))
         work = self.work()
-        with helped(assist, self.work, groups_for(starts, team_size()) - 1, end):
+        groups = len(groups_for(starts, team_size())) - 1
+        with helped(assist, self.work, groups - 1, end):
             yield run

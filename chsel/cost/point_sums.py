@@ -9,21 +9,20 @@ import numpy as np
 from chsel.cost.pose_lanes import slope
 from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import inner, leaf
-from chsel.numerics.pose_tuples import Pose, turned_back
-from chsel.problem.sdf_lookup import distance_between_nodes
+from chsel.numerics.pose_tuples import Pose
+from chsel.problem.sdf_lookup import at_node
 
 # A block holds the numbers of 64 points, a row for each quantity or four numbers for each point.
 _MOST = 64
-_BEYOND = 0  # row: squared distance to the box
+_LEVEL = 0  # row: below which signed distance a point costs something; beyond the box none does
 _PLACE = 1 * _MOST  # the first of 3 rows: from the node of the cell, in cells
 _CELL = 4 * _MOST  # row
 _POINT = 5 * _MOST  # the first of 3 rows
-_READ = 8 * _MOST  # four: signed distance and gradient, or weight and direction
-_LEFT = 12 * _MOST  # four: the gradient by the rotation is an outer product of three of these,
-_RIGHT = 16 * _MOST  # four: and three of these
-_SUMMAND = 20 * _MOST  # four: the gradient by the translation, and the value
-_SUMS = 24 * _MOST  # 3 rows of the gradient by the rotation, each with a further number; summands
-SIZE = 24 * _MOST + 16
+_WEIGHT = 8 * _MOST  # the first of 8 rows: how much each corner of the cell counts
+_SUMMAND = 16 * _MOST  # four: a number, and the gradient by the translation
+_VALUE = 20 * _MOST  # row
+_SUMS = 21 * _MOST  # 3 times a number and 3 of the gradient by the rotation; summands; values
+SIZE = 21 * _MOST + 17
 
 
 class CostAndGradient(NamedTuple):
@@ -36,72 +35,75 @@ class CostAndGradient(NamedTuple):
 NOTHING = CostAndGradient(0.0, (0.0,) * 12)
 
 
-@inner
+@leaf
 def sums_over(model, pose, move, numbers, count, block):
     """The sums over the first `count` points by number, block by block."""
     free = model.free
     spheres, nodes = free.tree.spheres, len(free.tree.starts) - 1
-    for i in range(16):
+    for i in range(17):
         block[_SUMS + i] = 0.0
     for first in range(0, count, _MOST):
         size = min(_MOST, count - first)
-        for n in range(size):
-            at = np.uint64(nodes + numbers[first + n])
-            x, y, z = spheres[0, at], spheres[1, at], spheres[2, at]
-            block[_POINT + n], block[_POINT + _MOST + n], block[_POINT + 2 * _MOST + n] = x, y, z
-            if not free.interior:
-                _put(block, _RIGHT, n, x, y, z, 0.0)
+        for n in range(np.uint64(size)):
+            at = np.uint64(nodes + numbers[np.uint64(first) + n])
+            block[np.uint64(_POINT) + n] = spheres[0, at]
+            block[np.uint64(_POINT + _MOST) + n] = spheres[1, at]
+            block[np.uint64(_POINT + 2 * _MOST) + n] = spheres[2, at]
         whole = (size + 3) // 4 * 4  # vectors read what is left of another block, for nothing
-        _locate(move, free.cells.box, block, whole)
+        _locate(move, free.cells.box, model.alpha, block, whole)
         if free.interior:
             _read_weights(free, numbers, first, block, size)
-            _weigh(pose, block, whole)
-            _add(block, _LEFT, size)
+            _subtract_points(pose, block, whole)
+            _add_weights(pose, block, np.uint64(_SUMMAND), block, size)
         else:
-            _read_distances(model, block, size)
-            _violate(model, block, whole)
-            _add(block, _SUMMAND, size)
-    return _sums_in(block)
+            if model.field.trilinear:
+                _weigh_corners(block, whole)
+                _violate_between_nodes(model, block, size)
+            else:
+                _violate_at_nodes(model, block, size)
+            _add_violations(block, size)
+    return _sums_in(free, block)
 
 
-@inner
+@leaf
 def sums_over_all(free, pose, block):
     """The sums over all interior points, which are all in free voxels."""
     weights, spheres, nodes = free.weights, free.tree.spheres, len(free.tree.starts) - 1
-    for i in range(16):
+    for i in range(17):
         block[_SUMS + i] = 0.0
-    for first in range(0, len(weights), _MOST):
-        size = min(_MOST, len(weights) - first)
-        for n in range(size):
-            at, point = np.uint64(first + n), np.uint64(nodes + first + n)
-            block[_POINT + n], block[_POINT + _MOST + n] = spheres[0, point], spheres[1, point]
-            block[_POINT + 2 * _MOST + n] = spheres[2, point]
-            w, nx, ny, nz = weights[at, 0], weights[at, 1], weights[at, 2], weights[at, 3]
-            _put(block, _READ, n, w, nx, ny, nz)
-        _weigh(pose, block, (size + 3) // 4 * 4)
-        _add(block, _LEFT, size)
-    return _sums_in(block)
+    for first in range(0, len(weights) // 4, _MOST):
+        size = min(_MOST, len(weights) // 4 - first)
+        for n in range(np.uint64(size)):
+            at = np.uint64(nodes + first) + n
+            block[np.uint64(_POINT) + n] = spheres[0, at]
+            block[np.uint64(_POINT + _MOST) + n] = spheres[1, at]
+            block[np.uint64(_POINT + 2 * _MOST) + n] = spheres[2, at]
+        _subtract_points(pose, block, size)
+        _add_weights(pose, weights, np.uint64(4 * first), block, size)
+    return _sums_in(free, block)
 
 
 @leaf
-def _sums_in(block):
-    a, b, c, _ = _four(block, _SUMS, 0)
-    d, e, f, _ = _four(block, _SUMS, 1)
-    g, h, i, _ = _four(block, _SUMS, 2)
-    x, y, z, cost = _four(block, _SUMS, 3)
-    return CostAndGradient(cost, (a, b, c, d, e, f, g, h, i, x, y, z))
+def _sums_in(free, block):
+    _, a, b, c = _four(block, _SUMS, 0)
+    _, d, e, f = _four(block, _SUMS, 1)
+    _, g, h, i = _four(block, _SUMS, 2)
+    value, x, y, z = _four(block, _SUMS, 3)
+    if free.interior:
+        return CostAndGradient(value, (a, b, c, d, e, f, g, h, i, x, y, z))
+    return CostAndGradient(block[_SUMS + 16], (a, d, g, b, e, h, c, f, i, x, y, z))
 
 
 @leaf
-def _put(block, first, n, a, b, c, d):
-    """Set four numbers of the n-th point."""
+def _put(block, first, n, four):
+    """Set the four numbers of the n-th point."""
     at = np.uint64(first) + np.uint64(4) * np.uint64(n)
-    block[at], block[at + np.uint64(1)] = a, b
-    block[at + np.uint64(2)], block[at + np.uint64(3)] = c, d
+    block[at], block[at + np.uint64(1)] = four[0], four[1]
+    block[at + np.uint64(2)], block[at + np.uint64(3)] = four[2], four[3]
 
 
 @inner
-def _locate(move, box, block, count):
+def _locate(move, box, level, block, count):
     """Where the points lie, once moved."""
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     for n in range(count):
@@ -112,7 +114,8 @@ def _locate(move, box, block, count):
         d = min(max(first[0], a), last[0])  # in this order, NaN ends up in the box
         e = min(max(first[1], b), last[1])
         f = min(max(first[2], c), last[2])
-        block[_BEYOND + n] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        beyond = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        block[_LEVEL + n] = level if beyond == 0.0 else -np.inf
         a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
         d = node_of(a, box.between, most[0])
         e = node_of(b, box.between, most[1])
@@ -122,85 +125,136 @@ def _locate(move, box, block, count):
         block[_CELL + n] = d * box.across + e * box.along + f
 
 
-@leaf
-def _holds(cells, block, n):
-    """Whether the n-th point lies in one of the cells."""
-    return cells.steps[np.uint64(np.int64(block[_CELL + n]))] == 0 and block[_BEYOND + n] == 0.0
+@inner
+def _weigh_corners(block, count):
+    """How much each corner of its cell counts at each point, as distance_between_nodes has it."""
+    for n in range(count):
+        u, v, w = block[_PLACE + n], block[_PLACE + _MOST + n], block[_PLACE + 2 * _MOST + n]
+        a, b, c = 1.0 - u, 1.0 - v, 1.0 - w
+        ab, av, ub, uv = a * b, a * v, u * b, u * v
+        block[_WEIGHT + n], block[_WEIGHT + _MOST + n] = ab * c, ab * w
+        block[_WEIGHT + 2 * _MOST + n], block[_WEIGHT + 3 * _MOST + n] = av * c, av * w
+        block[_WEIGHT + 4 * _MOST + n], block[_WEIGHT + 5 * _MOST + n] = ub * c, ub * w
+        block[_WEIGHT + 6 * _MOST + n], block[_WEIGHT + 7 * _MOST + n] = uv * c, uv * w
 
 
 @inner
-def _read_distances(model, block, count):
-    """Signed distance and gradient at each point; alpha, which costs nothing, elsewhere."""
-    field, cells, table = model.field, model.free.cells, model.field.table
-    for n in range(count):
-        s, nx, ny, nz = model.alpha, 0.0, 0.0, 0.0
-        if _holds(cells, block, n):
-            cell = np.uint64(np.int64(block[_CELL + n]))
-            if field.trilinear:
-                u, v = block[_PLACE + n], block[_PLACE + _MOST + n]
-                w = block[_PLACE + 2 * _MOST + n]
-                s, nx, ny, nz = distance_between_nodes(field.box, table, cell, u, v, w)
-            else:
-                s, nx, ny, nz = table[cell, 0], table[cell, 1], table[cell, 2], table[cell, 3]
-        _put(block, _READ, n, s, nx, ny, nz)
+def _violate_between_nodes(model, block, count):
+    """What each point costs where distances are interpolated, see _put_violation."""
+    table, box = model.field.table, model.field.box
+    across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
+    for n in range(np.uint64(count)):
+        cell = np.uint64(np.int64(block[np.uint64(_CELL) + n]))
+        next_cell = cell + across
+        read = _with_edge(table, cell, block, 0, n, (0.0, 0.0, 0.0, 0.0))
+        read = _with_edge(table, cell + along, block, 2, n, read)
+        read = _with_edge(table, next_cell, block, 4, n, read)
+        read = _with_edge(table, next_cell + along, block, 6, n, read)
+        _put_violation(model, block, n, cell, read)
+
+
+@leaf
+def _with_edge(table, node, block, corner, n, read):
+    """What was read so far, plus a node and the next on the third axis, with their weights."""
+    s, nx, ny, nz = read
+    weight = block[np.uint64(_WEIGHT + corner * _MOST) + n]
+    a, b, c, d = at_node(table, node)
+    s, nx, ny, nz = s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
+    weight = block[np.uint64(_WEIGHT + (corner + 1) * _MOST) + n]
+    a, b, c, d = at_node(table, node + np.uint64(1))
+    return s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
+
+
+@inner
+def _violate_at_nodes(model, block, count):
+    """What each point costs where the nearest node is read, see _put_violation."""
+    for n in range(np.uint64(count)):
+        cell = np.uint64(np.int64(block[np.uint64(_CELL) + n]))
+        _put_violation(model, block, n, cell, at_node(model.field.table, cell))
+
+
+@leaf
+def _put_violation(model, block, n, cell, read):
+    """lambda max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8); 0 elsewhere."""
+    scale, exact = model.free_scale, model.exact_gradient
+    s, nx, ny, nz = read
+    violation = max(block[np.uint64(_LEVEL) + n] - s, 0.0)
+    violation = violation if model.free.cells.steps[cell] == 0 else 0.0
+    size = -scale * slope(exact, violation)
+    _put(block, _SUMMAND, n, (size * s, size * nx, size * ny, size * nz))
+    block[np.uint64(_VALUE) + n] = scale * violation
 
 
 @inner
 def _read_weights(free, numbers, first, block, count):
-    """Weight, and it times the normal, of each point in a free voxel; else 0."""
-    weights = free.weights
+    """Weight, and it times the inward normal, of each point in a free voxel; else 0."""
+    steps = free.cells.steps
     for n in range(count):
-        w = nx = ny = nz = 0.0
-        if _holds(free.cells, block, n):
-            at = np.uint64(numbers[first + n])
-            w, nx, ny, nz = weights[at, 0], weights[at, 1], weights[at, 2], weights[at, 3]
-        _put(block, _READ, n, w, nx, ny, nz)
+        read = (0.0, 0.0, 0.0, 0.0)
+        if steps[np.uint64(np.int64(block[_CELL + n]))] == 0 and block[_LEVEL + n] > -np.inf:
+            read = _four(free.weights, 0, numbers[first + n])
+        _put(block, _SUMMAND, n, read)
 
 
 @inner
-def _violate(model, block, count):
-    """lambda sum max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8)."""
-    alpha, scale, exact = model.alpha, model.free_scale, model.exact_gradient
+def _subtract_points(pose, block, count):
+    """Replace points m by t - m."""
     for n in range(count):
-        at = _READ + 4 * n
-        violation = max(alpha - block[at], 0.0)
-        size = -scale * slope(exact, violation)
-        gx, gy, gz = size * block[at + 1], size * block[at + 2], size * block[at + 3]
-        _put(block, _SUMMAND, n, gx, gy, gz, scale * violation)
+        block[_POINT + n] = pose[9] - block[_POINT + n]
+        block[_POINT + _MOST + n] = pose[10] - block[_POINT + _MOST + n]
+        block[_POINT + 2 * _MOST + n] = pose[11] - block[_POINT + 2 * _MOST + n]
 
 
 @inner
-def _weigh(pose, block, count):
-    """A weight w at y = R^T (m - t), with gradient w R^T n by y: inwards, out of the free voxel."""
-    for n in range(count):
-        at = _READ + 4 * n
-        gx, gy, gz = block[at + 1], block[at + 2], block[at + 3]
-        a, b, c = turned_back(pose, gx, gy, gz)
-        x, y, z = block[_POINT + n], block[_POINT + _MOST + n], block[_POINT + 2 * _MOST + n]
-        _put(block, _LEFT, n, x - pose[9], y - pose[10], z - pose[11], 0.0)
-        _put(block, _RIGHT, n, a, b, c, 0.0)
-        _put(block, _SUMMAND, n, -gx, -gy, -gz, block[at])
-
-
-@inner
-def _add(block, left, count):
-    """Add the products and summands of each point, one after the other, to the sums."""
-    a, b, c, u = _four(block, _SUMS, 0)
-    d, e, f, v = _four(block, _SUMS, 1)
-    g, h, i, w = _four(block, _SUMS, 2)
-    x, y, z, cost = _four(block, _SUMS, 3)
+def _add_weights(pose, weights, begin, block, count):
+    """Add weights w at y = R^T (m - t), with gradient w R^T n by y: inwards, out of free voxels."""
+    _, a, b, c = _four(block, _SUMS, 0)
+    _, d, e, f = _four(block, _SUMS, 1)
+    _, g, h, i = _four(block, _SUMS, 2)
+    o, p, q, r = _four(block, _SUMS, 3)
+    s = t = u = 0.0  # of a fourth column, so that vectors have four lanes
     for n in range(np.uint64(count)):
-        p, q, r, _ = _four(block, left, n)
-        j, k, m, o = _four(block, _RIGHT, n)
-        a, b, c, u = a + p * j, b + p * k, c + p * m, u + p * o
-        d, e, f, v = d + q * j, e + q * k, f + q * m, v + q * o
-        g, h, i, w = g + r * j, h + r * k, i + r * m, w + r * o
-        p, q, r, value = _four(block, _SUMMAND, n)
-        x, y, z, cost = x + p, y + q, z + r, cost + value
-    _put(block, _SUMS, 0, a, b, c, u)
-    _put(block, _SUMS, 1, d, e, f, v)
-    _put(block, _SUMS, 2, g, h, i, w)
-    _put(block, _SUMS, 3, x, y, z, cost)
+        x, y = block[np.uint64(_POINT) + n], block[np.uint64(_POINT + _MOST) + n]
+        z = block[np.uint64(_POINT + 2 * _MOST) + n]
+        w, j, k, m = _four(weights, begin, n)
+        o, p, q, r = o + w, p + j, q + k, r + m
+        v, j, k, m = (
+            0.0 * j + 0.0 * k + 0.0 * m,
+            pose[0] * j + pose[3] * k + pose[6] * m,
+            pose[1] * j + pose[4] * k + pose[7] * m,
+            pose[2] * j + pose[5] * k + pose[8] * m,
+        )
+        s, a, b, c = s + x * v, a + x * j, b + x * k, c + x * m
+        t, d, e, f = t + y * v, d + y * j, e + y * k, f + y * m
+        u, g, h, i = u + z * v, g + z * j, h + z * k, i + z * m
+    _put(block, _SUMS, 0, (s, a, b, c))
+    _put(block, _SUMS, 1, (t, d, e, f))
+    _put(block, _SUMS, 2, (u, g, h, i))
+    _put(block, _SUMS, 3, (o, p, q, r))
+
+
+@inner
+def _add_violations(block, count):
+    """Add the violation of each point, one after the other, to the sums."""
+    a, b, c, d = _four(block, _SUMS, 0)
+    e, f, g, h = _four(block, _SUMS, 1)
+    i, j, k, m = _four(block, _SUMS, 2)
+    o, p, q, r = _four(block, _SUMS, 3)
+    cost = block[np.uint64(_SUMS + 16)]
+    for n in range(np.uint64(count)):
+        x, y = block[np.uint64(_POINT) + n], block[np.uint64(_POINT + _MOST) + n]
+        z = block[np.uint64(_POINT + 2 * _MOST) + n]
+        s, t, u, v = _four(block, _SUMMAND, n)
+        a, b, c, d = a + s * x, b + t * x, c + u * x, d + v * x
+        e, f, g, h = e + s * y, f + t * y, g + u * y, h + v * y
+        i, j, k, m = i + s * z, j + t * z, k + u * z, m + v * z
+        o, p, q, r = o + s, p + t, q + u, r + v
+        cost += block[np.uint64(_VALUE) + n]
+    _put(block, _SUMS, 0, (a, b, c, d))
+    _put(block, _SUMS, 1, (e, f, g, h))
+    _put(block, _SUMS, 2, (i, j, k, m))
+    _put(block, _SUMS, 3, (o, p, q, r))
+    block[np.uint64(_SUMS + 16)] = cost
 
 
 @leaf

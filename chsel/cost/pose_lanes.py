@@ -11,7 +11,7 @@ import numpy as np
 
 from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import inner, leaf
-from chsel.problem.sdf_lookup import distance_between_nodes
+from chsel.problem.sdf_lookup import at_node, distance_between_nodes
 
 LANES = 8
 POSE = 0  # the first of 12 rows
@@ -111,9 +111,7 @@ def _read(field, lanes, x, y, z):
             w = lanes[_PLACE + 2 * LANES + at]
             s, nx, ny, nz = distance_between_nodes(field.box, table, cell, u, v, w)
         else:
-            one = np.uint64(1)
-            s, nx = table[cell, np.uint64(0)], table[cell, one]
-            ny, nz = table[cell, np.uint64(2)], table[cell, np.uint64(3)]
+            s, nx, ny, nz = at_node(table, cell)
         lanes[_READ + at], lanes[_READ + LANES + at] = s, nx
         lanes[_READ + 2 * LANES + at], lanes[_READ + 3 * LANES + at] = ny, nz
         beyond = max(beyond, lanes[_BEYOND + at])

@@ -161,16 +161,12 @@ class _Algorithm1:
     def lowest_cost_cells(self, archive: GridArchive, index: int) -> Hypotheses:
         """Line 7."""
         problem, space, output = self.problem, self.space, self.settings.output
-        elites = space.poses(archive.solutions)
+        last = archive.snapshot(self.settings.emitter.iterations, index)
+        elites = space.poses(last.solutions)
         stream = problem.key.stream(Purpose.RESAMPLE, index)
-        chosen = select_elites(archive.costs, elites, problem, space, output, stream)
-        return ranked_hypotheses(
-            self.objective,
-            elites[chosen],
-            archive.occupied[chosen],
-            elites[self.within_workspace(elites)],
-            archive.snapshot(self.settings.emitter.iterations, index),
-        )
+        chosen = select_elites(-last.objectives, elites, problem, space, output, stream)
+        kept = elites[self.within_workspace(elites)]
+        return ranked_hypotheses(self.objective, elites[chosen], last.cells[chosen], kept, last)
 
     def within_workspace(self, poses: Poses) -> BoolArray:
         """True (B,) for the poses to keep."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.descent import Course, blocks_done, course_from, groups_for
+from chsel.cost.descent import Course, blocks_done, course_from
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most
 from chsel.methods.method import ConfiguredMethod
@@ -98,14 +98,22 @@ def _course(
     return course_from(
         vectors,
         costs,
-        blocks=1 if is_planar else settings.blocks_alike(block, starts),
-        groups=groups_for(len(vectors), team_size()),
+        1 if is_planar else settings.blocks_alike(block, starts),
+        threads=team_size(),
         iterations=settings.iterations,
         rate=settings.rate,
         divisor=starts,
         ends_on_poses=not is_planar,
         stop_below=settings.stop_below,
     )
+
+
+def _costs(vectors: FloatArray, run: Callable[[Course], None]) -> FloatArray:
+    """Costs (S,) of vectors (S, d), by those who descend."""
+    count, threads = len(vectors), team_size()
+    course = course_from(vectors, np.zeros(count), 1, threads=threads, ends_on_poses=True)
+    run(course)
+    return course.costs[1]
 
 
 def _blocks(
@@ -131,10 +139,10 @@ def descend(
     """
     space, total = objective.space, settings.restarts * settings.iterations
     vectors = space.encode(starts)
-    costs = objective.costs(vectors)
-    observer.trace("descent", 0, vectors.copy(), costs.copy())
     running, block, gain = np.arange(len(starts)), 0, np.inf
     with objective.descents(len(starts)) as run:
+        costs = _costs(vectors, run)
+        _show(observer, 0, vectors, costs)
         while block < settings.restarts and not settings.ends_after(gain):
             lowest = np.argsort(costs[running], kind="stable")
             running = np.sort(running[lowest[: settings.runners(block, len(starts))]])
@@ -142,15 +150,21 @@ def descend(
                 objective, vectors[running], costs[running], settings, block, len(starts)
             )
             for after in _blocks(objective, course, run):
-                gain = _mean_gain(costs[running], after[1])
+                if settings.stop_below is not None:
+                    gain = _mean_gain(costs[running], after[1])
                 vectors[running], costs[running] = after
                 block += 1
                 done = block * settings.iterations
-                observer.trace("descent", done, vectors.copy(), costs.copy())
+                _show(observer, done, vectors, costs)
                 observer.progress("descent", done, total)
                 if settings.ends_after(gain):
                     break
     return space.poses(vectors), costs
+
+
+def _show(observer: Observer, iteration: int, vectors: FloatArray, costs: FloatArray) -> None:
+    if type(observer) is not NullObserver:
+        observer.trace("descent", iteration, vectors.copy(), costs.copy())
 
 
 def _mean_gain(before: FloatArray, after: FloatArray) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from chsel.errors import require_choice
@@ -60,8 +61,15 @@ def preset_settings(name: str, preset: str = "default") -> Any:
     """The settings of a method by name in a preset, one of PRESETS."""
     make, default = _CHOICES.entry(name)
     require_choice("preset", preset, PRESETS)
-    own = getattr(make, "preset", None)  # of an installed method
+    if name in _OURS:
+        return _ours_in_preset(name, preset)
+    own = getattr(make, "preset", None)
     return own(preset) if own else in_preset(default, preset)
+
+
+@cache
+def _ours_in_preset(name: str, preset: str) -> Any:
+    return in_preset(_OURS[name][1], preset)
 
 
 def build_method(name: str, settings: Any = None) -> Method:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import sys
 from typing import Any
 
@@ -14,6 +15,7 @@ from chsel.errors import ChselError, PointsError
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+_LINE = 128  # bytes that processors hold together, at most
 
 
 def frozen(
@@ -54,6 +56,18 @@ def read_only(points: FloatArray) -> FloatArray:
     array = np.ascontiguousarray(points, dtype=np.float64).view()
     array.setflags(write=False)
     return array
+
+
+def scratch(*shape: int, dtype: Any = np.float64) -> NDArray[Any]:
+    """Zeros of a shape that one thread writes again and again.
+
+    They share no cache line with other data, which would slow down other threads, and begin with
+    one, as vector instructions are faster then.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = np.zeros(size + 2 * _LINE, dtype=np.uint8)
+    first = -memory.__array_interface__["data"][0] % _LINE
+    return memory[first : first + size].view(dtype).reshape(shape)
 
 
 def digest(*arrays: NDArray[Any]) -> str:

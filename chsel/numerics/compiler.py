@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ import numba
 from numba.core import event, types
 from numba.extending import overload
 
+from chsel.numerics.code_to_link import CompilerToLink
 from chsel.numerics.kernel_cache import KernelCache, cache_directory, has_kernels
 from chsel.numerics.kernel_sources import loaded
 
@@ -32,12 +34,12 @@ def compiled(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """`function` for other kernels to call, not for Python.
+    """`function` for other kernels to call, not for Python, and machine code only as part of these.
 
     It cannot make arrays, so that no references are counted when arrays are passed.
     """
     loaded(function)
-    kernel: Function = _njit(**_INNER)(function)
+    kernel: Function = _njit(**_INNER, pipeline_class=CompilerToLink)(function)
     return kernel
 
 
@@ -46,7 +48,7 @@ def kept(function: Function) -> Function:
 
     For functions that take seconds to compile.
     """
-    kernel: Any = inner(function)
+    kernel: Any = _njit(**_INNER)(function)
     kernel._cache = KernelCache(function)
     template = kernel.get_call_template  # for numbers that are written in the call, too
 
@@ -60,7 +62,7 @@ def kept(function: Function) -> Function:
 def leaf(function: Function) -> Function:
     """Like `inner`, and always inlined into its caller."""
     loaded(function)
-    kernel: Function = _njit(**_INNER, forceinline=True)(function)
+    kernel: Function = _njit(**_INNER, forceinline=True, pipeline_class=CompilerToLink)(function)
     return kernel
 
 
@@ -91,7 +93,7 @@ def implements(name: Callable[..., Any], model: type) -> Callable[[Function], Fu
         def chosen(first: Any, *others: Any) -> Function | None:
             return function if getattr(first, "instance_class", None) is model else None
 
-        options: Any = {**_INNER, "forceinline": True}
+        options: Any = {**_INNER, "forceinline": True, "pipeline_class": CompilerToLink}
         overload(name, jit_options=options, strict=False)(chosen)
         return function
 
@@ -124,7 +126,8 @@ class _CompilerWatch(event.Listener):
     """Reports that kernels are being compiled, and vectorises their straight-line code.
 
     Numba has the latter as a switch of the process, which is off otherwise. It makes interpolation
-    of the SDF twice as fast and changes no bit, as it reorders nothing.
+    of the SDF twice as fast and changes no bit, as it reorders nothing. Garbage is collected after
+    a kernel rather than all the time within it.
     """
 
     def __init__(self) -> None:
@@ -133,6 +136,7 @@ class _CompilerWatch(event.Listener):
         self._noticed = False
         self._depth = 0
         self._usual = _config.SLP_VECTORIZE
+        self._collects = True
 
     def on_start(self, event: Any) -> None:
         """The compilation of a function, or of one that it calls, begins."""
@@ -140,6 +144,8 @@ class _CompilerWatch(event.Listener):
             return
         if self._depth == 0:
             self._usual, _config.SLP_VECTORIZE = _config.SLP_VECTORIZE, 1
+            self._collects = gc.isenabled()
+            gc.disable()
             self._report()
         self._depth += 1
 
@@ -154,6 +160,8 @@ class _CompilerWatch(event.Listener):
         self._depth -= 1
         if self._depth == 0:
             _config.SLP_VECTORIZE = self._usual
+            if self._collects:
+                gc.enable()
             self.count += 1
             if self.show is not None:
                 self.show(self.count)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.numerics.arrays import IntArray
+from chsel.numerics.arrays import IntArray, scratch
 from chsel.numerics.compiler import inner, leaf
 from chsel.numerics.rough_tree import LANES, RoughTree
 
@@ -52,13 +52,11 @@ def near_points_for(tree: RoughTree, lists: int) -> NearPoints:
     room = lists * own + packets + LANES  # vectors reach beyond the last list
     x, y, z, radius = (np.empty(room, dtype=np.float32) for _ in range(4))
     kept = np.empty(room, dtype=np.int32)
-    begin, number = (np.zeros(lists, dtype=np.int64) for _ in range(2))
+    begin, number = (scratch(lists, dtype=np.int64) for _ in range(2))
     most = LANES * (max(packets, len(tree.first), len(tree.starts)) + 1)
     rows = np.empty((4, most), dtype=np.float32)
     nodes, cells, limits, hits = (np.empty(most, dtype=np.int32) for _ in range(4))
-    return NearPoints(
-        x, y, z, radius, kept, own, begin, number, rows, nodes, cells, limits, hits
-    )  # fmt: skip
+    return NearPoints(x, y, z, radius, kept, own, begin, number, rows, nodes, cells, limits, hits)
 
 
 @leaf
@@ -249,12 +247,8 @@ def _locate_spheres(xs, ys, zs, radii, begin, count, move, box, slack, near):
 @leaf
 def _last_centres(box):
     """The centre of the last cell, in cells."""
-    most = box.most
-    return (
-        np.float32(most[0] + 0.5),
-        np.float32(most[1] + 0.5),
-        np.float32(most[2] + 0.5),
-    )
+    p, q, r = box.most
+    return np.float32(p + 0.5), np.float32(q + 0.5), np.float32(r + 0.5)
 
 
 @inner
@@ -299,11 +293,8 @@ def _locate_points(x, y, z, packets, move, cells, rounding, where):
         c = move[6] * x[n] + move[7] * y[n] + move[8] * z[n] + move[11]
         a, b, c = min(max(_HALF, a), p), min(max(_HALF, b), q), min(max(_HALF, c), r)
         i, j, k = np.int32(a), np.int32(b), np.int32(c)
-        d, e, f = (
-            abs(a - np.float32(i) - _HALF),
-            abs(b - np.float32(j) - _HALF),
-            abs(c - np.float32(k) - _HALF),
-        )
+        d, e = abs(a - np.float32(i) - _HALF), abs(b - np.float32(j) - _HALF)
+        f = abs(c - np.float32(k) - _HALF)
         cell = np.int32(np.int32(np.int32(i * across) + np.int32(j * along)) + k)
         cell = unsure if max(d, max(e, f)) > edge else cell
         where[n] = cell if x[n] == x[n] else nothing

@@ -176,7 +176,8 @@ def _build(points, index_bits, finest, margin, tree):
             if key != last:
                 last, node = key, node + 1
                 starts[node], inner[node] = child, key
-                low[node], high[node] = low[child], high[child]
+                for axis in range(3):
+                    low[node, axis], high[node, axis] = low[child, axis], high[child, axis]
             for axis in range(3):
                 low[node, axis] = min(low[node, axis], low[child, axis])
                 high[node, axis] = max(high[node, axis], high[child, axis])

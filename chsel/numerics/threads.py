@@ -58,14 +58,16 @@ def spread(
     """Call run(first, last, scratch) on pieces of range(count), on `thread_count()` threads.
 
     scratch: makes the scratch of one thread. The pieces must not depend on each other. least: the
-    smallest number that is worth another thread. multiple: of which the size of pieces is one.
+    smallest number that is worth another thread, or a piece. multiple: of which the size of pieces
+    is one.
     """
     most = min(thread_count(), count // least)
     if most <= 1 or hasattr(_thread, "is_worker"):  # it must not wait for workers
         if count:
             run(0, count, scratch())
         return
-    size = -(-count // (most * _PIECES_PER_THREAD * multiple)) * multiple
+    size = max(least, -(-count // (most * _PIECES_PER_THREAD)))
+    size = -(-size // multiple) * multiple
     pieces = iter(range(0, count, size))
 
     def work() -> None:
@@ -78,6 +80,7 @@ def spread(
     try:
         work()
     finally:
+        others = [other for other in others if not other.cancel()]  # one that is late is not needed
         wait(others)
     for other in others:
         other.result()

@@ -75,7 +75,7 @@ class Poses:
     @property
     def origins(self) -> FloatArray:
         """Where the object's origin is in the world (B, 3), metres: -R^T t."""
-        return self.world_from_object[:, :3, 3]
+        return -rotated(np.swapaxes(self.rotations, 1, 2), self.translations)
 
     @cached_property
     def vectors(self) -> FloatArray:

@@ -17,7 +17,7 @@ class DistanceField(NamedTuple):
     """Signed distances and gradients at the nodes of a grid."""
 
     box: Box
-    table: FloatArray  # (nodes, 4): value and gradient of each node
+    table: FloatArray  # (4 nodes,): value and gradient of each node, one after the other
     trilinear: bool  # interpolate, else read the nearest node
     box_distance: bool  # how distances continue outside of the grid, see SdfGrid.at
 
@@ -26,7 +26,7 @@ def distance_field(sdf: SdfGrid, lookup: str, outside: str) -> DistanceField:
     """The signed distance field that kernels read; lookup, outside: see SdfGrid.at."""
     trilinear = lookup == "trilinear"
     box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=trilinear)
-    return DistanceField(box, sdf.table, trilinear, outside == "bounding_box")
+    return DistanceField(box, sdf.table.reshape(-1), trilinear, outside == "bounding_box")
 
 
 def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
@@ -46,7 +46,15 @@ def distance_in_box(field, places, n):
     if field.trilinear:
         u, v, w = places.u[n], places.v[n], places.w[n]
         return distance_between_nodes(field.box, table, at, u, v, w)
-    return table[at, 0], table[at, 1], table[at, 2], table[at, 3]
+    return at_node(table, at)
+
+
+@leaf
+def at_node(table, node):
+    """Signed distance and gradient of a node."""
+    at = np.uint64(4) * np.uint64(node)
+    s, nx = table[at], table[at + np.uint64(1)]
+    return s, nx, table[at + np.uint64(2)], table[at + np.uint64(3)]
 
 
 @leaf
@@ -59,10 +67,11 @@ def distance_between_nodes(box, table, base, u, v, w):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
         weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if c else 1.0 - w)
         at = lowest + np.uint64(a) * across + np.uint64(b) * along + np.uint64(c)
-        s += weight * table[at, 0]
-        nx += weight * table[at, 1]
-        ny += weight * table[at, 2]
-        nz += weight * table[at, 3]
+        d, e, f, g = at_node(table, at)
+        s += weight * d
+        nx += weight * e
+        ny += weight * f
+        nz += weight * g
     return s, nx, ny, nz
 
 
@@ -126,10 +135,11 @@ def distance_with_gradient(field, pose, x, y, z):
 def value_between_nodes(table, at, across, along, u, v, w):
     """Signed distance in the cell whose lowest node is `at`, at fractions u, v, w of its sides."""
     low, high = 1.0 - w, w
-    at, one, along = np.uint64(at), np.uint64(1), np.uint64(along)
-    a = low * table[at, 0] + high * table[at + one, 0]
-    b = low * table[at + along, 0] + high * table[at + along + one, 0]
-    at += np.uint64(across)
-    c = low * table[at, 0] + high * table[at + one, 0]
-    d = low * table[at + along, 0] + high * table[at + along + one, 0]
+    next_node = np.uint64(4)
+    at, along = next_node * np.uint64(at), next_node * np.uint64(along)
+    a = low * table[at] + high * table[at + next_node]
+    b = low * table[at + along] + high * table[at + along + next_node]
+    at += next_node * np.uint64(across)
+    c = low * table[at] + high * table[at + next_node]
+    d = low * table[at + along] + high * table[at + along + next_node]
     return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * d)

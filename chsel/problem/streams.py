@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from chsel.errors import SettingError, quoted
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.elementary import logs, sines_cosines
+from chsel.numerics.philox import Stream
 
 LAST_STEP = 2**32 - 1  # of a session; random streams distinguish no more steps
 
@@ -59,8 +60,15 @@ class StreamKey:
 
     def stream(self, purpose: Purpose, index: int = 0) -> np.random.Generator:
         """The Philox stream of one purpose; `index` distinguishes repetitions within a step."""
-        word = (self.step << 32) | (int(purpose) << 20) | index
-        return np.random.Generator(np.random.Philox(key=(word << 64) | self.seed))
+        key = (self._word(purpose, index) << 64) | self.seed
+        return np.random.Generator(np.random.Philox(key=key))
+
+    def kernel_stream(self, purpose: Purpose, index: int = 0) -> Stream:
+        """The same stream for kernels, which draw from it by `fill_uniforms`."""
+        return Stream(np.uint64(self.seed), np.uint64(self._word(purpose, index)))
+
+    def _word(self, purpose: Purpose, index: int) -> int:
+        return (self.step << 32) | (int(purpose) << 20) | index
 
 
 def uniforms(

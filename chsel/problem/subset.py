@@ -58,8 +58,11 @@ def surface_descriptors(sdf: SdfGrid, poses: Poses) -> FloatArray:
     The places lie on the surface in some of the poses, so descriptors differ as much as posed
     surfaces do: not at all between poses that a symmetry of the object maps to each other.
     """
-    stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
-    surface = sdf.derived("descriptors", lambda: surface_points(sdf, _PLACES, stream))
+
+    def make() -> FloatArray:
+        return surface_points(sdf, _PLACES, StreamKey(0, 0).stream(Purpose.MESH_SAMPLES))
+
+    surface = sdf.derived("descriptors", make)
     some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
     places = rotated(np.swapaxes(some.rotations, 1, 2), surface - some.translations)
     field = distance_field(sdf, "trilinear", "surface_point")

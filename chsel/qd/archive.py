@@ -256,7 +256,7 @@ class GridArchive:
     @property
     def occupied(self) -> IntArray:
         """Indices (C,) of the cells that hold a solution, ascending."""
-        return np.flatnonzero(~np.isneginf(self.cells.objectives))
+        return np.flatnonzero(self.cells.objectives != -np.inf)
 
     @property
     def solutions(self) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from chsel.cost.descent import EPSILON
 from chsel.cost.objective import Objective
 from chsel.cost.pose_lanes import LANES
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.team import close, new_team, piece_size
 from chsel.numerics.threads import helped
 from chsel.problem.registration_problem import NullObserver, Observer
@@ -152,11 +152,11 @@ def _iterate(
     size = piece_size(batch, LANES)
 
     def thread(leads: bool) -> tuple[Landscape, BatchShare]:
-        scratch = np.zeros(size), np.zeros((size, measure.count))
+        own = scratch(size), scratch(size, measure.count)
         landscape = Landscape(
             objective.model, objective.space_arrays, measure.code, objective.work()
         )
-        return landscape, BatchShare(team, leads, *scratch)
+        return landscape, BatchShare(team, leads, *own)
 
     def assist(thread: tuple[Landscape, BatchShare]) -> None:
         landscape, share = thread
@@ -165,11 +165,11 @@ def _iterate(
     landscape, share = thread(leads=True)
     normals, elites = draws.blocks(iterations, batch, dimension), draws.elites(iterations)
     drawn = draws.block(batch, dimension)
-    block = SearchDraws(next(normals, np.zeros((0, batch, dimension))), elites[:drawn])
+    block = SearchDraws(np.zeros((0, batch, dimension)), elites[:0])  # helpers need no more
     watch.start(archive)
     with helped(assist, lambda: thread(leads=False), -(-batch // size) - 1, partial(close, team)):
         for first, last in watch.segments(iterations, drawn):
-            if first > 0 and first % drawn == 0:
+            if first % drawn == 0:
                 block = SearchDraws(next(normals), elites[first : first + drawn])
             before = first - first % drawn
             kernel(landscape, archive.cells, search, block, first - before, last - before, share)

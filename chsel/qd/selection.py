@@ -139,7 +139,7 @@ def select_elites(
     """Indices of as many of C elites with costs (C,) as E_0 has, or fewer if so set, best first."""
     count, known_count = len(problem.initial_set), len(problem.points.known)
     order = np.argsort(costs, kind="stable")
-    order = order[within_workspace(elites[order], problem, space, settings.margin)]
+    order = order[within_workspace(elites, problem, space, settings.margin)[order]]
     good = order[costs[order] <= _limit(costs[order], settings, known_count)]
     if settings.choice == "representative" and len(good) > count and has_surface(problem.sdf):
         poses = elites[good]
@@ -193,10 +193,9 @@ def _limit(costs: FloatArray, settings: OutputSettings, known_count: int) -> flo
 
 def repeated(poses: Poses) -> BoolArray:
     """True (B,) for each pose that equals an earlier one."""
-    _, first = np.unique(poses.numbers, axis=0, return_index=True)
-    flags = np.ones(len(poses), dtype=bool)
-    flags[first] = False
-    return flags
+    first: dict[tuple[float, ...], int] = {}
+    rows = enumerate(map(tuple, poses.numbers.tolist()))
+    return np.array([first.setdefault(row, n) < n for n, row in rows], dtype=bool)
 
 
 def ranked_hypotheses(

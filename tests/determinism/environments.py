@@ -88,7 +88,7 @@ def _plain_libraries() -> dict[str, str]:
 
 
 _FMA = _x86() and _host_has("avx2", "fma")
-_HASWELL_BLAS = {"OPENBLAS_CORETYPE": "Haswell"} if _FMA and _openblas() else {}
+_HASWELL_BLAS = {"OPENBLAS_CORETYPE": "Haswell"} if _openblas() else {}
 _GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 _HASWELL = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": HASWELL}
 
@@ -103,12 +103,10 @@ def packaged(target: str, kept: Path) -> Environment:
 # processes: a difference shows for any of them.
 ENVIRONMENTS = {
     "default": Environment(),
-    "generic CPU": Environment(_GENERIC),
-    "Haswell with FMA": Environment(
-        _HASWELL, impossible=None if _FMA else "this CPU lacks AVX2 or FMA"
+    "generic CPU, libraries without SIMD": Environment(_GENERIC | _plain_libraries()),
+    "Haswell with FMA, two threads": Environment(
+        _HASWELL | _HASWELL_BLAS if _FMA else {}, ("--threads", "2")
     ),
-    "libraries without SIMD": Environment(_plain_libraries()),
-    "two threads, OpenBLAS for Haswell": Environment(_HASWELL_BLAS, ("--threads", "2")),
     "logged and scribbled over": Environment(arguments=("--watch", "scribbler")),
     "after other problems, nobody watching": Environment(
         arguments=("--again", "--watch", "nobody")

@@ -9,8 +9,8 @@ import numpy as np
 
 from chsel.errors import SettingError
 from chsel.methods.anchored.coarse_score import coarse_of, in_32_bits
-from chsel.methods.anchored.placing_kernels import DRAWS, Anchors
-from chsel.methods.anchored.sampling_kernels import Best, best_for, sample
+from chsel.methods.anchored.placing_kernels import Anchors
+from chsel.methods.anchored.sampling_kernels import Best, best_for, grades, sample
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.threads import spread
 from chsel.problem.points import KnownPoints
@@ -28,7 +28,6 @@ MOST_ANCHORS = 48  # contacts that the surface is put onto
 MOST_SAMPLES = 100_000_000
 MOST_KEPT = 100_000
 _MOST_ORDERED = 64  # known points that are put in order
-_BLOCK = 65_536  # poses that are drawn at a time
 _SAMPLES_PER_THREAD = 5_000
 _LENGTHS_ALIKE = 0.004  # metres
 _ROUNDING = 2e-6  # of coordinates in 32 bits, generously
@@ -81,19 +80,19 @@ class AnchorSampler:
         coarse = coarse_of(
             self._problem, self._known, self._middle, self._settings.margin, tolerance
         )
-        anchors, stream = self._placed(samples), self._problem.key.stream(Purpose.ANCHORS, index)
+        anchors = self._placed(samples)
+        stream = self._problem.key.kernel_stream(Purpose.ANCHORS, index)
         bests: list[Best] = []
+        shared = grades()
 
         def scratch() -> Best:
-            bests.append(best_for(min(most, samples)))
+            bests.append(best_for(min(most, samples), shared))
             return bests[-1]
 
         def run(first: int, last: int, best: Best) -> None:
-            sample(coarse, anchors, draws, before, first, last, best)
+            sample(coarse, anchors, stream, samples, first, last, best)
 
-        for before in range(0, samples, _BLOCK):
-            draws = stream.random((DRAWS, min(_BLOCK, samples - before)), dtype=np.float32)
-            spread(run, draws.shape[1], scratch, least=_SAMPLES_PER_THREAD)
+        spread(run, samples, scratch, least=_SAMPLES_PER_THREAD)
         keys = np.concatenate([best.keys[: best.size[0]] for best in bests])
         poses = np.concatenate([best.poses[best.slots[: best.size[0]]] for best in bests])
         return self._exact(poses[np.argsort(keys)[:most]].astype(np.float64))

@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from chsel.cost.cost_settings import uncertain_depth
 from chsel.methods.anchored.anchor_sampling import (
     AnchorSampler,
     most_informative_first,
 )
 from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
-from chsel.methods.anchored.energy import Energy, NoiseLevel
+from chsel.methods.anchored.energy import Energy, NoiseLevel, tolerances_of
 from chsel.methods.anchored.fit_kernels import Loss
 from chsel.methods.anchored.modes import has_new_mode
 from chsel.methods.anchored.rated_poses import RatedPoses
@@ -80,19 +79,6 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         return search.holds(best, Poses.of(object_from_world))
 
 
-def _tolerances(problem: RegistrationProblem, fixed: float | None) -> tuple[float, ...]:
-    """The depths (metres) that free points may have at no cost, the first unless nothing fits.
-
-    Voxels may be off by half of one, or by a whole one.
-    """
-    if fixed is not None:
-        return (fixed,)
-    if len(problem.points.free) == 0:
-        return (0.0,)
-    sdf, voxel = problem.sdf, problem.free_resolution
-    return tuple(dict.fromkeys(uncertain_depth(sdf, depth) for depth in (0.0, 0.5 * voxel, voxel)))
-
-
 class Search:
     """The stages of one registration."""
 
@@ -103,7 +89,7 @@ class Search:
         self._effort = settings.effort or EFFORTS[settings.size]
         self._space = search_space(settings.plane, problem.sdf)
         self._known = most_informative_first(problem.points)
-        self._tolerances = _tolerances(problem, settings.penetration_tolerance)
+        self._tolerances = tolerances_of(problem, settings.penetration_tolerance)
         bounds = origin_bounds(problem.workspace, self._space, settings.anchors.margin)
         self.energy = Energy(problem, self._known, self._space, bounds, self._wide(0))
 
@@ -295,11 +281,11 @@ class Search:
         archive = sized_archive(measure, mean, deviation, settings, space.dimension)
         archive.update_cells(offered)
         self._observer.snapshot(archive.snapshot(0, 0))
-        elites = space.poses(archive.solutions)
+        last = archive.snapshot(0, 0)  # one of our own: an observer may change what it gets
+        elites = space.poses(last.solutions)
         cells = archive.cells_of(offered.measures[chosen])
         hypotheses = space.poses(vectors[chosen])
         energies = self.energy.of(hypotheses)
-        last = archive.snapshot(0, 0)
         found = ranked(hypotheses.matrices, energies, cells, elites.matrices, last)
         return replace(found, candidates=poses.matrices)
 

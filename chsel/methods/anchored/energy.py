@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from copy import copy
+from threading import get_ident
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_settings import CostSettings
+from chsel.cost.cost_settings import CostSettings, uncertain_depth
 from chsel.methods.anchored.fine_cells import fine_cells_below
-from chsel.methods.anchored.fit_kernels import Loss, Twists, fit_for, fit_poses
+from chsel.methods.anchored.fit_kernels import Fit, Loss, Twists, fit_for, fit_poses
 from chsel.methods.anchored.walk_kernels import (
-    DRAWS,
     Chains,
+    MoveDraws,
     Stride,
     Walk,
     chains_from,
@@ -37,7 +38,6 @@ _FIT_LEVEL = -0.003  # metres: free points at less depth do not push
 _LEVER = 0.15  # metres that a radian counts for
 _FOREIGN = 8.0  # noise levels beyond which a known point costs no more
 _WRONG = 20.0  # noise levels off that a known point costs as much as a free one can
-_BLOCK = 512  # chains whose moves are drawn at a time
 
 
 class NoiseLevel(NamedTuple):
@@ -46,6 +46,19 @@ class NoiseLevel(NamedTuple):
     sigma: float  # standard deviation of known points, metres
     tolerance: float  # depth that free points may have at no cost, metres
     least_cap: float  # distance beyond which known points cost no more, at least, metres
+
+
+def tolerances_of(problem: RegistrationProblem, fixed: float | None) -> tuple[float, ...]:
+    """The depths (metres) that free points may have at no cost, the first unless nothing fits.
+
+    Voxels may be off by half of one, or by a whole one.
+    """
+    if fixed is not None:
+        return (fixed,)
+    if len(problem.points.free) == 0:
+        return (0.0,)
+    sdf, voxel = problem.sdf, problem.free_resolution
+    return tuple(dict.fromkeys(uncertain_depth(sdf, depth) for depth in (0.0, 0.5 * voxel, voxel)))
 
 
 class Energy:
@@ -95,6 +108,8 @@ class Energy:
 
     def _set(self, level: NoiseLevel) -> None:
         self.level = level
+        self._walks: dict[int, Walk] = {}
+        self._fits: dict[int, Fit] = {}
         self._model = self._cost.at_level(self._sdf, -level.tolerance)
         self._fitting = self._cost.at_level(self._sdf, _FIT_LEVEL - level.tolerance)
         self._fine = fine_cells_below(self._sdf, self._model.alpha)
@@ -109,8 +124,20 @@ class Energy:
         return energy
 
     def walk(self) -> Walk:
-        """Scratch of one thread for kernels of energies and walks."""
-        return walk_for(self._model, self._sdf.values.reshape(-1), self._fine)
+        """Scratch of this thread for kernels of energies and walks."""
+        thread = get_ident()
+        if thread not in self._walks:
+            table = self._sdf.values.reshape(-1)
+            self._walks[thread] = walk_for(self._model, table, self._fine)
+        return self._walks[thread]
+
+    def _fit(self) -> Fit:
+        """Scratch of this thread for fits."""
+        thread = get_ident()
+        if thread not in self._fits:
+            dimension = len(self._twists.basis)
+            self._fits[thread] = fit_for(self._fitting, self._fine_of_fits, dimension)
+        return self._fits[thread]
 
     def noise(self, pose: Poses, sensor_noise: float) -> Noise:
         """What known points are off at a pose."""
@@ -138,10 +165,7 @@ class Energy:
         def run(first: int, last: int, fit: Any) -> None:
             fit_poses(self._fitting, loss, self._twists, moved, steps, first, last, fit)
 
-        dimension = len(self._twists.basis)
-        spread(
-            run, len(moved), lambda: fit_for(self._fitting, self._fine_of_fits, dimension), least=8
-        )
+        spread(run, len(moved), self._fit, least=8)
         return Poses(moved)
 
     def walked(
@@ -162,13 +186,12 @@ class Energy:
         chains = chains_from(poses.numbers, energies, kept)
         if kept == 0 and (energies <= floor).all():
             return chains
-        stream = self._key.stream(Purpose.WALKS, index)
+        draws = MoveDraws(self._key.kernel_stream(Purpose.WALKS, index), moves)
 
         def run(first: int, last: int, walk: Any) -> None:
-            walk_below(self._model, self.loss, self._stride, floor, block, draws, first, last, walk)
+            walk_below(
+                self._model, self.loss, self._stride, floor, chains, draws, first, last, walk
+            )
 
-        for before in range(0, len(poses), _BLOCK):
-            block = Chains._make(part[before : before + _BLOCK] for part in chains)
-            draws = stream.random((len(block.poses), moves, DRAWS), dtype=np.float32)
-            spread(run, len(draws), self.walk, least=2)
+        spread(run, len(poses), self.walk, least=2)
         return chains

@@ -22,7 +22,7 @@ from chsel.methods.anchored.surrounding_kernels import (
     surrounding_for,
     travel_since_gathering,
 )
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
 from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
@@ -65,8 +65,8 @@ class Fit(NamedTuple):
 
 def fit_for(model: Model, fine: FineCells, d: int) -> Fit:
     """Scratch for one thread, for twists of d dimensions. fine: see surrounding_for."""
-    normal, right, factor = np.empty((2, d, d)), np.empty((2, d)), np.empty((d, d))
-    sums, row, twist = np.empty((8, 6)), np.empty(d), np.empty(6)
+    normal, right, factor = scratch(2, d, d), scratch(2, d), scratch(d, d)
+    sums, row, twist = scratch(8, 6), scratch(d), scratch(6)
     return Fit(surrounding_for(model, fine), sums, normal, right, factor, row, twist)
 
 

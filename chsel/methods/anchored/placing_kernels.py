@@ -14,6 +14,7 @@ from chsel.numerics.compiler import inner, leaf
 
 DRAWS = 6  # random numbers that a pose takes
 LANES = 256  # poses of a block
+DRAWN = LANES + 16  # room for the numbers that they draw for one purpose
 # Rows of a block: rotations, translations, two points, and a frame with a third point.
 ROTATION, SHIFT, _FROM, _ONTO, _FRAME = 0, 9 * LANES, 12 * LANES, 15 * LANES, 18 * LANES
 PLACED = 12 * LANES  # from here on, rows are free once poses are placed
@@ -50,20 +51,20 @@ class Anchors(NamedTuple):
 
 
 @inner
-def place(anchors, draws, start, count, number, lanes):
-    """Fill the rotations and translations of a block from columns of draws (DRAWS, n).
+def place(anchors, draws, count, number, lanes):
+    """Fill the rotations and translations of a block from draws, DRAWS rows of DRAWN numbers.
 
     number: of its first pose among all, which are of one kind up to the last of the block.
     """
     pairs, anchored = anchors.kinds
     if number < pairs:
-        _place_on_pairs(anchors, draws, start, count, lanes)
+        _place_on_pairs(anchors, draws, count, lanes)
     else:
-        _turn(anchors, draws, start, count, lanes)
+        _turn(anchors, draws, count, lanes)
         if number < anchored:
-            _place_on_contacts(anchors, draws, start, count, lanes)
+            _place_on_contacts(anchors, draws, count, lanes)
         else:
-            _place_anywhere(anchors, draws, start, count, lanes)
+            _place_anywhere(anchors, draws, count, lanes)
         if anchors.planar:
             _put_on_plane(anchors.plane, lanes, count)
 
@@ -92,21 +93,21 @@ def _sine_cosine(share):
 
 
 @inner
-def _turn(anchors, draws, start, count, lanes):
+def _turn(anchors, draws, count, lanes):
     """Rotations, uniform on SO(3) (Shoemake, 1992), or about the plane's axis."""
     if anchors.planar:
         p = anchors.plane
         for i in range(count):
-            sine, cosine = _sine_cosine(draws[3, start + i])
+            sine, cosine = _sine_cosine(draws[3 * DRAWN + i])
             back = ONE - cosine
             for j in range(9):
                 turned = p[4 + j] + sine * p[13 + j] + back * p[22 + j]
                 lanes[j * LANES + i] = turned
         return
     for i in range(count):
-        s, c = _sine_cosine(draws[3, start + i])
-        sine, cosine = _sine_cosine(draws[4, start + i])
-        share = draws[5, start + i]
+        s, c = _sine_cosine(draws[3 * DRAWN + i])
+        sine, cosine = _sine_cosine(draws[4 * DRAWN + i])
+        share = draws[5 * DRAWN + i]
         small, large = np.sqrt(ONE - share), np.sqrt(share)
         w, x, y, z = small * s, small * c, large * sine, large * cosine
         lanes[i] = ONE - _TWO * (y * y + z * z)
@@ -121,13 +122,13 @@ def _turn(anchors, draws, start, count, lanes):
 
 
 @inner
-def _place_on_contacts(anchors, draws, start, count, lanes):
+def _place_on_contacts(anchors, draws, count, lanes):
     """Translations that put a surface point, or one at the known distance, onto a contact."""
     singles, surface, normals = anchors.singles, anchors.surface, anchors.normals
     for i in range(count):
-        single = _index(draws[0, start + i], len(singles))
+        single = _index(draws[i], len(singles))
         first, size = anchors.single_spans[single, 0], anchors.single_spans[single, 1]
-        q = anchors.by_height[first + _index(draws[1, start + i], size)]
+        q = anchors.by_height[first + _index(draws[DRAWN + i], size)]
         for j in range(3):
             lanes[_FROM + j * LANES + i] = singles[single, j]
             lanes[_ONTO + j * LANES + i] = surface[q, j] + singles[single, 3] * normals[q, j]
@@ -135,12 +136,12 @@ def _place_on_contacts(anchors, draws, start, count, lanes):
 
 
 @inner
-def _place_anywhere(anchors, draws, start, count, lanes):
+def _place_anywhere(anchors, draws, count, lanes):
     """Translations that put the object's origin anywhere in its bounds."""
     for i in range(count):
         for j in range(3):
             low, high = anchors.lower[j], anchors.upper[j]
-            lanes[_FROM + j * LANES + i] = low + draws[j, start + i] * (high - low)
+            lanes[_FROM + j * LANES + i] = low + draws[j * DRAWN + i] * (high - low)
             lanes[_ONTO + j * LANES + i] = ZERO
     _move(lanes, count)
 
@@ -171,28 +172,28 @@ def _put_on_plane(plane, lanes, count):
 
 
 @inner
-def _place_on_pairs(anchors, draws, start, count, lanes):
+def _place_on_pairs(anchors, draws, count, lanes):
     """Poses that put two surface points onto the line of two contacts, turned about it."""
     surface, frames = anchors.surface, anchors.frames
     for i in range(count):
-        pair = _index(draws[0, start + i], len(frames))
+        pair = _index(draws[i], len(frames))
         first, size = anchors.pair_spans[pair, 0], anchors.pair_spans[pair, 1]
-        at = first + _index(draws[1, start + i], size)
-        flip = 1 if draws[2, start + i] < HALF else 0
+        at = first + _index(draws[DRAWN + i], size)
+        flip = 1 if draws[2 * DRAWN + i] < HALF else 0
         k, m = anchors.by_distance[at, flip], anchors.by_distance[at, 1 - flip]
         for j in range(3):
             lanes[_FROM + j * LANES + i] = surface[k, j]
             lanes[_ONTO + j * LANES + i] = surface[m, j]
         for j in range(12):
             lanes[_FRAME + j * LANES + i] = frames[pair, j]
-    _turn_pairs(draws, start, count, lanes)
+    _turn_pairs(draws, count, lanes)
 
 
 @inner
-def _turn_pairs(draws, start, count, lanes):
+def _turn_pairs(draws, count, lanes):
     """R = G^T F, with the frames' vectors as rows, and t = q - R p of the middles."""
     for i in range(count):
-        sine, cosine = _sine_cosine(draws[3, start + i])
+        sine, cosine = _sine_cosine(draws[3 * DRAWN + i])
         d, e, f = lanes[_FROM + i], lanes[_FROM + LANES + i], lanes[_FROM + 2 * LANES + i]
         u, v, w = lanes[_ONTO + i], lanes[_ONTO + LANES + i], lanes[_ONTO + 2 * LANES + i]
         x, y, z = u - d, v - e, w - f

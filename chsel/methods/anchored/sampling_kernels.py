@@ -10,7 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.methods.anchored.placing_kernels import LANES, ROWS, SHIFT, ZERO, place
+from chsel.methods.anchored.placing_kernels import (
+    DRAWN,
+    DRAWS,
+    LANES,
+    ROWS,
+    SHIFT,
+    ZERO,
+    place,
+)
 from chsel.methods.anchored.scoring_kernels import (
     HIGHEST,
     add_contact,
@@ -18,11 +26,15 @@ from chsel.methods.anchored.scoring_kernels import (
     score_below,
     turn_back,
 )
-from chsel.numerics.arrays import IntArray
+from chsel.numerics.arrays import IntArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.philox import fill_uniforms
+from chsel.numerics.team import increase, load
 
+_DRAWN_AT_ONCE = 65_536  # poses for which a stream has all first numbers, then all second ones, ...
 _CHUNK = 4  # contacts that a block is scored by at a time
 _INSIDE_CHUNK = 8  # points inside
+_GRADES = 432  # classes of scores, each up to 1/16 wider than the lowest of its scores
 _FEW = 8  # poses go on alone when at most the eighth part of a block is left
 
 
@@ -33,36 +45,49 @@ class Best(NamedTuple):
     keys: IntArray  # (K,), a heap with the worst first: 2^32 x score + number among all drawn
     slots: IntArray  # (K,), where the pose of each is
     poses: Any  # (K, 12)
+    grades: IntArray  # (_GRADES,), how many poses of each class all threads have kept
+    draws: Any  # (DRAWS DRAWN,), random numbers of a block
     lanes: Any  # rows of a block, one after the other
     cells: Any  # (LANES,), indices in a table
     found: Any  # (LANES,), what was read there
     scores: Any  # (LANES,)
 
 
-def best_for(most: int) -> Best:
-    """No poses yet, and room for `most`."""
-    cells, found, scores = (np.zeros(LANES, dtype=np.int32) for _ in range(3))
-    keys, slots = (np.zeros(most, dtype=np.int64) for _ in range(2))
-    lanes, poses = np.zeros(ROWS * LANES, dtype=np.float32), np.empty((most, 12), np.float32)
-    return Best(np.zeros(1, dtype=np.int64), keys, slots, poses, lanes, cells, found, scores)
+def grades() -> IntArray:
+    """What threads that look for the best of the same poses share."""
+    return scratch(_GRADES, dtype=np.int64)
+
+
+def best_for(most: int, grades: IntArray) -> Best:
+    """No poses yet, and room for `most`. grades: of all threads."""
+    cells, found, scores = (scratch(LANES, dtype=np.int32) for _ in range(3))
+    keys, slots = (scratch(most, dtype=np.int64) for _ in range(2))
+    draws, lanes = (scratch(n, dtype=np.float32) for n in (DRAWS * DRAWN, ROWS * LANES))
+    size, poses = scratch(1, dtype=np.int64), scratch(most, 12, dtype=np.float32)
+    return Best(size, keys, slots, poses, grades, draws, lanes, cells, found, scores)
 
 
 @compiled
-def sample(coarse, anchors, draws, before, first, last, best):
-    """Keep the best of the poses that columns of draws (DRAWS, n) make, from `first` to `last`.
+def sample(coarse, anchors, stream, samples, first, last, best):
+    """Keep the best of the poses from number `first` to before `last` of those that are drawn.
 
-    before: how many poses were drawn before column 0. Kept are those of the lowest scores, and of
-    equal ones the first, so that the result does not depend on how the columns are split.
+    Kept are those of the lowest scores, and of equal ones the first, so that the result does not
+    depend on how all `samples` are split.
     """
-    start = first
-    while start < last:
-        number, count = before + start, min(last - start, LANES)
+    number = first
+    while number < last:
+        together = number // _DRAWN_AT_ONCE * _DRAWN_AT_ONCE
+        size = min(_DRAWN_AT_ONCE, samples - together)
+        count = min(min(last, together + size) - number, LANES)
         for until in anchors.kinds:
             if number < until:
                 count = min(count, until - number)
-        place(anchors, draws, start, count, number, best.lanes)
+        for row in range(DRAWS):
+            at = DRAWS * together + row * size + number - together
+            fill_uniforms(stream, at, best.draws, row * DRAWN, count)
+        place(anchors, best.draws, count, number, best.lanes)
         _keep_best(coarse, anchors, number, count, best)
-        start += count
+        number += count
 
 
 @inner
@@ -70,7 +95,7 @@ def _keep_best(coarse, anchors, number, count, best):
     """Score a block of poses, and keep those that are among the best so far."""
     most, lanes, scores = len(best.keys), best.lanes, best.scores
     _check_origins(anchors, lanes, scores, count)
-    limit = _limit(best)
+    limit = min(_limit(best), _common_limit(best))
     done, inside, left = 0, 0, count
     while done < coarse.contacts.shape[1] and left * _FEW > count:
         until = min(done + _CHUNK, coarse.contacts.shape[1])
@@ -90,7 +115,8 @@ def _keep_best(coarse, anchors, number, count, best):
             key = (total << 32) + (number + i)
             if total <= limit and (best.size[0] < most or key < best.keys[0]):
                 _put(best, key, i)
-                limit = _limit(best)
+                increase(best.grades, _grade(total))
+                limit = min(limit, _limit(best))
 
 
 @leaf
@@ -106,6 +132,28 @@ def _left(scores, limit, count):
 def _limit(best):
     """The score that a pose must not exceed to be among the best."""
     return best.keys[0] >> 32 if best.size[0] == len(best.keys) else np.int64(HIGHEST - 1)
+
+
+@leaf
+def _grade(score):
+    """The class of a score."""
+    halved = np.int64(0)
+    while score >= 32:
+        score >>= 1
+        halved += 1
+    return 16 * halved + score
+
+
+@inner
+def _common_limit(best):
+    """A score that as many poses as are wanted do not exceed, of those of all threads."""
+    count = np.int64(0)
+    for grade in range(_GRADES):
+        count += load(best.grades, grade)
+        if count >= len(best.keys):
+            halved = np.int64(max(grade // 16 - 1, 0))
+            return ((grade - 16 * halved + 1) << halved) - 1
+    return np.int64(HIGHEST - 1)
 
 
 @inner

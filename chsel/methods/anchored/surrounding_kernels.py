@@ -13,7 +13,7 @@ import numpy as np
 from chsel.cost.cost_kernels import Model
 from chsel.cost.free_kernels import is_apart, remember, travel
 from chsel.methods.anchored.fine_cells import FineCells
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.compiler import inner, leaf, spliced
 from chsel.numerics.near_points import NearPoints, gather_points, near_points_for, to_cells
 from chsel.numerics.pose_tuples import moved, rigid
@@ -32,7 +32,7 @@ class Surrounding(NamedTuple):
 
 def surrounding_for(model: Model, fine: FineCells) -> Surrounding:
     """Scratch for one thread. fine: where free points cost something."""
-    return Surrounding(near_points_for(model.free.rough, 1), np.empty(12), fine)
+    return Surrounding(near_points_for(model.free.rough, 1), scratch(12), fine)
 
 
 @inner

@@ -6,7 +6,7 @@ as they are the fewest and rule out most poses.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,10 @@ from chsel.methods.anchored.surrounding_kernels import (
     surrounding_for,
     travel_since_gathering,
 )
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray, IntArray, scratch
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp
+from chsel.numerics.philox import Stream, fill_uniforms
 from chsel.numerics.pose_tuples import moved, origin_within, pose_at
 from chsel.problem.sdf_lookup import (
     distance_at,
@@ -34,6 +35,7 @@ from chsel.problem.sdf_lookup import (
 )
 
 DRAWS = 9  # random numbers that a move takes
+_MOVES = 8  # whose random numbers are drawn together
 _FIRST, _LEAST, _MOST = 0.01, 0.00005, 0.03  # metres: the size of moves
 _GROW, _SHRINK = 1.1, 0.97  # it, after a move that was accepted or refused
 _SMALLEST, _RANGE = 0.12589254117941673, 2.763102111592855  # a move's factor: 10^U(-0.9, 0.3)
@@ -70,6 +72,13 @@ class Chains(NamedTuple):
     moved: IntArray  # (C,), accepted moves
 
 
+class MoveDraws(NamedTuple):
+    """Random numbers for C chains: DRAWS for each move of the first, then of the second, ..."""
+
+    stream: Stream
+    moves: int  # of a chain
+
+
 def chains_from(poses: FloatArray, energies: FloatArray, kept: int) -> Chains:
     """Chains that begin at poses (C, 12) with energies (C,)."""
     count = len(poses)
@@ -89,6 +98,7 @@ class Walk(NamedTuple):
     table: FloatArray  # (nodes,), signed distances of the grid alone, which are read faster
     known: FloatArray  # (4, N), known points in the world, signed distances; the last repeated
     lanes: FloatArray  # (6 LANES,), rows of what is known about some of them
+    drawn: Any  # random numbers of some moves, float32
 
 
 def walk_for(model: Model, table: FloatArray, fine: FineCells) -> Walk:
@@ -97,7 +107,8 @@ def walk_for(model: Model, table: FloatArray, fine: FineCells) -> Walk:
     known = np.zeros((4, -(-count // LANES) * LANES))
     known[:3, :count], known[3, :count] = model.known, model.known_sdf
     known[:, count:] = known[:, count - 1 : count]
-    return Walk(surrounding_for(model, fine), table, known, np.zeros(6 * LANES))
+    drawn = scratch(_MOVES * DRAWS + 16, dtype=np.float32)
+    return Walk(surrounding_for(model, fine), table, known, scratch(6 * LANES), drawn)
 
 
 @leaf
@@ -232,21 +243,25 @@ def energies_below(model, loss, poses, limit, out, first, last, walk):
 
 @compiled
 def walk_below(model, loss, stride, floor, chains, draws, first, last, walk):
-    """Move the chains from `first` to before `last` once for each of their draws (C, M, 9).
+    """Move the chains from `first` to before `last` once for each of their draws.
 
     A move is accepted if its energy is at most the limit of its chain: the energy of the chain
     where that is above the floor, so that the limit comes down with it, else the floor. Chains of
     which no states are kept stop there.
     """
-    moves, keep, near = draws.shape[1], chains.kept.shape[1], walk.near
+    moves, keep, near = draws.moves, chains.kept.shape[1], walk.near
     for n in range(first, last):
         pose, energy, size = pose_at(chains.poses, n), chains.energies[n], _FIRST
         slack, done = -1.0, 0
         for m in range(moves):
             if keep == 0 and energy <= floor:
                 break
+            if m % _MOVES == 0:
+                drawn = (n * moves + m) * DRAWS
+                fill_uniforms(draws.stream, drawn, walk.drawn, 0, _MOVES * DRAWS)
             limit = max(energy, floor)
-            trial = _proposed(model, stride, pose, size, draws[n, m])
+            at = m % _MOVES * DRAWS
+            trial = _proposed(model, stride, pose, size, walk.drawn[at : at + DRAWS])
             accepted = False
             if origin_within(trial, stride.lower, stride.upper):
                 total = _known_below(model, loss, trial, limit, walk)

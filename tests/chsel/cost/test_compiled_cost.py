@@ -361,7 +361,7 @@ def test_an_object_that_leaves_free_space_step_by_step_costs_the_same_bits() -> 
         plain.costs_and_gradients(vectors), fast.costs_and_gradients(vectors), strict=True
     ):
         assert_same_bits(one, other)
-    whole = float(fast.model.free.weights[:, 0].sum())
+    whole = float(fast.model.free.weights[::4].sum())
     assert (plain.costs(vectors) < 0.999 * whole).any()
     known = KnownPoints(free, known=[[0.0, 0.3, 0.0], [0.05, 0.3, 0.0]])
     case = replace(case, points=known, vectors=vectors[::100])

@@ -17,7 +17,7 @@ from filelock import FileLock
 from numba import TypingError
 
 from chsel.numerics import kernel_cache, kernel_sources
-from chsel.numerics.compiler import compiled
+from chsel.numerics.compiler import compiled, inner
 from chsel.numerics.kernel_sources import kernel_sources as compiler_sources
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -166,7 +166,7 @@ def near(x):
     return 2.0 * far(x)
 """,
     "called.py": """
-from chsel.numerics.compiler import compiled
+from chsel.numerics.compiler import compiled, inner
 from planted.near import near
 def value_of(model):
     raise NotImplementedError
@@ -364,3 +364,21 @@ def test_kernels_take_constants_from_kernel_files_alone(tmp_path: Path) -> None:
         "from chsel.problem.sdf_grid import COARSEST\n@leaf\ndef f(x):\n    return x + COARSEST\n"
     )
     assert names_from_elsewhere(planted) == {"f: COARSEST"}
+
+
+def test_what_kernels_alone_call_is_made_machine_code_with_them_alone() -> None:
+    caller = compiled(_caller)
+    assert caller(2.0) == 9.0
+    (result,), (part,) = caller.overloads.values(), _part.overloads.values()  # type: ignore[attr-defined]
+    assert result.library._compiled_object
+    assert getattr(part.library, "_compiled_object", None) is None
+    assert part.entry_point is not None
+
+
+@inner
+def _part(x: float) -> float:
+    return x * x
+
+
+def _caller(x: float) -> float:
+    return 2.0 * _part(x) + 1.0

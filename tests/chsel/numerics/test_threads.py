@@ -96,6 +96,19 @@ def test_every_thread_works_in_scratch_of_its_own(threads: int) -> None:
     assert len(used) == threads
 
 
+def test_a_thread_that_is_too_late_for_any_piece_is_not_awaited() -> None:
+    done: list[int] = []
+    leave = threading.Event()
+    busy = numerics_threads._pool(1).submit(leave.wait, PATIENCE)
+    try:
+        with use_threads(2):
+            spread(lambda first, last, _: done.extend(range(first, last)), 100, no_scratch)
+        assert not busy.done()
+    finally:
+        leave.set()
+    assert done == list(range(100))
+
+
 def test_an_error_in_a_piece_reaches_the_caller_and_the_next_call_works(threads: int) -> None:
     def run(first: int, last: int, _: Any) -> None:
         if first <= 57 < last:

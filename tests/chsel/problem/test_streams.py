@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
 from chsel.errors import SettingError
 from chsel.numerics.arrays import digest
+from chsel.numerics.philox import Stream, fill_uniforms
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 
 MANY = 1_000_000
@@ -122,3 +124,21 @@ def test_streams_of_other_purposes_steps_seeds_and_repetitions_are_others() -> N
 def test_keys_out_of_range_are_refused(seed: int, step: int) -> None:
     with pytest.raises(SettingError, match=r"accepted: an integer from 0 to 2\*\*"):
         StreamKey(seed, step)
+
+
+@numba.njit
+def drawn(stream: Stream, first: int, count: int) -> np.ndarray:
+    numbers = np.full(count + 18, np.float32(-1.0))
+    fill_uniforms(stream, first, numbers, 2, count)
+    return numbers
+
+
+@pytest.mark.parametrize("first", [0, 3, 8, 1021, 8 * 2**40 + 5])
+def test_kernels_draw_the_numbers_of_a_stream_from_any_place(first: int) -> None:
+    key, count = StreamKey(2**64 - 5, 2**32 - 1), 300
+    expected = key.stream(Purpose.WALKS, 7)
+    expected.bit_generator.advance(first // 8)
+    wanted = expected.random(first % 8 + count, dtype=np.float32)[first % 8 :]
+    found = drawn(key.kernel_stream(Purpose.WALKS, 7), first, count)
+    np.testing.assert_array_equal(found[2 : 2 + count], wanted)
+    assert (found[[0, 1, -2, -1]] == -1.0).all()
