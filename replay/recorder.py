@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from functools import partial
+from functools import cache, partial
 from queue import Queue
 from threading import Thread
 
@@ -15,6 +15,9 @@ from replay.events import Event, Recorder
 
 class NullRecorder(Recorder):
     """Writes nothing down."""
+
+    def record_later(self, make: Callable[[], Event]) -> None:
+        """Let the event be."""
 
 
 class ListRecorder(Recorder):
@@ -38,6 +41,12 @@ class TeeRecorder(Recorder):
         """Give the event to each; the first error stops it."""
         for recorder in self._recorders:
             recorder.record(event)
+
+    def record_later(self, make: Callable[[], Event]) -> None:
+        """Let the event be made once, by the first that records it."""
+        make = cache(make)
+        for recorder in self._recorders:
+            recorder.record_later(make)
 
     def flush(self) -> None:
         """Flush each, also after one has failed."""
@@ -87,7 +96,7 @@ class BackgroundRecorder(Recorder):
         self._closed = False
         self._patient = patient
         self._most, self._until = most, until
-        self._kept: list[Event] = []
+        self._kept: list[Callable[[], None]] = []
         self._optional = optional
         self._ended = False  # by an error of what is optional
         # A daemon, so that a run that ends without closing its recorder does end.
@@ -99,10 +108,14 @@ class BackgroundRecorder(Recorder):
         if self._closed:
             self._recorder.record(event)
         else:
-            self._raise_error()
-            self._kept.append(event)
-            if isinstance(event, self._until) or len(self._kept) >= self._most:
-                self._hand_over()
+            self._keep(partial(self._recorder.record, event), isinstance(event, self._until))
+
+    def record_later(self, make: Callable[[], Event]) -> None:
+        """Let the event be made and recorded soon, both by the thread."""
+        if self._closed:
+            self._recorder.record_later(make)
+        else:
+            self._keep(partial(self._recorder.record_later, make), self._until is object)
 
     def flush(self) -> None:
         """Wait until all events so far are recorded and flushed, or only have it done soon."""
@@ -131,11 +144,18 @@ class BackgroundRecorder(Recorder):
             finally:
                 self._raise_error()
 
+    def _keep(self, job: Callable[[], None], at_once: bool) -> None:
+        """Keep what records an event, until more come or at once."""
+        self._raise_error()
+        self._kept.append(job)
+        if at_once or len(self._kept) >= self._most:
+            self._hand_over()
+
     def _hand_over(self) -> None:
         """Let the events that were kept be recorded soon."""
         kept, self._kept = self._kept, []
-        for event in kept:
-            self._jobs.put(partial(self._recorder.record, event))
+        for job in kept:
+            self._jobs.put(job)
 
     def _work(self) -> None:
         """What the thread does: one job after the other, none after an error."""

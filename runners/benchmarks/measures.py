@@ -171,7 +171,7 @@ def _rate(evaluate: Callable[[FloatArray], FloatArray], poses: FloatArray, repea
 
 
 def recording(scope: Scope) -> Iterator[Row]:
-    """What recordings add to a step: a registration and its trust. It is little, so taken often."""
+    """What recordings add to a step of a session. It is little, so taken often."""
     posed = pose(PROBLEMS[_PROBLEM], scope.seed)
     for preset in PRESETS:
         samples = recorded_registrations(posed, preset, scope.steps, scope.repeats**2)

@@ -1,4 +1,8 @@
-"""Steps of a session, with and without its recordings."""
+"""What recording adds to a step of `runners.probe`, against the same step with recording=none.
+
+A step is all that a session waits for between two probes: a problem is posed and registered, its
+result is judged (trust, errors), and all of it is in the file, to be read after a crash.
+"""
 
 from __future__ import annotations
 
@@ -46,18 +50,19 @@ def _session(
 ) -> Callable[[], float]:
     """Opens a recording, and returns what takes its next step in milliseconds.
 
-    A step is that of `runners.probe` behind its probe: registered, judged, and in the file.
+    All points are those of the first probe; the others, without any, are recorded in their steps.
     """
     started = _started(posed, preset)
+    symmetry = symmetry_for_errors(started)
     recorder.record(started)
-    problem, symmetry = posed.registration_problem(), symmetry_for_errors(started)
+    recorder.record(Probe(0, "points", posed.registration_problem().points))
+    recorder.flush()
     step = 0
 
     def take_step() -> float:
         nonlocal step
-        points = problem.points if step == 0 else KnownPoints()
-        recorder.record(Probe(step, "points", points))
-        recorder.flush()
+        if step > 0:
+            recorder.record(Probe(step, "points", KnownPoints()))
         begun = time.perf_counter()
         register_recorded(
             ProblemPosed(step, posed.registration_problem()),

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from chsel.errors import RecordingError
 from replay.events import Measured, Probe
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
-from replay.recorder import BackgroundRecorder, TeeRecorder
+from replay.recorder import BackgroundRecorder, NullRecorder, TeeRecorder
 
 
 class Gate:
@@ -32,6 +33,9 @@ class Gate:
 
     def record(self, event: object) -> None:
         self._note(event)
+
+    def record_later(self, make: Callable[[], object]) -> None:
+        self._note(make())
 
     def flush(self) -> None:
         self._note("flush")
@@ -152,6 +156,31 @@ def test_events_are_kept_until_one_of_some_type_a_flush_or_too_many():
     assert gate.calls[5:] == [0, 1, 2]
     recorder.close()
     assert gate.calls[8:] == [3, "close"]
+
+
+@pytest.mark.parametrize("until", [object, str])
+def test_an_event_for_later_is_made_once_and_not_by_the_caller(until):
+    gates, makers = [Gate(), Gate()], []
+    first = BackgroundRecorder(gates[0], until=until)
+    tee = TeeRecorder([first, BackgroundRecorder(gates[1], behind=first, until=until)])
+
+    def make() -> int:
+        makers.append(threading.current_thread())
+        return 1
+
+    tee.record(0)
+    tee.record_later(make)
+    tee.record(2)
+    tee.flush()
+    tee.close()
+    assert [gate.calls for gate in gates] == [[0, 1, 2, "flush", "close"]] * 2
+    assert len(makers) == 1
+    assert makers[0] is not threading.current_thread()
+
+
+def test_an_event_for_later_is_not_made_where_nobody_records():
+    for recorder in (NullRecorder(), TeeRecorder([])):
+        recorder.record_later(lambda: pytest.fail("it is made"))
 
 
 def test_equal_events_give_the_bytes_of_a_recorder_without_a_thread(tmp_path, events, write):

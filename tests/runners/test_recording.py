@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,19 @@ def test_what_is_handed_over_is_never_changed() -> None:
     assert len(set(recorder.digests)) > 1
     kept = [digest(*arrays(event.archive)) for event in recorder.events]
     assert kept == recorder.digests
+
+
+@pytest.mark.parametrize("count", [4, 5])
+def test_a_trace_is_of_the_moment_at_which_it_was_handed_over(count: int) -> None:
+    made: list[Callable[[], Event]] = []
+    recorder = NullRecorder()
+    recorder.record_later = made.append  # type: ignore[method-assign]
+    random = np.random.default_rng(count)
+    vectors, cost = random.normal(size=(count, 9)), random.uniform(size=count)
+    expected = digest(vectors, cost), cost.min(), np.median(cost), cost.max()
+    StepObserver(recorder, 0, 5, lambda *_: None).trace("descent", 10, vectors, cost)
+    vectors[:], cost[:] = 0.0, 0.0
+    assert [make() for make in made] == [Traced(0, "descent", 10, *expected)]
 
 
 def test_without_files_nothing_runs_in_the_background(tmp_path: Path) -> None:
