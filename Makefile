@@ -24,7 +24,7 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 kernels: $(VENV)/.installed
 	$(BIN)/python -m chsel.kernel_build
@@ -43,7 +43,11 @@ $(VENV)/constraints.txt: constraints.txt | $(VENV)/bin/python
 	@if $(BIN)/python -c "import importlib.metadata as m; m.version('torch')" 2>/dev/null; \
 		then sed '/^torch==/d' constraints.txt; else cat constraints.txt; fi > $@
 
+# The kernels of method=chsel need these packages alone, so they are compiled while others come.
+# Whatever becomes of that: a session compiles what it lacks.
 $(VENV)/.installed: pyproject.toml $(VENV)/constraints.txt
+	$(INSTALL) filelock numba numpy pyyaml scipy
+	@$(BIN)/python -m chsel.background_rehearsal >/dev/null 2>&1 &
 	$(INSTALL) --editable .
 	@touch $@
 

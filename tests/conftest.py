@@ -20,6 +20,8 @@ LONGEST = (  # minutes each; files that start first end before others are done
     "tests/runners/test_benchmark.py",
     "tests/determinism/test_machine_code.py",
     "tests/replay/test_kill.py",
+    "tests/replay/test_planted_changes.py",
+    "tests/runners/test_evaluate.py",
 )
 settings.register_profile("random", deadline=None)  # --hypothesis-profile=random: other examples
 settings.register_profile("fixed", deadline=None, derandomize=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +35,11 @@ def prepared(config_name: str, words: list[str]) -> list[str]:
     return hydra_arguments(config_name, words)
 
 
+@cache
 def store_choices() -> None:
     """Offer presets, methods, policies, definitions, simulated sessions and their faults, by name.
 
+    Once in a process.
     session/presets/rig/default has all keys of a rig, so that each can be changed by its name.
     """
     for preset in PRESETS:

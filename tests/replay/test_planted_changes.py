@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from chsel.numerics.kernel_cache import cache_directory
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REPLAYS = REPOSITORY / "tests" / "replays"
@@ -86,12 +89,7 @@ PLANTS = {
 
 
 RUN = """
-import importlib.util, sys
-class Planted:
-    def find_spec(self, name, path=None, target=None):
-        if name == sys.argv[1]:
-            return importlib.util.spec_from_file_location(name, sys.argv[2])
-sys.meta_path.insert(0, Planted())
+import sys
 from replay.__main__ import main
 status = main(["verify", sys.argv[3]])
 assert sys.modules[sys.argv[1]].__file__ == sys.argv[2]
@@ -100,20 +98,29 @@ sys.exit(status)
 
 
 def verified_with(plant: Plant, folder: Path) -> subprocess.CompletedProcess[str]:
-    """`replay verify` with a module of the code replaced; kernels are compiled anew for one."""
+    """`replay verify` in a copy of the code that has the plant.
+
+    A plant in a kernel is compiled into a folder of its own, which starts with the kept kernels:
+    those that can run what is planted are compiled anew.
+    """
     original = (REPOSITORY / plant.file).read_text()
     assert original.count(plant.line) == 1
-    folder.mkdir()
-    planted = folder / Path(plant.file).name
+    for package in ("chsel", "replay"):
+        unwanted = shutil.ignore_patterns("__pycache__", "machine_code")
+        shutil.copytree(REPOSITORY / package, folder / package, ignore=unwanted)
+    planted = folder / plant.file
     planted.write_text(original.replace(plant.line, plant.planted))
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder)}
+    if "chsel.numerics.compiler" in original:
+        kept, unfinished = cache_directory(), shutil.ignore_patterns("*.lock", "*.tmp")
+        links = folder / "kept" / kept.name
+        shutil.copytree(kept, links, copy_function=os.symlink, ignore=unfinished)
+        environment["CHSEL_CACHE_DIR"] = str(folder / "kept")
     module = plant.file.removesuffix(".py").replace("/", ".")
     recording = REPLAYS / f"{plant.recording}.mcap"
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    if "chsel.numerics.compiler" in original:  # else code with the plant would be kept for all
-        environment["CHSEL_CACHE_DIR"] = str(folder)
     return subprocess.run(
         [sys.executable, "-c", RUN, module, str(planted), str(recording)],
-        cwd=REPOSITORY,
+        cwd=folder,
         env=environment,
         capture_output=True,
         text=True,

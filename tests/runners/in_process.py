@@ -10,6 +10,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 
 import pytest
+from hydra._internal.hydra import Hydra
 
 from runners.evaluation.external_results import read_external
 from runners.evaluation.plan import Plan, Task
@@ -26,10 +27,14 @@ class Done:
 
 
 def run(program: Callable[[], None], *arguments: str, columns: int = 160) -> Done:
-    """Run a command as a shell would, on a terminal of so many columns."""
+    """Run a command as a shell would, on a terminal of so many columns.
+
+    Hydra would compose its configuration twice, first to see whether it has a hydra.mode.
+    """
     out, errors, status = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
         patch.setattr(sys, "argv", ["program", *arguments])
+        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
         patch.setenv("COLUMNS", str(columns))
         patch.setenv("HYDRA_FULL_ERROR", "0")
         patch.setattr(warnings, "showwarning", warnings.showwarning)
