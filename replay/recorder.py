@@ -61,42 +61,68 @@ class TeeRecorder(Recorder):
                 stack.callback(recorder.close)
 
 
+class DeferredRecorder(Recorder):
+    """Hands events to another recorder at `flush`, all at once, or when many wait.
+
+    What happens in between has the processor for itself.
+    """
+
+    def __init__(self, recorder: Recorder, *, most: int = 64) -> None:
+        """most: events that wait; with one more, all are handed over."""
+        self._recorder, self._most = recorder, most
+        self._kept: list[Callable[[], None]] = []
+
+    def record(self, event: Event) -> None:
+        """Keep the event."""
+        self._keep(partial(self._recorder.record, event))
+
+    def record_later(self, make: Callable[[], Event]) -> None:
+        """Keep what makes the event."""
+        self._keep(partial(self._recorder.record_later, make))
+
+    def flush(self) -> None:
+        """Let the other recorder record all events so far, and flush it."""
+        self._hand_over()
+        self._recorder.flush()
+
+    def close(self) -> None:
+        """Let the other recorder record all events, and close it, also after an error."""
+        try:
+            self._hand_over()
+        finally:
+            self._recorder.close()
+
+    def _keep(self, job: Callable[[], None]) -> None:
+        self._kept.append(job)
+        if len(self._kept) > self._most:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Record what was kept; what follows an event that cannot be recorded is dropped."""
+        kept, self._kept = self._kept, []
+        for job in kept:
+            job()
+
+
 class BackgroundRecorder(Recorder):
     """Hands every event to another recorder, in order, in a thread of its own.
 
-    Events are frozen values, and nobody may change their arrays. `flush` and `close` return when
-    the other recorder has done the same. An error of the other recorder is raised by the next call;
+    Events are frozen values, and nobody may change their arrays. `close` returns when the other
+    recorder is closed, `flush` at once. An error of the other recorder is raised by the next call;
     what was recorded in between is dropped, as if the caller had stopped at the event that failed.
     """
 
-    def __init__(
-        self,
-        recorder: Recorder,
-        *,
-        most: int = 16,
-        patient: bool = True,
-        behind: BackgroundRecorder | None = None,
-        until: type | tuple[type, ...] = object,
-        optional: str = "",
-    ) -> None:
+    def __init__(self, recorder: Recorder, *, most: int = 64, optional: str = "") -> None:
         """A recorder in front of another one.
 
-        most: events that may wait; the caller who records one more waits for its place. patient:
-        False lets `flush` only ask for it. behind: one that gets the same events first, and that
-        callers wait for; this one works only while it has nothing to do, as threads of Python take
-        turns, and each turn can take 5 ms. until: events are kept until one of these types comes,
-        or a flush, or `most` are kept, so that what the caller does in between has the processor
-        for itself. optional: what to do about a recording that is not written; where this is given,
-        a RecordingError is a warning that ends with it, and no more is recorded.
+        most: events that may wait; the caller who records one more waits for its place. optional:
+        what to do about a recording that is not written; where this is given, a RecordingError is a
+        warning that ends with it, and no more is recorded.
         """
         self._recorder = recorder
-        self._behind = behind
         self._jobs: Queue[Callable[[], None] | None] = Queue(most)
         self._error: BaseException | None = None
         self._closed = False
-        self._patient = patient
-        self._most, self._until = most, until
-        self._kept: list[Callable[[], None]] = []
         self._optional = optional
         self._ended = False  # by an error of what is optional
         # A daemon, so that a run that ends without closing its recorder does end.
@@ -105,38 +131,20 @@ class BackgroundRecorder(Recorder):
 
     def record(self, event: Event) -> None:
         """Let the event be recorded soon."""
-        if self._closed:
-            self._recorder.record(event)
-        else:
-            self._keep(partial(self._recorder.record, event), isinstance(event, self._until))
+        self._do_soon(partial(self._recorder.record, event))
 
     def record_later(self, make: Callable[[], Event]) -> None:
         """Let the event be made and recorded soon, both by the thread."""
-        if self._closed:
-            self._recorder.record_later(make)
-        else:
-            self._keep(partial(self._recorder.record_later, make), self._until is object)
+        self._do_soon(partial(self._recorder.record_later, make))
 
     def flush(self) -> None:
-        """Wait until all events so far are recorded and flushed, or only have it done soon."""
-        if self._closed:
-            self._recorder.flush()
-        else:
-            self._hand_over()
-            self._jobs.put(self._recorder.flush)
-            if self._patient:
-                self.wait()
-            self._raise_error()
-
-    def wait(self) -> None:
-        """Wait until there is nothing to do, whether it went well or not."""
-        self._jobs.join()
+        """Let all events so far be flushed soon."""
+        self._do_soon(self._recorder.flush)
 
     def close(self) -> None:
         """Record what waits, and close the other recorder, also after an error."""
         if not self._closed:
             self._closed = True
-            self._hand_over()
             self._jobs.put(None)
             self._thread.join()
             try:
@@ -144,32 +152,23 @@ class BackgroundRecorder(Recorder):
             finally:
                 self._raise_error()
 
-    def _keep(self, job: Callable[[], None], at_once: bool) -> None:
-        """Keep what records an event, until more come or at once."""
-        self._raise_error()
-        self._kept.append(job)
-        if at_once or len(self._kept) >= self._most:
-            self._hand_over()
-
-    def _hand_over(self) -> None:
-        """Let the events that were kept be recorded soon."""
-        kept, self._kept = self._kept, []
-        for job in kept:
+    def _do_soon(self, job: Callable[[], None]) -> None:
+        if self._closed:
+            job()
+        else:
+            self._raise_error()
             self._jobs.put(job)
 
     def _work(self) -> None:
         """What the thread does: one job after the other, none after an error."""
         while (job := self._jobs.get()) is not None:
             try:
-                if self._behind is not None:
-                    self._behind.wait()
                 if self._error is None:
                     self._run(job)
             except BaseException as error:
                 self._error = error
             finally:
                 self._jobs.task_done()
-        self._jobs.task_done()
 
     def _run(self, job: Callable[[], None]) -> None:
         if self._ended:
@@ -186,7 +185,6 @@ class BackgroundRecorder(Recorder):
         """Raise an error once; the jobs behind it are dropped by then."""
         if self._error is not None:
             if not self._closed:
-                self.wait()
-            self._kept.clear()
+                self._jobs.join()
             error, self._error = self._error, None
             raise error

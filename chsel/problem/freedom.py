@@ -16,7 +16,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.noise import FOREIGN
 from chsel.problem.outline import (
     in_order,
-    outline_distances,
+    outline_distances_to,
     outline_in_world,
     signed_distances,
 )
@@ -44,9 +44,9 @@ def can_be_moved(problem: RegistrationProblem, pose: Poses, sigma: float, distan
     moved = _moved(problem, pose, distance * np.concatenate([motions, -motions]))
     poses = Poses.joined([pose, moved])
     unlikely = _unlikelihood(problem, poses, sigma)
-    apart = outline_distances(problem.sdf, poses)[0]  # not as far for turns that are symmetries
-    likely = (unlikely - unlikely[0] <= MOST_WORSE) & (apart >= 0.5 * distance)
-    return bool(likely[1:].any())
+    apart = outline_distances_to(problem.sdf, moved, pose)  # near for turns that are symmetries
+    likely = (unlikely[1:] - unlikely[0] <= MOST_WORSE) & (apart >= 0.5 * distance)
+    return bool(likely.any())
 
 
 def _loosest_motions(problem: RegistrationProblem, pose: Poses) -> FloatArray:

@@ -7,9 +7,8 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.sdf_lookup import distance_field
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.subset import distances_from_surface, evenly_spaced
+from chsel.problem.subset import evenly_spaced, surface_distances
 from chsel.problem.surface import has_surface, surface_points
 
 _POINTS = 100
@@ -52,11 +51,7 @@ def outline_in_world(sdf: SdfGrid, poses: Poses) -> FloatArray:
 
 def signed_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
     """Signed distances (B, N), metres, of world points (N, 3), at most FARTHEST."""
-    field = distance_field(sdf, "trilinear", "surface_point")
-    signed = np.empty((len(poses), len(points)))
-    numbers, places = np.array(poses.numbers), np.array(points)
-    distances_from_surface(field, numbers, places, signed, 0, len(poses))
-    return np.minimum(signed, FARTHEST)
+    return np.minimum(surface_distances(sdf, poses, points), FARTHEST)
 
 
 def in_order(values: FloatArray) -> FloatArray:

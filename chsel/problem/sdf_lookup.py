@@ -105,15 +105,36 @@ def distance_in_place(field, pose, x, y, z, places, n):
 @leaf
 def distance_at(field, pose, x, y, z):
     """Interpolated signed distance at a world point."""
-    return distance_with_gradient(field, pose, x, y, z)[0]
+    box, table = field.box, field.table
+    a, b, c = moved(pose, x, y, z)
+    cell, is_beyond = _cell_of(box, a, b, c)
+    s = value_between_nodes(table, *cell)
+    if is_beyond:
+        _, nx, ny, nz = _row_in_cell(box, table, cell)
+        s = distance_beyond_box(field.box_distance, box, (s, nx, ny, nz), a, b, c)[0]
+    return s
 
 
 @leaf
 def distance_with_gradient(field, pose, x, y, z):
     """Interpolated signed distance and gradient (s, n_x, n_y, n_z) at a world point."""
     box, table = field.box, field.table
-    first, last, most, inverse = box.first, box.last, box.most, box.inverse
     a, b, c = moved(pose, x, y, z)
+    cell, is_beyond = _cell_of(box, a, b, c)
+    s = value_between_nodes(table, *cell)
+    _, nx, ny, nz = _row_in_cell(box, table, cell)
+    if is_beyond:
+        return distance_beyond_box(field.box_distance, box, (s, nx, ny, nz), a, b, c)
+    return s, nx, ny, nz
+
+
+@leaf
+def _cell_of(box, a, b, c):
+    """The arguments of `value_between_nodes`; and whether a point is beyond the box.
+
+    Of the nearest point of the box, then.
+    """
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
     d = min(max(first[0], a), last[0])
     e = min(max(first[1], b), last[1])
     f = min(max(first[2], c), last[2])
@@ -121,14 +142,15 @@ def distance_with_gradient(field, pose, x, y, z):
     i = min(np.floor(u), most[0])
     j = min(np.floor(v), most[1])
     k = min(np.floor(w), most[2])
-    u, v, w = u - i, v - j, w - k
     across, along = int(box.across), int(box.along)
     at = int(i) * across + int(j) * along + int(k)
-    s = value_between_nodes(table, at, across, along, u, v, w)
-    _, nx, ny, nz = distance_between_nodes(box, table, at, u, v, w)
-    if a != d or b != e or c != f:
-        s, nx, ny, nz = distance_beyond_box(field.box_distance, box, (s, nx, ny, nz), a, b, c)
-    return s, nx, ny, nz
+    return (at, across, along, u - i, v - j, w - k), a != d or b != e or c != f
+
+
+@leaf
+def _row_in_cell(box, table, cell):
+    at, _, _, u, v, w = cell
+    return distance_between_nodes(box, table, at, u, v, w)
 
 
 @leaf

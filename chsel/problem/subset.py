@@ -17,6 +17,7 @@ from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
 
 _PLACES = 64  # of a descriptor
+_LOOKUPS_PER_THREAD = 6400  # fewer are done before another thread wakes up
 
 
 def evenly_spaced(size: int, count: int) -> IntArray:
@@ -65,14 +66,25 @@ def surface_descriptors(sdf: SdfGrid, poses: Poses) -> FloatArray:
     surface = sdf.derived("descriptors", make)
     some = poses[np.arange(_PLACES) * len(poses) // _PLACES]
     places = rotated(np.swapaxes(some.rotations, 1, 2), surface - some.translations)
+    return surface_distances(sdf, poses, places)
+
+
+def surface_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:
+    """Signed distances (B, N), metres, of world points (N, 3) to the object's surface in poses."""
     field = distance_field(sdf, "trilinear", "surface_point")
-    distances = np.empty((len(poses), _PLACES))
+    numbers, places = np.array(poses.numbers), np.array(points)
+    distances = np.empty((len(poses), len(points)))
 
     def run(first: int, last: int, _: Any) -> None:
-        distances_from_surface(field, poses.numbers, places, distances, first, last)
+        distances_from_surface(field, numbers, places, distances, first, last)
 
-    spread(run, len(poses), lambda: None, least=100)
+    spread(run, len(poses), lambda: None, least=poses_per_thread(len(points)))
     return distances
+
+
+def poses_per_thread(points: int) -> int:
+    """How many poses are worth another thread where each looks up so many distances."""
+    return 1 + _LOOKUPS_PER_THREAD // max(points, 1)
 
 
 @compiled

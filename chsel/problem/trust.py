@@ -7,18 +7,23 @@ docs/trust.md has the model, and what its limits were chosen on.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from chsel.errors import PointsWarning, PoseError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.compiler import compiled
+from chsel.numerics.pose_tuples import moved, pose_at
+from chsel.numerics.threads import spread
 from chsel.problem.freedom import can_be_moved
 from chsel.problem.noise import FOREIGN, estimate_noise
 from chsel.problem.outline import in_order, outline_distances, signed_distances
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
-from chsel.problem.sdf_grid import FARTHEST
-from chsel.problem.subset import evenly_spaced
+from chsel.problem.sdf_grid import FARTHEST, SdfGrid
+from chsel.problem.sdf_lookup import distance_at, distance_field
+from chsel.problem.subset import evenly_spaced, poses_per_thread
 
 SENSOR_NOISE = 0.0005  # metres, of known points, where nothing is known about the sensor
 DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS
@@ -169,12 +174,55 @@ def _mean_errors(
     known_share = len(known) / max(len(points.known), 1)
     for sign, group in ((-1.0, points.free), (1.0, points.occupied)):
         some = evenly_spaced(len(group), _MOST_FREE if thinned else len(group))
-        depth = sign * signed_distances(sdf, poses, group[some])
-        wrong = depth > tolerance
+        depth, wrong = _contradictions(sdf, poses, group[some], sign, tolerance)
         each = (known_share or 1.0) * len(group) / max(len(some), 1)
-        total += each * in_order(np.where(wrong, depth, 0.0))
-        count += each * wrong.sum(axis=1)
+        total += each * depth
+        count += each * wrong
     return total / np.maximum(count, 1.0)
+
+
+def _contradictions(
+    sdf: SdfGrid, poses: Poses, points: FloatArray, sign: float, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
+    """The sum of the depths (B,), metres, of points deeper than a tolerance, and their number (B,).
+
+    sign: 1 for depths outside of the object, -1 for those inside.
+    """
+    field, numbers = distance_field(sdf, "trilinear", "surface_point"), np.array(poses.numbers)
+    places, (depths, counts) = np.array(points), np.empty((2, len(poses)))
+
+    def run(first: int, last: int, _: Any) -> None:
+        _add_depths(field, numbers, places, sign, tolerance, depths, counts, first, last)
+
+    spread(run, len(poses), lambda: None, least=poses_per_thread(len(points)))
+    return depths, counts
+
+
+@compiled
+def _add_depths(
+    field: Any,
+    poses: Any,
+    points: Any,
+    sign: Any,
+    tolerance: Any,
+    depths: Any,
+    counts: Any,
+    first: Any,
+    last: Any,
+) -> None:
+    """Fill depths and counts (B,) for poses (B, 12), first to last; see `_contradictions`."""
+    low, high = field.box.first, field.box.last
+    for b in range(first, last):
+        pose, depth, count = pose_at(poses, b), 0.0, 0
+        for n in range(len(points)):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            p, q, r = moved(pose, x, y, z)
+            is_near = low[0] <= p <= high[0] and low[1] <= q <= high[1] and low[2] <= r <= high[2]
+            if is_near or sign > 0.0:  # the object is in the box
+                deep = sign * min(distance_at(field, pose, x, y, z), FARTHEST)
+                if deep > tolerance:
+                    depth, count = depth + deep, count + 1
+        depths[b], counts[b] = depth, count
 
 
 def _widest(apart: FloatArray, mode: IntArray) -> float:

@@ -9,14 +9,13 @@ from datetime import datetime
 from pathlib import Path
 
 from chsel.errors import RecordingError, require_positive
-from replay.events import HypothesesFound, Recorder
+from replay.events import Recorder
 from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
-from replay.recorder import BackgroundRecorder, TeeRecorder
+from replay.recorder import BackgroundRecorder, DeferredRecorder, TeeRecorder
 
 IN_RUN_FOLDER = "a logs=DIR that can be written"
 """What is accepted where a file of a run cannot be written."""
-_WAITING = 64  # events that may wait to be recorded: those of a registration, mostly
 # What Rerun itself would print of a failing disk, over several lines; one line of ours says it.
 _LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
@@ -62,34 +61,23 @@ def write_in_run_folder(path: Path, text: str) -> None:
 
 
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
-    """A recorder to all files that `config` asks for, each written by a thread of its own.
+    """A recorder to all files that `config` asks for.
 
-    A registration has the processor for itself: its events are written from its result on, while
-    the run judges that. After every step the run waits for the MCAP file, the full record, and not
-    for the pictures, which are drawn from then on, while the next probe is taken; those of a live
-    view at once. Beside that file, pictures that cannot be written are a warning.
+    A registration has the processor for itself: events are recorded after a step. The run waits for
+    the MCAP file, the full record, which a thread would not write sooner, as threads of Python take
+    turns. It does not wait for the pictures, which a thread draws from then on, while the next
+    probe is taken; those of a live view at once. Beside that file, pictures that cannot be written
+    are a warning.
     """
     recorders: list[Recorder] = []
-    record = None
     if config.mcap:
-        file = McapRecorder(folder / "recording.mcap")
-        record = BackgroundRecorder(file, most=_WAITING, until=HypothesesFound)
-        recorders.append(record)
+        recorders.append(DeferredRecorder(McapRecorder(folder / "recording.mcap")))
     if config.rerun or config.live:
         os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
         from replay.rerun.rerun_recorder import RerunRecorder
 
         path = folder / "recording.rrd" if config.rerun else None
-        pictures = RerunRecorder(path, live=config.live)
         optional = "`replay view` makes it anew" if config.mcap else ""
-        recorders.append(
-            BackgroundRecorder(
-                pictures,
-                most=_WAITING,
-                patient=False,
-                behind=record,
-                until=object if config.live else (),
-                optional=optional,
-            )
-        )
+        pictures = BackgroundRecorder(RerunRecorder(path, live=config.live), optional=optional)
+        recorders.append(pictures if config.live else DeferredRecorder(pictures))
     return TeeRecorder(recorders)

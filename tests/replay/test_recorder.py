@@ -16,7 +16,7 @@ from chsel.errors import RecordingError
 from replay.events import Measured, Probe
 from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
-from replay.recorder import BackgroundRecorder, NullRecorder, TeeRecorder
+from replay.recorder import BackgroundRecorder, DeferredRecorder, NullRecorder, TeeRecorder
 
 
 class Gate:
@@ -87,25 +87,15 @@ def test_the_caller_goes_on_while_an_event_is_recorded():
     assert "recorder" in gate.threads
 
 
-def test_an_impatient_flush_comes_soon_and_keeps_nobody_waiting():
+def test_a_flush_in_the_background_comes_soon_and_keeps_nobody_waiting():
     gate = Gate(is_open=False)
-    recorder = BackgroundRecorder(gate, patient=False)
+    recorder = BackgroundRecorder(gate)
     recorder.record("first")
     recorder.flush()
     assert gate.calls == []
     gate.gate.set()
     recorder.close()
     assert gate.calls == ["first", "flush", "close"]
-
-
-def test_flush_returns_when_all_before_it_is_recorded_and_flushed():
-    gate = Gate()
-    recorder = BackgroundRecorder(gate)
-    for event in range(100):
-        recorder.record(event)
-    recorder.flush()
-    assert gate.calls == [*range(100), "flush"]
-    recorder.close()
 
 
 def test_who_records_faster_than_the_recorder_has_to_wait():
@@ -125,47 +115,46 @@ def test_who_records_faster_than_the_recorder_has_to_wait():
     assert gate.calls == ["in work", 0, 1, 2, "fifth", "close"]
 
 
-def test_who_comes_behind_another_works_only_while_that_has_nothing_to_do():
-    first, second = Gate(is_open=False), Gate()
-    ahead = BackgroundRecorder(first)
-    tee = TeeRecorder([ahead, BackgroundRecorder(second, patient=False, behind=ahead)])
-    tee.record("event")
-    assert first.entered.wait(60)
-    assert not second.entered.wait(0.05)
-    first.gate.set()
-    tee.flush()
-    tee.close()
-    assert first.calls == second.calls == ["event", "flush", "close"]
-
-
-def test_events_are_kept_until_one_of_some_type_a_flush_or_too_many():
+def test_deferred_events_are_recorded_by_a_flush_or_when_there_are_too_many():
     gate = Gate()
-    recorder = BackgroundRecorder(gate, most=3, until=str)
+    recorder = DeferredRecorder(gate, most=3)
     recorder.record(0)
-    recorder.record(1)
-    assert not gate.entered.wait(0.05)
-    recorder.record("result")
-    recorder.wait()
-    assert gate.calls == [0, 1, "result"]
-    recorder.record(2)
+    recorder.record_later(lambda: 1)
+    assert gate.calls == []
     recorder.flush()
-    assert gate.calls[3:] == [2, "flush"]
-    for event in range(4):
+    assert gate.calls == [0, 1, "flush"]
+    for event in range(3):
         recorder.record(event)
-    recorder.wait()
-    assert gate.calls[5:] == [0, 1, 2]
+    assert gate.calls[3:] == []
+    recorder.record(3)
+    assert gate.calls[3:] == [0, 1, 2, 3]
+    recorder.record(4)
     recorder.close()
-    assert gate.calls[8:] == [3, "close"]
+    assert gate.calls[7:] == [4, "close"]
+    assert gate.threads == {threading.current_thread().name}
 
 
-@pytest.mark.parametrize("until", [object, str])
-def test_an_event_for_later_is_made_once_and_not_by_the_caller(until):
-    gates, makers = [Gate(), Gate()], []
-    first = BackgroundRecorder(gates[0], until=until)
-    tee = TeeRecorder([first, BackgroundRecorder(gates[1], behind=first, until=until)])
+@pytest.mark.parametrize("end", ["flush", "close"])
+def test_what_follows_a_deferred_event_that_fails_is_dropped(end):
+    gate = Gate("bad")
+    recorder = DeferredRecorder(gate)
+    for event in ("good", "bad", "dropped"):
+        recorder.record(event)
+    with pytest.raises(RecordingError, match="no bad"):
+        getattr(recorder, end)()
+    assert gate.calls == ["good", "bad", *(["close"] if end == "close" else [])]
+    recorder.record("after")
+    recorder.close()
+    assert gate.calls[2:] == ["after", "close"] if end == "flush" else ["close", "after", "close"]
+
+
+def test_an_event_for_later_is_made_once():
+    gates, made = [Gate(), Gate()], []
+    background = BackgroundRecorder(gates[1])
+    tee = TeeRecorder([DeferredRecorder(gates[0]), DeferredRecorder(background)])
 
     def make() -> int:
-        makers.append(threading.current_thread())
+        made.append(1)
         return 1
 
     tee.record(0)
@@ -174,6 +163,14 @@ def test_an_event_for_later_is_made_once_and_not_by_the_caller(until):
     tee.flush()
     tee.close()
     assert [gate.calls for gate in gates] == [[0, 1, 2, "flush", "close"]] * 2
+    assert made == [1]
+
+
+def test_an_event_for_later_is_made_by_the_thread():
+    makers = []
+    recorder = BackgroundRecorder(Gate())
+    recorder.record_later(lambda: makers.append(threading.current_thread()))
+    recorder.close()
     assert len(makers) == 1
     assert makers[0] is not threading.current_thread()
 
@@ -183,9 +180,10 @@ def test_an_event_for_later_is_not_made_where_nobody_records():
         recorder.record_later(lambda: pytest.fail("it is made"))
 
 
-def test_equal_events_give_the_bytes_of_a_recorder_without_a_thread(tmp_path, events, write):
-    path = tmp_path / "background.mcap"
-    recorder = BackgroundRecorder(McapRecorder(path))
+@pytest.mark.parametrize("kind", [BackgroundRecorder, DeferredRecorder])
+def test_equal_events_give_the_bytes_of_a_recorder_alone(tmp_path, events, write, kind):
+    path = tmp_path / "later.mcap"
+    recorder = kind(McapRecorder(path))
     for event in events:
         recorder.record(event)
     recorder.close()
@@ -199,7 +197,7 @@ def test_an_error_is_told_by_the_next_call_and_what_follows_it_is_dropped():
         recorder.record(event)
     gate.gate.set()
     with pytest.raises(RecordingError, match="no bad"):
-        recorder.flush()
+        record_often(recorder, "dropped")
     recorder.record("after")
     recorder.close()
     assert gate.calls == ["good", "bad", "after", "close"]
@@ -254,10 +252,10 @@ def test_closing_twice_is_closing_once_and_ends_the_thread(tmp_path, events):
 
 _SCRIPT = """
 import runpy, sys
-from replay.recorder import BackgroundRecorder
+from replay.recorder import DeferredRecorder
 from replay.mcap.writer import McapRecorder
 events = runpy.run_path(sys.argv[1])["example_events"]()
-recorder = BackgroundRecorder(McapRecorder(sys.argv[2]))
+recorder = DeferredRecorder(McapRecorder(sys.argv[2]))
 for event in events:
     recorder.record(event)
     if type(event).__name__ == "Measured":
