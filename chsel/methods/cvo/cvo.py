@@ -89,7 +89,7 @@ class CvoSettings(CheckedSettings):
     max_step: Annotated[float, positive] = 0.8  # the greatest length of a step that is tried first
     # A start ends when its inner product grew by no more than this fraction in 5 iterations in a
     # row; null: never.
-    stop_below: Annotated[float | None, not_negative] = 1e-6
+    stop_below: Annotated[float | None, not_negative] = 1e-5
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
     _AUTHORS: ClassVar = {"ell_min": 0.1, "c": 7.0, "origin": "world", "stop_below": None}
