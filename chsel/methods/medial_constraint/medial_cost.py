@@ -38,7 +38,7 @@ _POSES_PER_THREAD = 100  # fewer are costed faster than a thread wakes up
 class MedialCostSettings(CheckedSettings):
     """Settings of the Medial Constraint cost."""
 
-    inflation: Annotated[float, not_negative] = 0.02  # of balls, to cover others, at most, metres
+    inflation: Annotated[float, not_negative] = 0.04  # of balls, to cover others, at most, metres
     # Weights of the two means; a ball_scale of 0 ignores free space, as the authors' released code
     # does, whose balls never enter the cost.
     ball_scale: Annotated[float, not_negative] = 1.0
@@ -47,8 +47,13 @@ class MedialCostSettings(CheckedSettings):
     outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
 
     presets: ClassVar[Presets] = {
-        "paper": {"lookup": "nearest"},
-        "reference": {"ball_scale": 0.0, "lookup": "nearest", "outside": "bounding_box"},
+        "paper": {"inflation": 0.02, "lookup": "nearest"},
+        "reference": {
+            "inflation": 0.02,
+            "ball_scale": 0.0,
+            "lookup": "nearest",
+            "outside": "bounding_box",
+        },
     }
 
 
