@@ -26,10 +26,12 @@ from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
+from chsel.problem.trust import trust_in
 from chsel.qd.archive import GridArchive
 from chsel.qd.measures import MEASURES
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
+from tests.chsel.samples import hypotheses_at
 from tests.determinism.cases import CASES
 from tests.determinism.decisions import decision_stages
 from tests.determinism.libraries import fused as contracted
@@ -84,6 +86,7 @@ def code() -> dict[str, str]:
     )
     poses = PoseGridSettings(rotations=5, upright=2)
     members = plausible_set(problem, first[0], PlausibleSettings(epsilon=10.0, grid=poses))
+    trust_in(problem, hypotheses_at(first))
     stepped(first, np.zeros((1, 6)), 0.01, 0.1)
     surface = surface_points(where.sdf, 4, key.stream(Purpose.METRIC_POINTS))
     for method in ("grid", "exact"):

@@ -11,7 +11,8 @@ import trimesh
 import chsel
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.outline import outline_distances
+from chsel.numerics.threads import threads
+from chsel.problem.outline import outline_distances, signed_distances
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
@@ -19,6 +20,7 @@ from chsel.problem.trust import (
     MOST_OFF,
     MOST_SYSTEMATIC,
     MOST_WIDTH,
+    _contradictions,
     check_trust,
     correlation,
     has_pose,
@@ -228,3 +230,22 @@ def test_an_object_thinner_than_its_grid_is_judged_too() -> None:
     assert trust.spread > 0.005
     nowhere = chsel.SdfGrid(np.zeros(3), 0.01, np.ones((4, 4, 4)), np.ones((4, 4, 4, 3)))
     assert trust_in(problem(chsel.KnownPoints(known=known), nowhere), hypotheses(POSE)).modes == 1
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_contradictions_are_by_the_distances_that_the_grid_gives(sign: float, count: int) -> None:
+    random = np.random.default_rng(1)
+    world_from_object = [moved(*random.uniform(-0.05, 0.05, 4)) for _ in range(7)]
+    poses, tolerance = Poses.of(inverse(np.array(world_from_object))), 0.003
+    points = CENTRE + random.uniform(-0.15, 0.15, (5000, 3))  # the grid's box ends among them
+    places = [apply(pose, points) for pose in poses.matrices]
+    expected = np.array([GRID.at(place, lookup="trilinear")[0] for place in places])
+    with threads(count):
+        found = signed_distances(GRID, poses, points)
+        depths, counts = _contradictions(GRID, poses, points, sign, tolerance)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    wrong = sign * expected > tolerance
+    assert (wrong.sum(axis=1) > 100).all()
+    assert counts.tolist() == wrong.sum(axis=1).tolist()
+    np.testing.assert_allclose(depths, (sign * expected * wrong).sum(axis=1), rtol=1e-9)
