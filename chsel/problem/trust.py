@@ -218,7 +218,7 @@ def _add_depths(
             x, y, z = points[n, 0], points[n, 1], points[n, 2]
             p, q, r = moved(pose, x, y, z)
             is_near = low[0] <= p <= high[0] and low[1] <= q <= high[1] and low[2] <= r <= high[2]
-            if is_near or sign > 0.0:  # the object is in the box
+            if is_near or sign > 0.0:  # beyond the box, all is outside of the object
                 deep = sign * min(distance_at(field, pose, x, y, z), FARTHEST)
                 if deep > tolerance:
                     depth, count = depth + deep, count + 1
