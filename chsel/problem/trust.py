@@ -13,8 +13,6 @@ import numpy as np
 
 from chsel.errors import PointsWarning, PoseError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.compiler import compiled
-from chsel.numerics.pose_tuples import moved, pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.freedom import can_be_moved
 from chsel.problem.noise import FOREIGN, estimate_noise
@@ -22,7 +20,7 @@ from chsel.problem.outline import in_order, outline_distances, signed_distances
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.sdf_lookup import distance_at, distance_field
+from chsel.problem.sdf_lookup import add_depths, distance_field
 from chsel.problem.subset import evenly_spaced, poses_per_thread
 
 SENSOR_NOISE = 0.0005  # metres, of known points, where nothing is known about the sensor
@@ -190,39 +188,13 @@ def _contradictions(
     """
     field, numbers = distance_field(sdf, "trilinear", "surface_point"), np.array(poses.numbers)
     places, (depths, counts) = np.array(points), np.empty((2, len(poses)))
+    limits = sign, tolerance, FARTHEST
 
     def run(first: int, last: int, _: Any) -> None:
-        _add_depths(field, numbers, places, sign, tolerance, depths, counts, first, last)
+        add_depths(field, numbers, places, limits, depths, counts, first, last)
 
     spread(run, len(poses), lambda: None, least=poses_per_thread(len(points)))
     return depths, counts
-
-
-@compiled
-def _add_depths(
-    field: Any,
-    poses: Any,
-    points: Any,
-    sign: Any,
-    tolerance: Any,
-    depths: Any,
-    counts: Any,
-    first: Any,
-    last: Any,
-) -> None:
-    """Fill depths and counts (B,) for poses (B, 12), first to last; see `_contradictions`."""
-    low, high = field.box.first, field.box.last
-    for b in range(first, last):
-        pose, depth, count = pose_at(poses, b), 0.0, 0
-        for n in range(len(points)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            p, q, r = moved(pose, x, y, z)
-            is_near = low[0] <= p <= high[0] and low[1] <= q <= high[1] and low[2] <= r <= high[2]
-            if is_near or sign > 0.0:  # beyond the box, all is outside of the object
-                deep = sign * min(distance_at(field, pose, x, y, z), FARTHEST)
-                if deep > tolerance:
-                    depth, count = depth + deep, count + 1
-        depths[b], counts[b] = depth, count
 
 
 def _widest(apart: FloatArray, mode: IntArray) -> float:
