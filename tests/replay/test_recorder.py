@@ -252,10 +252,11 @@ def test_closing_twice_is_closing_once_and_ends_the_thread(tmp_path, events):
 
 _SCRIPT = """
 import runpy, sys
-from replay.recorder import DeferredRecorder
+from replay.recorder import BackgroundRecorder, DeferredRecorder, NullRecorder, TeeRecorder
 from replay.mcap.writer import McapRecorder
 events = runpy.run_path(sys.argv[1])["example_events"]()
-recorder = DeferredRecorder(McapRecorder(sys.argv[2]))
+file = DeferredRecorder(McapRecorder(sys.argv[2]))
+recorder = TeeRecorder([file, BackgroundRecorder(NullRecorder())])
 for event in events:
     recorder.record(event)
     if type(event).__name__ == "Measured":
