@@ -369,7 +369,7 @@ def test_kernels_take_constants_from_kernel_files_alone(tmp_path: Path) -> None:
 def test_what_kernels_alone_call_is_made_machine_code_with_them_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CHSEL_CACHE_DIR", str(tmp_path))  # nothing is loaded
+    monkeypatch.setattr(kernel_cache, "cache_directory", lambda: tmp_path)  # nothing is loaded
     caller = compiled(_caller)
     assert caller(2.0) == 9.0
     (result,), (part,) = caller.overloads.values(), _part.overloads.values()  # type: ignore[attr-defined]
