@@ -6,6 +6,7 @@ import importlib.util
 import logging
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ _PRELOAD = "runners.evaluation.tasks"
 _LOOPBACK = "127.0.0.1"
 _LOCAL_PORT = f"{_LOOPBACK}:0"  # any free port, for this machine alone
 _CONNECT = 30.0  # s
+_PATIENCE = 120.0  # s, before a worker that is not there is given up
 
 
 @dataclass(frozen=True)
@@ -118,8 +120,10 @@ def connected(
             size = {"n": workers or _cores()}
             started = _local_cluster(size["n"], dashboard=config.dashboard)
         with started as cluster, Client(cluster, set_as_default=False) as client:
-            restore = partial(cluster.scale, **size)
+            restore: Callable[[], object] = partial(cluster.scale, **size)
             restore()
+            if isinstance(config, LocalConfig):
+                restore = partial(_restore_local, cluster, client, size["n"], _Absence())
             if config.dashboard:
                 say(f"dashboard: {cluster.dashboard_link}")
             yield Connection(client, restore)
@@ -161,6 +165,30 @@ def _local_cluster(workers: int, *, dashboard: bool) -> Any:
         preload=[_PRELOAD],
         env={"NUMBA_NUM_THREADS": "1"},  # Dask sets those of OpenMP, MKL and OpenBLAS
     )
+
+
+@dataclass
+class _Absence:
+    """Since when how many workers have been missing."""
+
+    workers: int = 0
+    since: float = 0.0
+
+
+def _restore_local(cluster: Any, client: Any, workers: int, absence: _Absence) -> None:
+    """Start workers in place of those that are lost.
+
+    Dask does so itself, but for a worker that dies before Dask has noted that it had started. So
+    those that stay away are given up: scaling down takes them first.
+    """
+    there = len(client.nthreads())
+    if workers - there != absence.workers:
+        absence.workers, absence.since = workers - there, time.monotonic()
+    if absence.workers > 0 and time.monotonic() - absence.since >= _PATIENCE:
+        absence.workers = 0
+        cluster.scale(there)  # the next call starts others, which may have the same names
+    else:
+        cluster.scale(workers)
 
 
 @contextmanager

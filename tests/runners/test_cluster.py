@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 import requests
+from distributed import Status
 
 from chsel.errors import SettingError
 from runners.evaluation import cluster
@@ -78,10 +80,7 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         start("s", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", *where)
         for name in ("a", "b"):
             start(name, "worker", "--nthreads", "1", "--local-directory", ".", *where)
-        latest = time.monotonic() + 120.0
-        while not file.exists():
-            assert time.monotonic() < latest
-            time.sleep(0.05)
+        wait_until(file.exists)
         yield json.loads(file.read_text())["address"]
 
 
@@ -167,3 +166,30 @@ def test_the_address_of_the_dashboard_is_printed(
         assert re.fullmatch(shown, printed)
         if dashboard:
             assert requests.get(printed.split()[1], timeout=30).status_code == 200
+
+
+def test_a_worker_that_dask_does_not_start_again_is_given_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with connected(LocalConfig("local", None, False), 1, print) as connection:
+        client = connection.client
+        (nanny,) = client.cluster.workers.values()
+        nanny.status = Status.starting  # as if it had died before it was noted as running
+        os.kill(nanny.pid, signal.SIGKILL)
+        wait_until(lambda: not client.nthreads())
+        connection.restore()
+        assert nanny.name in client.cluster.worker_spec
+        monkeypatch.setattr(cluster, "_PATIENCE", 0.0)
+        connection.restore()
+        wait_until(lambda: nanny not in client.cluster.workers.values())
+        monkeypatch.undo()
+        connection.restore()
+        wait_until(lambda: len(client.nthreads()) == 1)
+        assert client.submit(sum, (1, 2)).result() == 3
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    latest = time.monotonic() + 120.0
+    while not is_so():
+        assert time.monotonic() < latest
+        time.sleep(0.05)
