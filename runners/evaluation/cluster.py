@@ -28,7 +28,7 @@ _PRELOAD = "runners.evaluation.tasks"
 _LOOPBACK = "127.0.0.1"
 _LOCAL_PORT = f"{_LOOPBACK}:0"  # any free port, for this machine alone
 _CONNECT = 30.0  # s
-_PATIENCE = 120.0  # s, before a worker that is not there is given up
+_PATIENCE = 60.0  # s, before a worker that is not there is given up
 
 
 @dataclass(frozen=True)
@@ -178,8 +178,8 @@ class _Absence:
 def _restore_local(cluster: Any, client: Any, workers: int, absence: _Absence) -> None:
     """Start workers in place of those that are lost.
 
-    Dask does so itself, but for a worker that dies before Dask has noted that it had started. So
-    those that stay away are given up: scaling down takes them first.
+    Dask does so itself where a worker was killed, but not where it ended itself, as over a task
+    that it could not read. So those that stay away are given up: scaling down takes them first.
     """
     there = len(client.nthreads())
     if workers - there != absence.workers:

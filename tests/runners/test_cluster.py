@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -17,7 +16,6 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 import requests
-from distributed import Status
 
 from chsel.errors import SettingError
 from runners.evaluation import cluster
@@ -168,15 +166,28 @@ def test_the_address_of_the_dashboard_is_printed(
             assert requests.get(printed.split()[1], timeout=30).status_code == 200
 
 
-def test_a_worker_that_dask_does_not_start_again_is_given_up(
+class Unreadable:
+    """What no other process can read."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return read_in, (os.getpid(),)
+
+
+def read_in(process: int) -> Unreadable:
+    if os.getpid() != process:
+        raise ModuleNotFoundError("No module named 'runners'")
+    return Unreadable()
+
+
+def test_a_worker_that_ends_itself_is_given_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with connected(LocalConfig("local", None, False), 1, print) as connection:
         client = connection.client
         (nanny,) = client.cluster.workers.values()
-        nanny.status = Status.starting  # as if it had died before it was noted as running
-        os.kill(nanny.pid, signal.SIGKILL)
+        task = client.submit(len, Unreadable())
         wait_until(lambda: not client.nthreads())
+        task.cancel()
         connection.restore()
         assert nanny.name in client.cluster.worker_spec
         monkeypatch.setattr(cluster, "_PATIENCE", 0.0)
