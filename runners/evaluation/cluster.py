@@ -123,7 +123,7 @@ def connected(
             restore: Callable[[], object] = partial(cluster.scale, **size)
             restore()
             if isinstance(config, LocalConfig):
-                restore = partial(_restore_local, cluster, client, size["n"], _Absence())
+                restore = _LocalWorkers(cluster, client, size["n"]).restore
             if config.dashboard:
                 say(f"dashboard: {cluster.dashboard_link}")
             yield Connection(client, restore)
@@ -168,27 +168,29 @@ def _local_cluster(workers: int, *, dashboard: bool) -> Any:
 
 
 @dataclass
-class _Absence:
-    """Since when how many workers have been missing."""
-
-    workers: int = 0
-    since: float = 0.0
-
-
-def _restore_local(cluster: Any, client: Any, workers: int, absence: _Absence) -> None:
-    """Start workers in place of those that are lost.
+class _LocalWorkers:
+    """The workers of this machine: others start in place of those that are lost.
 
     Dask does so itself where a worker was killed, but not where it ended itself, as over a task
     that it could not read. So those that stay away are given up: scaling down takes them first.
     """
-    there = len(client.nthreads())
-    if workers - there != absence.workers:
-        absence.workers, absence.since = workers - there, time.monotonic()
-    if absence.workers > 0 and time.monotonic() - absence.since >= _PATIENCE:
-        absence.workers = 0
-        cluster.scale(there)  # the next call starts others, which may have the same names
-    else:
-        cluster.scale(workers)
+
+    cluster: Any  # of Dask
+    client: Any  # of Dask
+    count: int
+    missing: int = 0
+    since: float = 0.0  # from when so many have been missing
+
+    def restore(self) -> None:
+        """Start workers in place of those that are lost."""
+        there = len(self.client.nthreads())
+        if self.count - there != self.missing:
+            self.missing, self.since = self.count - there, time.monotonic()
+        if self.missing > 0 and time.monotonic() - self.since >= _PATIENCE:
+            self.missing = 0
+            self.cluster.scale(there)  # the next call starts others, which may have the same names
+        else:
+            self.cluster.scale(self.count)
 
 
 @contextmanager

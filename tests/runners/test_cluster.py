@@ -179,9 +179,7 @@ def read_in(process: int) -> Unreadable:
     return Unreadable()
 
 
-def test_a_worker_that_ends_itself_is_given_up(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_worker_that_ends_itself_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     with connected(LocalConfig("local", None, False), 1, print) as connection:
         client = connection.client
         (nanny,) = client.cluster.workers.values()
