@@ -140,6 +140,8 @@ def descend(model, space, course, work, leads):
                 return
         at = _GROUPS + group * APART
         state = load(words, at) // STATES * STATES
+        if state // STATES >= load(words, _LIMIT):  # another thread was faster
+            continue
         if is_open and not replace(words, at, state + OPEN, state + CLAIMED):
             continue
         polls = 0

@@ -70,7 +70,7 @@ class KernelCache(NullCache):
         name = self._file_name(sig)
         if name is None:
             return None
-        payload = _kept(name) or _checked(packaged_code(name))
+        payload = _kept(name) or _checked(packaged_code(name), name)
         if payload is None:
             self._claim(name)
             payload = _kept(name)  # by the process that had claimed it
@@ -88,7 +88,7 @@ class KernelCache(NullCache):
         path = cache_directory() / name
         try:
             _make(path.parent)
-            _write(path, _digest(payload) + payload)
+            _write(path, _digest(payload, name) + payload)
             _prune(path)
         except OSError as error:
             _log.warning("machine code cannot be kept in %s: %s", path.parent, error)
@@ -166,27 +166,28 @@ def _environment() -> str:
     return hashlib.blake2b("|".join(versions).encode(), digest_size=8).hexdigest()
 
 
-def _digest(payload: bytes) -> bytes:
-    return hashlib.blake2b(payload, digest_size=_CHECK_SIZE).digest()
+def _digest(payload: bytes, name: str) -> bytes:
+    """Of the code in the file of that name, so that no kernel loads another's."""
+    return hashlib.blake2b(name.encode() + payload, digest_size=_CHECK_SIZE).digest()
 
 
 def _kept(name: str) -> bytes | None:
     """What the cache holds by that name, or None."""
     path = cache_directory() / name
     try:
-        payload = _checked(path.read_bytes())
+        payload = _checked(path.read_bytes(), name)
     except OSError:
         return None
     _touch(path)
     return payload
 
 
-def _checked(whole: bytes | None) -> bytes | None:
-    """What a file holds behind its digest, or None if there is no such file or it is damaged."""
+def _checked(whole: bytes | None, name: str) -> bytes | None:
+    """What the file of that name holds behind its digest, None if it is missing or damaged."""
     if whole is None:
         return None
     payload = whole[_CHECK_SIZE:]
-    return payload if _digest(payload) == whole[:_CHECK_SIZE] else None
+    return payload if _digest(payload, name) == whole[:_CHECK_SIZE] else None
 
 
 def _write(path: Path, whole: bytes) -> None:

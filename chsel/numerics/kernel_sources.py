@@ -15,6 +15,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+import numba
 from numba.core import types
 from numba.core.serialize import dumps
 
@@ -24,6 +25,7 @@ _IMPORT = re.compile(
     rb"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
 )
+_config: Any = numba.core.config
 _TUPLE: Any = types.BaseTuple
 _WORD = re.compile(rb"\w+")
 _files: dict[Path, SourceFile] = {}
@@ -92,8 +94,9 @@ def code_digest(function: Callable[..., Any], arguments: tuple[types.Type, ...])
 
     Of its file and of those with kernels that it imports, directly or through others; of the
     fields of all named tuples among the arguments, and of their files likewise, as a kernel runs
-    what `implements` such a model. None if code cannot be kept: files that have changed while this
-    process had them, or code that is in no file.
+    what `implements` such a model; of the constants of these files, and of numba's options. None
+    if code cannot be kept: files that have changed while this process had them, or code that is in
+    no file.
     """
     state = hashlib.blake2b(digest_size=16)
     own = _files.get(Path(function.__code__.co_filename))
@@ -106,7 +109,10 @@ def code_digest(function: Callable[..., Any], arguments: tuple[types.Type, ...])
         if file and _read(Path(file)).has_kernels:
             starts.add(_read(Path(file)))
     for file in sorted(_closure(starts), key=lambda file: file.name):
-        state.update(file.digest)
+        module = sys.modules.get(file.name)
+        names = function.__globals__ if file is own else vars(module) if module else {}
+        state.update(file.digest + _constants(names).encode())
+    state.update(f"{_config.OPT} {_config.BOUNDSCHECK}\n".encode())
     text = f"{own.name}.{function.__qualname__} {function.__code__.co_firstlineno}"
     state.update(f"{text} {signature_text(arguments)}\n".encode())
     state.update(function.__code__.co_code)
@@ -118,6 +124,12 @@ def code_digest(function: Callable[..., Any], arguments: tuple[types.Type, ...])
 def signature_text(arguments: tuple[types.Type, ...]) -> str:
     """The types of arguments in words that are the same in every process."""
     return ", ".join(_type_text(kind) for kind in arguments)
+
+
+def _constants(names: dict[str, Any]) -> str:
+    """The numbers among a module's names, which kernels take as constants, as they are now."""
+    numbers = [(name, value) for name, value in names.items() if isinstance(value, int | float)]
+    return repr(sorted(numbers))
 
 
 def _type_text(kind: Any) -> str:

@@ -86,8 +86,9 @@ class AnchorSampler:
         shared = grades()
 
         def scratch() -> Best:
-            bests.append(best_for(min(most, samples), shared))
-            return bests[-1]
+            best = best_for(min(most, samples), shared)
+            bests.append(best)  # another thread may append its own before this one goes on
+            return best
 
         def run(first: int, last: int, best: Best) -> None:
             sample(coarse, anchors, stream, samples, first, last, best)

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 from filelock import FileLock
 from numba import TypingError
@@ -264,8 +265,15 @@ def test_imports_are_found_as_python_finds_them() -> None:
     assert relative.imported >= {"x.y", "x.y.a", "x.b", "x.b.c", "d.e", "g"}
 
 
+FACTOR = 2.0
+
+
 def halves(value: float) -> float:
     return 0.5 * value
+
+
+def doubles(value: float) -> float:
+    return FACTOR * value
 
 
 def wrong(value: float) -> Any:
@@ -293,6 +301,33 @@ def test_a_kernel_that_another_process_compiles_is_waited_for(
     with pytest.raises(TypingError):
         compiled(wrong)(1.0)
     assert [path.suffix for path in tmp_path.iterdir()] == [".nbc"]  # and no claim
+
+
+def test_code_is_kept_for_the_constants_and_options_that_it_was_compiled_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_cache, "cache_directory", lambda: tmp_path)
+    assert compiled(doubles)(3.0) == 6.0
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.modules[__name__], "FACTOR", 5.0)
+        assert compiled(doubles)(3.0) == 15.0
+    for number, (name, value) in enumerate([("BOUNDSCHECK", 1), ("OPT", 0)]):
+        with monkeypatch.context() as patch:
+            patch.setattr(numba.core.config, name, value)
+            assert compiled(doubles)(3.0) == 6.0
+        assert len(kernels_in(tmp_path)) == 3 + number
+
+
+def test_the_code_of_another_kernel_is_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_cache, "cache_directory", lambda: tmp_path)
+    compiled(halves)(1.0)
+    (other,) = kernels_in(tmp_path)
+    compiled(doubles)(1.0)
+    (own,) = set(kernels_in(tmp_path)) - {other}
+    own.write_bytes(other.read_bytes())
+    assert compiled(doubles)(3.0) == 6.0
 
 
 def test_code_that_nobody_uses_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
