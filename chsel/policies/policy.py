@@ -107,4 +107,4 @@ class ConfiguredPolicy(Generic[Settings]):
         if not feasible.any():
             return "actions"
         promised = forecast.spread - float(forecast.gains.expected_spread[feasible].min())
-        return "gain" if promised < settings.stop.gain else ""
+        return "gain" if 0.0 < settings.stop.gain > promised else ""

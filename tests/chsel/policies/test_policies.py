@@ -97,6 +97,14 @@ def test_gains_are_a_second(name: str) -> None:
     assert np.array_equal(decision.score, usual.score / seconds)
 
 
+def test_rules_that_are_switched_off_end_no_session() -> None:
+    """Of some numbers of poses the rounding of what a miss leaves of the spread is above it."""
+    policy = build_policy("information", {"stop": {"spread": 0.0, "gain": 0.0}})
+    for count in range(2, 12):
+        poses = at(*((0.01 * n, 0.0, 0.0) for n in range(count)))
+        assert policy.decide(ball_problem(poses, along_x([(0.25, 0.25)]))).stop == ""
+
+
 def test_names_and_settings_that_do_not_exist_are_refused() -> None:
     with pytest.raises(SettingError, match="policy is 'greedy'; accepted: grid, random"):
         build_policy("greedy")
