@@ -51,11 +51,12 @@ class Clouds:
         counts.outside += int((~within_reach).sum())
         if self._place is None and len(points):
             self._place = np.median(points, axis=0)
+        points = points[within_reach]
         if self._rig.role == "rays":
             with self._cell.free.by(counts) as grid:
                 grid.along_rays(origin, origin + self._rig.fraction * (points - origin))
         else:
-            self._new.append(self._unseen(points[within_reach], counts))
+            self._new.append(self._unseen(points, counts))
 
     def check(self, total: Counts) -> str | None:
         """What is suspicious about the counts of a whole log: that no point was within reach."""

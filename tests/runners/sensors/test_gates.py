@@ -148,6 +148,18 @@ def test_a_few_touches_are_all_kept(tmp_path: Path) -> None:
     assert len(read(log, rig)[1][0].contacts) == 4
 
 
+def test_ends_of_rays_that_are_too_far_away_give_no_free_space(tmp_path: Path) -> None:
+    ends = np.array([[1.0, 0.2, 0.55], [200.0, 0.0, 100.0]])  # m
+    log = cloud_log(tmp_path / "log.mcap", ends)
+    rig = Rig("lidar", "world", RIG.workspace, clouds=(CloudRig("/cloud", "rays"),))
+    session, (probe,), _ = read(log, rig)
+    assert session.report.total()["/cloud"].outside == 1
+    log = cloud_log(tmp_path / "near.mcap", ends[:1])
+    (near,) = read(log, rig)[1]
+    assert len(near.new_points.free) > 0
+    np.testing.assert_array_equal(probe.new_points.free, near.new_points.free)
+
+
 def test_the_table_shows_what_was_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
