@@ -21,7 +21,7 @@ from chsel.problem.surface import object_centre
 
 MOST_POSES = 2000
 _DRAWN = 1000  # poses before any registration, of which those that free space allows are kept
-_MOST_FREE = 2000  # free points that are compared with them
+_SOME_FREE = 2000  # free points that rule most of these out, before all are compared
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,22 @@ def belief_before(
     if settings.floor is not None:
         position[:, 2] -= heights(sdf, poses, settings.floor)
         poses = Poses.of(inverse(compose(rotation, position)))
-    free = points.free[evenly_spaced(len(points.free), _MOST_FREE)]
-    depth = -signed_distances(sdf, poses, free).min(axis=1, initial=np.inf)
-    order = np.argsort(np.maximum(depth, sdf.resolution), kind="stable")[: settings.poses]
+    free = points.free
+    depth = _depths(sdf, poses, free[evenly_spaced(len(free), _SOME_FREE)])
+    missing = settings.poses
+    for n in np.flatnonzero(depth <= sdf.resolution):
+        if missing == 0:
+            break
+        depth[n] = _depths(sdf, poses[n : n + 1], free)[0]
+        missing -= depth[n] <= sdf.resolution
+    order = np.argsort(depth, kind="stable")[: settings.poses]
     return Belief(poses.matrices[order], np.full(len(order), 1.0 / len(order)))
+
+
+def _depths(sdf: SdfGrid, poses: Poses, free: FloatArray) -> FloatArray:
+    """Depth (B,) of the deepest of free points (N, 3), metres, at least the resolution."""
+    deepest: FloatArray = -signed_distances(sdf, poses, free).min(axis=1, initial=np.inf)
+    return np.maximum(deepest, sdf.resolution)
 
 
 def heights(sdf: SdfGrid, poses: Poses, floor: float) -> FloatArray:
