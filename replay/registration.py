@@ -185,7 +185,7 @@ def register_recorded(
     """Register a problem, and record it with all that the registration gives.
 
     world_from_object (4, 4): the true pose, where known. symmetry: of the object, for the errors to
-    the true pose; see `result_numbers`. show: gets stage, iteration and total.
+    the true pose; None: without errors. show: gets stage, iteration and total.
     """
     recorder.record(posed)
     observer = StepObserver(recorder, posed.step, snapshot_interval, show)
@@ -195,7 +195,8 @@ def register_recorded(
     seconds["other"] = time.perf_counter() - begun - sum(observer.seconds.values())
     recorder.record(HypothesesFound(posed.step, hypotheses))
     trust = trust_by(method, posed.problem, hypotheses)
-    numbers = result_numbers(hypotheses, posed.problem, world_from_object, symmetry, trust)
+    truth = None if symmetry is None else world_from_object
+    numbers = result_numbers(hypotheses, posed.problem, truth, symmetry, trust)
     recorder.record(Measured(posed.step, numbers))
     return Registered(hypotheses, numbers, seconds, trust)
 

@@ -177,7 +177,8 @@ class ResultDifferences:
     ) -> None:
         """The numbers about the result, within tolerances.
 
-        Those about a shape that is lost, and trust in recordings of before, are not compared.
+        Errors that were not recorded, or that need a lost shape, and trust in recordings of before
+        are not compared.
         """
         values = [event.values for event in recorded if isinstance(event, Measured)]
         computed = next((event.values for event in again if isinstance(event, Measured)), None)
@@ -188,8 +189,9 @@ class ResultDifferences:
             names = {*values[0], *computed}
             if not names.intersection(_TRUST, values[0]):
                 names -= _TRUST
-            if is_lost(recording.start.mesh):  # errors are modulo the shape's symmetries
-                names = {name for name in names if not name.endswith("_error")}
+            errors = {name for name in names if name.endswith("_error")}
+            if is_lost(recording.start.mesh) or not errors.intersection(values[0]):
+                names -= errors  # which are modulo the shape's symmetries
             far = [
                 name
                 for name in sorted(names)

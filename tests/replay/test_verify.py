@@ -17,6 +17,7 @@ from replay.comparing.verification import DIFFERS, EQUAL, NO_RESULT, Verdict, ve
 from replay.events import Event, HypothesesFound, Measured, Probe, SessionStarted, Traced
 from replay.mcap.reader import read_recording
 from replay.registration import recorded_method
+from tests.tools import small_recordings
 from tests.tools.small_recordings import measured_again
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
@@ -149,6 +150,16 @@ def test_how_far_a_result_is_trusted_is_computed_again(write: Write) -> None:
     assert found[1].differences[0].startswith("measured verdict: 3.5 -> ")
     assert found[2].differences[0].startswith("measured modes: 0.0 -> ")
     assert found[3].differences[0].startswith("measured outlier_share: absent -> ")
+
+
+def test_a_recording_without_symmetries_has_no_errors_to_compare(
+    write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(small_recordings, "symmetry_for_errors", lambda _: None)
+    events = small_recordings.registered_session("gradient_descent")
+    assert isinstance(events[0], SessionStarted)
+    assert events[0].world_from_object is not None
+    assert [verdict.outcome for verdict in verdicts(write(events))] == [EQUAL, EQUAL]
 
 
 def test_a_registration_that_was_interrupted_has_nothing_to_compare(
