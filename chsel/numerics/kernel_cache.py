@@ -14,6 +14,7 @@ import os
 import pickle
 import re
 import shutil
+import stat
 import sys
 import tempfile
 import time
@@ -268,6 +269,12 @@ def _unusable(place: Path, fingerprint: str) -> str | None:
             "which others can write to, and compiled kernels are executed; accepted: a folder "
             "that only you can write to (chmod go-w)"
         )
+    for parent in (*place.absolute().parents, *place.resolve().parents):
+        if not _is_safe(parent):
+            return (
+                f"whose parent {parent} others can write to, and compiled kernels are executed; "
+                "accepted: a folder whose parents only you and root can write to"
+            )
     return None
 
 
@@ -293,3 +300,12 @@ def _is_private(place: Path) -> bool:
         return True
     state = place.stat()
     return state.st_uid == os.getuid() and not state.st_mode & _OTHERS_WRITE
+
+
+def _is_safe(parent: Path) -> bool:
+    """Whether nobody else but root can replace what this user has in a folder."""
+    if sys.platform == "win32":
+        return True
+    state = parent.stat()
+    sticky = bool(state.st_mode & stat.S_ISVTX)
+    return state.st_uid in (0, os.getuid()) and (sticky or not state.st_mode & _OTHERS_WRITE)

@@ -136,6 +136,24 @@ def test_a_named_folder_that_cannot_be_used_is_named_and_passed_over(
     assert named.read_text() == "no folder" if mode is None else not kernels_in(named)
 
 
+def test_a_named_folder_in_one_that_others_can_write_to_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    named = tmp_path / "open" / "named"
+    named.mkdir(parents=True)
+    monkeypatch.setenv("CHSEL_CACHE_DIR", str(named))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    named.parent.chmod(0o777)
+    assert kernel_cache.cache_directory.__wrapped__().is_relative_to(tmp_path / "xdg")
+    assert [record.getMessage() for record in caplog.records] == [
+        f"CHSEL_CACHE_DIR is {named}, whose parent {named.parent} others can write to, and "
+        "compiled kernels are executed; accepted: a folder whose parents only you and root can "
+        "write to. The default folder is used"
+    ]
+    named.parent.chmod(0o1777)  # sticky, as /tmp
+    assert kernel_cache.cache_directory.__wrapped__().is_relative_to(named)
+
+
 NAMELESS = """
 import pwd
 def nobody(user):
