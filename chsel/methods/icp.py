@@ -39,7 +39,7 @@ _NO_SPREAD = 1e-20  # and so do those this much apart, m^2: points that differ b
 class IcpSettings(CheckedSettings):
     """All settings of ICP."""
 
-    surface_points: Annotated[int, positive, at_most(MOST_POINTS)] = 500  # Q, of the object
+    surface_points: Annotated[int, positive, at_most(MOST_POINTS)] = 2000  # Q, of the object
     # New points for every "registration", or the same for a session.
     redraw: Annotated[str, one_of("registration", "session")] = "session"
     iterations: Annotated[int, not_negative, at_most(MOST_ITERATIONS)] = 100  # at most
@@ -47,7 +47,10 @@ class IcpSettings(CheckedSettings):
     stop_below: float | None = 1e-6
     online: OnlineSettings = field(default_factory=OnlineSettings)
 
-    presets: ClassVar[Presets] = {"paper": {"redraw": "registration"}}
+    presets: ClassVar[Presets] = {
+        "paper": {"surface_points": 500, "redraw": "registration"},
+        "reference": {"surface_points": 500},
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
