@@ -59,9 +59,9 @@ def register(
     hypotheses: B, 30 by default. workspace: where the object can be; by default the bounds of the
     points padded by the object's diameter. initial_set (B, 4, 4): E_0 as object_from_world.
     previous: the last result, when points were added since (CHSEL, Alg. 2). resolution: of the
-    SDF grid of a mesh, metres; by default a twentieth of the object's smallest extent, at most
-    1 cm. free_resolution: voxel side of free space, metres; used by free_term interior.
-    seed, step: of the random streams.
+    SDF grid of a mesh, metres; by default that of `SdfGrid.from_mesh`. The grid is kept for the
+    next call with this mesh. free_resolution: voxel side of free space, metres; used by free_term
+    interior. seed, step: of the random streams.
 
     Returns hypotheses with costs, best first, repeated poses flagged, and with `trust`: how far to
     trust them, see `trust_in`; None if an installed method finds no pose.

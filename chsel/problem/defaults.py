@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_grid import DEFAULT_NODES, OBJECT_PADDING, SdfGrid
 
 if TYPE_CHECKING:
     import trimesh
 
 FREE_RESOLUTION = 0.01  # side of a voxel of free space, metres
-OBJECT_PADDING = 0.05  # of the SDF grid around the object, metres
-_NODES_PER_EXTENT = 20  # of the SDF grid, over the object's smallest extent
-_COARSEST = 0.01  # spacing of these nodes, metres
+_KEPT_NODES = 2 * DEFAULT_NODES  # of all grids that are kept
+_kept: dict[tuple[str, float | None, float], SdfGrid] = {}  # the last used, in this order
 
 
 def object_grid(
@@ -26,13 +24,16 @@ def object_grid(
     padding: float = OBJECT_PADDING,
     progress: Callable[[int, int], None] | None = None,
 ) -> SdfGrid:
-    """The signed distance grid of a clean mesh, metres, see `SdfGrid.from_mesh`.
-
-    resolution: metres; None: a twentieth of the object's smallest extent, at most 1 cm.
-    """
-    if resolution is None:
-        resolution = min(_COARSEST, float(np.min(mesh.extents)) / _NODES_PER_EXTENT)
-    return SdfGrid.from_mesh(mesh, resolution, padding=padding, progress=progress)
+    """The grid of a clean mesh by `SdfGrid.from_mesh`, kept for the next call with this mesh."""
+    key = mesh_digest(mesh), resolution, padding
+    grid = _kept.pop(key, None)
+    if grid is None:
+        grid = SdfGrid.from_mesh(mesh, resolution, padding=padding, progress=progress)
+    _kept[key] = grid
+    for oldest in list(_kept):
+        if sum(each.values.size for each in list(_kept.values())) > _KEPT_NODES:
+            _kept.pop(oldest, None)
+    return grid
 
 
 def workspace_around(points: KnownPoints, sdf: SdfGrid) -> Workspace:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from chsel.errors import MeshError, SdfError, quoted, require_choice, require_positive
+from chsel.errors import MeshError, MeshWarning, SdfError, quoted, require_choice, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen
 
 if TYPE_CHECKING:
@@ -21,10 +23,16 @@ if TYPE_CHECKING:
 
 LOOKUPS = ("nearest", "trilinear")
 OUTSIDE = ("surface_point", "bounding_box")
+OBJECT_PADDING = 0.05  # around the object, metres
 MAX_NODES = 50_000_000
+DEFAULT_NODES = 2_000_000  # at most, where the caller chooses no resolution; 64 MB
 FINEST, COARSEST = 1e-6, 1e3  # spacing of nodes, metres, so that rounding merges no nodes
 FARTHEST = 1e6  # coordinates of the first node, metres
 Derived = TypeVar("Derived")
+_NODES_PER_EXTENT = 20  # of the default grid, over the object's smallest extent
+_DEFAULT_SPACING = 0.01  # of its nodes, at most, metres
+_NODES_ACROSS = 2  # of the default grid, in the thickness of a thin object
+_LEAST_PADDING = 1.5  # spacings: nodes are half a spacing beside a flat side, not on it
 _PART_NODES = 250_000  # least number of nodes that are sampled at once
 _PART_FACES = 5  # faces per node of a part: preparing 1.3 million costs as much as 65 000 nodes
 _NORMAL_RANGE = 1e-3  # metres; nearer to the surface, the face normal is the better gradient
@@ -89,14 +97,17 @@ class SdfGrid:
     def from_mesh(
         cls,
         mesh: trimesh.Trimesh,
-        resolution: float = 0.01,
+        resolution: float | None = None,
         *,
-        padding: float = 0.05,
+        padding: float = OBJECT_PADDING,
         progress: Callable[[int, int], None] | None = None,
     ) -> SdfGrid:
-        """Sample the exact signed distance of a mesh over its padded bounding box.
+        """Sample the exact signed distance of a mesh, metres, over its padded bounding box.
 
         Values are rounded to 32 bits (nanometres), which halves the size in recordings.
+        resolution: metres; None: a twentieth of the smallest extent, at most 1 cm, or what keeps
+        the grid at 2 million nodes. The padding of a thin object then shrinks, so that two nodes
+        are across it. A MeshWarning says what was chosen.
         progress: called before each part of a large grid with the number of nodes done and of all
         nodes; it changes no bit.
         """
@@ -105,25 +116,25 @@ class SdfGrid:
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             accepted = "a Trimesh with faces, such as chsel.load_mesh(path)"
             raise MeshError(f"mesh is {quoted(mesh)}; accepted: {accepted}")
-        require_positive("SDF resolution", resolution)
         require_positive("SDF padding", padding)
+        if resolution is None:
+            resolution, padding = _default_spacing(mesh, padding)
+        require_positive("SDF resolution", resolution)
         _check_resolution(resolution)
-        lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
-        origin = lower - padding
-        shape = tuple(int(n) + 2 for n in np.floor((upper + padding - origin) / resolution))
-        if np.prod(shape, dtype=float) > MAX_NODES:
+        shape = _shape(mesh, resolution, padding)
+        if math.prod(shape) > MAX_NODES:
             raise SdfError(
-                f"an SDF of resolution {resolution} m needs {np.prod(shape, dtype=float):.3g} "
-                f"nodes; accepted: at most {MAX_NODES:.0e}, so a coarser resolution"
+                f"an SDF of resolution {resolution:g} m needs {math.prod(shape):.3g} nodes; "
+                f"accepted: at most {MAX_NODES:.0e}, so a coarser resolution"
             )
-        nodes = origin + np.indices(shape).reshape(3, -1).T * resolution
-        parts, done = [], 0
-        for part in _parts(nodes, len(mesh.faces)):
+        origin = np.asarray(mesh.bounds, dtype=np.float64)[0] - padding
+        values, gradients = np.empty(math.prod(shape)), np.empty((math.prod(shape), 3))
+        for part in _parts(len(values), len(mesh.faces)):
             if progress is not None:
-                progress(done, len(nodes))
-            parts.append(mesh_sdf(mesh, part))
-            done += len(part)
-        values, gradients = (_rounded(np.concatenate(part)) for part in zip(*parts, strict=True))
+                progress(part.start, len(values))
+            nodes = np.stack(np.unravel_index(np.arange(part.start, part.stop), shape), axis=1)
+            signed, gradient = mesh_sdf(mesh, origin + nodes * resolution)
+            values[part], gradients[part] = _rounded(signed), _rounded(gradient)
         return cls(origin, resolution, values.reshape(shape), gradients.reshape(*shape, 3))
 
     @property
@@ -262,10 +273,47 @@ def _lengths(vectors: FloatArray) -> FloatArray:
     return lengths
 
 
-def _parts(nodes: FloatArray, face_count: int) -> list[FloatArray]:
-    """The nodes (N, 3) in parts, so large that preparing the mesh for each costs little."""
+def _default_spacing(mesh: trimesh.Trimesh, padding: float) -> tuple[float, float]:
+    """Spacing and padding, metres, of a grid of at most DEFAULT_NODES nodes."""
+    extents = np.asarray(mesh.extents, dtype=np.float64)
+    thickness = float(extents.min())
+    if not min(thickness, float(mesh.area)) > 0.0:
+        raise MeshError("mesh is flat; accepted: a solid, with three extents above 0")
+    spacing = usual = min(_DEFAULT_SPACING, thickness / _NODES_PER_EXTENT)
+    if mesh.is_watertight:  # the mean one, also of a plate that is not along the axes
+        thickness = min(thickness, 2.0 * abs(float(mesh.volume)) / float(mesh.area))
+    coarsest = thickness / _NODES_ACROSS
+    while math.prod(_shape(mesh, spacing, padding)) > DEFAULT_NODES:
+        if spacing < coarsest:
+            spacing = min(1.01 * spacing, coarsest)
+        elif padding > _LEAST_PADDING * spacing:
+            padding = max(0.9 * padding, _LEAST_PADDING * spacing)
+        else:
+            spacing *= 1.01
+            padding = _LEAST_PADDING * spacing
+    if spacing > usual:
+        size = " x ".join(f"{1e3 * extent:.3g}" for extent in extents)
+        lost = " (thinner parts may be missing)" if spacing > coarsest else ""
+        text = (
+            f"the SDF grid of an object of {size} mm has nodes {1e3 * spacing:.3g} mm apart{lost} "
+            f"and a padding of {1e3 * padding:.3g} mm: {1e3 * usual:.3g} mm would take more than "
+            f"{DEFAULT_NODES / 1e6:g} million nodes; choose another by resolution"
+        )
+        warnings.warn(MeshWarning("coarse_grid", text), stacklevel=3)
+    return spacing, padding
+
+
+def _shape(mesh: trimesh.Trimesh, resolution: float, padding: float) -> tuple[int, ...]:
+    """Nodes per axis of the grid of a mesh."""
+    lower, upper = np.asarray(mesh.bounds, dtype=np.float64)
+    span = upper + padding - (lower - padding)
+    return tuple(int(n) + 2 for n in np.floor(span / resolution))
+
+
+def _parts(count: int, face_count: int) -> list[slice]:
+    """Parts of so many nodes, so large that preparing the mesh for each costs little."""
     size = max(_PART_NODES, face_count // _PART_FACES)
-    return [nodes[first : first + size] for first in range(0, len(nodes), size)]
+    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
 
 
 def _check_resolution(resolution: float) -> None:

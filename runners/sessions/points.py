@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from chsel.errors import PointsError, SettingError, require_positive
-from chsel.problem.defaults import FREE_RESOLUTION, OBJECT_PADDING, workspace_around
+from chsel.problem.defaults import FREE_RESOLUTION, workspace_around
 from chsel.problem.input_checks import check_points
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.problem.sdf_grid import OBJECT_PADDING
 from replay.events import Probe
 from runners.objects.loader import ObjectModel
 from runners.sessions.point_files import read_points

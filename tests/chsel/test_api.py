@@ -47,6 +47,22 @@ def test_a_grid_a_mesh_lists_and_tensors_give_the_same_bits() -> None:
     assert register(surface=SURFACE, seed=1).digest not in digests
 
 
+@pytest.mark.filterwarnings("ignore:the SDF grid of an object:chsel.MeshWarning")
+def test_a_thin_plate_is_found_and_its_grid_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("chsel.problem.sdf_grid.DEFAULT_NODES", 40_000)
+    plate = trimesh.creation.box((0.1, 0.06, 0.002))
+    touched = trimesh.sample.sample_surface(plate, 40, seed=0)[0]
+    rim = np.array([[0.05, 0.01, 0.0], [0.05, -0.02, 0.0], [-0.05, 0.01, 0.0], [0.01, 0.03, 0.0]])
+    surface = apply(POSE, np.concatenate([touched, rim]))
+    found = chsel.register(plate, surface=surface, method="anchored")
+    corners = apply(found.object_from_world[0], apply(POSE, np.asarray(plate.vertices)))
+    expected = np.tile(plate.extents / 2.0, (8, 1))  # after half turns, too
+    np.testing.assert_allclose(np.abs(corners), expected, atol=5e-4)
+    monkeypatch.setattr("chsel.problem.sdf_grid.mesh_sdf", None)
+    again = chsel.register(plate, surface=surface, method="anchored")
+    assert again.digest == found.digest
+
+
 def test_points_added_later_start_from_the_previous_result() -> None:
     first = register(surface=SURFACE[:20])
     second = register(surface=SURFACE, previous=first, step=1)

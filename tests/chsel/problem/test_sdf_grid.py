@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,12 @@ import pytest
 import trimesh
 
 from chsel import SdfGrid
-from chsel.errors import MeshError, SdfError, SettingError
+from chsel.errors import MeshError, MeshWarning, SdfError, SettingError
+from chsel.problem import defaults
+from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
-from chsel.problem.sdf_grid import _parts, mesh_sdf
+from chsel.problem.sdf_grid import DEFAULT_NODES, _default_spacing, _parts, _shape, mesh_sdf
+from chsel.problem.surface import surface_points
 from tests.chsel.samples import box_distance
 
 SIZE = np.array([0.2, 0.12, 0.08])
@@ -91,8 +95,68 @@ def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
     assert remade().digest == grid.digest
     assert told == [(done, nodes) for done in range(0, nodes, 1000)]
     monkeypatch.setattr("chsel.problem.sdf_grid._PART_NODES", 1)
-    parts = _parts(np.zeros((10, 3)), face_count=20)  # of a large mesh, parts are large
-    assert [len(part) for part in parts] == [4, 4, 2]
+    parts = _parts(10, face_count=20)  # of a large mesh, parts are large
+    assert parts == [slice(0, 4), slice(4, 8), slice(8, 10)]
+
+
+@pytest.mark.parametrize(
+    ("size", "tilt"),
+    [
+        ((0.1, 0.06, 0.0006), 0.0),
+        ((0.1, 0.06, 0.0006), 0.03),
+        ((0.2, 0.12, 0.0006), 0.0),
+        ((0.18, 0.09, 0.015), 0.03),
+    ],
+)
+def test_the_default_grid_of_a_thin_object_is_small_and_has_two_nodes_across(
+    size: tuple[float, float, float], tilt: float
+) -> None:
+    plate = trimesh.creation.box(size)
+    plate.apply_transform(trimesh.transformations.rotation_matrix(tilt, [1.0, 2.0, 0.0]))
+    with pytest.warns(MeshWarning, match=r"mm has nodes [0-9.]+ mm apart and a padding"):
+        spacing, padding = _default_spacing(plate, 0.05)
+    nodes = np.prod((np.asarray(plate.extents) + 2.0 * padding) / spacing + 1.0)
+    assert 0.7 * DEFAULT_NODES < nodes <= 1.1 * DEFAULT_NODES
+    assert np.prod(_shape(plate, spacing, padding)) <= DEFAULT_NODES
+    assert spacing <= size[2] / 2.0
+
+
+def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("chsel.problem.sdf_grid.DEFAULT_NODES", 20_000)
+    size = np.array([0.1, 0.06, 0.003])
+    plate = trimesh.creation.box(size)
+    with pytest.warns(MeshWarning, match=r"100 x 60 x 3 mm .* 0.15 mm would take") as caught:
+        grid = SdfGrid.from_mesh(plate)
+    assert len(caught) == 1
+    assert grid.values.size <= 20_000
+    assert (grid.values < 0.0).sum(axis=2).max() == 2
+    nodes = grid.origin + np.indices(grid.shape).reshape(3, -1).T * grid.resolution
+    np.testing.assert_allclose(grid.values.reshape(-1), box_distance(nodes, size), atol=1e-8)
+    points = np.random.default_rng(0).uniform(-0.6 * size, 0.6 * size, (3000, 3))
+    distance = grid.at(points, lookup="trilinear")[0]
+    np.testing.assert_allclose(distance, box_distance(points, size), atol=grid.resolution / 2.0)
+    on_it = surface_points(grid, 1000, np.random.default_rng(0))
+    assert np.abs(box_distance(on_it, size)).max() < grid.resolution / 2.0
+
+
+def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(
+    box: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = object_grid(box)
+    assert grid.resolution == SIZE.min() / 20.0
+    assert SdfGrid.from_mesh(box).digest == grid.digest
+    assert object_grid(box.copy()) is grid
+    assert object_grid(box, 0.01) is not grid
+    assert object_grid(box.copy().apply_scale(0.9)) is not grid
+    assert object_grid(box) is grid
+    monkeypatch.setattr("chsel.problem.defaults._KEPT_NODES", grid.values.size)
+    assert object_grid(box) is grid  # the last used, so that the others are gone
+    assert list(defaults._kept.values()) == [grid]
+    monkeypatch.setattr("chsel.problem.defaults._KEPT_NODES", grid.values.size - 1)
+    assert object_grid(box) is grid
+    assert not defaults._kept
 
 
 def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid: SdfGrid) -> None:
@@ -192,7 +256,10 @@ def test_grids_that_make_no_sense_are_refused(grid: SdfGrid, box: trimesh.Trimes
         SdfGrid(
             grid.origin, 0.01, np.where(grid.values < -0.03, np.nan, grid.values), grid.gradients
         )
-    with pytest.raises(SdfError, match="coarser resolution"):
+    with pytest.raises(MeshError, match="mesh is flat; accepted: a solid"):
+        SdfGrid.from_mesh(box.copy().apply_scale([1.0, 1.0, 0.0]))
+    nodes = re.escape(f"{30_002 * 22_002 * 18_002:.3g}")
+    with pytest.raises(SdfError, match=rf"1e-05 m needs {nodes} nodes; .* coarser resolution"):
         SdfGrid.from_mesh(box, 1e-5)
     with pytest.raises(SettingError, match="SDF resolution is 0"):
         SdfGrid.from_mesh(box, 0)
