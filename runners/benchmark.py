@@ -12,7 +12,6 @@ import torch
 import yaml
 from omegaconf import DictConfig
 
-from chsel.cost.torch_cost import device_named, gpus
 from chsel.errors import require_choice, require_positive
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
@@ -45,7 +44,6 @@ class BenchmarkConfig:
     package: PackageConfig
     steps: Steps
     logs: str
-    device: str  # where evaluation takes many poses, besides the processor
     format: str  # of the picture
     repeats: int
     seed: int
@@ -62,14 +60,6 @@ class BenchmarkConfig:
         for measure in self.alone:
             require_choice("alone", measure, MEASURES)
         require_choice("format", self.format, FORMATS)
-        require_choice("device", self.device, ("auto", "cpu", "cuda"))
-        if self.device == "cuda":
-            device_named("cuda")
-
-    @property
-    def on_gpu(self) -> bool:
-        """Whether a GPU is measured, too."""
-        return self.device == "cuda" or (self.device == "auto" and gpus() > 0)
 
     def shortened(self) -> BenchmarkConfig:
         """As much as takes under a minute; its times are not to be quoted."""
@@ -156,7 +146,6 @@ def _run(
             config.seed,
             config.free_points,
             config.hypotheses,
-            config.on_gpu,
         )
         for name in config.alone:
             status.update(f"measuring {name}")

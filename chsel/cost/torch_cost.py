@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,64 +11,24 @@ from torch import Tensor
 
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.interior_points import interior_points
-from chsel.cost.torch_octree import NODES_PER_POSE, FreeTree, Pairs
-from chsel.errors import EngineError, require_positive
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, VoxelGrid
-from chsel.problem.poses import as_tensor, moved, stacked
+from chsel.problem.poses import stacked
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 
-
-def gpus() -> int:
-    """The number of GPUs that torch finds on this machine."""
-    return torch.cuda.device_count() if torch.cuda.is_available() else 0
-
-
-def device_named(name: str) -> torch.device:
-    """The device "cpu", "cuda" (torch's current GPU) or "cuda:N".
-
-    Raises EngineError, which lists the devices of this machine, for any other name.
-    """
-    count = gpus()
-    accepted = ["cpu", *(["cuda"] if count else []), *(f"cuda:{n}" for n in range(count))]
-    if name == "cuda" and count:
-        return torch.device("cuda", torch.cuda.current_device())
-    if name in accepted:
-        return torch.device(name)
-    present = f"{count} GPU{'s' * (count > 1)}" if count else "no GPU"
-    but = f", but torch finds {present} here" if str(name).startswith("cuda") else ""
-    raise EngineError(f"device is {name}{but}; accepted: {', '.join(accepted)}")
-
-
-_PAIRS_ON_CPU = 60_000  # fits its cache
-_PAIRS_ON_GPU = 4_000_000  # at most 1.6 GB of its memory
-
-
-class Part(NamedTuple):
-    """A term of the cost for B poses, and its gradient."""
-
-    value: Tensor  # (B,)
-    by_rotation: Tensor  # (B, 3, 3)
-    by_translation: Tensor  # (B, 3)
+_PAIRS_AT_ONCE = 60_000  # of poses and points; more leave the processor's cache
 
 
 class RelaxedCost:
     """C^(X) = lambda sum_free c_f + lambda sum_occupied c_o + sum_known c_k (CHSEL, Eq. 7).
 
-    A function of rotations (B, 3, 3) and translations (B, 3) of object_from_world; B may differ
-    from call to call, and no pose's cost depends on the others. Built from numpy arrays and
-    differentiable by torch: the gradient is the one that Eqs. 8 to 10 define, pushed through
-    x~ = R x + t.
+    A function of rotations (B, 3, 3) and translations (B, 3) of object_from_world, float64 tensors
+    on the processor. Built from numpy arrays and differentiable by torch: the gradient is the one
+    that Eqs. 8 to 10 define, pushed through x~ = R x + t.
 
-    Use it for gradients by torch, and with device "cuda" for the costs of 10^5 poses and more.
-    The methods use CompiledCost: on a processor it is 20 to 35 times as fast, and its bits are the
-    same on every machine. Those of RelaxedCost are the same in every run on one device, and in any
-    batch there, as sums run in a fixed order. Between devices, costs agree to a relative 1e-9.
-
-    pairs_at_once: how many pairs of pose and point are processed together, at 250 to 400 bytes
-    each; one pose is never divided. By default 60 000 on a processor and 4 million on a GPU.
-    Raises EngineError for a device that this machine does not have.
+    The methods use CompiledCost, which is many times as fast and has the same bits on every
+    machine.
     """
 
     def __init__(
@@ -78,136 +38,94 @@ class RelaxedCost:
         settings: CostSettings | None = None,
         *,
         free_resolution: float = 0.01,
-        device: str = "cpu",
-        pairs_at_once: int | None = None,
     ) -> None:
-        settings = (settings or CostSettings()).of_object(sdf, free_resolution)
-        self.settings = settings
-        self.sdf = sdf
-        self.points = points
-        self.device = device_named(device)
-        if pairs_at_once is None:
-            pairs_at_once = _PAIRS_ON_CPU if self.device.type == "cpu" else _PAIRS_ON_GPU
-        require_positive("pairs_at_once", pairs_at_once)
-        self.pairs_at_once = pairs_at_once
-        self._occupied = as_tensor(points.occupied, self.device)
-        self._known = as_tensor(points.known, self.device)
-        self._known_sdf = as_tensor(points.sdf, self.device)
-        self._tree: FreeTree | None = None
+        self.sdf, self.points = sdf, points
+        self.settings = settings = (settings or CostSettings()).of_object(sdf, free_resolution)
+        self._world = {
+            "free": _tensor(points.free if settings.free_term == "direct" else np.zeros((0, 3))),
+            "occupied": _tensor(points.occupied),
+            "known": _tensor(points.known),
+        }
+        self._known_sdf = _tensor(points.sdf)
         self._interior: _InteriorPoints | None = None
-        free, alpha, lookup = points.free, settings.alpha, settings.lookup
-        if len(free) and not bool(sdf.active_cells(alpha, lookup).any()):
+        deep = np.argwhere(sdf.values < settings.alpha)
+        corners = (deep.min(axis=0) - 1, deep.max(axis=0) + 1) if len(deep) else (1, 0)
+        # Free points outside of this box cost nothing.
+        self._deep = [_tensor(sdf.origin + sdf.resolution * np.asarray(c)) for c in corners]
+        if len(points.free) and not len(deep):
             warnings.warn(
-                f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
-                "use a smaller penetration_tolerance",
+                f"no node of the SDF is deeper than {-settings.alpha} m: free points cannot be "
+                "violated; use a smaller penetration_tolerance",
                 stacklevel=2,
             )
-        if len(free) and settings.free_term == "interior":
-            self._interior = _InteriorPoints(sdf, free, free_resolution, settings, self.device)
-        elif len(free):
-            self._tree = FreeTree(sdf, free, free_resolution, alpha, lookup, self.device)
+        if len(points.free) and settings.free_term == "interior":
+            self._interior = _InteriorPoints(sdf, points.free, free_resolution, settings)
+        interior = 0 if self._interior is None else len(self._interior.points)
+        pairs = max(1, interior + sum(map(len, self._world.values())))
+        self._poses_at_once = max(1, _PAIRS_AT_ONCE // pairs)
 
     @classmethod
-    def of(
-        cls,
-        problem: RegistrationProblem,
-        settings: CostSettings | None = None,
-        *,
-        device: str = "cpu",
-    ) -> RelaxedCost:
+    def of(cls, problem: RegistrationProblem, settings: CostSettings | None = None) -> RelaxedCost:
         """The cost that a problem's points define."""
-        resolution = problem.free_resolution
-        return cls(problem.sdf, problem.points, settings, free_resolution=resolution, device=device)
+        return cls(problem.sdf, problem.points, settings, free_resolution=problem.free_resolution)
 
     def __call__(self, rotation: Tensor, translation: Tensor) -> Tensor:
         """Costs (B,) of object_from_world rotations (B, 3, 3) and translations (B, 3)."""
-        for tensor in (rotation, translation):
-            if tensor.device != self.device:
-                raise EngineError(
-                    f"poses are on {tensor.device}, the cost is on {self.device}; accepted: equal"
-                )
-        cost: Tensor = _DefinedGradient.apply(rotation, translation, self)
+        cost: Tensor = _InBatches.apply(rotation, translation, self)
         return cost
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
         transforms = stacked(object_from_world)
-        costs, size = np.empty(len(transforms)), self._poses_at_once
-        for first in range(0, len(transforms), size):
-            batch = as_tensor(transforms[first : first + size], self.device)
-            with torch.no_grad():
-                costs[first : first + size] = self(batch[:, :3, :3], batch[:, :3, 3]).cpu().numpy()
+        batches = _tensor(transforms).split(self._poses_at_once)
+        with torch.no_grad():
+            costs = torch.cat([self.of_batch(b[:, :3, :3], b[:, :3, 3]) for b in batches]).numpy()
         costs[~np.isfinite(transforms[:, :3]).all(axis=(1, 2))] = np.inf
-        return costs
+        return np.asarray(costs)
 
-    def terms(self, rotation: Tensor, translation: Tensor) -> dict[str, Part]:
-        """The weighted terms "free", "occupied" and "known" for B poses."""
-        size = self._poses_at_once
-        batches = list(zip(rotation.split(size), translation.split(size), strict=True))
-        terms = {"free": self._free, "occupied": self._of_occupied, "known": self._of_known}
-        return {name: _joined([term(r, t) for r, t in batches]) for name, term in terms.items()}
-
-    @property
-    def _poses_at_once(self) -> int:
-        free = 0 if self._tree is None else NODES_PER_POSE
-        interior = 0 if self._interior is None else len(self._interior.points)
-        most = max(1, free, interior, len(self._occupied), len(self._known))
-        return max(1, self.pairs_at_once // most)
-
-    def _free(self, rotation: Tensor, translation: Tensor) -> Part:
-        """lambda sum max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8)."""
+    def of_batch(self, rotation: Tensor, translation: Tensor) -> Tensor:
+        """The same, of a few poses, as torch differentiates it."""
+        settings = self.settings
+        lookup, outside = settings.lookup, settings.outside
+        total = 0.0 * (rotation[:, 0, 0] + translation[:, 0])
+        for name, scale in (
+            ("free", settings.free_scale),
+            ("occupied", settings.occupied_scale),
+            ("known", settings.known_scale),
+        ):
+            points = self._world[name]
+            pose, point = self._pairs(rotation, translation, points, can_be_far=name != "free")
+            local = _moved(rotation[pose], translation[pose], points[point])  # (Q, 3)
+            s, n = map(_tensor, self.sdf.at(local.detach().numpy(), lookup=lookup, outside=outside))
+            if name == "known":  # sum |s - v|, with gradient (s - v) n (Eq. 10)
+                s = s - self._known_sdf[point]
+                violation, side = s.abs() - settings.known_tolerance, torch.sign(s)
+            else:  # sum max(0, alpha -+ s), with gradient -+ max(0, alpha -+ s) n (Eqs. 8 and 9)
+                sign = -1.0 if name == "free" else 1.0
+                violation, side = settings.alpha + sign * s, torch.full_like(s, sign)
+            violation = violation.clamp_min(0.0)
+            slope = (violation > 0.0).double() if settings.gradient == "exact" else violation
+            values = scale * _with_gradient(violation, (slope * side)[:, None] * n, local)
+            total = total.index_add(0, pose, values)
         if self._interior is not None:
-            return self._interior.part(rotation, translation)
-        if self._tree is None:
-            return _zero(rotation)
-        violated = self._tree.violated(rotation, translation, self.pairs_at_once)
-        if violated is None:
-            half = -(-len(rotation) // 2)
-            halves = zip(rotation.split(half), translation.split(half), strict=True)
-            return _joined([self._free(r, t) for r, t in halves])
-        s, n = self._query(violated)
-        violation = (self.settings.alpha - s).clamp_min(0.0)
-        return self._sum(rotation, violated, self.settings.free_scale, violation, -n)
+            total = total + self._interior.cost(rotation, translation)
+        return total
 
-    def _of_occupied(self, rotation: Tensor, translation: Tensor) -> Part:
-        """lambda sum max(0, alpha + s), with gradient lambda max(0, alpha + s) n (Eq. 9)."""
-        if len(self._occupied) == 0:
-            return _zero(rotation)
-        pairs = _all_pairs(rotation, translation, self._occupied)
-        s, n = self._query(pairs)
-        violation = (self.settings.alpha + s).clamp_min(0.0)
-        return self._sum(rotation, pairs, self.settings.occupied_scale, violation, n)
+    def _pairs(
+        self, rotation: Tensor, translation: Tensor, points: Tensor, *, can_be_far: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Indices (Q,) of poses and of points, pose by pose; without points that cost nothing.
 
-    def _of_known(self, rotation: Tensor, translation: Tensor) -> Part:
-        """sum |s - v|, with gradient (s - v) n (Eq. 10)."""
-        if len(self._known) == 0:
-            return _zero(rotation)
-        pairs = _all_pairs(rotation, translation, self._known)
-        s, n = self._query(pairs)
-        difference = s - self._known_sdf.repeat(len(rotation))
-        excess = (difference.abs() - self.settings.known_tolerance).clamp_min(0.0)
-        along = torch.sign(difference)[:, None] * n
-        return self._sum(rotation, pairs, self.settings.known_scale, excess, along)
-
-    def _query(self, pairs: Pairs) -> tuple[Tensor, Tensor]:
-        lookup, outside = self.settings.lookup, self.settings.outside
-        return self.sdf.query(pairs.local, lookup=lookup, outside=outside)
-
-    def _sum(
-        self, rotation: Tensor, pairs: Pairs, scale: float, violation: Tensor, along: Tensor
-    ) -> Part:
-        """Sums by pose of violations (P,), which grow along object-frame directions (P, 3)."""
-        exact = self.settings.gradient == "exact"
-        slope = (violation > 0.0).double() if exact else violation
-        gradient = scale * slope[:, None] * along
-        return _sum_by_pose(
-            rotation,
-            pairs.pose,
-            scale * violation,
-            by_translation=gradient,
-            left=gradient,
-            right=pairs.world,
-        )
+        can_be_far: points far from the object cost something, too.
+        """
+        if can_be_far:
+            pairs = torch.ones((len(rotation), len(points)), dtype=torch.bool)
+        else:
+            with torch.no_grad():
+                local = points @ rotation.transpose(1, 2) + translation[:, None]
+            pairs = ((local >= self._deep[0]) & (local <= self._deep[1])).all(dim=2)
+        pose, point = pairs.nonzero(as_tuple=True)
+        return pose, point
 
 
 class _InteriorPoints:
@@ -218,95 +136,63 @@ class _InteriorPoints:
     """
 
     def __init__(
-        self,
-        sdf: SdfGrid,
-        free: FloatArray,
-        free_resolution: float,
-        settings: CostSettings,
-        device: torch.device,
+        self, sdf: SdfGrid, free: FloatArray, free_resolution: float, settings: CostSettings
     ) -> None:
         interior = interior_points(sdf, settings)
         voxels = VoxelGrid.around(free, free_resolution)
-        self.points = as_tensor(interior.points, device)  # (M, 3)
-        self._weight = as_tensor(interior.weights(settings, free_resolution), device)
-        self._normal = as_tensor(interior.normals, device)
-        self._is_free = torch.from_numpy(voxels.flags.reshape(-1)).to(device)
-        self._counts = voxels.flags.shape
-        self._last = torch.tensor(voxels.flags.shape).to(device) - 1
-        self._origin = as_tensor(voxels.origin, device)
-        self._inverse = 1.0 / voxels.resolution
+        self.points = _tensor(interior.points)  # (M, 3)
+        self._weight = _tensor(interior.weights(settings, free_resolution))
+        self._normal = _tensor(interior.normals)
+        self._is_free = torch.from_numpy(voxels.flags)
+        self._origin, self._inverse = _tensor(voxels.origin), 1.0 / voxels.resolution
 
-    def part(self, rotation: Tensor, translation: Tensor) -> Part:
-        """The term for B poses."""
-        back, nothing = rotation.transpose(1, 2), torch.zeros_like(translation)
-        start = -moved(back, nothing, translation)
-        world = moved(back[:, None], start[:, None], self.points)  # (B, M, 3): R^T m - R^T t
-        index = torch.round((world - self._origin) * self._inverse).to(torch.int64)
-        i, j, k = torch.minimum(index.clamp_min(0), self._last).unbind(dim=2)
-        _, ny, nz = self._counts
-        flat = (i * ny + j) * nz + k
-        pose, point = self._is_free[flat].nonzero(as_tuple=True)
-        weight = self._weight[point]
-        pull = weight[:, None] * self._normal[point]  # R dC/dy
-        local = self.points[point] - translation[pose]
-        by_world = moved(back[pose], nothing[pose], pull)
-        return _sum_by_pose(
-            rotation, pose, weight, by_translation=-pull, left=local, right=by_world
+    def cost(self, rotation: Tensor, translation: Tensor) -> Tensor:
+        """The term (B,) for B poses."""
+        back = rotation.transpose(1, 2)
+        nothing = torch.zeros_like(translation)
+        world = _moved(  # (B, M, 3): R^T m - R^T t
+            back[:, None], -_moved(back, nothing, translation)[:, None], self.points
         )
+        last = torch.tensor(self._is_free.shape) - 1
+        index = torch.round((world.detach() - self._origin) * self._inverse).to(torch.int64)
+        i, j, k = torch.minimum(index.clamp_min(0), last).unbind(dim=2)
+        weight = self._weight * self._is_free[i, j, k]  # (B, M)
+        inwards = _moved(back[:, None].detach(), nothing[:, None], self._normal)
+        return _with_gradient(weight, weight[..., None] * inwards, world).sum(dim=1)
 
 
-class _DefinedGradient(torch.autograd.Function):
-    """Forward, the value; backward, the gradient that the terms define."""
+def _tensor(array: FloatArray) -> Tensor:
+    return torch.tensor(array, dtype=torch.float64)
+
+
+def _moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
+    """R x + t (..., 3), without a matrix product, whose order of additions may differ."""
+    columns = [rotation[..., i] * points[..., i, None] for i in range(3)]
+    return columns[0] + columns[1] + columns[2] + translation
+
+
+def _with_gradient(values: Tensor, gradients: Tensor, points: Tensor) -> Tensor:
+    """Values (..., P), with given gradients (..., P, 3) by points (..., P, 3)."""
+    moves = gradients.detach() * (points - points.detach())  # zero, but not their derivative
+    return values.detach() + moves.sum(dim=-1)
+
+
+class _InBatches(torch.autograd.Function):
+    """The cost of a batch of poses after the other, and its gradient at once, to save memory."""
 
     @staticmethod
     def forward(ctx: Any, rotation: Tensor, translation: Tensor, cost: RelaxedCost) -> Tensor:
-        free, occupied, known = cost.terms(rotation.detach(), translation.detach()).values()
-        value, *gradient = (a + b + c for a, b, c in zip(free, occupied, known, strict=True))
-        ctx.save_for_backward(*gradient)
-        return value
+        values, slopes, size = [], [], cost._poses_at_once
+        for some in zip(rotation.split(size), translation.split(size), strict=True):
+            leaves = tuple(part.detach().requires_grad_() for part in some)
+            with torch.enable_grad():
+                value = cost.of_batch(*leaves)
+                slopes.append(torch.autograd.grad(value.sum(), leaves))
+            values.append(value.detach())
+        ctx.save_for_backward(*(torch.cat(parts) for parts in zip(*slopes, strict=True)))
+        return torch.cat(values)
 
     @staticmethod
     def backward(ctx: Any, by_value: Tensor) -> tuple[Tensor, Tensor, None]:
         by_rotation, by_translation = ctx.saved_tensors
         return by_value[:, None, None] * by_rotation, by_value[:, None] * by_translation, None
-
-
-def _all_pairs(rotation: Tensor, translation: Tensor, points: Tensor) -> Pairs:
-    """All pairs of B poses and points (N, 3)."""
-    count = len(rotation)
-    pose = torch.arange(count, device=points.device).repeat_interleave(len(points))
-    local = moved(rotation[:, None], translation[:, None], points)
-    return Pairs(pose, points.repeat(count, 1), local.reshape(-1, 3))
-
-
-def _sum_by_pose(
-    rotation: Tensor,
-    pose: Tensor,
-    value: Tensor,
-    *,
-    by_translation: Tensor,
-    left: Tensor,
-    right: Tensor,
-) -> Part:
-    """Sums by pose (P,), ascending, of values (P,) and gradients (P, 3); that by R is left right^T.
-
-    Each sum runs in the order of its pairs: the same bits in any batch.
-    """
-    count = len(rotation)
-    if len(pose) == 0:
-        return _zero(rotation)
-    columns = [value[:, None], by_translation, *(left[:, i : i + 1] * right for i in range(3))]
-    ends = torch.searchsorted(pose, torch.arange(count + 1, device=pose.device))
-    # For two and more columns, torch adds rows one after another, on a GPU too.
-    sums = torch.segment_reduce(torch.cat(columns, dim=1), "sum", lengths=ends.diff(), axis=0)
-    return Part(sums[:, 0], sums[:, 4:].reshape(-1, 3, 3), sums[:, 1:4])
-
-
-def _zero(rotation: Tensor) -> Part:
-    """Zero for each of the rotations (B, 3, 3)."""
-    zeros = torch.zeros_like(rotation)
-    return Part(zeros[:, 0, 0], zeros, zeros[:, 0])
-
-
-def _joined(parts: list[Part]) -> Part:
-    return Part(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))

@@ -1,11 +1,11 @@
-"""Poses and rigid transforms, then rotations, then quaternions, then the same in torch."""
+"""Poses and rigid transforms, then rotations, then quaternions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +13,6 @@ from chsel.errors import PoseError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.elementary import arctangents, sines_cosines
 from chsel.problem.streams import normals
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
 
 RIGID_TOLERANCE = 1e-6
 SENSOR_TOLERANCE = 1e-3  # of poses from files and sensors, which are often rounded
@@ -271,30 +267,3 @@ def _product(left: FloatArray, right: FloatArray) -> FloatArray:
     """Inner products (N, 1) of vectors (N, 4), summed in a fixed order."""
     terms = left * right
     return ((terms[:, 0] + terms[:, 1]) + (terms[:, 2] + terms[:, 3]))[:, None]
-
-
-def as_tensor(value: Any, device: torch.device | str = "cpu") -> Tensor:
-    """A float64 copy of an array, on a device."""
-    import torch
-
-    return torch.tensor(np.asarray(value), dtype=torch.float64).to(device)
-
-
-def moved(rotation: Tensor, translation: Tensor, points: Tensor) -> Tensor:
-    """R x + t (..., 3) of rotations (..., 3, 3), translations (..., 3) and points (..., 3).
-
-    Written out, because a matrix product sums in an order that depends on the machine.
-    """
-    columns = [rotation[..., i] * points[..., i, None] for i in range(3)]
-    return columns[0] + columns[1] + columns[2] + translation
-
-
-def length(vectors: Tensor) -> Tensor:
-    """Lengths (B, 1) of vectors (B, 3), of at least 1e-12 so that they can be divided by."""
-    return squared_length(vectors).sqrt().clamp_min(1e-12)
-
-
-def squared_length(vectors: Tensor) -> Tensor:
-    """Squared lengths (B, 1) of vectors (B, 3), each sum in the order of its index."""
-    squares = vectors * vectors
-    return squares[:, 0:1] + squares[:, 1:2] + squares[:, 2:3]

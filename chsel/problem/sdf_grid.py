@@ -15,11 +15,8 @@ from chsel.errors import MeshError, MeshWarning, SdfError, quoted, require_choic
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen
 
 if TYPE_CHECKING:
-    import torch
     import trimesh
-    from torch import Tensor
 
-    from chsel.problem.torch_grid import TorchGrid
 
 LOOKUPS = ("nearest", "trilinear")
 OUTSIDE = ("surface_point", "bounding_box")
@@ -218,26 +215,6 @@ class SdfGrid:
             value[beyond] = distance[:, 0]
             gradient[beyond] = away / distance
         return value, gradient
-
-    def query(
-        self, points: Any, *, lookup: str = "nearest", outside: str = "surface_point"
-    ) -> tuple[Tensor, Tensor]:
-        """The same in torch, on the device of the points, which may round otherwise. See `at`."""
-        import torch
-
-        require_choice("lookup", lookup, LOOKUPS)
-        require_choice("outside", outside, OUTSIDE)
-        points = torch.as_tensor(points, dtype=torch.float64)
-        return self.on(points.device).query(points, lookup=lookup, outside=outside)
-
-    def on(self, device: torch.device) -> TorchGrid:
-        """The grid in torch on a device, where it stays."""
-        from chsel.problem.torch_grid import TorchGrid
-
-        def make() -> TorchGrid:
-            return TorchGrid(self.bounds, self.resolution, self.values, self.gradients, device)
-
-        return self.derived(("torch", device), make)
 
     def _nearest(self, cell: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Value and gradient at grid coordinates (P, 3) by the nearest node."""

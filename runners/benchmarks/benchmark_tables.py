@@ -70,8 +70,7 @@ def _machine(machine: Values) -> list[str]:
     versions = ", ".join(f"{name} {machine[f'package {name}']}" for name in packages)
     lines = [
         f"{machine['processor']}, {machine['cores_usable']} of {machine['cores']} cores usable, "
-        f"load {machine['load_before']} before, {machine['load_after']} after; "
-        f"{machine['gpu'] or 'no GPU here'}",
+        f"load {machine['load_before']} before, {machine['load_after']} after",
         f"Python {machine['python']}, {versions}",
     ]
     if "published" in machine:

@@ -44,7 +44,6 @@ _SPREAD = (*PRESETS, "anchored, medium")
 _STAGED = (*PRESETS, "anchored, adaptive")
 _POSES = 100_000
 _POSES_AT_ONCE = 1000
-_POSES_ON_GPU = (100_000, 1_000_000, 10_000_000)
 _LONGEST = 3.0  # seconds
 
 
@@ -127,10 +126,7 @@ def methods(scope: Scope) -> Iterator[Row]:
 
 
 def evaluation(scope: Scope) -> Iterator[Row]:
-    """Poses evaluated in a second, without gradients: as the methods do, and as torch does.
-
-    On a GPU, many poses in one call, which takes them there and the costs back.
-    """
+    """Poses evaluated in a second, without gradients: as the methods do, and as torch does."""
     posed = pose(PROBLEMS[_PROBLEM], scope.seed)
     problem = posed.registration_problem()
     settings = OnlineSettings(hypotheses=_POSES)
@@ -145,13 +141,6 @@ def evaluation(scope: Scope) -> Iterator[Row]:
             evaluate(poses[:_POSES_AT_ONCE])
             rates = tuple(_rate(evaluate, poses, scope.repeats) for _ in range(scope.repeats))
             yield Row("evaluation", case, preset, "poses/s", rates)
-        for count in _POSES_ON_GPU if scope.gpu else ():
-            many = np.resize(poses, (count, 4, 4))
-            on_gpu = RelaxedCost.of(problem, cost, device="cuda").evaluate
-            on_gpu(many[:_POSES])
-            rates = tuple(count / _seconds(on_gpu, many) for _ in range(scope.repeats))
-            case = f"torch, GPU, {count} poses"
-            yield Row("evaluation", case, preset, "poses/s", rates, float(count))
 
 
 def _seconds(evaluate: Callable[[FloatArray], FloatArray], poses: FloatArray) -> float:

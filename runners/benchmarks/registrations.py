@@ -108,7 +108,6 @@ class Scope:
     seed: int
     free_points: tuple[int, ...] = ()  # sizes that show how the time grows
     hypotheses: tuple[int, ...] = ()
-    gpu: bool = False  # whether evaluation is measured there, too
 
     def timed(self, posed: PosedProblem, name: str) -> tuple[float, ...]:
         """Milliseconds of repeated registrations of a problem, after one that is not counted."""

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
-from chsel.cost.torch_cost import gpus
 from chsel.numerics.threads import threads
 from replay.environment import environment
 from replay.startup import package_version
@@ -73,9 +71,8 @@ def milliseconds(run: Callable[[], object], count: int | None = None) -> float:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, GPU, Python and versions."""
+    """Processor, cores, Python and versions."""
     values: dict[str, Any] = {**environment(), "cores": os.cpu_count(), "cores_usable": cores()}
-    values["gpu"] = torch.cuda.get_device_name() if gpus() else None
     return values | {f"package {name}": package_version(name) for name in _PACKAGES}
 
 

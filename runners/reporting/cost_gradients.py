@@ -101,8 +101,10 @@ def point_gradients(
         warnings.simplefilter("ignore")
         cost = RelaxedCost(sdf, KnownPoints(**{kind: origin}), settings)
     rotations = torch.eye(3, dtype=torch.float64).expand(len(points), 3, 3)
-    terms = cost.terms(rotations, torch.from_numpy(points))
-    return terms[kind].by_translation.numpy()
+    translations = torch.tensor(points, requires_grad=True)
+    (gradients,) = torch.autograd.grad(cost(rotations, translations).sum(), translations)
+    gradients_by_point: FloatArray = gradients.numpy()
+    return gradients_by_point
 
 
 def section_plane(sdf: SdfGrid) -> int:

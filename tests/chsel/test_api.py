@@ -104,8 +104,7 @@ def warned(**arguments: Any) -> list[chsel.InputWarning]:
 
 FREE = np.random.default_rng(0).uniform(-0.3, 0.3, (4000, 3)) + POSE[:3, 3]
 FREE = FREE[
-    chsel.SdfGrid.from_mesh(BOX, 0.005, padding=0.5).query(apply(inverse(POSE), FREE))[0].numpy()
-    > 0.005
+    chsel.SdfGrid.from_mesh(BOX, 0.005, padding=0.5).at(apply(inverse(POSE), FREE))[0] > 0.005
 ]
 
 

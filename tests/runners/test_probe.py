@@ -297,5 +297,5 @@ def test_real_measurements_are_registered(
     (step,) = recording.steps
     problem = recording.problem(step)
     moved = apply(recording.hypotheses(step).object_from_world[0], problem.points.known)
-    sdf, _ = problem.sdf.query(moved, lookup="trilinear")
+    sdf, _ = problem.sdf.at(moved, lookup="trilinear")
     assert float(sdf.abs().mean()) < limit

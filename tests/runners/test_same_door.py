@@ -32,7 +32,7 @@ def known(mesh: trimesh.Trimesh) -> dict[str, FloatArray]:
     """Points of every class on, in and around a mesh at POSE."""
     surface = trimesh.sample.sample_surface(mesh, 24, seed=0)[0]
     around = np.random.default_rng(0).uniform(-0.2, 0.2, (2000, 3)) + mesh.bounds.mean(axis=0)
-    height = chsel.SdfGrid.from_mesh(mesh, 0.01, padding=0.25).query(around, lookup="trilinear")[0]
+    height = chsel.SdfGrid.from_mesh(mesh, 0.01, padding=0.25).at(around, lookup="trilinear")[0]
     far = np.asarray(height > 0.02)
     inside = np.asarray(height < -0.02)
     points = {"surface": surface, "free": around[far], "occupied": around[inside][:5]}

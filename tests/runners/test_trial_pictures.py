@@ -42,7 +42,7 @@ def section_at(
     inside = (sdf.values < 0.0).sum(axis=(0, 2))
     y = sdf.origin[1] + sdf.resolution * int(np.argmax(inside))
     points = np.stack([x, np.full(len(x), y), z], axis=1)
-    values, gradients = sdf.query(points, lookup=lookup)
+    values, gradients = sdf.at(points, lookup=lookup)
     return np.asarray(values), np.asarray(gradients)[:, [0, 2]]
 
 

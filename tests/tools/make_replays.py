@@ -120,7 +120,7 @@ def write_points(path: Path, name: str) -> None:
     world_from_object = compose(turned, np.array([[0.1, 0.05, 0.1]]))[0]
     lower, upper = model.mesh.bounds
     anywhere = random.uniform(lower - 0.08, upper + 0.08, (4000, 3))
-    distance = np.asarray(sdf.query(anywhere)[0])
+    distance = np.asarray(sdf.at(anywhere)[0])
     chosen = {
         "surface": np.asarray(model.mesh.triangles_center)[:: len(model.mesh.faces) // 12][:12],
         "free": anywhere[distance > 0.01][:1200],

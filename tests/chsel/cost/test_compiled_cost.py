@@ -254,8 +254,8 @@ def summed_over_all(cost: CompiledCost, sdf: SdfGrid, free: FloatArray, pose: Fl
         pose[3 * i] * x + pose[3 * i + 1] * y + pose[3 * i + 2] * z + pose[9 + i] for i in range(3)
     ]
     changes = cost.settings
-    s, _ = sdf.query(np.stack(moved, axis=1), lookup=changes.lookup, outside=changes.outside)
-    violation = np.maximum(changes.penetration_tolerance - s.numpy(), 0.0)
+    s, _ = sdf.at(np.stack(moved, axis=1), lookup=changes.lookup, outside=changes.outside)
+    violation = np.maximum(changes.penetration_tolerance - s, 0.0)
     return float(np.add.accumulate(changes.free_scale * violation)[-1])
 
 

@@ -53,8 +53,8 @@ def known_points(world_from_object: FloatArray, contacts: int) -> KnownPoints:
     lower, upper = WORKSPACE.bounds
     counts = np.rint((upper - lower) / SIDE).astype(int)
     free = lower + SIDE * (0.5 + np.indices(counts).reshape(3, -1).T)
-    sdf, _ = GRID.query(apply(inverse(world_from_object), free))
-    return KnownPoints(free=free[sdf.numpy() > SIDE], known=apply(world_from_object, surface))
+    sdf, _ = GRID.at(apply(inverse(world_from_object), free))
+    return KnownPoints(free=free[sdf > SIDE], known=apply(world_from_object, surface))
 
 
 POINTS = known_points(TRUTH, 40)

@@ -45,7 +45,7 @@ def distances(poses: FloatArray, points: FloatArray, lookup: str = "trilinear") 
     """Signed distances (B, M) at world points."""
     rotations = poses[:, :9].reshape(-1, 3, 3)
     moved = np.einsum("nij,mj->nmi", rotations, points) + poses[:, None, 9:]
-    s = BOX_GRID.query(moved.reshape(-1, 3), lookup=lookup)[0].numpy()
+    s = BOX_GRID.at(moved.reshape(-1, 3), lookup=lookup)[0]
     return s.reshape(len(poses), len(points))
 
 

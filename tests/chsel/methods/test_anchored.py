@@ -197,7 +197,7 @@ def test_a_round_tolerates_wrong_free_points_where_nothing_fits() -> None:
     """Voxels that a sensor took for free, up to half a voxel inside of the object."""
     inner = np.stack(np.meshgrid(*[np.arange(-0.05, 0.3, 0.005)] * 3, indexing="ij"), -1)
     inner = inner.reshape(-1, 3)
-    depths = -GRID.query(inner, lookup="trilinear")[0].numpy()
+    depths = -GRID.at(inner, lookup="trilinear")[0]
     wrong = apply(TRUTH, inner[(depths > 0.002) & (depths < 0.5 * SIDE)])
     points = replace(POINTS, free=np.concatenate([POINTS.free, wrong[::60]]))
     method = Anchored(AnchoredSettings())

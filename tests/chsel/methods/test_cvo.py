@@ -187,7 +187,7 @@ WORLD_FROM_OBJECT = compose(
 def touched_all_over() -> KnownPoints:
     surface = trimesh.sample.sample_surface(MESH, 400, seed=1)[0]
     lattice = np.indices((21, 21, 21)).reshape(3, -1).T * 0.02 - 0.2
-    signed = SDF.query(apply(inverse(WORLD_FROM_OBJECT), lattice))[0].numpy()
+    signed = SDF.at(apply(inverse(WORLD_FROM_OBJECT), lattice))[0]
     return KnownPoints(free=lattice[signed > 0.01], known=apply(WORLD_FROM_OBJECT, surface))
 
 

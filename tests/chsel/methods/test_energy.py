@@ -22,7 +22,7 @@ from tests.chsel.methods.scene import BOX, BOX_GRID, TRUTH, WORKSPACE, contacts_
 RANDOM = np.random.default_rng(8)
 CONTACTS = contacts_on(BOX, 30)
 LATTICE = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.04)] * 3, indexing="ij"), -1).reshape(-1, 3)
-FREE = LATTICE[BOX_GRID.query(apply(inverse(TRUTH), LATTICE))[0].numpy() > 0.005]
+FREE = LATTICE[BOX_GRID.at(apply(inverse(TRUTH), LATTICE))[0] > 0.005]
 POINTS = KnownPoints(
     free=np.concatenate([FREE, [[5.0, 0.0, -3.0]]]),
     occupied=apply(TRUTH, 0.03 * RANDOM.standard_normal((5, 3))),
@@ -68,7 +68,7 @@ def plainly(points: KnownPoints, poses: Poses, tau: float) -> FloatArray:
     energies = []
     for transform in poses.matrices:
         known, free, occupied = (
-            BOX_GRID.query(apply(transform, part), lookup="trilinear")[0].numpy()
+            BOX_GRID.at(apply(transform, part), lookup="trilinear")[0]
             for part in (points.known, points.free, points.occupied)
         )
         mean = losses(known - points.sdf, SIGMA, CAP).mean() if len(known) else 0.0
@@ -81,7 +81,7 @@ def fit_losses(points: KnownPoints, poses: Poses, loss: Loss) -> FloatArray:
     """What a fit lowers, without free points."""
     sums = []
     for transform in poses.matrices:
-        known = BOX_GRID.query(apply(transform, points.known), lookup="trilinear")[0].numpy()
+        known = BOX_GRID.at(apply(transform, points.known), lookup="trilinear")[0]
         sums.append(losses(known - points.sdf, loss.knee, loss.cap).sum())
     return np.array(sums)
 

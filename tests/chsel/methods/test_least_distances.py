@@ -53,7 +53,7 @@ def test_no_distance_is_less(
     for sdf in (ball_grid(0.05, 0.01, 8), rugged()):
         least = least_distances(sdf, outside, REACH)
         points = around(sdf, least)
-        distance = sdf.query(points, lookup=lookup, outside=outside)[0].numpy()
+        distance = sdf.at(points, lookup=lookup, outside=outside)[0]
         away = np.sqrt(((points - np.clip(points, *sdf.bounds)) ** 2).sum(axis=1))
         found = looked_up(least, points)
         assert (found < np.maximum(distance, away))[found > 0.0].all()  # no radius is below 0

@@ -78,8 +78,8 @@ def test_costs_are_those_of_the_equation(lookup: str, outside: str) -> None:
 
     def distances(of: FloatArray) -> FloatArray:
         moved = apply(poses(), of)
-        s, _ = GRID.query(moved.reshape(-1, 3), lookup=lookup, outside=outside)
-        return s.numpy().reshape(moved.shape[:2])
+        s, _ = GRID.at(moved.reshape(-1, 3), lookup=lookup, outside=outside)
+        return s.reshape(moved.shape[:2])
 
     depth = np.maximum(balls.radii - distances(balls.centres), 0.0)
     expected = (depth**2).mean(axis=1) + (distances(points.known) ** 2).mean(axis=1)

@@ -66,8 +66,8 @@ def directions_by_torch(
 def free_points() -> FloatArray:
     lattice = np.stack(np.meshgrid(*[np.arange(-0.1, 0.6, 0.05)] * 3, indexing="ij"), -1)
     free = lattice.reshape(-1, 3)
-    distance, _ = BOX_GRID.query(apply(inverse(TRUTH), free))
-    return free[distance.numpy() > 0.01]
+    distance, _ = BOX_GRID.at(apply(inverse(TRUTH), free))
+    return free[distance > 0.01]
 
 
 def posed(

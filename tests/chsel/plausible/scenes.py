@@ -70,7 +70,7 @@ def scene(
     if stream.integers(2) and len(free):
         free = np.unique(np.rint(free / 0.03), axis=0) * 0.03
     known = around(int(stream.integers(0, 12)), 0.5)
-    inside = sdf.query(apply(np.linalg.inv(truth), known))[0].numpy() if len(known) else []
+    inside = sdf.at(apply(np.linalg.inv(truth), known))[0] if len(known) else []
     values = np.asarray(inside) * stream.integers(0, 2, len(known))
     occupied = around(int(stream.integers(0, 4)), 0.1)
     points = KnownPoints(free, occupied, known, values)

@@ -61,7 +61,7 @@ def brute_force(
     known, free, occupied = [], [], []
     for move in inverse(poses):
         s = [
-            sdf.query(apply(move, part), lookup=by.lookup, outside=by.outside)[0].numpy()
+            sdf.at(apply(move, part), lookup=by.lookup, outside=by.outside)[0]
             for part in (points.known, points.free, points.occupied)
         ]
         known.append(np.abs(s[0] - points.sdf).sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from chsel.problem.poses import as_tensor, hat, length
+from chsel.problem.poses import hat
 from chsel.problem.search_space import SE2Space, SearchSpace
 
 
@@ -13,10 +13,9 @@ def decode(space: SearchSpace, vectors: Tensor) -> tuple[Tensor, Tensor]:
     """Rotations (B, 3, 3) and translations (B, 3) of vectors (B, d), differentiable."""
     if not isinstance(space, SE2Space):
         return _gram_schmidt(vectors[:, :6]), vectors[:, 6:9]
-    device = vectors.device
-    turn, rest = as_tensor(hat(space.axis), device), as_tensor(space.resting_rotation, device)
-    e_u, e_v, axis = (as_tensor(part, device) for part in (space.e_u, space.e_v, space.axis))
-    identity = torch.eye(3, dtype=torch.float64, device=device)
+    turn, rest = torch.tensor(hat(space.axis)), torch.tensor(space.resting_rotation)
+    e_u, e_v, axis = (torch.tensor(part).double() for part in (space.e_u, space.e_v, space.axis))
+    identity = torch.eye(3, dtype=torch.float64)
     turn_squared = axis[:, None] * axis - identity
     sine, cosine = torch.sin(vectors[:, 0]), torch.cos(vectors[:, 0])
     about_axis = identity + sine[:, None, None] * turn
@@ -28,7 +27,7 @@ def decode(space: SearchSpace, vectors: Tensor) -> tuple[Tensor, Tensor]:
 def _gram_schmidt(rows: Tensor) -> Tensor:
     """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
     first, second = rows[:, 0:3], rows[:, 3:6]
-    b1 = first / length(first)
+    b1 = first / first.norm(dim=1, keepdim=True)
     b2 = second - (b1 * second).cumsum(dim=1)[:, 2:] * b1
-    b2 = b2 / length(b2)
+    b2 = b2 / b2.norm(dim=1, keepdim=True)
     return torch.stack([b1, b2, torch.linalg.cross(b1, b2)], dim=1)
