@@ -1,5 +1,4 @@
 # make probe: set up and run a session. make test: set up and run all checks.
-# make kernels: compile all kernels for common processors. make wheel: the same, and a wheel.
 # make PYTHON=python3.12 probe: with another Python, 3.11 or newer.
 # make PIP_ARGS="--extra-index-url URL" probe: with options for pip install.
 # make VENV_ARGS=--system-site-packages probe: with the packages that PYTHON has already.
@@ -11,7 +10,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint $(VENV)/constraints.txt
 
-.PHONY: probe test kernels wheel clean
+.PHONY: probe test clean
 
 probe: $(VENV)/.installed
 	@if $(BIN)/python -c "import pybullet" 2>/dev/null; then session=simulated; else \
@@ -25,12 +24,6 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
-
-kernels: $(VENV)/.installed
-	$(BIN)/python -m chsel.kernel_build
-
-wheel: kernels
-	$(BIN)/python -m pip wheel --quiet $(PIP_ARGS) --no-deps --wheel-dir dist .
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -56,4 +49,4 @@ $(VENV)/.installed-test: $(VENV)/.installed
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info chsel/machine_code
+	rm -rf $(VENV) build dist *.egg-info

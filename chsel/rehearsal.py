@@ -11,10 +11,7 @@ import numpy as np
 from chsel.methods.method import ConfiguredMethod, Method
 from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.hand_shape import HandShape
-from chsel.plausible.plausible_set import plausible_set
-from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
 from chsel.plausible.pose_metrics import result_numbers
-from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance
 from chsel.policies.policy import Policy, StopSettings
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration
@@ -22,8 +19,7 @@ from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import Purpose, StreamKey
-from chsel.problem.surface import surface_points
+from chsel.problem.streams import StreamKey
 from chsel.problem.trust import trust_in
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
@@ -90,22 +86,6 @@ def warm_up_policy(policy: Policy) -> None:
         steering.felt(np.zeros((1, 3)))
     except Exception:  # as above
         return
-
-
-def warm_up_plausible() -> None:
-    """Compile the kernels of the plausible set and of what is measured by it, or load them.
-
-    See `warm_up`.
-    """
-    problem = _problem()
-    ball, first, key = problem.sdf, problem.initial_set, problem.key
-    grid = PoseGridSettings(rotations=5, upright=2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # as above
-        members = plausible_set(problem, first[0], PlausibleSettings(epsilon=10.0, grid=grid))
-        samples = surface_points(ball, 4, key.stream(Purpose.METRIC_POINTS))
-        distance = SurfaceDistance(ball, None, samples, DistanceSettings(method="grid"))
-        distance.between(first, members.world_from_object)
 
 
 def _problem() -> RegistrationProblem:

@@ -15,9 +15,6 @@ import pytest
 import trimesh
 import yaml
 
-from chsel.kernel_build import collect
-from chsel.numerics.packaged_code import TARGETS, target_folder
-
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 SCRIPTS = tuple(PROJECT["scripts"])
@@ -34,46 +31,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if (REPOSITORY / name).is_file():
             (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(REPOSITORY / name, folder / "source" / name)
-    bring_code(folder / "source" / "chsel" / "machine_code", tmp_path_factory.mktemp("kept"))
     options = ["--no-deps", "--no-build-isolation", "--quiet", "--target", str(folder / "site")]
     install = [sys.executable, "-m", "pip", "install", str(folder / "source"), *options]
     subprocess.run(install, check=True)
     return folder / "site"
-
-
-SINE = "import numpy as np; from chsel.numerics.elementary import sines_cosines as f; "
-SINE += "print(f(np.ones(3))[0].tobytes().hex())"
-TARGET = list(TARGETS)[-1]  # which any CPU of this kind can run
-
-
-def bring_code(folder: Path, kept: Path) -> None:
-    """Give the sources machine code of one kernel, as chsel.kernel_build does with all."""
-    environment = {**os.environ, "CHSEL_CACHE_DIR": str(kept), "PYTHONPATH": str(REPOSITORY)}
-    environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": ""}
-    subprocess.run([sys.executable, "-c", SINE], env=environment, check=True)
-    assert collect(kept, folder / target_folder(TARGET).name) > 0
-
-
-def test_an_installation_brings_machine_code_which_is_checked(site: Path, tmp_path: Path) -> None:
-    (wheel,) = site.glob("chsel_replay-*.dist-info/WHEEL")
-    assert "Root-Is-Purelib: false" in wheel.read_text()
-    assert "-none-any" not in wheel.read_text()
-    (folder,) = (site / "chsel" / "machine_code").iterdir()
-    plain = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}  # code for another CPU
-    results = []
-    for case in ("brought", "damaged", "named"):
-        kept = tmp_path / case
-        changes = {"CHSEL_CACHE_DIR": str(kept), **(plain if case == "named" else {})}
-        done = ran(site, tmp_path, sys.executable, "-c", SINE, **changes)
-        assert done.returncode == 0, done.stderr
-        results.append(done.stdout)
-        assert ("compiling" in done.stderr) == (case != "brought")
-        assert bool(list(kept.rglob("*.nbc"))) == (case != "brought")
-        for file in folder.glob("*.nbc"):  # from the second case on
-            whole = bytearray(file.read_bytes())
-            whole[-1] ^= 1
-            file.write_bytes(whole)
-    assert len(set(results)) == 1
 
 
 def ran(

@@ -33,7 +33,6 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
 from chsel.numerics.kernel_sources import code_digest, loaded, signature_text
-from chsel.numerics.packaged_code import has_packaged_code, packaged_code
 
 CACHE_VARIABLE = "CHSEL_CACHE_DIR"
 KEPT_DAYS = 60  # how long a folder of code stays that nobody uses
@@ -71,7 +70,7 @@ class KernelCache(NullCache):
         name = self._file_name(sig)
         if name is None:
             return None
-        payload = _kept(name) or _checked(packaged_code(name), name)
+        payload = _kept(name)
         if payload is None:
             self._claim(name)
             payload = _kept(name)  # by the process that had claimed it
@@ -148,8 +147,8 @@ def cache_directory() -> Path:
 
 
 def has_kernels() -> bool:
-    """Whether any kernel was compiled and kept earlier, or came with the package."""
-    return has_packaged_code() or kept_count() > 0
+    """Whether any kernel was compiled and kept earlier."""
+    return kept_count() > 0
 
 
 def kept_count() -> int:
@@ -183,10 +182,8 @@ def _kept(name: str) -> bytes | None:
     return payload
 
 
-def _checked(whole: bytes | None, name: str) -> bytes | None:
-    """What the file of that name holds behind its digest, None if it is missing or damaged."""
-    if whole is None:
-        return None
+def _checked(whole: bytes, name: str) -> bytes | None:
+    """What the file of that name holds behind its digest, None if it is damaged."""
     payload = whole[_CHECK_SIZE:]
     return payload if _digest(payload, name) == whole[:_CHECK_SIZE] else None
 

@@ -13,8 +13,6 @@ from pathlib import Path
 import llvmlite.binding as llvm
 import numpy as np
 
-from chsel.numerics.kernel_cache import CACHE_VARIABLE
-from chsel.numerics.packaged_code import target_folder
 from tests.determinism.record import read_record
 from tests.determinism.stages import Stages
 
@@ -25,11 +23,10 @@ _TIMEOUT = 600.0
 
 @dataclass(frozen=True)
 class Environment:
-    """One setting: environment variables and arguments of the process, or why it cannot be had."""
+    """One setting: environment variables and arguments of the process."""
 
     variables: Mapping[str, str] = field(default_factory=dict)
     arguments: tuple[str, ...] = ()
-    impossible: str | None = None
 
     def record(self, directory: Path) -> tuple[dict[str, Stages], dict[str, str]]:
         """Run all cases in a fresh process; see read_record for what comes back."""
@@ -91,12 +88,6 @@ _FMA = _x86() and _host_has("avx2", "fma")
 _HASWELL_BLAS = {"OPENBLAS_CORETYPE": "Haswell"} if _openblas() else {}
 _GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 _HASWELL = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": HASWELL}
-
-
-def packaged(target: str, kept: Path) -> Environment:
-    """Code of `python -m chsel.kernel_build` for a target, and a folder for what it lacks."""
-    missing = None if target_folder(target).is_dir() else f"there is no packaged code for {target}"
-    return Environment({CACHE_VARIABLE: str(kept)}, ("--packaged", target), missing)
 
 
 # Each CPU's machine code is kept apart in the kernels' cache. Several changes in one setting save

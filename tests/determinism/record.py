@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from chsel.numerics import packaged_code
 from tests.determinism import libraries
 from tests.determinism.cases import CASES
 from tests.determinism.decisions import SCENES, decision_stages
@@ -51,10 +50,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--watch", choices=WATCHES, default="stages")
     parser.add_argument("--again", action="store_true", help="after all cases in other order")
-    parser.add_argument("--packaged", metavar="TARGET", help="packaged code for this one alone")
     arguments = parser.parse_args()
-    if arguments.packaged:
-        packaged_code.usable_targets = lambda: [arguments.packaged]
     torch.set_num_threads(arguments.threads)
     warnings.filterwarnings("ignore", category=UserWarning, module="chsel")
     watch = WATCHES[arguments.watch]

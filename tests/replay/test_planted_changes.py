@@ -106,7 +106,7 @@ def verified_with(plant: Plant, folder: Path) -> subprocess.CompletedProcess[str
     original = (REPOSITORY / plant.file).read_text()
     assert original.count(plant.line) == 1
     for package in ("chsel", "replay"):
-        unwanted = shutil.ignore_patterns("__pycache__", "machine_code")
+        unwanted = shutil.ignore_patterns("__pycache__")
         shutil.copytree(REPOSITORY / package, folder / package, ignore=unwanted)
     planted = folder / plant.file
     planted.write_text(original.replace(plant.line, plant.planted))

@@ -1,8 +1,7 @@
-"""The golden digests: `python -m tests.tools.golden [--write] [--all] [--packaged]`.
+"""The golden digests: `python -m tests.tools.golden [--write] [--all]`.
 
 Without options: what differs from golden.json here. --write: make it anew, and say what changed.
 --all: compare every setting of the matrix, and say which libraries each setting changes.
---packaged: compare the code that `make kernels` made, for each target that this CPU can run.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from chsel.numerics.packaged_code import usable_targets
 from tests.determinism.comparison import (
     GOLDEN_FILE,
     Golden,
@@ -23,7 +21,7 @@ from tests.determinism.comparison import (
     read_golden,
     write_golden,
 )
-from tests.determinism.environments import ENVIRONMENTS, Environment, packaged
+from tests.determinism.environments import ENVIRONMENTS, Environment
 from tests.determinism.stages import Stages
 
 
@@ -32,7 +30,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write golden.json")
     parser.add_argument("--all", action="store_true", help="every setting, not the default alone")
-    parser.add_argument("--packaged", action="store_true", help="code that make kernels made, too")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
         record, libraries = ENVIRONMENTS["default"].record(Path(directory))
@@ -48,8 +45,6 @@ def main() -> None:
         unequal = bool(lines) and not arguments.write
         if arguments.all:
             unequal |= _matrix(ENVIRONMENTS, golden, record, libraries, Path(directory))
-        if arguments.packaged:
-            unequal |= _packaged(golden, record, libraries, Path(directory))
     sys.exit(int(unequal))
 
 
@@ -62,20 +57,6 @@ def _changes(golden: Golden, record: dict[str, Stages]) -> list[str]:
     return lines
 
 
-def _packaged(
-    golden: Golden, usual: dict[str, Stages], libraries: dict[str, str], directory: Path
-) -> bool:
-    """Likewise for packaged code of each target, and how many kernels it lacks."""
-    unequal = False
-    for target in usable_targets():
-        kept = directory / "kept" / target
-        matrix = {f"packaged code for {target}": packaged(target, kept)}
-        unequal |= _matrix(matrix, golden, usual, libraries, directory)
-        if compiled := len(list(kept.rglob("*.nbc"))):
-            print(f"  {compiled} kernels of the cases were compiled, as it lacks them")
-    return unequal
-
-
 def _matrix(
     matrix: Mapping[str, Environment],
     golden: Golden,
@@ -86,9 +67,6 @@ def _matrix(
     """Print a line or more for each setting; whether any differs."""
     unequal = False
     for name, environment in matrix.items():
-        if environment.impossible:
-            print(f"{name}: left out, as {environment.impossible}", flush=True)
-            continue
         record, theirs = environment.record(directory)
         lines = differences(golden, record, usual)
         unequal |= bool(lines)
