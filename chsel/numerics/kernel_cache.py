@@ -40,6 +40,7 @@ KEPT_FOLDERS = 16  # the most, of versions and CPUs
 KEPT_VERSIONS = 8  # of the code of a kernel for the same types of arguments
 
 _OTHERS_WRITE = 0o022
+_UNMAPPED = 65534  # owner of what belongs to root outside of a container
 _DAY = 86400.0
 _CHECK_SIZE = 16  # bytes of the digest before the code in a file
 _LOCK = ".lock"
@@ -305,4 +306,5 @@ def _is_safe(parent: Path) -> bool:
         return True
     state = parent.stat()
     sticky = bool(state.st_mode & stat.S_ISVTX)
-    return state.st_uid in (0, os.getuid()) and (sticky or not state.st_mode & _OTHERS_WRITE)
+    owners = 0, os.getuid(), _UNMAPPED
+    return state.st_uid in owners and (sticky or not state.st_mode & _OTHERS_WRITE)
