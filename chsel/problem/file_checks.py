@@ -1,18 +1,18 @@
-"""Checks of files from outside: no device or pipe, complete, and of bounded size."""
+"""Checks of files from outside: no device or pipe, archives of arrays whole and not too large."""
 
 from __future__ import annotations
 
 import stat
 import zipfile
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from chsel.errors import ChselError, MeshError
+from chsel.errors import ChselError
 
 MOST_BYTES = 512 * 2**20  # of the arrays of an .npz file, unpacked: 16 million points with steps
 
@@ -42,90 +42,6 @@ def refuse_special_file(name: str, path: Path, error: type[ChselError]) -> None:
     for is_kind, kind in _SPECIAL_FILES:
         if is_kind(mode):
             raise error(f"{name} is {kind}; accepted: a file")
-
-
-def check_complete(path: Path, kind: str) -> None:
-    """Raise MeshError if a file of text is shorter than it announces or has unexpected lines.
-
-    kind: "ply", "off", "stl" or "xyz"; other kinds and binary files pass, as their readers compare
-    sizes themselves. The message does not name the file.
-    """
-    if kind in _TEXT_CHECKS:
-        _TEXT_CHECKS[kind](path)
-
-
-def _check_ply(path: Path) -> None:
-    """Each vertex, face and other element is a line after the header."""
-    with path.open("rb") as file:
-        counts: dict[str, int] = {}
-        for line in file:
-            words = line.split()
-            if words[:1] == [b"format"] and words[1:2] != [b"ascii"]:
-                return
-            if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
-                counts[words[1].decode("ascii", "replace")] = int(words[2])
-            if line.strip() == b"end_header":
-                break
-        _compare(counts, sum(1 for line in file if line.strip()))
-
-
-def _check_off(path: Path) -> None:
-    """A line of counts, then a line for each vertex and each face."""
-    lines = _text_lines(path)
-    head = next(lines, "").removeprefix("COFF").removeprefix("OFF").strip()
-    words = (head or next(lines, "")).split()
-    if len(words) < 2 or not (words[0].isdigit() and words[1].isdigit()):
-        raise MeshError("its line of counts is missing")
-    vertices, faces = int(words[0]), int(words[1])
-    read = 0
-    for read, line in enumerate(lines, 1):
-        words = line.split()
-        corners = words[0] if read > vertices else "2"
-        if not corners.isdigit() or len(words) <= int(corners):
-            raise MeshError(f"line {line[:60]!r} is cut")
-    _compare({"vertex": vertices, "face": faces}, read)
-
-
-def _check_stl(path: Path) -> None:
-    """As many facets and solids end as begin."""
-    with path.open("rb") as file:
-        head = file.read(80).lower()
-        if not head.lstrip().startswith(b"solid"):
-            return
-        lines = (head + file.read().lower()).splitlines()
-    count = Counter(words[0] for words in map(bytes.split, lines) if words)
-    begun, ended = count[b"facet"] + count[b"solid"], count[b"endfacet"] + count[b"endsolid"]
-    if count[b"facet"] and begun != ended:  # without any, a binary file with such a comment
-        raise MeshError(f"it has {ended} whole facets and solids of {begun} that begin")
-
-
-def _check_xyz(path: Path) -> None:
-    """Every line has as many numbers as the first one."""
-    columns = 0
-    for number, line in enumerate(_text_lines(path), 1):
-        count = len(line.replace(",", " ").split())
-        columns = columns or count
-        if count != columns:
-            raise MeshError(f"point {number} has {count} numbers, the first one has {columns}")
-
-
-_TEXT_CHECKS = {"ply": _check_ply, "off": _check_off, "stl": _check_stl, "xyz": _check_xyz}
-
-
-def _compare(counts: dict[str, int], lines: int) -> None:
-    announced = sum(counts.values())
-    if lines != announced:
-        listed = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise MeshError(f"it announces {announced} lines ({listed}) and has {lines}")
-
-
-def _text_lines(path: Path) -> Iterator[str]:
-    """Lines without comments that are not empty."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for line in file:
-            content = line.partition("#")[0].strip()
-            if content:
-                yield content
 
 
 def read_npz(

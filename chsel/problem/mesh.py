@@ -10,7 +10,7 @@ import numpy as np
 
 from chsel.errors import MeshError, MeshWarning, quoted, require_positive
 from chsel.numerics.arrays import digest, frozen
-from chsel.problem.file_checks import check_complete, refuse_special_file
+from chsel.problem.file_checks import refuse_special_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -139,7 +139,6 @@ def _read(path: Path) -> trimesh.Trimesh:
     if kind not in _mesh_formats():
         raise MeshError(f"mesh file {path} is of no known kind; accepted: {_accepted_files()}")
     try:
-        check_complete(path, kind)
         loaded = trimesh.load(
             str(path), file_type=kind, force="mesh", process=False, skip_materials=True
         )

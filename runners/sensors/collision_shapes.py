@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.problem.file_checks import check_complete
 
 if TYPE_CHECKING:
     import trimesh
@@ -89,7 +88,6 @@ class MeshFiles:
                 f"{where} makes the meshes more than {MOST_BYTES} bytes; accepted: fewer"
             )
         try:
-            check_complete(path, path.suffix.lower().removeprefix("."))
             loaded: Any = trimesh.load(
                 str(path), force="mesh", process=False, skip_materials=True, ignore_broken=True
             )

@@ -13,7 +13,7 @@ import numpy as np
 
 from chsel.errors import ChselError, PointsError, PoseError
 from chsel.numerics.arrays import FloatArray, IntArray, frozen
-from chsel.problem.file_checks import check_complete, read_npz, refuse_special_file
+from chsel.problem.file_checks import read_npz, refuse_special_file
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import nearest_rigid
 from chsel.problem.streams import LAST_STEP
@@ -207,7 +207,6 @@ def _read_surface(path: Path) -> PointFile:
 
     kind = path.suffix.lower().removeprefix(".")
     try:
-        check_complete(path, kind)
         loaded = trimesh.load(str(path), file_type=kind, process=False)
         geometries = list(getattr(loaded, "geometry", {"": loaded}).values())
         vertices = np.concatenate([_vertices(geometry) for geometry in geometries])

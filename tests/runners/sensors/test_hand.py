@@ -250,7 +250,6 @@ PLY_BOMB = (
         ("count.stl", bytes(80) + b"\xff\xff\xff\xff" + bytes(100)),
         ("bomb.ply", PLY_BOMB),
         ("bomb.off", b"OFF\n99999999999 99999999999 0\n0 0 0\n"),
-        ("cut.off", b"OFF\n4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n"),
         ("empty.obj", b""),
         ("missing.obj", b"v 0 0 0\nf 1 2 3\n"),
         ("nan.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 
 from chsel.errors import ChselError, PointsError
 from chsel.problem import file_checks
@@ -196,61 +195,6 @@ def test_what_an_error_quotes_of_a_file_is_short(tmp_path: Path) -> None:
         with pytest.raises(PointsError) as caught:
             read_points(path)
         assert len(str(caught.value)) < 400
-
-
-def mesh_files() -> dict[str, bytes]:
-    """A mesh of 42 vertices, or 100 points, in every form that is text or binary."""
-    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.03)
-    cloud = trimesh.PointCloud(np.random.default_rng(0).random((100, 3)))
-    files = {
-        "mesh.ply": mesh.export(file_type="ply", encoding="ascii"),
-        "mesh_binary.ply": mesh.export(file_type="ply", encoding="binary"),
-        "cloud.ply": cloud.export(file_type="ply", encoding="ascii"),
-        "cloud_binary.ply": cloud.export(file_type="ply", encoding="binary"),
-        "mesh.off": mesh.export(file_type="off"),
-        "mesh.stl": mesh.export(file_type="stl_ascii"),
-        "mesh_binary.stl": mesh.export(file_type="stl"),
-    }
-    return {name: f.encode() if isinstance(f, str) else f for name, f in files.items()}
-
-
-FILES = mesh_files()
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_cut_file_of_points_is_refused_wherever_it_is_cut(tmp_path: Path, name: str) -> None:
-    whole, path = (
-        FILES[name].rstrip(b"\n") if "binary" not in name else FILES[name],
-        tmp_path / name,
-    )
-    path.write_bytes(whole)
-    count = read_points(path).at(0).count
-    assert count == (100 if "cloud" in name else 42)
-    last = len(whole) - (len(whole.splitlines()[-1]) if "binary" not in name else 0)
-    for length in range(0, last, max(1, len(whole) // 60)):
-        path.write_bytes(whole[:length])
-        with pytest.raises(PointsError) as caught:
-            read_points(path)
-        assert "\n" not in str(caught.value)
-
-
-def test_a_cut_cloud_names_what_is_missing(tmp_path: Path) -> None:
-    lines = FILES["cloud.ply"].splitlines(keepends=True)
-    path = tmp_path / "cut.ply"
-    path.write_bytes(b"".join(lines[:-60]))
-    message = r"announces 100 lines \(100 of vertex\) and has 40"
-    with pytest.raises(PointsError, match=rf"cut\.ply: not a readable \.ply file \(it {message}"):
-        read_points(path)
-    path.write_bytes(FILES["cloud.ply"].replace(b"element vertex 100", b"element vertex 40"))
-    with pytest.raises(PointsError, match=r"announces 40 lines \(40 of vertex\) and has 100"):
-        read_points(path)
-
-
-def test_a_cut_line_of_an_xyz_file_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "points.xyz"
-    path.write_text("# x y z\n0 0 0\n0, 0.1, 0\n\n0.1 0 0\n0.1 0\n")
-    with pytest.raises(PointsError, match="point 4 has 2 numbers, the first one has 3"):
-        read_points(path)
 
 
 def test_vertices_beside_the_faces_are_points_too(tmp_path: Path) -> None:
