@@ -82,14 +82,14 @@ def build_method(name: str, settings: Any = None) -> Method:
     return _CHOICES.build(name, settings, preset_settings(name))
 
 
-def noise_of(method: Method) -> float | None:
-    """The noise of known points by a method's settings, metres; None if it has no such setting."""
+def noise_of(method: Method) -> float:
+    """The noise of known points by a method's settings, metres; SENSOR_NOISE if it has none."""
     settings = getattr(method, "settings", None)
-    return settings.noise if isinstance(settings, AnchoredSettings) else None
+    return settings.noise if isinstance(settings, AnchoredSettings) else SENSOR_NOISE
 
 
 def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypotheses) -> Trust | None:
     """How far to trust what a method found, by the noise in its settings; None without a pose."""
     if not has_pose(hypotheses):
         return None
-    return trust_in(problem, hypotheses, noise_of(method) or SENSOR_NOISE)
+    return trust_in(problem, hypotheses, noise_of(method))

@@ -84,25 +84,23 @@ def trust_in(
     return Trust(noise.sigma, noise.outliers, error / sensor_noise, int(count), spread, verdict)
 
 
-def check_trust(trust: Trust, sensor_noise: float | None = None) -> list[PointsWarning]:
-    """A warning if no hypothesis explains the points, or not with the sensor's noise.
+def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[PointsWarning]:
+    """A warning if no hypothesis explains the points, or not with the sensor's noise, metres.
 
-    sensor_noise: metres, where a method's settings state it; see `trust_in`.
+    The texts have no measured numbers, so that Python shows repeated ones once.
     """
     if trust.verdict == NOTHING:
         text = (
-            f"no hypothesis explains the points: at the best, they are {trust.misfit:.3g} noise "
-            f"levels of the sensor off on average, and {100.0 * trust.outliers:.0f} % of the known "
-            "points are outliers; check units, frames, the object and its scale, and whether it "
-            "moved"
+            "no hypothesis explains the points, see the trust in the result; check units, frames, "
+            "the object and its scale, and whether it moved"
         )
         return [PointsWarning("no_fit", text)]
-    if sensor_noise is None or trust.misfit <= MOST_LEVELS:
+    if trust.misfit <= MOST_LEVELS:
         return []
     text = (
-        f"points are {trust.misfit:.3g} noise levels off the best hypothesis on average: the "
-        f"sensor is less exact than the method's noise of {sensor_noise:g} m, perhaps "
-        f"{trust.noise:.2g} m, or the object is not quite this one"
+        f"points are more than {MOST_LEVELS:g} noise levels off the best hypothesis on average, "
+        f"see the trust in the result: the sensor is less exact than {sensor_noise:g} m, the "
+        "object is not quite this one, or a better pose was not found"
     )
     return [PointsWarning("above_noise", text)]
 

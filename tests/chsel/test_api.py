@@ -143,6 +143,26 @@ def test_points_13_noise_levels_from_all_poses_give_a_warning() -> None:
     assert [warning.code for warning in found] == ["above_noise"]
 
 
+@pytest.mark.parametrize("method", ["chsel", "icp"])
+def test_points_far_off_all_poses_give_one_warning_with_any_method(
+    method: str,
+) -> None:
+    """Two calls with other points, whose misfits differ, at one line, as Python shows them."""
+    mesh = BOX.copy().apply_scale(3.0)
+    misfits = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for seed in range(2):
+            noise = np.random.default_rng(seed).normal(0.0, 0.012, SURFACE.shape)
+            found = chsel.register(mesh, surface=3.0 * SURFACE + noise, method=method)
+            assert found.trust is not None
+            misfits.append(found.trust.misfit)
+    assert 10.0 < min(misfits) < max(misfits)
+    (warning,) = caught
+    assert isinstance(warning.message, chsel.InputWarning)
+    assert warning.message.code == "above_noise"
+
+
 @pytest.mark.parametrize("points", [1000.0 * SURFACE, [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]])
 def test_points_in_millimetres_are_an_error(points: Any) -> None:
     with pytest.raises(chsel.ChselError, match=r"the object is 0\.1.* m: are they in mill"):
