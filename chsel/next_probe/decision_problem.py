@@ -130,7 +130,7 @@ class Decision:
 
     chosen: int  # index of the action to take; -1 for none
     stop: str  # why none is taken, one of STOPS
-    spread: float  # of the belief: mean distance of two surfaces drawn from it, metres
+    spread: float  # of the belief: root mean square distance of two surfaces, metres
     score: FloatArray  # (A,): the higher the better, in the policy's own unit
     hit_chance: FloatArray  # (A,): that the hand meets the object
     blocked_chance: FloatArray  # (A,): that the object is in the way to the start

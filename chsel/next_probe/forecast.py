@@ -9,16 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import Belief, DecisionProblem
+from chsel.next_probe.decision_problem import DecisionProblem
 from chsel.next_probe.first_contact import FirstContacts, first_contacts
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import spread
-from chsel.problem.outline import in_order
+from chsel.problem.outline import in_order, outline_distances, surface_spread
 from chsel.problem.poses import Poses
-from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.subset import surface_descriptors
 
 _FARTHEST = 60.0  # exponents beyond count as zero
 _UNLIKE = 0.01  # overlap of a hit with a miss: a sensor may err
@@ -28,7 +26,9 @@ class _Gains(NamedTuple):
     """What the kernel fills, for A actions."""
 
     information: FloatArray  # (A,), nats
-    expected_spread: FloatArray  # (A,), metres
+    # (A,), metres: root mean square distance of the surface in the pose that shows the outcome
+    # from that in a pose drawn from what is left of the belief after it
+    expected_spread: FloatArray
     surviving: FloatArray  # (A,): expected weight of the poses that the outcome does not rule out
 
 
@@ -67,26 +67,27 @@ class Forecast:
     def distances(self) -> FloatArray:
         """How far the surface in one pose is from that in another (K, K), metres.
 
-        Root mean square difference of distances from 64 places on surfaces of the belief.
+        See `outline_distances`.
         """
-        return surface_distances(self.problem.sdf, self.problem.belief)
+        poses = Poses.of(self.problem.belief.object_from_world)
+        return outline_distances(self.problem.sdf, poses)
 
     @cached_property
     def spread(self) -> float:
-        """Mean distance of two surfaces drawn from the belief, metres."""
-        return mean_distance(self.problem.belief, self.distances)
+        """Root mean square distance of two surfaces drawn from the belief, metres."""
+        return surface_spread(self.distances, self.problem.belief.weights)
 
     @cached_property
     def gains(self) -> _Gains:
         """What is gained by each action."""
         count = len(self.problem.actions)
         gains = _Gains(np.zeros(count), np.full(count, self.spread), np.ones(count))
-        weights, distances = np.array(self.problem.belief.weights), self.distances
+        weights, squares = np.array(self.problem.belief.weights), self.distances**2
         contacts = self.first  # before threads begin, which must not wait for each other
         size = len(weights)
 
         def run(first: int, last: int, scratch: Any) -> None:
-            overlap(contacts, weights, distances, self.noise, gains, scratch, (first, last))
+            overlap(contacts, weights, squares, self.noise, gains, scratch, (first, last))
 
         spread(run, count, lambda: np.empty((4, size)), least=20)
         return gains
@@ -96,38 +97,9 @@ class Forecast:
         return in_order(np.where(flags, self.problem.belief.weights[:, None], 0.0).T)
 
 
-def surface_distances(sdf: SdfGrid, belief: Belief) -> FloatArray:
-    """See `Forecast.distances`."""
-    descriptors = surface_descriptors(sdf, Poses.of(belief.object_from_world))
-    apart: FloatArray = np.empty((len(belief), len(belief)))
-    distances_between(np.ascontiguousarray(descriptors.T), apart)
-    return apart
-
-
-def mean_distance(belief: Belief, distances: FloatArray) -> float:
-    """Mean of distances (K, K), metres, over two poses drawn from a belief."""
-    return float(in_order(belief.weights * in_order(belief.weights * distances)))
-
-
-@compiled
-def distances_between(descriptors: Any, apart: Any) -> None:
-    """Fill apart (K, K) with root mean square differences of descriptors (D, K)."""
-    size, count = descriptors.shape
-    for i in range(count):
-        row = apart[i]
-        for j in range(count):
-            row[j] = 0.0
-        for d in range(size):
-            values, value = descriptors[d], descriptors[d, i]
-            for j in range(count):
-                row[j] += (values[j] - value) * (values[j] - value)
-        for j in range(count):
-            row[j] = np.sqrt(row[j] / size)
-
-
 @compiled
 def overlap(
-    first: Any, weights: Any, distances: Any, noise: Any, gains: Any, scratch: Any, some: Any
+    first: Any, weights: Any, squares: Any, noise: Any, gains: Any, scratch: Any, some: Any
 ) -> None:
     """Fill `gains` of some actions (first, last) from how alike their outcomes are.
 
@@ -161,8 +133,8 @@ def overlap(
                 alike[j] += weights[i] * b
                 alive[i] += weights[j] * g
                 alive[j] += weights[i] * g
-                far[i] += weights[j] * g * distances[i, j]
-                far[j] += weights[i] * g * distances[i, j]
+                far[i] += weights[j] * g * squares[i, j]
+                far[j] += weights[i] * g * squares[i, j]
         information, left, surviving = 0.0, 0.0, 0.0
         for i in range(count):
             if weights[i] > 0.0:
@@ -170,5 +142,5 @@ def overlap(
                 left += weights[i] * far[i] / alive[i]
                 surviving += weights[i] * alive[i]
         gains.information[a] = max(information, 0.0)
-        gains.expected_spread[a] = left
+        gains.expected_spread[a] = np.sqrt(left)
         gains.surviving[a] = surviving

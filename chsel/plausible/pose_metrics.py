@@ -1,10 +1,9 @@
-"""How far hypotheses are from the true pose, from each other, and from the plausible set."""
+"""How far hypotheses are from the true pose, and from the plausible set."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
-from chsel.problem.poses import apply, inverse, product, rotated, rotation_angle
+from chsel.problem.poses import inverse, product, rotated
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 
 
@@ -65,30 +64,6 @@ def result_numbers(
     return values
 
 
-class Spread(NamedTuple):
-    """How far hypotheses are from each other."""
-
-    position: float  # m, root mean square distance of the object's centres from their mean
-    rotation: float  # radians, mean angle between the best hypothesis, the first, and the others
-
-
-def spread(hypotheses: Hypotheses, centre: FloatArray) -> Spread | None:
-    """Spread of the hypotheses that repeat no other; None if there is none.
-
-    centre (3,): of the object, in its frame, metres. Symmetries of the object are not considered;
-    the rotation is 0 for a single hypothesis.
-    """
-    object_from_world = hypotheses.object_from_world[~hypotheses.duplicate]  # (B, 4, 4)
-    if len(object_from_world) == 0:
-        return None
-    centres = np.stack([apply(pose, centre[None])[0] for pose in inverse(object_from_world)])
-    distances = np.linalg.norm(centres - centres.mean(axis=0), axis=1)
-    rotations = object_from_world[:, :3, :3]
-    angles = rotation_angle(rotations[1:] @ rotations[0].T)
-    rotation = float(angles.mean()) if len(angles) else 0.0
-    return Spread(float(np.sqrt(np.mean(distances**2))), rotation)
-
-
 def cheapest(costs: FloatArray, quantile: float) -> BoolArray:
     """Flags (B,) of hypotheses whose cost is at most this quantile of costs (B,); 1: all."""
     if not 0.0 < quantile <= 1.0:
@@ -134,11 +109,10 @@ class Calibration:
 
     rank: float  # share in (0, 1] of the B + 1 poses that are at least as far out as the true one;
     # uniform over many registrations if calibrated, small if the set is too narrow, or off
-    spread: float  # mm, root mean squared surface distance between hypotheses
     error: float  # mm, root mean squared surface distance from hypotheses to the truth
 
     def within(self, level: float = 0.05) -> bool:
-        """Whether the truth is within the set's spread: not among the outermost `level`."""
+        """Whether the truth is not among the outermost `level`."""
         return self.rank > level
 
 
@@ -157,6 +131,5 @@ def calibration(
     outwards = lengths.sum(axis=1) / count
     # Rounding must not rank equal poses.
     rank = (outwards >= outwards[-1] * (1.0 - 1e-9)).mean()
-    between = distances[:-1, :-1].sum() / (count * (count - 1))
     error = np.sqrt(distances[-1, :-1].mean())
-    return Calibration(float(rank), float(np.sqrt(between)), float(error))
+    return Calibration(float(rank), float(error))

@@ -23,5 +23,5 @@ class ExpectedLoss(ConfiguredPolicy[ExpectedLossSettings]):
     settings_class = ExpectedLossSettings
 
     def rate(self, problem: DecisionProblem, forecast: Forecast) -> FloatArray:
-        """Expected decrease (A,) of the mean distance of two surfaces; 0 where it would grow."""
+        """Expected decrease (A,) of the belief's spread, metres; 0 where it would grow."""
         return np.maximum(forecast.spread - forecast.gains.expected_spread, 0.0)

@@ -21,12 +21,22 @@ def outline_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
     other. As exact as the grid's interpolation, a fraction of its resolution.
     """
     places = outline_in_world(sdf, poses)  # (B, Q, 3)
-    count, size = places.shape[:2]
-    distances = signed_distances(sdf, poses, places.reshape(-1, 3)).reshape(count, count, size)
-    squares = in_order(distances**2) / max(size, 1)
+    squares = np.array([in_order(signed_distances(sdf, poses, there) ** 2) for there in places])
+    squares /= max(places.shape[1], 1)
     apart: FloatArray = np.sqrt(0.5 * (squares + squares.T))
     np.fill_diagonal(apart, 0.0)
     return apart
+
+
+def surface_spread(distances: FloatArray, weights: FloatArray | None = None) -> float:
+    """Root mean square distance of the surfaces in two poses drawn from a set, metres.
+
+    This is the spread of hypotheses and of beliefs. distances (B, B), metres: `outline_distances`.
+    weights (B,): with which poses are drawn, each again; None: all alike.
+    """
+    if weights is None:
+        weights = np.full(len(distances), 1.0 / len(distances))
+    return float(np.sqrt(in_order(weights * in_order(weights * distances**2))))
 
 
 def outline_distances_to(sdf: SdfGrid, poses: Poses, other: Poses) -> FloatArray:

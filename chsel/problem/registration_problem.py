@@ -105,7 +105,7 @@ class Trust:
     outliers: float  # share of known points that are not on the object, estimated
     misfit: float  # how far points are off the best hypothesis on average, in sensor noise levels
     modes: int  # groups of hypotheses that explain the points, with gaps between their surfaces
-    spread: float  # root mean square distance of their surfaces to that of the best one, metres
+    spread: float  # root mean square distance of two surfaces of these hypotheses, metres
     verdict: str  # one of VERDICTS
 
     def __str__(self) -> str:

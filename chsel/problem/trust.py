@@ -16,7 +16,12 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.threads import spread
 from chsel.problem.freedom import can_be_moved
 from chsel.problem.noise import FOREIGN, estimate_noise
-from chsel.problem.outline import in_order, outline_distances, signed_distances
+from chsel.problem.outline import (
+    in_order,
+    outline_distances,
+    signed_distances,
+    surface_spread,
+)
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
@@ -72,7 +77,7 @@ def trust_in(
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     count, mode = _components(apart <= gap)
-    spread = _root_mean_square(apart[0])
+    spread = surface_spread(apart)
     if error > limit or noise.outliers > MOST_OUTLIERS:
         verdict = NOTHING
     elif count == 1:
@@ -196,13 +201,9 @@ def _contradictions(
 
 
 def _widest(apart: FloatArray, mode: IntArray) -> float:
-    """The largest spread of a mode about its best pose, of distances (B, B), metres."""
-    firsts = np.unique(mode, return_index=True)[1]
-    return max(_root_mean_square(apart[first][mode == mode[first]]) for first in firsts)
-
-
-def _root_mean_square(values: FloatArray) -> float:
-    return math.sqrt(math.fsum((values**2).tolist()) / len(values))
+    """The largest spread of a mode, of distances (B, B), metres."""
+    parts = (np.flatnonzero(mode == one) for one in range(mode.max() + 1))
+    return max(surface_spread(apart[np.ix_(part, part)]) for part in parts)
 
 
 def _components(adjacent: BoolArray) -> tuple[int, IntArray]:

@@ -17,7 +17,7 @@ from chsel.problem.registration_problem import Hypotheses
 from replay.colors import BACKGROUND, GRID
 from replay.events import SessionStarted
 from replay.rerun.clock import PROBE, REGISTRATION, TIMELINES
-from replay.rerun.curves import SEARCH_FRAME, SPREADS
+from replay.rerun.curves import SEARCH_FRAME
 from replay.rerun.decisions import DECISION_CURVES
 from replay.rerun.hypotheses import shown_hypotheses
 from replay.rerun.legend import LEGEND_FRAME
@@ -169,12 +169,10 @@ def _curve_views(*, pose_known: bool, timed: bool) -> list[rrb.View | rrb.Contai
         views.append(rrb.Vertical(*(curves_view(f"error/{kind}", name) for kind, name in errors)))
     if timed:
         views.append(curves_view("seconds", "Seconds by stage"))
-    spreads = [curves_view(f"spread/{kind}", SPREADS[kind], legend=False) for kind in SPREADS]
     views.append(
         rrb.Tabs(
-            rrb.Vertical(*spreads, name="Spread"),
+            curves_view("trust", "Spread and noise [mm]"),
             curves_view("distinct", "Distinct"),
-            curves_view("trust", "Noise and spread [mm]"),
             curves_view("measured", "Other"),
         )
     )

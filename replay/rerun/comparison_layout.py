@@ -17,7 +17,6 @@ from replay.rerun.blueprint import (
     plane_view,
     scene_view,
 )
-from replay.rerun.curves import SPREADS
 from replay.rerun.plane import Frame
 
 SUMMARY_FRAME = Frame(12.0, 1.2)
@@ -28,7 +27,7 @@ CURVES: Mapping[str, str] = {
     "best_cost": "best cost",
     "log10_median_cost": "log₁₀ median",
     "median_cost": "median",
-    **{f"spread_{kind}": title for kind, title in SPREADS.items()},
+    "spread": "Spread [mm]",
     "best_position_error": "Position error of the best [mm]",
     "best_rotation_error": "Rotation error of the best [°]",
     "closest_position_error": "Position error of the closest [mm]",
@@ -36,7 +35,7 @@ CURVES: Mapping[str, str] = {
 }
 """What is drawn over probes, a curve for each method: name of the number, title of the view."""
 
-_WITH_LEGEND = "spread_position"  # of the view at the right edge: one legend serves all
+_WITH_LEGEND = "spread"  # of the view at the right edge: one legend serves all
 _IN_A_ROW = 4
 _SUMMARIES = 10.0  # so many texts of two lines are as high as all views of methods
 _LONGEST = 40
@@ -98,5 +97,5 @@ def _curve_views(*, pose_known: bool) -> list[rrb.View | rrb.Container]:
         for which in ("best", "closest"):
             errors = [view(f"{which}_{kind}_error") for kind in ("position", "rotation")]
             views.append(rrb.Vertical(*errors))
-    views.append(rrb.Vertical(*(view(f"spread_{kind}") for kind in SPREADS)))
+    views.append(view("spread"))
     return views

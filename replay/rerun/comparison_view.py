@@ -13,8 +13,8 @@ import rerun as rr
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
-from chsel.plausible.pose_metrics import spread
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.trust import has_pose, trust_in
 from replay.colors import SERIES, CostScale, Rgb, number
 from replay.comparing.comparison import CommonCost, common_cost, numbers_under
 from replay.events import Probe, ProblemPosed
@@ -144,7 +144,9 @@ class _Comparison:
                 self._summarise(label, "no result")
             else:
                 meshes.draw(hypotheses, scale)
-                numbers = numbers_under(judge, hypotheses, self._start) | self._spread(hypotheses)
+                numbers = numbers_under(judge, hypotheses, self._start)
+                if has_pose(found[label]):
+                    numbers["spread"] = trust_in(problem, found[label]).spread
                 self._add_numbers(label, numbers)
                 count = f"{len(shown_hypotheses(hypotheses))} of {len(hypotheses.cost)} drawn"
                 self._summarise(label, *_summary(numbers, count))
@@ -171,12 +173,6 @@ class _Comparison:
             if isfinite(values[name]):
                 times = next((SHOWN_UNIT[kind] for kind in SHOWN_UNIT if kind in name), 1.0)
                 self._stream.log(self._curve(name, label), rr.Scalars(times * values[name]))
-
-    def _spread(self, hypotheses: Hypotheses) -> dict[str, float]:
-        """How far hypotheses are from each other, in metres and radians."""
-        spreads = spread(hypotheses, np.asarray(self._start.mesh.centroid))
-        named = {} if spreads is None else spreads._asdict()
-        return {f"spread_{kind}": value for kind, value in named.items()}
 
     def _summarise(self, label: str, *rows: str) -> None:
         """Text below the view of a method."""

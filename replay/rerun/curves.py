@@ -7,8 +7,6 @@ import math
 import numpy as np
 import rerun as rr
 
-from chsel.numerics.arrays import FloatArray
-from chsel.plausible.pose_metrics import spread
 from chsel.problem.registration_problem import Hypotheses
 from replay.colors import CURVES, SERIES, CostScale, Rgb, number
 from replay.events import Traced
@@ -16,20 +14,15 @@ from replay.rerun.clock import ITERATION
 from replay.rerun.plane import Frame, Label, lines, texts, ticks
 
 SEARCH_FRAME = Frame(1.5, 1.0)
-SPREADS = {
-    "position": "Spread of positions [mm]",
-    "rotation": "Spread of rotations [°]",
-}
-"""What the curves of a set's spread show."""
 _CURVE_NAMES = ("lowest", "median", "highest")
-SHOWN_UNIT = {"position": 1e3, "rotation": math.degrees(1.0)}
+SHOWN_UNIT = {"position": 1e3, "rotation": math.degrees(1.0), "spread": 1e3}
 """What turns metres and radians into the units shown, millimetres and degrees."""
 _OF_TRUST = ("estimated_noise", "set_spread")  # measured lengths, metres
 _AT_ONCE = 64  # blocks of iterations that are sent together
 
 
 class Curves:
-    """Scalars over probes: costs, spread, pose errors, seconds by stage, and all else measured.
+    """Scalars over probes: costs, pose errors, seconds by stage, and all else measured.
 
     Lengths are in millimetres and angles in degrees, as on the console.
     """
@@ -37,28 +30,22 @@ class Curves:
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
         self._named: set[str] = set()
-        self._centre = np.zeros(3)
         self._traced: list[tuple[int, tuple[float, float, float]]] = []
 
-    def set_up(self, centre: FloatArray) -> None:
-        """The curves that every session has. centre: (3,), of the object in its frame, metres."""
-        self._centre = centre
+    def set_up(self) -> None:
+        """The curves that every session has."""
         for name, color in CURVES.items():
             self._style(f"cost/{name}", name, color)
             self._style(f"search/{name}", name, color)
 
     def add_hypotheses(self, hypotheses: Hypotheses) -> None:
-        """Lowest, median and highest cost of the hypotheses, their spread, and how many differ."""
+        """Lowest, median and highest cost of the hypotheses, and how many differ."""
         cost = hypotheses.cost
         if len(cost):
             values = (cost.min(), np.median(cost), cost.max())
             for name, value in zip(_CURVE_NAMES, values, strict=True):
                 self._scalar(f"cost/{name}", name, float(value))
         self._scalar("distinct/hypotheses", "distinct hypotheses", float(hypotheses.distinct))
-        spreads = spread(hypotheses, self._centre)
-        if spreads is not None:
-            for kind, value in spreads._asdict().items():
-                self._scalar(f"spread/{kind}", kind, SHOWN_UNIT[kind] * value)
 
     def add_measured(self, name: str, value: float) -> None:
         """One measured number; its name says where it is shown."""

@@ -9,7 +9,6 @@ from contextlib import closing, contextmanager, suppress
 from functools import singledispatchmethod
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
 
 from chsel.errors import RecordingError
@@ -155,7 +154,7 @@ class RerunRecorder(Recorder):
         self._meshes.set_up(mesh)
         self._legend.set_up(pose_known=known)
         self._legend.add_kinds(event.initial_points)
-        self._curves.set_up(np.asarray(mesh.centroid))
+        self._curves.set_up()
         self._scene.add_points(event.initial_points, new=False)
 
     @_draw.register

@@ -8,11 +8,15 @@ import numpy as np
 
 from chsel.next_probe.belief import belief_after, belief_before
 from chsel.next_probe.decision_problem import Belief, Decision
-from chsel.next_probe.forecast import mean_distance, surface_distances
 from chsel.numerics.arrays import FloatArray
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
-from chsel.problem.outline import in_order, outline_distances_to
+from chsel.problem.outline import (
+    in_order,
+    outline_distances,
+    outline_distances_to,
+    surface_spread,
+)
 from chsel.problem.poses import Poses, inverse
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
@@ -118,8 +122,9 @@ class ProbeRows:
 
 
 def spread_of(sdf: SdfGrid, belief: Belief) -> float:
-    """Mean distance of two surfaces drawn from a belief, metres, as decisions have it."""
-    return mean_distance(belief, surface_distances(sdf, belief))
+    """Spread of a belief, metres, as decisions have it."""
+    poses = Poses.of(belief.object_from_world)
+    return surface_spread(outline_distances(sdf, poses), belief.weights)
 
 
 def promised_gain(decision: Decision) -> float | None:

@@ -39,7 +39,9 @@ def decision_stages(place: str, sdf: SdfGrid) -> dict[str, Stages]:
     keep(stages, "first contacts", forecast.first._asdict())
     chances = {"hit": forecast.hit_chance, "blocked": forecast.blocked_chance}
     keep(stages, "chances", chances)
-    keep(stages, "distances", {"between": forecast.distances, "mean": np.array([forecast.spread])})
+    keep(
+        stages, "distances", {"between": forecast.distances, "spread": np.array([forecast.spread])}
+    )
     keep(stages, "gains", forecast.gains._asdict())
     cases = {f"forecast, {place}": stages}
     for name in OURS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.policies import POLICIES, build_policy
 from chsel.problem.points import KnownPoints
-from tests.chsel.next_probe.decisions import along_x, at, ball_problem, box_hand
+from tests.chsel.next_probe.decisions import RADIUS, along_x, at, ball_problem, box_hand
 
 NOISE = 0.005
 PLACES = [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.03), (0.0, -0.1), (0.28, 0.28)]
@@ -67,8 +68,21 @@ def test_the_order_of_poses_and_those_without_weight_do_not_matter(seed: int) ->
     assert there.hit_chance == pytest.approx(here.hit_chance, abs=1e-12)
     assert there.gains.information == pytest.approx(here.gains.information, abs=1e-12)
     assert there.gains.surviving == pytest.approx(here.gains.surviving, abs=1e-12)
-    # The places by which distances are measured depend on the poses and their order.
-    assert there.gains.expected_spread == pytest.approx(here.gains.expected_spread, rel=0.35)
+    assert there.gains.expected_spread == pytest.approx(here.gains.expected_spread, abs=1e-9)
+
+
+def test_the_spread_is_the_root_mean_square_distance_of_surfaces() -> None:
+    """Of two balls of radius r, d apart: the mean square of |r - |x + d|| over |x| = r."""
+    apart, weight = 0.02, 0.25
+    cosines = np.linspace(-1.0, 1.0, 20_001)
+    between = np.sqrt(RADIUS**2 + apart**2 + 2.0 * RADIUS * apart * cosines) - RADIUS
+    squares = 2.0 * weight * (1.0 - weight) * (between**2).mean()
+    poses = at((0.0, 0.0, 0.0), (0.0, apart, 0.0))
+    aside = along_x([(0.25, 0.25)])  # which misses both
+    problem = ball_problem(poses, aside, weights=np.array([weight, 1.0 - weight]))
+    decision = build_policy("expected_loss").decide(problem)
+    assert decision.spread == pytest.approx(math.sqrt(squares), rel=0.05)
+    assert decision.expected_spread == pytest.approx([decision.spread])
 
 
 def test_information_is_that_of_the_formula() -> None:
@@ -81,11 +95,14 @@ def test_information_is_that_of_the_formula() -> None:
     with np.errstate(divide="ignore"):
         inner = np.log(np.einsum("j,ija->ia", weights, alike))
     expected = -np.einsum("i,ia->a", weights, np.where(weights[:, None] > 0.0, inner, 0.0))
+    left = weights[:, None] * alike**2 / np.einsum("j,ija->ia", weights, alike**2)[:, None]
+    squares = np.einsum("i,ija,ij->a", weights, left, Forecast(problem, NOISE).distances ** 2)
     surviving = np.einsum("i,ija,j->a", weights, alike**2, weights)
     gains = Forecast(problem, NOISE).gains
     assert (expected > 0.5).sum() >= 2
     assert gains.information == pytest.approx(expected, abs=1e-9)
     assert gains.surviving == pytest.approx(surviving, abs=1e-9)
+    assert gains.expected_spread == pytest.approx(np.sqrt(squares), abs=1e-9)
 
 
 @pytest.mark.parametrize("weight", [0.5, 0.9, 1.0])
@@ -96,7 +113,9 @@ def test_two_poses_that_an_outcome_splits(weight: float) -> None:
     forecast = Forecast(problem, NOISE)
     assert forecast.hit_chance == pytest.approx([1.0 - weight])
     assert forecast.gains.information == pytest.approx([entropy(weights)], abs=0.03)
-    assert forecast.gains.expected_spread == pytest.approx([0.0], abs=1e-4)
+    # A sensor errs: what an outcome rules out keeps 0.01^2 of its weight.
+    left = forecast.distances[0, 1] * (0.01 if weight < 1.0 else 0.0)
+    assert forecast.gains.expected_spread == pytest.approx([left], rel=1e-3)
     assert forecast.gains.surviving == pytest.approx([(weights**2).sum()], abs=1e-4)
 
 

@@ -182,6 +182,17 @@ def test_poses_on_two_sides_are_two_modes_and_far_ones_do_not_count() -> None:
     assert trust_in(posed, hypotheses(*along)).verdict == "wide"
 
 
+def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs() -> None:
+    """Of balls d apart, each point of a surface is d |cos| off the other, d / sqrt(3) on average.
+
+    Three balls in a row have four of nine pairs d apart, and two of them 2 d."""
+    shift = 0.002
+    row = [compose(np.eye(3), moved(x=n * shift)[:3, 3]) for n in range(3)]
+    trust = trust_in(problem(chsel.KnownPoints(known=at_height(0.0))), hypotheses(*row), 0.01)
+    expected = shift / math.sqrt(3.0) * math.sqrt((4 * 1.0 + 2 * 4.0) / 9.0)
+    assert trust.spread == pytest.approx(expected, rel=0.1)  # of 100 points
+
+
 def test_distances_of_outlines_are_those_of_shifts_and_turns() -> None:
     """A shift along x moves the two sides across x by it, and the others within themselves."""
     shift = 0.01

@@ -13,9 +13,9 @@ from rerun.blueprint.components import PlayState
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
-from chsel.plausible.pose_metrics import spread
 from chsel.problem.poses import compose, inverse
 from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.trust import trust_in
 from replay.colors import cost_colors, number
 from replay.comparing.comparison import common_cost, numbers_under
 from replay.events import Event
@@ -148,21 +148,19 @@ def test_curves_are_the_numbers_of_the_table(
         numbers = numbers_under(judge, results["chsel"][step], recording.start)
         numbers["log10_best_cost"] = np.log10(numbers["best_cost"])
         numbers["log10_median_cost"] = np.log10(numbers["median_cost"])
-        spreads = spread(
-            ranked(results["chsel"][step], judge), np.asarray(recording.start.mesh.centroid)
-        )
-        assert spreads is not None
-        numbers |= {"spread_position": spreads.position, "spread_rotation": spreads.rotation}
+        numbers["spread"] = trust_in(recording.problem(step), results["chsel"][step]).spread
         for curve, title in CURVES.items():
             shown = shown_at(rows[f"/curves/{curve}/{name}"], step)
             unit = 1e3 if "[mm]" in title else 180.0 / np.pi if "[°]" in title else 1.0
             assert shown["Scalars:scalars"] == [pytest.approx(unit * numbers[curve], rel=1e-9)]
             assert shown["SeriesLines:names"] == ["chsel"]
         units = {name: title[-4:] for name, title in CURVES.items() if title.endswith("]")}
-        assert {name for name in units if "position" in name} == {
-            name for name, unit in units.items() if unit == "[mm]"
+        assert {name for name, unit in units.items() if unit == "[mm]"} == {
+            "spread",
+            "best_position_error",
+            "closest_position_error",
         }
-        assert len(units) == 6
+        assert len(units) == 5
 
 
 def test_it_opens_at_the_first_compared_step_with_all_that_was_known_by_then(
