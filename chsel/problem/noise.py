@@ -12,7 +12,7 @@ from chsel.numerics.arrays import FloatArray
 PRIOR_CONTACTS = 4.0  # that the sensor's noise counts for
 PRIOR_OUTLIERS = 0.02  # the share of outliers in them
 FOREIGN = 4.0  # noise levels beyond which a contact is an outlier
-_FITTED = 6  # numbers of a pose: so many distances are small whatever the noise
+FREEDOMS = 6  # of a pose: it can make so many distances small whatever the noise
 _MEDIAN = 1.4826  # standard deviations of normal numbers by the median of their sizes
 _ROUNDS = 20
 
@@ -42,7 +42,7 @@ def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
         if within == before:
             break
         squares = math.fsum((sizes[:within] ** 2).tolist())
-        weight = PRIOR_CONTACTS + max(within - _FITTED, 0)
+        weight = PRIOR_CONTACTS + max(within - FREEDOMS, 0)
         sigma = math.sqrt((PRIOR_CONTACTS * sensor_noise**2 + squares) / weight)
     foreign = PRIOR_CONTACTS * PRIOR_OUTLIERS + count - max(within, 0)
     return Noise(max(sigma, sensor_noise), foreign / (PRIOR_CONTACTS + count))

@@ -104,17 +104,21 @@ class Trust:
     noise: float  # standard deviation of the known points on the object, estimated, metres
     outliers: float  # share of known points that are not on the object, estimated
     misfit: float  # how far points are off the best hypothesis on average, in sensor noise levels
-    modes: int  # groups of hypotheses that explain the points, with gaps between their surfaces
+    modes: int  # places of the object that explain the points; 0 if it is wide, or nothing fits
     spread: float  # root mean square distance of two surfaces of these hypotheses, metres
     verdict: str  # one of VERDICTS
+    redundancy: int  # known points beyond the six that a pose can fit; at 0, misfit is no evidence
 
     def __str__(self) -> str:
         """One line for people."""
-        modes = f"{self.modes} modes" if self.modes > 1 else "1 mode"
+        modes = {0: "", 1: "1 mode, "}.get(self.modes, f"{self.modes} modes, ")
+        exact = ": no evidence, a pose can fit so few contacts exactly"
+        if self.redundancy or self.verdict == "nothing fits":
+            exact = ""
         return (
-            f"{self.verdict} ({modes}, spread {1000.0 * self.spread:.1f} mm, noise "
+            f"{self.verdict} ({modes}spread {1000.0 * self.spread:.1f} mm, noise "
             f"{1000.0 * self.noise:.1f} mm, {100.0 * self.outliers:.0f} % outliers, misfit "
-            f"{self.misfit:.1f} noise levels)"
+            f"{self.misfit:.1f} noise levels{exact})"
         )
 
     @property

@@ -15,7 +15,7 @@ from chsel.errors import PointsWarning, PoseError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.threads import spread
 from chsel.problem.freedom import can_be_moved
-from chsel.problem.noise import FOREIGN, estimate_noise
+from chsel.problem.noise import FOREIGN, FREEDOMS, estimate_noise
 from chsel.problem.outline import (
     in_order,
     outline_distances,
@@ -73,20 +73,26 @@ def trust_in(
 
     errors = _mean_errors(problem, poses, sensor_noise, most, thinned=True)
     least = max(float(errors[0]), sensor_noise, _GRID_ERROR * sdf.resolution / ALIKE)
-    apart = outline_distances(sdf, poses[errors <= ALIKE * least])
+    poses = poses[errors <= ALIKE * least]
+    apart = outline_distances(sdf, poses)
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     count, mode = _components(apart <= gap)
-    spread = surface_spread(apart)
+    parts = [np.flatnonzero(mode == one) for one in range(count)]
+    redundancy = max(len(off) - FREEDOMS, 0)
     if error > limit or noise.outliers > MOST_OUTLIERS:
-        verdict = NOTHING
-    elif count == 1:
-        wide = spread > width or can_be_moved(problem, poses[:1], noise.sigma, width)
-        verdict = WIDE if wide else DETERMINED
+        count, verdict = 0, NOTHING
+    elif (
+        redundancy + len(problem.points.free) + len(problem.points.occupied) == 0
+        or count > MOST_MODES
+        or max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width
+        or any(can_be_moved(problem, poses[part[:1]], noise.sigma, width) for part in parts)
+    ):
+        count, verdict = 0, WIDE
     else:
-        narrow = count <= MOST_MODES and _widest(apart, mode) <= width
-        verdict = SEVERAL if narrow else WIDE
-    return Trust(noise.sigma, noise.outliers, error / sensor_noise, int(count), spread, verdict)
+        verdict = DETERMINED if count == 1 else SEVERAL
+    misfit, spread = error / sensor_noise, surface_spread(apart)
+    return Trust(noise.sigma, noise.outliers, misfit, count, spread, verdict, redundancy)
 
 
 def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[PointsWarning]:
@@ -198,12 +204,6 @@ def _contradictions(
 
     spread(run, len(poses), lambda: None, least=poses_per_thread(len(points)))
     return depths, counts
-
-
-def _widest(apart: FloatArray, mode: IntArray) -> float:
-    """The largest spread of a mode, of distances (B, B), metres."""
-    parts = (np.flatnonzero(mode == one) for one in range(mode.max() + 1))
-    return max(surface_spread(apart[np.ix_(part, part)]) for part in parts)
 
 
 def _components(adjacent: BoolArray) -> tuple[int, IntArray]:

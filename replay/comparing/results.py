@@ -36,7 +36,7 @@ RELATIVE, ABSOLUTE = 1e-9, 1e-12
 ERRORS = 1e-4
 """m or rad: how far errors to the true pose may be, as symmetries depend on LAPACK and libigl."""
 
-_TRUST = Trust(0.0, 0.0, 0.0, 1, 0.0, VERDICTS[0]).numbers.keys()
+_TRUST = Trust(0.0, 0.0, 0.0, 1, 0.0, VERDICTS[0], 0).numbers.keys()
 _HYPOTHESES = ("object_from_world", "cost", "duplicate", "cell", "elites")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from chsel.problem.streams import StreamKey
 from chsel.problem.trust import (
     MOST_OFF,
     MOST_SYSTEMATIC,
-    MOST_WIDTH,
     _contradictions,
     check_trust,
     correlation,
@@ -167,19 +167,32 @@ def test_occupied_points_must_not_be_far_outside() -> None:
         assert (trust_in(problem(points), ball()).verdict != "nothing fits") is fits
 
 
-def test_poses_on_two_sides_are_two_modes_and_far_ones_do_not_count() -> None:
-    """One flat side is touched: the box may stand on either half of it, or anywhere along it."""
-    side = apply(POSE, np.array([[0.05, y, z] for y in (-0.02, 0.02) for z in (-0.04, 0.0, 0.04)]))
-    posed = problem(chsel.KnownPoints(known=side), GRID)
-    near = [moved(z=shift) for shift in (0.0, 0.001, 0.03, 0.031)]
-    off = moved(x=-0.03)
-    trust = trust_in(posed, hypotheses(*near, off))
-    assert (trust.verdict, trust.modes) == ("several modes", 2)
-    assert trust.spread > MOST_WIDTH * GRID.diameter
-    alike = trust_in(posed, hypotheses(near[0], near[1], off))
-    assert (alike.verdict, alike.modes) == ("wide", 1)  # a set that leaves out what also fits
-    along = [moved(z=shift) for shift in np.linspace(0.0, 0.04, 12)]
-    assert trust_in(posed, hypotheses(*along)).verdict == "wide"
+def test_poses_that_fit_one_corner_are_modes_and_far_ones_do_not_count() -> None:
+    """A corner is touched, near it alone: the three sides of a box can lie along it in six ways."""
+    corner = np.array([[x, y, 0.0] for x in (0.005, 0.02, 0.035) for y in (0.005, 0.02, 0.035)])
+    known = apply(POSE, np.concatenate([np.roll(corner, n, axis=1) for n in range(3)]))
+    posed = problem(chsel.KnownPoints(known=known), GRID)
+    ways = []
+    for axes in permutations(range(3)):
+        turn = np.eye(3)[list(axes)]  # side n of the box lies along axis axes[n] of the corner
+        turn *= np.linalg.det(turn)  # no reflection; the box is the same from behind
+        ways.append(POSE @ compose(turn.T, 0.5 * SIDES[np.argsort(axes)]))
+    off = np.asarray(ways[0] @ compose(np.eye(3), np.array([0.03, 0.0, 0.0])))
+    for count, verdict in ((1, "determined"), (2, "several modes"), (6, "several modes")):
+        trust = trust_in(posed, hypotheses(*ways[:count], off))
+        assert (trust.verdict, trust.modes) == (verdict, count)
+    near = np.asarray(ways[1] @ compose(np.eye(3), np.array([0.0005, 0.0, 0.0])))
+    assert trust_in(posed, hypotheses(*ways[:2], near)).modes == 2
+
+
+@pytest.mark.parametrize("shifts", [[0.0], [0.0, 0.001, 0.03, 0.031], np.linspace(0.0, 0.04, 12)])
+def test_samples_of_a_continuum_are_no_modes(shifts: list[float]) -> None:
+    """One flat side is touched: the box may stand anywhere along it."""
+    side = np.array([[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.0, 0.04)])
+    posed = problem(chsel.KnownPoints(known=apply(POSE, side)), GRID)
+    trust = trust_in(posed, hypotheses(*(moved(z=shift) for shift in shifts), moved(x=-0.03)))
+    assert (trust.verdict, trust.modes) == ("wide", 0)
+    assert str(trust).startswith("wide (spread ")
 
 
 def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs() -> None:
@@ -191,6 +204,20 @@ def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs() -> None:
     trust = trust_in(problem(chsel.KnownPoints(known=at_height(0.0))), hypotheses(*row), 0.01)
     expected = shift / math.sqrt(3.0) * math.sqrt((4 * 1.0 + 2 * 4.0) / 9.0)
     assert trust.spread == pytest.approx(expected, rel=0.1)  # of 100 points
+
+
+def test_points_that_a_pose_can_fit_exactly_are_no_evidence() -> None:
+    """Six contacts of a ball, which no motion leaves, and the same with one more or free points."""
+    contacts = at_height(0.0)
+    for count, free, verdict in ((6, 0, "wide"), (7, 0, "determined"), (6, 60, "determined")):
+        points = chsel.KnownPoints(free=at_height(0.05)[:free], known=contacts[:count])
+        trust = trust_in(problem(points), ball(), NOISE)
+        assert (trust.verdict, trust.redundancy) == (verdict, count - 6)
+        assert ("no evidence" in str(trust)) is (count == 6)
+    inside = chsel.KnownPoints(free=at_height(-0.05), known=contacts[:6])  # which is evidence
+    trust = trust_in(problem(inside), ball(), NOISE)
+    assert trust.verdict == "nothing fits"
+    assert "no evidence" not in str(trust)
 
 
 def test_distances_of_outlines_are_those_of_shifts_and_turns() -> None:
@@ -244,7 +271,8 @@ def test_an_object_thinner_than_its_grid_is_judged_too() -> None:
     trust = trust_in(problem(chsel.KnownPoints(known=known), sdf), hypotheses(POSE, moved(x=0.05)))
     assert trust.spread > 0.005
     nowhere = chsel.SdfGrid(np.zeros(3), 0.01, np.ones((4, 4, 4)), np.ones((4, 4, 4, 3)))
-    assert trust_in(problem(chsel.KnownPoints(known=known), nowhere), hypotheses(POSE)).modes == 1
+    trust = trust_in(problem(chsel.KnownPoints(known=known), nowhere), hypotheses(POSE))
+    assert (trust.verdict, trust.modes) == ("nothing fits", 0)
 
 
 @pytest.mark.parametrize("count", [1, 3])
