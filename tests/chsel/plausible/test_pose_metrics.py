@@ -1,4 +1,4 @@
-"""Pose errors modulo symmetries, at the object's centre; the spread of a set of hypotheses."""
+"""Pose errors modulo symmetries, at the object's centre."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible.pose_metrics import pose_errors, result_numbers, spread
+from chsel.plausible.pose_metrics import pose_errors, result_numbers
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import axis_angle, compose, inverse, rotation_vector
-from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from runners.objects.models import MODELS
@@ -108,39 +108,3 @@ def test_numbers_of_a_result_are_modulo_symmetries_with_or_without_a_mesh() -> N
     assert without["best_position_error"] == pytest.approx(0.02, abs=0.005)
     assert without["best_rotation_error"] == pytest.approx(np.pi, abs=1e-6)
     assert "best_position_error" not in result_numbers(found, problem, None, None)
-
-
-MIDDLE = np.array([0.5, 0.0, 0.0])
-QUARTER = axis_angle(Z, np.pi / 2)
-
-
-def hypotheses(world_from_object: np.ndarray, duplicate: list[bool]) -> Hypotheses:
-    return hypotheses_at(inverse(world_from_object), duplicate)
-
-
-def test_turning_about_the_centre_spreads_rotations_alone() -> None:
-    turned = compose(QUARTER, MIDDLE - QUARTER @ MIDDLE)
-    half_turned = compose(QUARTER @ QUARTER, MIDDLE - QUARTER @ QUARTER @ MIDDLE)
-    found = spread(hypotheses(np.stack([np.eye(4), turned, half_turned]), [False] * 3), MIDDLE)
-    assert found is not None
-    assert found.position == pytest.approx(0.0, abs=1e-12)
-    assert found.rotation == pytest.approx(0.75 * np.pi)  # a quarter and a half turn
-
-
-def test_positions_are_those_of_the_centre_in_the_world() -> None:
-    poses = compose(np.stack([np.eye(3), QUARTER]), np.zeros((2, 3)))
-    found = spread(hypotheses(poses, [False, False]), MIDDLE)
-    assert found is not None
-    assert found.position == pytest.approx(np.sqrt(0.5) / 2)  # from (0.5, 0) to (0, 0.5)
-
-
-def test_duplicates_do_not_count() -> None:
-    poses = compose(np.tile(np.eye(3), (3, 1, 1)), np.array([[0, 0, 0], [0.2, 0, 0], [9, 0, 0]]))
-    found = spread(hypotheses(poses, [False, False, True]), MIDDLE)
-    assert found is not None
-    assert found.position == pytest.approx(0.1)
-
-
-def test_one_hypothesis_has_no_spread_and_none_has_none() -> None:
-    assert spread(hypotheses(np.eye(4)[None], [False]), MIDDLE) == (0.0, 0.0)
-    assert spread(hypotheses(np.zeros((0, 4, 4)), []), MIDDLE) is None
