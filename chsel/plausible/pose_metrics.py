@@ -11,8 +11,10 @@ from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry
-from chsel.problem.poses import inverse, product, rotated
+from chsel.problem.outline import outline_distances_to
+from chsel.problem.poses import Poses, inverse, product, rotated
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
+from chsel.problem.sdf_grid import FARTHEST, SdfGrid
 
 
 def pose_errors(
@@ -32,6 +34,20 @@ def pose_errors(
     return distance, symmetry.rotation_errors(relative)
 
 
+def closest_pose(object_from_world: FloatArray, world_from_object: FloatArray, sdf: SdfGrid) -> int:
+    """Which hypothesis (B, 4, 4), B > 0, is closest to the true pose (4, 4), by its surface.
+
+    As `outline_distances_to` has it, so that poses that look the same are as close. Those that no
+    kernel can read are left out; the first of equal ones.
+    """
+    poses, truth = Poses.of(object_from_world), Poses.of(inverse(world_from_object)[None])
+    readable = (np.abs(poses.numbers) <= FARTHEST).all(axis=1)
+    readable &= (np.abs(truth.numbers) <= FARTHEST).all()
+    distances = np.full(len(poses), np.inf)
+    distances[readable] = outline_distances_to(sdf, poses[readable], truth)
+    return int(np.argmin(distances))
+
+
 def result_numbers(
     hypotheses: Hypotheses,
     problem: RegistrationProblem,
@@ -41,7 +57,7 @@ def result_numbers(
 ) -> dict[str, float]:
     """Counts, archive measures and trust, and the errors to the true pose (4, 4) where it is known.
 
-    Errors are those of the best hypothesis and of the one closest in position, in metres and
+    Errors are those of the best hypothesis and of the closest, see `closest_pose`, in metres and
     radians, as `pose_errors` defines them. symmetry: of the object; None if its mesh is not
     available: the identity alone, about the centre of the problem's grid.
     """
@@ -57,7 +73,7 @@ def result_numbers(
     if world_from_object is not None and len(hypotheses.object_from_world) > 0:
         symmetry = symmetry or grid_symmetry(problem.sdf)
         position, rotation = pose_errors(hypotheses.object_from_world, world_from_object, symmetry)
-        closest = int(np.argmin(position))
+        closest = closest_pose(hypotheses.object_from_world, world_from_object, problem.sdf)
         for name, index in (("best", 0), ("closest", closest)):
             values[f"{name}_position_error"] = float(position[index])
             values[f"{name}_rotation_error"] = float(rotation[index])

@@ -10,7 +10,7 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import ChselError
-from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.pose_metrics import closest_pose, pose_errors
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.settings import PRESETS, in_preset
 from replay.comparing.contenders import Contender, recorded_or_none
@@ -92,7 +92,7 @@ def numbers_under(
 ) -> dict[str, float]:
     """Numbers about hypotheses, judged by a cost that may be another than their method's.
 
-    Best is the one of the lowest cost, closest the one nearest to the true pose in position.
+    Best is the one of the lowest cost, closest the one whose surface is nearest to the true one.
     Errors in metres and radians, modulo the object's symmetries, at its centre.
     """
     poses = hypotheses.object_from_world
@@ -106,7 +106,8 @@ def numbers_under(
     if start.world_from_object is not None:
         symmetry = recorded_symmetry(start)
         position, rotation = pose_errors(poses, start.world_from_object, symmetry)
-        for name, index in (("best", best), ("closest", int(np.argmin(position)))):
+        closest = closest_pose(poses, start.world_from_object, start.sdf)
+        for name, index in (("best", best), ("closest", closest)):
             numbers[f"{name}_position_error"] = float(position[index])
             numbers[f"{name}_rotation_error"] = float(rotation[index])
     return numbers

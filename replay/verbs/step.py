@@ -159,7 +159,7 @@ def _table(recording: Recording, again: StepAgain) -> Table:
     if truth:
         title += (
             "; errors to the true pose modulo the object's symmetries, at its centre: "
-            "best hypothesis, closest one"
+            "best hypothesis, closest one by its surface"
         )
     errors = ("mm", "°", "mm", "°") if truth else ()
     numbers = ("best cost", "median cost", "distinct", *errors)

@@ -85,12 +85,12 @@ def problem_of(start: SessionStarted) -> RegistrationProblem:
 
 
 def test_recorded_errors(start: SessionStarted) -> None:
-    recorder, method = ListRecorder(), Fixed(found(turned(180.0, 0.003), turned(10.0)))
+    recorder, method = ListRecorder(), Fixed(found(turned(180.0, 0.03), turned(10.0)))
     posed = ProblemPosed(1, problem_of(start))
     registered = register_recorded(posed, method, recorder, TRUTH, symmetry_for_errors(start))
     (measured,) = (event for event in recorder.events if isinstance(event, Measured))
     assert measured.values == registered.numbers
-    assert measured.values["best_position_error"] == pytest.approx(0.003, abs=1e-9)
+    assert measured.values["best_position_error"] == pytest.approx(0.03, abs=1e-9)
     assert measured.values["best_rotation_error"] == pytest.approx(0.0, abs=1e-6)
     assert measured.values["closest_position_error"] == pytest.approx(0.0, abs=1e-9)
     assert measured.values["closest_rotation_error"] == pytest.approx(np.deg2rad(10.0), abs=1e-6)

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible.pose_metrics import pose_errors, result_numbers
+from chsel.plausible.pose_metrics import closest_pose, pose_errors, result_numbers
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import axis_angle, compose, inverse, rotation_vector
@@ -96,15 +96,27 @@ def problem_of(mesh: trimesh.Trimesh, poses: FloatArray) -> RegistrationProblem:
 
 def test_numbers_of_a_result_are_modulo_symmetries_with_or_without_a_mesh() -> None:
     motions = [about_centre(Z, np.pi, np.array([0.0, 0.02, 0.0])), about_centre(X, 0.5)]
+    motions += [about_centre(X, np.deg2rad(3.0), np.array([0.002, 0.0, 0.0]))]
     poses = np.concatenate([hypothesis(motion) for motion in motions])
     found = hypotheses_at(poses)
     problem = problem_of(BOX, poses)
     numbers = result_numbers(found, problem, TRUTH, SYMMETRY)
     assert numbers["best_position_error"] == pytest.approx(0.02, abs=1e-9)
     assert numbers["best_rotation_error"] == pytest.approx(0.0, abs=1e-6)
-    assert numbers["closest_position_error"] == pytest.approx(0.0, abs=1e-9)
-    assert numbers["closest_rotation_error"] == pytest.approx(0.5, abs=1e-6)
+    assert numbers["closest_position_error"] == pytest.approx(0.002, abs=1e-9)  # not the centre's
+    assert numbers["closest_rotation_error"] == pytest.approx(np.deg2rad(3.0), abs=1e-6)
     without = result_numbers(found, problem, TRUTH, None)
     assert without["best_position_error"] == pytest.approx(0.02, abs=0.005)
     assert without["best_rotation_error"] == pytest.approx(np.pi, abs=1e-6)
     assert "best_position_error" not in result_numbers(found, problem, None, None)
+
+
+def test_the_closest_pose_is_that_of_the_closest_surface() -> None:
+    """Modulo symmetries, and whatever stands where no kernel can read."""
+    sdf = SdfGrid.from_mesh(BOX, 0.01)
+    motions = [about_centre(Z, 0.1), about_centre(Z, np.pi, np.array([0.001, 0.0, 0.0]))]
+    unreadable = np.diag([1.0, 1.0, 1.0, 1.0])[None] + np.array([[np.nan], [0], [0], [0]])
+    poses = np.concatenate([unreadable, *(hypothesis(motion) for motion in motions)])
+    assert closest_pose(poses, TRUTH, sdf) == 2
+    assert closest_pose(poses[:2], TRUTH, sdf) == 1
+    assert closest_pose(poses[:1], TRUTH, sdf) == 0
