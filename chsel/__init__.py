@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     from chsel.cost.cost_settings import CostSettings
     from chsel.cost.torch_cost import RelaxedCost
     from chsel.errors import ChselError, InputWarning, MeshWarning, PointsWarning
+    from chsel.methods import build_method
+    from chsel.next_probe.action_lattice import (
+        ActionSettings,
+        around_actions,
+        forward_actions,
+        straight_actions,
+    )
     from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
     from chsel.next_probe.hand_shape import HandShape
     from chsel.numerics.threads import set_threads
@@ -37,8 +44,13 @@ if TYPE_CHECKING:
     )
     from chsel.problem.sdf_grid import SdfGrid
     from chsel.problem.trust import trust_in
+    from chsel.sensing.free_space import FreeGrid
+    from chsel.sensing.swept import interior_lattice, poses_between
+
+    __version__: str
 
 __all__ = [
+    "ActionSettings",
     "Actions",
     "ArchiveSnapshot",
     "Belief",
@@ -47,6 +59,7 @@ __all__ = [
     "CostSettings",
     "Decision",
     "DecisionProblem",
+    "FreeGrid",
     "HandShape",
     "Hypotheses",
     "InputWarning",
@@ -60,14 +73,21 @@ __all__ = [
     "Steering",
     "Trust",
     "Workspace",
+    "around_actions",
+    "build_method",
     "build_policy",
+    "forward_actions",
+    "interior_lattice",
     "load_mesh",
+    "poses_between",
     "register",
     "set_threads",
+    "straight_actions",
     "trust_in",
 ]
 
 _PLACES = {
+    "ActionSettings": "next_probe.action_lattice",
     "Actions": "next_probe.decision_problem",
     "ArchiveSnapshot": "problem.registration_problem",
     "Belief": "next_probe.decision_problem",
@@ -76,6 +96,7 @@ _PLACES = {
     "CostSettings": "cost.cost_settings",
     "Decision": "next_probe.decision_problem",
     "DecisionProblem": "next_probe.decision_problem",
+    "FreeGrid": "sensing.free_space",
     "HandShape": "next_probe.hand_shape",
     "Hypotheses": "problem.registration_problem",
     "InputWarning": "errors",
@@ -89,16 +110,26 @@ _PLACES = {
     "Steering": "policies.steering",
     "Trust": "problem.registration_problem",
     "Workspace": "problem.points",
+    "around_actions": "next_probe.action_lattice",
+    "build_method": "methods",
     "build_policy": "policies",
+    "forward_actions": "next_probe.action_lattice",
+    "interior_lattice": "sensing.swept",
     "load_mesh": "problem.mesh",
+    "poses_between": "sensing.swept",
     "register": "api",
     "set_threads": "numerics.threads",
+    "straight_actions": "next_probe.action_lattice",
     "trust_in": "problem.trust",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for, so that `replay info` need not wait for torch."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("chsel-replay")
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)

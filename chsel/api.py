@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_instance
-from chsel.methods import build_method, noise_of, preset_settings, trust_by
+from chsel.methods import build_method, default_method, noise_of, preset_settings, trust_by
 from chsel.numerics.arrays import frozen
 from chsel.problem.defaults import FREE_RESOLUTION, object_grid, workspace_around
-from chsel.problem.input_checks import check_contacts, check_points
+from chsel.problem.input_checks import check_contacts, check_points, require_parts
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
@@ -36,7 +36,7 @@ def register(
     occupied: Any = None,
     known: Any = None,
     known_sdf: Any = None,
-    method: str = "chsel",
+    method: str | None = None,
     preset: str = "default",
     settings: Any = None,
     hypotheses: int | None = None,
@@ -54,8 +54,9 @@ def register(
     target: the object's mesh in metres, or its signed distance grid. surface (M, 3), free (N, 3),
     occupied (K, 3): points on, outside and inside of the object. known (L, 3), known_sdf (L,):
     points of known signed distance, metres. Numpy arrays, torch tensors or lists.
-    method, preset: see chsel.methods. settings: a mapping of single settings over the preset's,
-    such as {"emitter": {"iterations": 500}}, or a whole settings object.
+    method, preset: see chsel.methods; by default `anchored`, and in the presets paper and reference
+    `chsel`, their method. settings: a mapping of single settings over the preset's, such as
+    {"size": "large"}, or a whole settings object.
     hypotheses: B, 30 by default. workspace: where the object can be; by default the bounds of the
     points padded by the object's diameter. initial_set (B, 4, 4): E_0 as object_from_world.
     previous: the last result, when points were added since (CHSEL, Alg. 2). resolution: of the
@@ -71,10 +72,11 @@ def register(
     """
     points = _known_points(surface, free, occupied, known, known_sdf)
     if workspace is not None:
-        require_instance("workspace", workspace, Workspace, "chsel.Workspace(lower, upper)")
+        require_parts(workspace=workspace)
     if previous is not None:
         what = "the Hypotheses of the registration before, or None"
         require_instance("previous", previous, Hypotheses, what)
+    method = default_method(preset) if method is None else method
     solver = build_method(method, _settings(method, preset, settings, hypotheses))
     sdf = _grid(target, resolution)
     _warn(check_points(points, sdf.diameter, free_resolution, workspace) + check_contacts(points))
@@ -150,7 +152,7 @@ def _settings(method: str, preset: str, changes: Any, hypotheses: int | None) ->
         chosen = changes
     elif changes is not None:
         require_instance("settings", changes, Mapping, "a mapping, or the settings of the method")
-        chosen = changed_settings(chosen, changes, "method")
+        chosen = changed_settings(chosen, changes, f"method={method}: settings")
     if hypotheses is not None:
         online = {"online": {"hypotheses": hypotheses}}
         chosen = changed_settings(chosen, online, "method")

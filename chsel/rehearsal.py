@@ -20,7 +20,6 @@ from chsel.problem.poses import compose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from chsel.problem.trust import trust_in
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 
@@ -107,8 +106,7 @@ def _register_twice(method: Method) -> None:
     for step in online.steps(enumerate((touched, others)), method.register):
         assert step.hypotheses is not None
         assert step.problem is not None
-        trust = trust_in(step.problem, step.hypotheses)
-        result_numbers(step.hypotheses, step.problem, np.eye(4), None, trust)
+        result_numbers(step.hypotheses, step.problem, np.eye(4), None)
 
 
 def _ball() -> SdfGrid:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from chsel.numerics.arrays import FloatArray, digest
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
 from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Trust
+from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from chsel.problem.settings import PRESETS, changed_settings, settings_mapping
 from replay.events import (
     HypothesesFound,
@@ -84,12 +84,11 @@ class NamedMethod:
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """What a registration gave: its result, numbers about it, and wall-clock seconds by stage."""
+    """What a registration gave: its result with trust, numbers, wall-clock seconds by stage."""
 
     hypotheses: Hypotheses
     numbers: Mapping[str, float]
     seconds: Mapping[str, float]
-    trust: Trust | None  # None if no pose was found
 
     @property
     def total_seconds(self) -> float:
@@ -198,7 +197,7 @@ def register_recorded(
     truth = None if symmetry is None else world_from_object
     numbers = result_numbers(hypotheses, posed.problem, truth, symmetry, trust)
     recorder.record(Measured(posed.step, numbers))
-    return Registered(hypotheses, numbers, seconds, trust)
+    return Registered(replace(hypotheses, trust=trust), numbers, seconds)
 
 
 def _traced(step: int, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> Traced:

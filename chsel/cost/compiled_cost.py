@@ -21,6 +21,7 @@ from chsel.numerics.pose_tuples import Triple
 from chsel.numerics.rough_tree import rough_tree
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.numerics.voxels import bounds_of
+from chsel.problem.input_checks import require_parts
 from chsel.problem.points import KnownPoints, VoxelGrid
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
@@ -54,6 +55,7 @@ class CompiledCost:
     ) -> None:
         require_ieee_arithmetic()
         require_choice("culling", culling, CULLINGS)
+        require_parts(sdf=sdf, points=points)
         settings = (settings or CostSettings()).of_object(sdf, free_resolution)
         self.settings = settings
         self.model = Model(

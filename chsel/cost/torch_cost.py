@@ -12,6 +12,7 @@ from torch import Tensor
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.interior_points import interior_points
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.input_checks import require_parts
 from chsel.problem.points import KnownPoints, VoxelGrid
 from chsel.problem.poses import stacked
 from chsel.problem.registration_problem import RegistrationProblem
@@ -39,6 +40,7 @@ class RelaxedCost:
         *,
         free_resolution: float = 0.01,
     ) -> None:
+        require_parts(sdf=sdf, points=points)
         self.sdf, self.points = sdf, points
         self.settings = settings = (settings or CostSettings()).of_object(sdf, free_resolution)
         self._world = {

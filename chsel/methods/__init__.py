@@ -4,9 +4,18 @@ from chsel.methods.registry import (
     METHODS,
     OURS,
     build_method,
+    default_method,
     noise_of,
     preset_settings,
     trust_by,
 )
 
-__all__ = ["METHODS", "OURS", "build_method", "noise_of", "preset_settings", "trust_by"]
+__all__ = [
+    "METHODS",
+    "OURS",
+    "build_method",
+    "default_method",
+    "noise_of",
+    "preset_settings",
+    "trust_by",
+]

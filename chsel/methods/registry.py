@@ -57,6 +57,12 @@ _CHOICES = NamedChoices[Method](
 METHODS = _CHOICES.names
 
 
+def default_method(preset: str = "default") -> str:
+    """The method for points of one's own; of presets that are the paper's, the paper's method."""
+    require_choice("preset", preset, PRESETS)
+    return "anchored" if preset == "default" else "chsel"
+
+
 def preset_settings(name: str, preset: str = "default") -> Any:
     """The settings of a method by name in a preset, one of PRESETS."""
     make, default = _CHOICES.entry(name)

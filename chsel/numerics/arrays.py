@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,18 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 _LINE = 128  # bytes that processors hold together, at most
+
+
+class ShapesShown:
+    """Base of dataclasses whose repr has the shapes of arrays, and not their numbers."""
+
+    def __repr__(self) -> str:
+        shown = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        parts = [
+            f"{name}: {value.shape}" if isinstance(value, np.ndarray) else f"{name}={value!r}"
+            for name, value in shown.items()
+        ]
+        return f"{type(self).__name__}({', '.join(parts)})"
 
 
 def frozen(

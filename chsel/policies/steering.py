@@ -6,13 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.errors import ChselError
+from chsel.errors import ChselError, SettingError, quoted, require_instance
 from chsel.next_probe.belief import belief_after, belief_before
 from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
 from chsel.next_probe.hand_shape import HandShape
 from chsel.next_probe.surprise import surprise
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.policies.policy import Policy
+from chsel.problem.input_checks import require_parts
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
@@ -44,6 +45,11 @@ class Steering:
         seed: int = 0,
     ) -> None:
         """free_resolution: voxel side of free space, metres. seed: of the random streams."""
+        if not callable(getattr(policy, "decide", None)):
+            raise SettingError(f"policy is {quoted(policy)}; accepted: chsel.build_policy(name)")
+        require_parts(sdf=sdf, workspace=workspace)
+        require_instance("actions", actions, Actions, "chsel.Actions(world_from_hand, length)")
+        require_instance("hand", hand, HandShape, "chsel.HandShape.of(mesh)")
         self.policy, self.actions, self.hand = policy, actions, hand
         self._sdf, self._workspace, self._free_resolution = sdf, workspace, free_resolution
         self._seed = seed
@@ -58,6 +64,7 @@ class Steering:
         points: all that are known. available (A,): the actions that can be taken now. Raises
         ChselError if the policy, of another package, gives something else than a decision.
         """
+        require_parts(points=points)
         key = StreamKey(self._seed, done)
         problem = DecisionProblem(
             self._sdf,

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chsel.errors import PointsError, PointsWarning
+from chsel.errors import PointsError, PointsWarning, require_instance
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Lattice, Workspace
+from chsel.problem.sdf_grid import SdfGrid
 
 # In diameters of the object:
 MOST_APART = 10.0  # between contacts, and from a contact to the free points
@@ -18,6 +19,21 @@ MOST_OUTSIDE = 0.2  # from the workspace to a contact
 
 _BLOCK = np.array(sorted(np.ndindex(3, 3, 3), key=lambda at: at != (1, 1, 1))) - 1  # centre first
 _MOST_VOXELS = 2.0**62  # that can be numbered
+
+
+_PARTS = {
+    "sdf": (SdfGrid, "a grid such as chsel.SdfGrid.from_mesh(mesh)"),
+    "points": (KnownPoints, "chsel.KnownPoints(free=..., known=...)"),
+    "workspace": (Workspace, "chsel.Workspace(lower, upper)"),
+}
+
+
+def require_parts(**parts: object) -> None:
+    """Raise SettingError unless what is named sdf, points or workspace is of its class."""
+    for name, part in parts.items():
+        kind, accepted = _PARTS[name]
+        if not getattr(type(part), "stands_in", False):  # for a grid that a recording has lost
+            require_instance(name, part, kind, accepted)
 
 
 def check_points(

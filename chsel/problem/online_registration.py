@@ -8,8 +8,9 @@ from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel.errors import PoseError
+from chsel.errors import PoseError, require_instance
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.input_checks import require_parts
 from chsel.problem.points import GrowingPoints, KnownPoints, Workspace
 from chsel.problem.poses import (
     axis_angle,
@@ -23,6 +24,7 @@ from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
+from chsel.problem.trust import SENSOR_NOISE, has_pose, trust_in
 
 MOST_HYPOTHESES = 1_000_000
 _CENTROID_SPREAD = 0.05
@@ -153,7 +155,7 @@ class OnlineStep:
 
     step: int
     problem: RegistrationProblem | None = None  # None if nothing was to be registered
-    hypotheses: Hypotheses | None = None  # None if nothing was registered
+    hypotheses: Hypotheses | None = None  # with trust; None if nothing was registered
     failure: Exception | None = None  # of posing or registering the problem, if it was to be caught
 
 
@@ -176,17 +178,22 @@ class OnlineRegistration:
         previous: Hypotheses | None = None,
         start: Start = _AT_ONCE,
         only: Container[int] | None = None,
+        sensor_noise: float = SENSOR_NOISE,
     ) -> None:
         """settings: how E_0 and E_l follow from the result before, `method.online` of a method.
 
         free_resolution: voxel side of free space, metres. seed: of the random streams of all
         steps. points: known before the first step. only: steps that register; None for all.
+        sensor_noise: of known points, metres, by which results are judged, see `trust_in`.
         """
+        points = KnownPoints() if points is None else points
+        require_parts(sdf=sdf, workspace=workspace, points=points)
+        require_instance("settings", settings, OnlineSettings, "method.online of a method")
         self.sdf, self._workspace, self._free_resolution = sdf, workspace, free_resolution
         self._settings, self._seed = settings, seed
-        self._start, self._only = start, only
+        self._start, self._only, self._sensor_noise = start, only, sensor_noise
         self._larger = 1
-        self.points = GrowingPoints(points or KnownPoints())
+        self.points = GrowingPoints(points)
         self.previous = previous
 
     def steps(
@@ -204,6 +211,7 @@ class OnlineRegistration:
         from the last result that there was.
         """
         for step, new_points in perceived:
+            require_parts(points=new_points)
             self.points.add(new_points)  # X <- perceived from environment
             problem = hypotheses = failure = None
             if self.enough(step):
@@ -211,11 +219,20 @@ class OnlineRegistration:
                     problem = self.pose(step)  # with E_0 and E_l
                     if register is not None:
                         hypotheses = register(problem)  # E <- CHSEL(X, E_0, E_l)
+                        hypotheses = self._judged(problem, hypotheses)
                 except catch as error:
                     failure = error
             if hypotheses is not None:
                 self.remember(hypotheses)
             yield OnlineStep(step, problem, hypotheses, failure)
+
+    def _judged(
+        self, problem: RegistrationProblem, hypotheses: Hypotheses | None
+    ) -> Hypotheses | None:
+        """The same hypotheses with trust, unless there is no pose."""
+        if hypotheses is None or hypotheses.trust is not None or not has_pose(hypotheses):
+            return hypotheses
+        return replace(hypotheses, trust=trust_in(problem, hypotheses, self._sensor_noise))
 
     def enough(self, step: int) -> bool:
         """Whether a step registers, with the points that are known."""

@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 
 from chsel.errors import PointsError, SettingError, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, digest, frozen, read_only, same_bits
+from chsel.numerics.arrays import (
+    BoolArray,
+    FloatArray,
+    ShapesShown,
+    digest,
+    frozen,
+    read_only,
+    same_bits,
+)
 from chsel.numerics.voxels import bounds_of, set_voxels
 
 _CLASSES = ("free", "occupied", "known", "known_sdf")
@@ -21,8 +29,8 @@ def _no_points() -> FloatArray:
     return np.zeros((0, 3))
 
 
-@dataclass(frozen=True, eq=False)
-class KnownPoints:
+@dataclass(frozen=True, eq=False, repr=False)
+class KnownPoints(ShapesShown):
     """Known points in world coordinates, metres, by their semantics (CHSEL, Sec. III).
 
     Raises PointsError for wrong shapes and values that are not finite.

@@ -9,15 +9,16 @@ from typing import Protocol
 import numpy as np
 
 from chsel.errors import PoseError, SettingError, require_between, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
+from chsel.problem.input_checks import require_parts
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import check_rigid
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
 from chsel.problem.streams import StreamKey
 
 
-@dataclass(frozen=True, eq=False)
-class RegistrationProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class RegistrationProblem(ShapesShown):
     """Everything that determines the outcome of one registration, and nothing else."""
 
     sdf: SdfGrid  # signed distances of the object, in its frame
@@ -31,6 +32,7 @@ class RegistrationProblem:
     )
 
     def __post_init__(self) -> None:
+        require_parts(sdf=self.sdf, points=self.points, workspace=self.workspace)
         require_positive("free_resolution", self.free_resolution)
         require_between("free_resolution", self.free_resolution, FINEST, COARSEST)
         for name in ("initial_set", "low_cost_set"):
@@ -108,6 +110,7 @@ class Trust:
     spread: float  # root mean square distance of two surfaces of these hypotheses, metres
     verdict: str  # one of VERDICTS
     redundancy: int  # known points beyond the six that a pose can fit; at 0, misfit is no evidence
+    best_of_modes: tuple[int, ...] = (0,)  # indices of hypotheses, one a mode, the best first
 
     def __str__(self) -> str:
         """One line for people."""
@@ -147,7 +150,12 @@ class Hypotheses:
     # (C, 4, 4): poses that the points allow, before B of them were chosen; none if the method does
     # not say. Decisions on the next probe weigh them up; they are not part of the digest.
     candidates: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    trust: Trust | None = None  # of `chsel.register`; methods leave it out, see `chsel.trust_in`
+    trust: Trust | None = None  # methods leave it out; who calls them adds it, see `chsel.trust_in`
+
+    def __repr__(self) -> str:
+        best = f", best cost {self.cost[0]:.4g}" if len(self.cost) else ""
+        judged = "" if self.trust is None else f", {self.trust}"
+        return f"<Hypotheses: {len(self.cost)}, {self.distinct} distinct{best}{judged}>"
 
     @property
     def distinct(self) -> int:

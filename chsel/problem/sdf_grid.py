@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from chsel.errors import MeshError, MeshWarning, SdfError, quoted, require_choice, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, digest, frozen
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
 
 if TYPE_CHECKING:
     import trimesh
@@ -59,8 +59,8 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     return np.asarray(signed, dtype=np.float64), gradient
 
 
-@dataclass(frozen=True, eq=False)
-class SdfGrid:
+@dataclass(frozen=True, eq=False, repr=False)
+class SdfGrid(ShapesShown):
     """Signed distances and their gradients at the nodes of a regular grid in the object frame.
 
     Raises SdfError if a shape is wrong, a value is not finite, or a node of the border is inside.

@@ -62,7 +62,7 @@ def trust_in(
     that is not above 0.
     """
     require_positive("sensor_noise", sensor_noise)
-    poses, sdf = _compared(hypotheses), problem.sdf
+    (poses, indices), sdf = _compared(hypotheses), problem.sdf
     off = signed_distances(sdf, poses[:1], problem.points.known)[0] - problem.points.sdf
     noise = estimate_noise(off, sensor_noise)
     most = FOREIGN * noise.sigma
@@ -73,7 +73,8 @@ def trust_in(
 
     errors = _mean_errors(problem, poses, sensor_noise, most, thinned=True)
     least = max(float(errors[0]), sensor_noise, _GRID_ERROR * sdf.resolution / ALIKE)
-    poses = poses[errors <= ALIKE * least]
+    explaining = errors <= ALIKE * least
+    poses, indices = poses[explaining], indices[explaining]
     apart = outline_distances(sdf, poses)
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
@@ -92,7 +93,8 @@ def trust_in(
     else:
         verdict = DETERMINED if count == 1 else SEVERAL
     misfit, spread = error / sensor_noise, surface_spread(apart)
-    return Trust(noise.sigma, noise.outliers, misfit, count, spread, verdict, redundancy)
+    best = tuple(int(indices[part[0]]) for part in parts[: max(count, 1)])
+    return Trust(noise.sigma, noise.outliers, misfit, count, spread, verdict, redundancy, best)
 
 
 def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[PointsWarning]:
@@ -146,8 +148,8 @@ def _within(poses: Poses) -> BoolArray:
     return np.asarray((np.abs(poses.numbers) <= FARTHEST).all(axis=1))
 
 
-def _compared(hypotheses: Hypotheses) -> Poses:
-    """The best hypotheses that repeat no other."""
+def _compared(hypotheses: Hypotheses) -> tuple[Poses, IntArray]:
+    """The best hypotheses that repeat no other, and their indices."""
     if not has_pose(hypotheses):
         raise PoseError(
             "there is no hypothesis, or the best is not finite; accepted: at least one pose, "
@@ -156,7 +158,8 @@ def _compared(hypotheses: Hypotheses) -> Poses:
     poses = Poses.of(hypotheses.object_from_world)
     chosen = _within(poses) & ~hypotheses.duplicate
     chosen[0] = True
-    return poses[np.flatnonzero(chosen)[:_MOST_HYPOTHESES]]
+    indices = np.flatnonzero(chosen)[:_MOST_HYPOTHESES]
+    return poses[indices], indices
 
 
 def _mean_errors(

@@ -43,7 +43,7 @@ def interior_lattice(
     return np.concatenate([np.zeros((0, 3)), *(_inside(solid, spacing) for solid in solids)])
 
 
-def between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
+def poses_between(poses: FloatArray, *, step: float, radius: float) -> FloatArray:
     """Poses (Q, 4, 4) on the path through poses (P, 4, 4), about one step apart.
 
     Nothing within `radius` metres of the frame's origin moves by more than `step` metres from one

@@ -15,6 +15,7 @@ from chsel.policies.steering import Steering
 from chsel.problem.input_checks import check_contacts, check_points
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
 from chsel.problem.points import KnownPoints
+from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.trust import check_trust
 from replay.events import (
@@ -106,14 +107,18 @@ class SessionRun:
                 "free_points": self._online.points.free,
             }
             if step.problem is not None and self.registered is not None:
-                found, trust = self.registered.hypotheses, self.registered.trust
+                found = self.registered.hypotheses
+                trust = found.trust
                 if len(found.cost) > 0:
                     row["best_cost"] = float(found.cost[0])
                 row |= {"distinct": found.distinct, "digest": found.digest}
                 row |= self.registered.numbers
+                row["registration_seconds"] = self.registered.total_seconds
                 if trust is not None:
                     self._warn(check_trust(trust, noise_of(self._method)))
                     self.trust, row["verdict"] = trust, trust.verdict
+                    modes = inverse(found.object_from_world[[*trust.best_of_modes]]).tolist()
+                    row |= {"world_from_object": modes[0], "modes_world_from_object": modes}
             if self.steering is not None:
                 row |= self._decide(step.step, self.steering)
             self._recorder.record(Logged(step.step, "info", self._line(row)))

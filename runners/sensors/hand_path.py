@@ -10,7 +10,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse
-from chsel.sensing.swept import between, interior_lattice
+from chsel.sensing.swept import interior_lattice, poses_between
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import PushEnd
 from runners.sensors.hand import HandModel
@@ -93,7 +93,7 @@ class HandPath:
     def _dense(self, poses: FloatArray, interior: FloatArray) -> FloatArray:
         """Poses so close that no interior point moves by more than half a voxel in between."""
         reach = float(np.sqrt((interior**2).sum(axis=1).max(initial=0.0)))
-        return between(poses, step=0.5 * self._cell.spacing, radius=reach)
+        return poses_between(poses, step=0.5 * self._cell.spacing, radius=reach)
 
     def _interior(self, joints: dict[str, float]) -> FloatArray:
         """Points (M, 3) in the hand, dense enough to miss no voxel."""

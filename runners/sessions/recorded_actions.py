@@ -15,7 +15,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, nearest_rigid
 from chsel.problem.sdf_grid import mesh_sdf
-from chsel.sensing.swept import between, interior_lattice
+from chsel.sensing.swept import interior_lattice, poses_between
 from replay.events import Probe
 
 _ASIDE = 0.010  # m: from the line of a push, what is before it
@@ -97,7 +97,7 @@ class RecordedActions:
                 f"{self._resolution:g} m; accepted: fewer"
             )
         met = np.zeros(shape, dtype=bool)
-        poses = between(path, step=self._resolution / _FINE, radius=self._radius)
+        poses = poses_between(path, step=self._resolution / _FINE, radius=self._radius)
         for first in range(0, len(poses), _TOGETHER):
             places = apply(poses[first : first + _TOGETHER], self._interior).reshape(-1, 3)
             at = self._lattice.voxels(places) - low

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import warnings
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,12 @@ BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.4)), np.array([0.3, 0.1, 0.2]))
 SURFACE = apply(POSE, trimesh.sample.sample_surface(BOX, 40, seed=0)[0])
 QUICK = {"descent": {"restarts": 2, "iterations": 10}, "emitter": {"iterations": 5}}
+DOWN = np.diag([1.0, -1.0, -1.0])
 POINT = [[0.1, 0.2, 0.3]]
 
 
 def register(**arguments: Any) -> chsel.Hypotheses:
-    return chsel.register(BOX, **{"settings": QUICK, **arguments})
+    return chsel.register(BOX, **{"method": "chsel", "settings": QUICK, **arguments})
 
 
 def test_a_mesh_and_points_are_all_it_takes() -> None:
@@ -41,7 +43,7 @@ def test_a_grid_a_mesh_lists_and_tensors_give_the_same_bits() -> None:
         register(surface=SURFACE).digest,
         register(surface=SURFACE.tolist()).digest,
         register(surface=torch.tensor(SURFACE)).digest,
-        chsel.register(grid, surface=SURFACE, settings=QUICK).digest,
+        chsel.register(grid, surface=SURFACE, method="chsel", settings=QUICK).digest,
     }
     assert len(digests) == 1
     assert register(surface=SURFACE, seed=1).digest not in digests
@@ -96,7 +98,7 @@ def warned(**arguments: Any) -> list[chsel.InputWarning]:
     """The warnings of a registration, each of this file's line that asked for it."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        chsel.register(BOX, **{"settings": QUICK, **arguments})
+        chsel.register(BOX, **{"method": "chsel", "settings": QUICK, **arguments})
     mine = [each for each in caught if issubclass(each.category, chsel.InputWarning)]
     assert {Path(each.filename).name for each in mine} <= {"test_api.py"}
     return [each.message for each in mine if isinstance(each.message, chsel.InputWarning)]
@@ -179,7 +181,10 @@ def test_points_in_millimetres_are_an_error(points: Any) -> None:
         ({"surface": POINT, "method": "magic"}, "method is 'magic'; accepted: chsel"),
         ({"surface": POINT, "preset": "best"}, "preset is 'best'; accepted: default"),
         ({"surface": POINT, "hypotheses": 0}, "hypotheses is 0"),
-        ({"surface": POINT, "settings": {"alpha": 1}}, "method.alpha does not exist"),
+        (
+            {"surface": POINT, "settings": {"alpha": 1}},
+            "settings.alpha does not exist",
+        ),
         ({"surface": POINT, "resolution": -0.1}, "SDF resolution is -0.1"),
         (
             {"surface": POINT, "initial_set": np.zeros((2, 4, 4))},
@@ -213,7 +218,7 @@ def test_points_in_millimetres_are_an_error(points: Any) -> None:
         ({"surface": POINT, "settings": 3}, "settings is 3; accepted: a mapping"),
         ({"surface": POINT, "settings": chsel.CostSettings}, "settings is .*; accepted: a map"),
         ({"surface": POINT, "settings": {"emitter": 3}}, "emitter is 3; accepted: a group of set"),
-        ({"surface": POINT, "settings": {3: 4}}, r"method\.3 does not exist"),
+        ({"surface": POINT, "settings": {3: 4}}, r"settings\.3 does not exist"),
         ({"surface": POINT, "resolution": 0}, "SDF resolution is 0; accepted: a finite number"),
         ({"surface": POINT, "resolution": np.nan}, "SDF resolution is nan"),
         ({"surface": POINT, "resolution": 5e-324}, "SDF resolution is 5e-324; accepted: 1e-06"),
@@ -251,6 +256,83 @@ def test_integers_of_numpy_are_seeds_and_steps_too() -> None:
     assert type(key.seed) is type(key.step) is int
 
 
+def test_the_default_is_anchored_and_in_the_presets_of_the_paper_chsel() -> None:
+    points = {"surface": SURFACE[:5], "settings": None}
+    default = chsel.register(BOX, **points)
+    assert default.digest == chsel.register(BOX, **points, method="anchored").digest
+    quick = {"surface": SURFACE[:5], "settings": QUICK, "preset": "paper"}
+    assert chsel.register(BOX, **quick).digest == register(**quick).digest
+    with pytest.raises(chsel.ChselError, match="method=anchored: settings"):
+        chsel.register(BOX, surface=POINT, settings=QUICK)
+
+
+def test_a_repr_is_a_line() -> None:
+    found = register(surface=SURFACE[:5])
+    best = f"<Hypotheses: 30, {found.distinct} distinct, best cost {found.cost[0]:.4g}"
+    assert repr(found) == f"{best}, {found.trust}>"
+    assert repr(dataclasses.replace(found, trust=None)) == f"{best}>"
+    points = chsel.KnownPoints(known=POINT, free=FREE)
+    assert repr(points).startswith(f"KnownPoints(free: ({len(FREE)}, 3), occupied: (0, 3)")
+    grid = chsel.SdfGrid.from_mesh(BOX, 0.02)
+    assert repr(grid).startswith("SdfGrid(origin: (3,), resolution=0.02, values: (")
+
+
+def test_all_names_of_the_package_are_there() -> None:
+    assert chsel.__version__ == metadata.version("chsel-replay")
+    assert all(getattr(chsel, name) is not None for name in chsel.__all__)
+
+
+HAND = chsel.HandShape.of(BOX)
+ACTIONS = chsel.Actions(np.eye(4)[None], np.ones(1))
+POLICY = chsel.build_policy("information")
+ONLINE = build_method("icp").online
+GRID, ROOM = chsel.SdfGrid.from_mesh(BOX, 0.02), chsel.Workspace((0, 0, 0), (1, 1, 1))
+KNOWN = chsel.KnownPoints(known=SURFACE)
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "message"),
+    [
+        (chsel.RelaxedCost, (BOX, KNOWN), r"sdf is .*; accepted: .*chsel\.SdfGrid\.from_mesh"),
+        (chsel.RelaxedCost, (GRID, SURFACE), r"points is .*; accepted: chsel\.KnownPoints\("),
+        (chsel.CompiledCost, (KNOWN, GRID), r"sdf is .*; accepted: .*chsel\.SdfGrid\.from_mesh"),
+        (chsel.OnlineRegistration, (BOX, ROOM, 0.01, ONLINE), "sdf is .*; accepted: "),
+        (
+            chsel.OnlineRegistration,
+            (GRID, [[0, 0, 0], [1, 1, 1]], 0.01, ONLINE),
+            r"workspace is \[\[0, .*; accepted: chsel\.Workspace\(lower, upper\)",
+        ),
+        (chsel.OnlineRegistration, (GRID, ROOM, 0.01, "icp"), "settings is 'icp'; accepted: met"),
+        (
+            chsel.RegistrationProblem,
+            (BOX, KNOWN, POSE[None], ROOM, 0.01, StreamKey(0, 0)),
+            "sdf is .*; accepted: ",
+        ),
+        (
+            chsel.Steering,
+            ("information", GRID, ROOM, 0.01, ACTIONS, HAND),
+            r"policy is 'information'; accepted: chsel\.build_policy",
+        ),
+        (chsel.Steering, (POLICY, BOX, ROOM, 0.01, ACTIONS, HAND), "sdf is .*; accepted: "),
+        (chsel.Steering, (POLICY, GRID, ROOM, 0.01, POSE, HAND), "actions is .*; accepted: chs"),
+        (chsel.Steering, (POLICY, GRID, ROOM, 0.01, ACTIONS, BOX), "hand is .*; accepted: chs"),
+    ],
+)
+def test_values_of_another_class_are_refused(make: Any, arguments: Any, message: str) -> None:
+    with pytest.raises(chsel.ChselError, match=message) as caught:
+        make(*arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_arrays_in_place_of_known_points_are_refused() -> None:
+    online = chsel.OnlineRegistration(GRID, ROOM, 0.01, ONLINE)
+    with pytest.raises(chsel.ChselError, match=r"points is .*; accepted: chsel\.KnownPoints"):
+        next(online.steps(enumerate([SURFACE])))  # type: ignore[list-item]
+    steering = chsel.Steering(POLICY, GRID, ROOM, 0.01, ACTIONS, HAND)
+    with pytest.raises(chsel.ChselError, match=r"points is .*; accepted: chsel\.KnownPoints"):
+        steering.decide(0, SURFACE, None, np.ones(1, dtype=bool))  # type: ignore[arg-type]
+
+
 def test_single_settings_and_whole_settings_are_both_taken() -> None:
     whole = preset_settings("gradient_descent", "paper")
     a = chsel.register(BOX, surface=SURFACE[:5], method="gradient_descent", settings=whole)
@@ -278,11 +360,13 @@ def test_own_starts_are_used() -> None:
 
 def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
     readme = (Path(__file__).parents[2] / "README.md").read_text()
-    examples = re.findall(r"```python\n(import chsel.*?)```", readme, re.DOTALL)
+    examples = re.findall(r"```python\n(hand = chsel.*?)```", readme, re.DOTALL)
+    examples += re.findall(r"```python\n(import chsel.*?)```", readme, re.DOTALL)
     examples += re.findall(r"```python\n(cost = chsel.*?)```", readme, re.DOTALL)
-    examples += re.findall(r"```python\n(method = build_method.*?)```", readme, re.DOTALL)
+    examples += re.findall(r"```python\n(method = chsel\.build_method.*?)```", readme, re.DOTALL)
     examples += re.findall(r"```python\n(trust = hypotheses.*?)```", readme, re.DOTALL)
-    assert len(examples) == 4
+    examples += re.findall(r"```python\n(inside = chsel.*?)```", readme, re.DOTALL)
+    assert len(examples) == 6
     BOX.export(tmp_path / "drill.obj")
     names = {
         "contacts": SURFACE,
@@ -291,7 +375,16 @@ def test_the_example_in_the_readme_runs(tmp_path: Path) -> None:
         "mesh": BOX,
         "rotation": torch.eye(3, dtype=torch.float64)[None].requires_grad_(),
         "translation": torch.full((1, 3), 0.01, dtype=torch.float64).requires_grad_(),
-        "build_method": build_method,
+        "chsel": chsel,
+        "gripper_mesh": BOX,
+        "world_from_hand": compose(
+            np.array([DOWN, DOWN]), POSE[:3, 3] + [[0, 0, 0.2], [0.1, 0, 0.2]]
+        ),
+        "length": np.full(2, 0.3),
+        "hypotheses": None,
+        "available": np.ones(2, dtype=bool),
+        "done": 0,
+        "points": chsel.KnownPoints(known=SURFACE),
         "grid": chsel.SdfGrid.from_mesh(BOX, 0.002),
         "workspace": chsel.Workspace((0.0, -0.2, 0.0), (0.6, 0.4, 0.4)),
         "probes": [chsel.KnownPoints(known=part) for part in np.split(SURFACE, 2)],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel import Hypotheses, KnownPoints, OnlineRegistration, SdfGrid, Workspace
+from chsel import Hypotheses, KnownPoints, OnlineRegistration, SdfGrid, Workspace, trust_in
 from chsel.errors import ChselError, PoseError
 from chsel.problem.online_registration import OnlineSettings, Start, pose_problem
 from chsel.problem.registration_problem import RegistrationProblem
@@ -46,6 +46,19 @@ def test_every_problem_has_all_points_and_follows_from_the_result_before() -> No
         assert step.failure is None
         previous = step.hypotheses
     assert points.count == 5
+
+
+def test_results_say_how_far_to_trust_them() -> None:
+    online = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS, sensor_noise=0.002)
+    for step in online.steps(enumerate(PROBES[:2]), starts_as_found):
+        assert step.problem is not None
+        assert step.hypotheses is not None
+        expected = trust_in(step.problem, starts_as_found(step.problem), 0.002)
+        assert step.hypotheses.trust == expected
+    nothing = OnlineRegistration(GRID, WORKSPACE, 0.01, SETTINGS)
+    (step,) = nothing.steps([(0, PROBES[0])], lambda _: hypotheses_at(np.zeros((0, 4, 4))))
+    assert step.hypotheses is not None
+    assert step.hypotheses.trust is None
 
 
 @pytest.mark.parametrize(

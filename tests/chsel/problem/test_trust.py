@@ -220,6 +220,16 @@ def test_points_that_a_pose_can_fit_exactly_are_no_evidence() -> None:
     assert "no evidence" not in str(trust)
 
 
+def test_each_mode_has_its_best_hypothesis() -> None:
+    """Indices are those of all hypotheses, whatever is left out between them."""
+    side = apply(POSE, np.array([[0.05, y, z] for y in (-0.02, 0.02) for z in (-0.04, 0.0, 0.04)]))
+    motions = [moved(), moved(), moved(x=-0.03), moved(z=0.001), moved(z=0.031), moved(z=0.03)]
+    repeated = [False, True, False, False, False, False]
+    found = hypotheses_at(inverse(np.array(motions)), repeated)
+    trust = trust_in(problem(chsel.KnownPoints(known=side), GRID), found)
+    assert trust.best_of_modes == (0, 4)
+
+
 def test_distances_of_outlines_are_those_of_shifts_and_turns() -> None:
     """A shift along x moves the two sides across x by it, and the others within themselves."""
     shift = 0.01

@@ -11,7 +11,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.swept import between, interior_lattice
+from chsel.sensing.swept import interior_lattice, poses_between
 from tests.chsel.samples import box_distance, random_poses
 
 SIZE = np.array([0.10, 0.04, 0.06])
@@ -62,7 +62,7 @@ def test_a_spacing_that_makes_too_many_nodes_is_refused() -> None:
 def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way() -> None:
     stream = np.random.default_rng(0)
     poses = random_poses(stream, 6, 0.2)
-    way = between(poses, step=0.005, radius=0.1)
+    way = poses_between(poses, step=0.005, radius=0.1)
     np.testing.assert_array_equal(way[[0, -1]], poses[[0, -1]])
     points = stream.normal(size=(50, 3))
     points *= 0.1 / np.sqrt((points**2).sum(axis=1, keepdims=True))
@@ -76,22 +76,22 @@ def test_nothing_moves_further_than_a_step_and_all_poses_lie_near_the_way() -> N
 def test_poses_that_hardly_move_are_thinned() -> None:
     poses = np.tile(np.eye(4), (5001, 1, 1))
     poses[:, 0, 3] = np.linspace(0.0, 0.1, 5001)
-    way = between(poses, step=0.01, radius=0.2)
+    way = poses_between(poses, step=0.01, radius=0.2)
     assert 11 <= len(way) <= 12
     assert np.diff(way[:, 0, 3]).max() <= 0.01 + 1e-12
     np.testing.assert_array_equal(way[[0, -1]], poses[[0, -1]])
-    assert len(between(np.tile(np.eye(4), (100, 1, 1)), step=0.01, radius=0.2)) == 2
-    assert len(between(np.eye(4)[None], step=0.01, radius=0.2)) == 1
-    assert len(between(np.zeros((0, 4, 4)), step=0.01, radius=0.2)) == 0
+    assert len(poses_between(np.tile(np.eye(4), (100, 1, 1)), step=0.01, radius=0.2)) == 2
+    assert len(poses_between(np.eye(4)[None], step=0.01, radius=0.2)) == 1
+    assert len(poses_between(np.zeros((0, 4, 4)), step=0.01, radius=0.2)) == 0
 
 
 def test_poses_too_far_apart_are_refused() -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 1e9
     with pytest.raises(PoseError, match=r"1e\+09 m.*accepted: at most 1_000_000"):
-        between(poses, step=0.005, radius=0.1)
+        poses_between(poses, step=0.005, radius=0.1)
     with pytest.raises(PoseError, match=r"poses\[1\] is not a rigid transform"):
-        between(np.stack([np.eye(4), 2.0 * np.eye(4)]), step=0.005, radius=0.1)
+        poses_between(np.stack([np.eye(4), 2.0 * np.eye(4)]), step=0.005, radius=0.1)
 
 
 @pytest.mark.parametrize("turned", [0.0, 1.3, 3.0])
@@ -101,7 +101,7 @@ def test_a_box_that_moves_and_turns_frees_the_voxels_it_passes(turned: float) ->
     )
     interior = interior_lattice(trimesh.creation.box(SIZE), 0.005)
     grid = FreeGrid(WORKSPACE, SPACING)
-    fresh = grid.at(interior, poses=between(given, step=0.005, radius=0.07))
+    fresh = grid.at(interior, poses=poses_between(given, step=0.005, radius=0.07))
     centres = grid.new()
     assert len(centres) == fresh
 
