@@ -7,12 +7,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import yaml
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from chsel.methods import build_method
 from chsel.numerics.threads import set_threads
 from chsel.problem.settings import build_settings
 from replay.startup import importing
+from runners.command.choices import calls_for_anchored
 from runners.command.program import command, plain
 from runners.run.compiling import Compiling
 from runners.run.display import Display, reading_bar
@@ -27,6 +29,9 @@ def main(config: DictConfig) -> None:
     values = plain(config)
     checked = build_settings(ProbeConfig, values, "probe")
     display = Display(f"{_title(checked)}, preset {checked.preset.name}, seed {checked.seed}")
+    if why := _default_because():
+        name = checked.method["name"]
+        display.say(f"method={name} (the default for {why}; method=chsel is the paper's)")
     with importing():  # what takes long, after there is something to read
         import igl  # noqa: F401
         import trimesh  # noqa: F401
@@ -56,6 +61,15 @@ def _title(config: ProbeConfig) -> str:
     kind = str(config.session.get("kind"))
     session = f"{kind} session, {config.method.get('name')}"
     return session if kind == "recorded" else f"{config.object.name}, {session}"
+
+
+def _default_because() -> str:
+    """The choice that `anchored` is the default for, if it was taken as such; else ""."""
+    chosen = HydraConfig.get()
+    choices = chosen.runtime.choices
+    if choices["method"] == "chsel" or any(w.startswith("method=") for w in chosen.overrides.task):
+        return ""
+    return calls_for_anchored(choices["session"], choices["policy"])
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ def test_the_installed_command_runs_in_any_folder(site: Path, tmp_path: Path) ->
     box.export(tmp_path / "box.stl")
     np.savez(tmp_path / "points.npz", surface=box.vertices[:6])
     overrides = ["session=points", "session.path=points.npz", "object=mesh", "object.path=box.stl"]
-    overrides += ["method.descent.restarts=1", "method.emitter.iterations=5"]
+    overrides += ["method=chsel", "method.descent.restarts=1", "method.emitter.iterations=5"]
     imported = ran(site, tmp_path, sys.executable, "-c", "import runners; print(runners.__file__)")
     assert str(site) in imported.stdout
     done = ran(site, tmp_path, "chsel-probe", *overrides)

@@ -12,7 +12,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from chsel.errors import SettingError
-from chsel.methods import METHODS, preset_settings
+from chsel.methods import METHODS, default_method, preset_settings
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
@@ -26,6 +26,21 @@ NESTED_GROUPS = (
     "session/rig",
     "session/faults",
 )  # choices of their own, not options of the group around them
+
+
+def calls_for_anchored(session: str, policy: str) -> str:
+    """The choice, as typed, for which the default of method= is `default_method`; "" if none is."""
+    if policy != "grid":
+        return f"policy={policy}"
+    return f"session={session}" if session in ("points", "sensors") else ""
+
+
+def _method(session: str, policy: str, preset: str) -> str:
+    return default_method(preset) if calls_for_anchored(session, policy) else "chsel"
+
+
+# Here, as processes of launchers compose configurations and have no more than the imports.
+OmegaConf.register_new_resolver("default_method", _method, replace=True)
 
 
 def prepared(config_name: str, words: list[str]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import Any
 
 import hydra
@@ -77,7 +77,8 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, config_name: str)
     return _no_key(where or config_name, name, error.parent_node or {})
 
 
-def _no_key(where: str, name: str, node: Iterable[Any]) -> str:
+def _no_key(where: str, name: str, node: Mapping[Any, Any]) -> str:
+    where = f"{where}={node['name']}" if where == "method" else where
     accepted = [str(known) for known in node if known != "hydra"]
     return _not_accepted(where, f"has no key {name!r}", name, accepted)
 

@@ -54,7 +54,7 @@ def test_every_reported_probe_survives_kills_at_random_moments() -> None:
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     overrides = points_session(tmp_path_factory.mktemp("points"))
-    return (*overrides, "method.descent.restarts=2", "method.descent.iterations=20")
+    return (*overrides, "method=chsel", "method.descent.restarts=2", "method.descent.iterations=20")
 
 
 @pytest.mark.parametrize("probes", [1, 3, 5])

@@ -41,6 +41,7 @@ NAMES = (
 SHORT = (
     "recording=mcap",
     "recording.snapshot_interval=0",
+    "method=chsel",
     "method.descent.restarts=1",
     "method.descent.iterations=5",
     "method.emitter.iterations=2",

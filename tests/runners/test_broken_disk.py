@@ -29,7 +29,7 @@ TIMEOUT = 120
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     """The overrides of a session whose archives grow to megabytes."""
     overrides = points_session(tmp_path_factory.mktemp("points"))
-    quick = ("method.descent.restarts=2", "method.descent.iterations=20")
+    quick = ("method=chsel", "method.descent.restarts=2", "method.descent.iterations=20")
     return (*overrides, *quick, "method.archive.bins=400", "method.emitter.iterations=200")
 
 

@@ -27,10 +27,10 @@ STEPS = np.arange(30) // 10
 FREE = np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3)) + POSE[:3, 3]
 FREE = FREE[mesh_sdf(BOX, apply(inverse(POSE), FREE))[0] > 0.0]
 QUICK = (
+    "method=chsel",
     "method.descent.restarts=2",
     "method.descent.iterations=50",
     "method.emitter.iterations=10",
-    "recording=mcap",
 )
 Found = tuple[Done, list[dict[str, Any]], list[tuple[int, str]]]
 
@@ -42,8 +42,8 @@ def probe(folder: Path, *overrides: str, points: dict[str, Any], mesh: Any = BOX
     chosen = ["session=points", f"session.path={folder / 'points.npz'}", f"logs={folder / 'logs'}"]
     if not any(override.startswith("object=") for override in overrides):
         chosen += ["object=mesh", f"object.path={folder / 'box.ply'}"]
-    quick = [] if any(override.startswith("method=") for override in overrides) else QUICK[:3]
-    done = run(main, *chosen, *quick, QUICK[3], *overrides, columns=1000)
+    quick = () if any(override.startswith("method=") for override in overrides) else QUICK
+    done = run(main, *chosen, *quick, "recording=mcap", *overrides, columns=1000)
     if done.returncode:
         return done, [], []
     (made,) = (folder / "logs" / "probe").iterdir()
@@ -149,7 +149,7 @@ def test_a_recording_of_such_points_gives_the_warnings_again(tmp_path: Path) -> 
     (recording,) = (tmp_path / "logs").rglob("recording.mcap")
     again = tmp_path / "again"
     source = ["session=recorded", f"session.path={recording}", f"logs={again}"]
-    done = run(main, *source, *QUICK, columns=1000)
+    done = run(main, *source, *QUICK, "recording=mcap", columns=1000)
     assert done.returncode == 0, done.stderr
     (summary,) = again.rglob("summary.json")
     assert json.loads(summary.read_text())["warnings"] == told
@@ -188,7 +188,7 @@ def test_a_recording_of_points_in_millimetres_is_refused_as_well(tmp_path: Path)
 def test_a_simulated_session_gives_no_warning(tmp_path: Path) -> None:
     """Its object is larger than life on purpose."""
     chosen = ["session=kinematic", "object=spam_can", "session.start_probe=11"]
-    done = run(main, *chosen, *QUICK[3:], f"logs={tmp_path}")
+    done = run(main, *chosen, "recording=mcap", f"logs={tmp_path}")
     assert done.returncode == 0, done.stderr
     assert said(done) == []
     (summary,) = tmp_path.rglob("summary.json")
@@ -199,6 +199,6 @@ def test_a_simulated_session_gives_no_warning(tmp_path: Path) -> None:
 def test_real_points_give_no_warning(real_directory: Path, tmp_path: Path, name: str) -> None:
     points = ["session=points", f"session.path={real_directory / name}.npz", "object=mesh"]
     mesh = f"object.path={real_directory / name}.obj"
-    done = run(main, *points, mesh, "recording=none", f"logs={tmp_path}")
+    done = run(main, *points, mesh, "method=chsel", "recording=none", f"logs={tmp_path}")
     assert done.returncode == 0, done.stderr
     assert said(done) == []

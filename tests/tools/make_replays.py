@@ -33,6 +33,7 @@ _SMALL = ["session.object_resolution=0.03", "session.free_resolution=0.05"]
 _OF_POINTS = ["object.scale=1", "session=points", f"session.path={_POINTS}", *_BRIEF]
 _FEW = [*_OF_POINTS, "session.object_resolution=0.015", "session.start_probe=2"]  # the last two
 _QUICK = ["method.archive.bins=10", "method.emitter.iterations=30"]
+_BY_CHSEL = ["method=chsel", *_QUICK]
 _CHSEL = ("chsel", "chsel_cma_me")
 _MEDIAL = ("medial_constraint", "medial_constraint_cma_me")
 _BASELINES: dict[str, list[str]] = {  # with what keeps those brief that take long
@@ -95,13 +96,13 @@ def cases() -> dict[str, list[str]]:
     plane = "method.plane={plane_height: 0.0}"
     return found | {
         STEERED: [],  # of `tests.tools.small_recordings`: those of commands are larger
-        "points_mustard": ["object=mustard", *points, *_QUICK, "recording.snapshot_interval=10"],
-        "points_two_passes": ["object=drill", *points, *_QUICK, "method.passes=2", "seed=3"],
+        "points_mustard": ["object=mustard", *points, *_BY_CHSEL, "recording.snapshot_interval=10"],
+        "points_two_passes": ["object=drill", *points, *_BY_CHSEL, "method.passes=2", "seed=3"],
         "points_on_a_table": [
-            "object=spam_can", *points, *_QUICK, plane, "method.archive.measure=plane_position",
+            "object=spam_can", *points, *_BY_CHSEL, plane, "method.archive.measure=plane_position",
         ],
         "points_interior": [
-            "object=hammer", *points, *_QUICK, "preset=reference",
+            "object=hammer", *points, *_BY_CHSEL, "preset=reference",
             "method.cost.volume_normalise=true",
         ],
         "points_exact_descent": [
