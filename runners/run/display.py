@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.filesize import decimal
 from rich.progress import BarColumn, TimeElapsedColumn
@@ -18,6 +19,7 @@ from rich.table import Table
 
 from chsel.errors import InputWarning
 from chsel.policies.steering import Steering
+from chsel.problem.poses import quaternions
 from chsel.problem.registration_problem import Trust
 from replay.console import Console, Progress, TextColumn
 from runners.run.session_run import FROM_SESSION, StepWarning
@@ -140,7 +142,7 @@ class Display:
         if truth:
             title += (
                 "; errors to the true pose modulo the object's symmetries, at its centre: "
-                "best hypothesis, closest one"
+                "best hypothesis, closest one by its surface"
             )
         table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
         names = ["probe", "contacts", "best cost"]
@@ -152,7 +154,8 @@ class Display:
             cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
             if truth:
                 cells += [*_errors(row, "best"), *_errors(row, "closest")]
-            table.add_row(*cells, f"{row['seconds']:.2f} s", row.get("verdict", ""))
+            milliseconds = f"{1000.0 * row['registration_seconds']:.0f} ms"
+            table.add_row(*cells, milliseconds, row.get("verdict", ""))
         self._console.print(table)
 
     def sensed(self, report: Report) -> None:
@@ -168,10 +171,29 @@ class Display:
         for name, size in files.items():
             self._console.print(f"  {name:<15} {decimal(size):>9}")
         if "recording.rrd" in files:
-            viewer = f"{_viewer()} --bind 127.0.0.1"
+            viewer = f"{_program('rerun')} --bind 127.0.0.1"
             path = shlex.quote(str(folder / "recording.rrd"))
             self._console.print("look at it:")
             self._console.print(f"{viewer} {path}", soft_wrap=True)
+
+    def pose(self, rows: list[dict[str, Any]], folder: Path) -> None:
+        """The best pose of the last registration that found one, and how to write all of them."""
+        row = next((row for row in reversed(rows) if "world_from_object" in row), None)
+        if row is None:
+            return
+        recording = folder / "recording.mcap"
+        if recording.is_file():
+            python = _program(Path(sys.executable).name)
+            export = f"export {shlex.quote(str(recording))} --what hypotheses --format npz"
+            self._console.print("all hypotheses as arrays:")
+            self._console.print(f"{python} -m replay {export}", soft_wrap=True)
+        pose = np.array(row["world_from_object"])
+        position = " ".join(f"{number:.1f}" for number in 1000.0 * pose[:3, 3])
+        quaternion = " ".join(f"{number:.4f}" for number in quaternions(pose[None, :3, :3])[0])
+        where = "world_from_object (one per mode: summary.json)"
+        self._console.print(f"best pose after probe {row['step']}, {where}:")
+        self._console.print(f"  position {position} mm")
+        self._console.print(f"  quaternion {quaternion} (x y z w)")
 
     def verdict(self, trust: Trust | None) -> None:
         """How far to trust the last result, if there is one."""
@@ -187,11 +209,11 @@ class Display:
         self._console.print(line)
 
 
-def _viewer() -> str:
-    """How to start Rerun's viewer from here."""
-    beside = Path(sys.executable).with_name("rerun")
-    if shutil.which("rerun") or not beside.is_file():
-        return "rerun"
+def _program(name: str) -> str:
+    """How to start a program of this environment from here."""
+    beside = Path(sys.executable).with_name(name)
+    if shutil.which(name) == str(beside) or not beside.is_file():
+        return name
     return str(beside.relative_to(Path.cwd()) if beside.is_relative_to(Path.cwd()) else beside)
 
 

@@ -134,6 +134,7 @@ def run(
     if steering is not None:
         display.stopped(steering)
     display.written(folder, ending.sizes())
+    display.pose(rows, folder)
     display.verdict(session_run.trust)
     return outcome == "interrupted"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,18 +11,24 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from hydra import compose, initialize_config_dir
+from scipy.spatial.transform import Rotation
 
 import chsel
 from chsel.errors import MeshError
 from chsel.methods import METHODS, build_method
+from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
 from chsel.problem.poses import apply
+from replay.__main__ import main as replay
 from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
 from runners import probe
+from runners.command.choices import CONF, store_choices
 from runners.run.display import MEANINGS
 from tests.runners.in_process import Done
 from tests.runners.in_process import run as in_process
@@ -32,6 +39,7 @@ QUICK = (
     "method.descent.iterations=20",
     "method.emitter.iterations=10",
     "recording.snapshot_interval=5",
+    "method=chsel",
 )
 
 
@@ -82,7 +90,7 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
     recording = read_recording(folder / "recording.mcap")
     trusts = [chsel.trust_in(recording.problem(n), recording.hypotheses(n)) for n in range(3)]
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["trust"] == pytest.approx(asdict(trusts[2]))
+    assert summary["trust"] == json.loads(json.dumps(asdict(trusts[2])))
     assert [step["verdict"] for step in summary["steps"]] == [trust.verdict for trust in trusts]
     logged = [event.text for event in recording.events() if isinstance(event, Logged)]
     assert logged[0] == f"probe 0: points, 5 contacts; {trusts[0]}"
@@ -90,6 +98,90 @@ def test_trust_is_on_the_terminal_in_the_summary_and_in_the_log(
     assert table[0].split()[:2] == ["0", "5"]
     shown = " ".join(done.stdout.split())
     assert shown.rpartition(f"{trusts[2]}: ")[2] in set(MEANINGS.values())
+
+
+def after(done: Done, text: str) -> list[str]:
+    """The lines of the output behind the one that begins with this text."""
+    lines = done.stdout.splitlines()
+    return lines[next(n for n, line in enumerate(lines) if line.startswith(text)) + 1 :]
+
+
+def shown_pose(done: Done, step: int) -> FloatArray:
+    """The pose at the end of a run, world_from_object (4, 4), from millimetres and x y z w."""
+    position, quaternion = after(done, f"best pose after probe {step}, world_from_object")[:2]
+    assert position.endswith(" mm")
+    assert quaternion.endswith(" (x y z w)")
+    pose = np.eye(4)
+    pose[:3, 3] = [0.001 * float(number) for number in position.split()[1:4]]
+    pose[:3, :3] = Rotation.from_quat([*map(float, quaternion.split()[1:5])]).as_matrix()
+    return pose
+
+
+def test_a_run_ends_with_the_best_pose_and_the_command_that_exports_all(
+    finished: tuple[Path, Done], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, done = finished
+    recording = read_recording(folder / "recording.mcap")
+    rows = json.loads((folder / "summary.json").read_text())["steps"]
+    for step, row in enumerate(rows):
+        found = recording.hypotheses(step)
+        world = np.linalg.inv(found.object_from_world)
+        trust = chsel.trust_in(recording.problem(step), found)
+        np.testing.assert_allclose(row["world_from_object"], world[0], atol=1e-12)
+        modes = world[[*trust.best_of_modes]]
+        np.testing.assert_allclose(row["modes_world_from_object"], modes, atol=1e-12)
+        assert len(modes) == trust.modes
+    np.testing.assert_allclose(shown_pose(done, 2), rows[2]["world_from_object"], atol=2e-4)
+    command = shlex.split(after(done, "all hypotheses as arrays:")[0])
+    monkeypatch.chdir(tmp_path)
+    assert replay(command[3:]) == 0
+    exported = np.load("recording_hypotheses.npz")["step_2/object_from_world"]
+    np.testing.assert_array_equal(exported, recording.hypotheses(2).object_from_world)
+
+
+def test_the_table_has_the_time_of_registrations_alone(finished: tuple[Path, Done]) -> None:
+    folder, done = finished
+    table = [line.split() for line in done.stdout.splitlines() if line.split()[1:2] == ["10"]]
+    row = json.loads((folder / "summary.json").read_text())["steps"][1]
+    stages = row["seconds_by_stage"]
+    own = sum(stages.values()) - stages["probe"]
+    assert row["registration_seconds"] == pytest.approx(own)
+    assert f"{1000.0 * own:.0f} ms" in " ".join(table[0])
+
+
+def test_points_of_ones_own_are_registered_by_anchored_unless_a_method_is_named(
+    points: tuple[str, ...], finished: tuple[Path, Done], tmp_path: Path
+) -> None:
+    done = run(tmp_path, *points, "method.size=small", "recording=none")
+    assert done.returncode == 0, done.stderr
+    line = "method=anchored (the default for session=points; method=chsel is the paper's)"
+    assert done.stdout.splitlines()[1] == line
+    summary = json.loads((run_folder(tmp_path) / "summary.json").read_text())
+    assert summary["method"] == "anchored"
+    last = summary["steps"][-1]["world_from_object"]
+    np.testing.assert_allclose(shown_pose(done, 2), last, atol=2e-4)
+    assert "replay export" not in done.stdout
+    assert "(the default for" not in finished[1].stdout
+
+
+@pytest.mark.parametrize(
+    ("overrides", "method"),
+    [
+        ((), "chsel"),
+        (("session=kinematic", "preset=paper"), "chsel"),
+        (("session=recorded",), "chsel"),
+        (("session=recorded", "policy=information"), "anchored"),
+        (("policy=nearest_mean", "preset=reference"), "chsel"),
+        (("session=sensors",), "anchored"),
+        (("session=points", "method=icp"), "icp"),
+    ],
+)
+def test_the_default_method_follows_from_session_policy_and_preset(
+    overrides: tuple[str, ...], method: str
+) -> None:
+    store_choices()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert compose("probe", [*overrides]).method.name == method
 
 
 def test_a_run_leaves_recordings_config_and_summary(
@@ -182,7 +274,7 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
     points: tuple[str, ...], tmp_path: Path
 ) -> None:
     command = [sys.executable, "-m", "runners.probe", *points, f"logs={tmp_path}"]
-    slow = ["method.emitter.iterations=50000", "recording=mcap"]
+    slow = ["method=chsel", "method.emitter.iterations=50000", "recording=mcap"]
     process = subprocess.Popen(command + slow, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     recordings: list[Path] = []
@@ -212,8 +304,12 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
     ("override", "message"),
     [
         ("+typo=3", "probe.typo does not exist; accepted: assets"),
-        ("+method.typo=3", "method.typo does not exist; accepted: archive"),
-        ("method.cst.alpha=1", "method has no key 'cst'; did you mean cost? accepted: "),
+        ("+method.typo=3", "method.typo does not exist; accepted: anchors"),
+        ("method.descent.iterations=9", "method=anchored has no key 'descent'; accepted: size, "),
+        (
+            "method=chsel method.cst.alpha=1",
+            "method=chsel has no key 'cst'; did you mean cost? accepted: ",
+        ),
         ("methd=chsel", "probe has no key 'methd'; did you mean method? accepted: "),
         (
             "definition=paper",
@@ -226,10 +322,13 @@ def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> No
         ("object=ycb/dril", "object has no option 'ycb/dril'; did you mean ycb/drill? accepted: "),
         ("preset=papr", "preset has no option 'papr'; did you mean paper?"),
         (
-            "method.cost.free_term=out",
+            "method=chsel method.cost.free_term=out",
             "method.cost: free_term is 'out'; accepted: direct, interior",
         ),
-        ("method.cost.free_scale=many", "method.cost.free_scale is 'many'; accepted: a number"),
+        (
+            "method=chsel method.cost.free_scale=many",
+            "method.cost.free_scale is 'many'; accepted: a number",
+        ),
         ("seed=-1", "seed is -1; accepted: an integer from 0"),
         ("threads=0", "threads is 0; accepted"),
         ("threads=10000", "threads is 10000; accepted: an integer from 1 to 256"),
@@ -288,7 +387,7 @@ def test_real_measurements_are_registered(
     real_directory: Path, tmp_path: Path, name: str, limit: float
 ) -> None:
     """Mean |SDF| of the best hypothesis stays in the range of multi-start ICP."""
-    overrides = ["session=points", "object=mesh", "recording=mcap"]
+    overrides = ["session=points", "object=mesh", "method=chsel", "recording=mcap"]
     overrides += [f"session.path={real_directory / name}.npz"]
     overrides += [f"object.path={real_directory / name}.obj"]
     done = run(tmp_path, *overrides)
