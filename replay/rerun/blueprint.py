@@ -200,8 +200,9 @@ def _text_views() -> rrb.Container:
     )
     return rrb.Vertical(
         rrb.TextDocumentView(origin="/session", name="Session"),
+        rrb.TextDocumentView(origin="/verdict", name="Verdict"),
         rrb.TextLogView(origin="/log", name="Log", columns=columns),
-        row_shares=[5, 3],
+        row_shares=[4, 3, 3],
     )
 
 

@@ -32,7 +32,7 @@ from replay.rerun.plane import Frame
 from replay.rerun.scene import Scene
 from replay.rerun.sensors import SensorImages
 from replay.rerun.stream import RrdFile, abandon, new_stream
-from replay.rerun.text import session_markdown
+from replay.rerun.text import session_markdown, verdict_markdown
 from replay.rerun.viewer import live_sink
 
 APPLICATION = "chsel"
@@ -139,6 +139,8 @@ class RerunRecorder(Recorder):
         if event.topic in NUMBERS:
             for name, value in step_numbers(event).items():
                 self._curves.add_measured(name, value)
+        if isinstance(event, events.Measured) and (text := verdict_markdown(event.values)):
+            self._stream.log("verdict", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     @_draw.register
     def _(self, event: events.SessionStarted) -> None:

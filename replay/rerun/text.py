@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Any
 
 import yaml
 
+from chsel.problem.registration_problem import VERDICTS, Trust
 from replay.events import SessionStarted
 
 
@@ -41,6 +43,17 @@ def session_markdown(started: SessionStarted) -> str:
             fence = "`" * (1 + max([2, *map(len, re.findall("`+", text))]))
             parts.append(f"**{title}**\n{fence}\n{text}{fence}")
     return "\n\n".join(parts) + "\n"
+
+
+def verdict_markdown(values: Mapping[str, float]) -> str:
+    """How far to trust a result, by its measured values: the verdict large; "" without one."""
+    names = ("estimated_noise", "outlier_share", "misfit", "modes", "set_spread", "verdict")
+    noise, outliers, misfit, modes, spread, verdict = (values.get(n, math.nan) for n in names)
+    if verdict not in range(len(VERDICTS)) or not math.isfinite(modes):
+        return ""
+    trust = Trust(noise, outliers, misfit, int(modes), spread, VERDICTS[int(verdict)])
+    _, _, reasons = str(trust).partition("(")
+    return f"# {trust.verdict}\n\n{reasons.rstrip(')')}\n"
 
 
 def _literal(text: Any) -> str:

@@ -22,7 +22,12 @@ from rerun.chunk import RrdReader
 from chsel.errors import RecordingError
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose, inverse, random_rotations
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
+from chsel.problem.registration_problem import (
+    ArchiveSnapshot,
+    Hypotheses,
+    RegistrationProblem,
+    Trust,
+)
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from replay.events import (
@@ -381,6 +386,15 @@ def test_the_log_has_every_line_with_its_level(rows: dict[str, list[Row]]) -> No
     results = [text for text, level in lines if level == "INFO"]
     assert len(results) == 3
     assert all(re.fullmatch(r"best cost \S+, 5 distinct hypotheses", text) for text in results)
+
+
+def test_the_verdict_is_a_text_of_its_own(tmp_path: Path) -> None:
+    trust = Trust(0.0005, 0.02, 1.5, 3, 0.0042, "several modes")
+    numbers = [trust.numbers, {"verdict": 9.0}, {"verdict": float("nan")}]
+    told = [started(), *(Measured(step, values) for step, values in enumerate(numbers))]
+    (row,) = read(write(tmp_path / "session.rrd", told))["/verdict"]
+    reasons = "3 modes, spread 4.2 mm, noise 0.5 mm, 2 % outliers, misfit 1.5 noise levels"
+    assert row[1]["TextDocument:text"] == [f"# several modes\n\n{reasons}\n"]
 
 
 def test_without_a_true_pose_no_object_is_drawn(tmp_path: Path) -> None:
