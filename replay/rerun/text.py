@@ -51,7 +51,8 @@ def verdict_markdown(values: Mapping[str, float]) -> str:
     noise, outliers, misfit, modes, spread, verdict = (values.get(n, math.nan) for n in names)
     if verdict not in range(len(VERDICTS)) or not math.isfinite(modes):
         return ""
-    trust = Trust(noise, outliers, misfit, int(modes), spread, VERDICTS[int(verdict)])
+    named = VERDICTS[int(verdict)]
+    trust = Trust(noise, outliers, misfit, int(modes), spread, named, redundancy=1)  # not recorded
     _, _, reasons = str(trust).partition("(")
     return f"# {trust.verdict}\n\n{reasons.rstrip(')')}\n"
 

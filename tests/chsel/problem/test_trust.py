@@ -182,7 +182,10 @@ def test_poses_that_fit_one_corner_are_modes_and_far_ones_do_not_count() -> None
         trust = trust_in(posed, hypotheses(*ways[:count], off))
         assert (trust.verdict, trust.modes) == (verdict, count)
     near = np.asarray(ways[1] @ compose(np.eye(3), np.array([0.0005, 0.0, 0.0])))
-    assert trust_in(posed, hypotheses(*ways[:2], near)).modes == 2
+    poses = np.array([ways[0], ways[0], off, ways[1], near, ways[2]])
+    found = hypotheses_at(inverse(poses), [False, True, False, False, False, False])
+    trust = trust_in(posed, found)
+    assert (trust.modes, trust.best_of_modes) == (3, (0, 3, 5))  # indices of all hypotheses
 
 
 @pytest.mark.parametrize("shifts", [[0.0], [0.0, 0.001, 0.03, 0.031], np.linspace(0.0, 0.04, 12)])
@@ -218,16 +221,6 @@ def test_points_that_a_pose_can_fit_exactly_are_no_evidence() -> None:
     trust = trust_in(problem(inside), ball(), NOISE)
     assert trust.verdict == "nothing fits"
     assert "no evidence" not in str(trust)
-
-
-def test_each_mode_has_its_best_hypothesis() -> None:
-    """Indices are those of all hypotheses, whatever is left out between them."""
-    side = apply(POSE, np.array([[0.05, y, z] for y in (-0.02, 0.02) for z in (-0.04, 0.0, 0.04)]))
-    motions = [moved(), moved(), moved(x=-0.03), moved(z=0.001), moved(z=0.031), moved(z=0.03)]
-    repeated = [False, True, False, False, False, False]
-    found = hypotheses_at(inverse(np.array(motions)), repeated)
-    trust = trust_in(problem(chsel.KnownPoints(known=side), GRID), found)
-    assert trust.best_of_modes == (0, 4)
 
 
 def test_distances_of_outlines_are_those_of_shifts_and_turns() -> None:

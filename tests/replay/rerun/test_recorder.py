@@ -389,7 +389,7 @@ def test_the_log_has_every_line_with_its_level(rows: dict[str, list[Row]]) -> No
 
 
 def test_the_verdict_is_a_text_of_its_own(tmp_path: Path) -> None:
-    trust = Trust(0.0005, 0.02, 1.5, 3, 0.0042, "several modes")
+    trust = Trust(0.0005, 0.02, 1.5, 3, 0.0042, "several modes", 4)
     numbers = [trust.numbers, {"verdict": 9.0}, {"verdict": float("nan")}]
     told = [started(), *(Measured(step, values) for step, values in enumerate(numbers))]
     (row,) = read(write(tmp_path / "session.rrd", told))["/verdict"]
