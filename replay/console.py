@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import unicodedata
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import IO, Any
 
 import rich.console
@@ -35,6 +36,12 @@ def printable(text: str, *, keep: str = "") -> str:
 def print_page(text: str) -> None:
     """Print a text of several lines, such as a command's help."""
     print(printable(text, keep="\n"))
+
+
+def print_written(*files: Path) -> None:
+    """Print the path of each file that was written."""
+    for file in files:
+        print(f"written: {printable(str(file))}")
 
 
 def print_error(text: str) -> None:

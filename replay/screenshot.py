@@ -15,7 +15,7 @@ from typing import IO, TypeVar
 from rerun.experimental import ViewerClient
 
 from chsel.errors import RecordingError
-from replay.console import print_error
+from replay.console import print_error, print_written
 from replay.rerun.clock import PROBE
 from replay.rerun.viewer import free_port, is_listening, is_loaded, viewer_process, viewer_url
 
@@ -138,6 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     width, height = given.size
     try:
         save_screenshot(given.rrd, given.png, step=given.step, width=width, height=height)
+        print_written(given.png)
     except RecordingError as error:
         print_error(str(error))
         return 2

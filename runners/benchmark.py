@@ -96,7 +96,8 @@ def main(config: DictConfig) -> None:
     with drawing():
         if (picture := picture_of_benchmark(found)) is not None:
             write_picture(picture, folder, checked.format, accepted=IN_RUN_FOLDER)
-    say(f"written: {folder}")
+    for path in sorted(folder.iterdir()):
+        say(f"written: {path}")
 
 
 def _run(

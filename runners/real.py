@@ -35,7 +35,7 @@ from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.selection import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.reporting.statistics import spreads
-from runners.reporting.tables import Cell, Table, number, print_table, range_text
+from runners.reporting.tables import Cell, Table, number, print_table
 from runners.run.compiling import Compiling
 from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
@@ -49,10 +49,10 @@ _EPSILON = 0.001  # m, of plausible sets, which are not made here
 _SPLIT = 1  # the random stream, of a seed, that halves the touches
 _ALL, _HALF = "all", "half"
 _MEDIANS = (  # column, which rows, heading, factor
-    ("residual", _ALL, "residual, mm", 1e3),
-    ("position_error", _ALL, "position, mm", 1e3),
-    ("rotation_error", _ALL, "rotation, °", degrees(1.0)),
-    ("held_out", _HALF, "held out, mm", 1e3),
+    ("residual", _ALL, "resi-\ndual\nmm", 1e3),
+    ("position_error", _ALL, "posi-\ntion\nmm", 1e3),
+    ("rotation_error", _ALL, "rota-\ntion\n°", degrees(1.0)),
+    ("held_out", _HALF, "held\nout\nmm", 1e3),
     ("seconds", _ALL, "ms", 1e3),
 )
 
@@ -155,7 +155,7 @@ class RealCase:
     def published(self) -> Iterator[dict[str, Any]]:
         """A row of the true pose itself, where it is known: what residual there is to reach."""
         if (truth := self._session.world_from_object) is not None:
-            about = {"case": self._name, "method": "(published pose)", "points": _ALL}
+            about = {"case": self._name, "method": "(published)", "points": _ALL}
             every = np.arange(len(self._points.contacts))
             yield about | self._counts(every, inverse(truth[None])[0])
 
@@ -197,28 +197,26 @@ class RealCase:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Medians [quartiles] over seeds of every case and method."""
+    """Medians over seeds of every case and method."""
     table, by = pd.DataFrame(rows), ["points", "case", "method"]
     medians = {column: spreads(table, by, column) for column, *_ in _MEDIANS}
     lines = []
     for (case, method), own in table.groupby(by[1:], sort=False):
         every = own[own["points"] == _ALL]
         right = every["right"].dropna()
-        counts = (every["touches"].iloc[0], every["free_points"].iloc[0])
-        cells = [Cell(str(text)) for text in (case, method, *counts)]
-        cells.append(Cell(f"{sum(right)} of {len(right)}" if len(right) else "-"))
+        shares = f"{sum(right)}/{len(right)}" if len(right) else "-"
+        texts = [str(case), str(method), str(every["touches"].iloc[0]), shares]
         for column, points, _, scale in _MEDIANS:
             found = medians[column].reindex([(points, case, method)]).iloc[0]
-            quartiles = range_text(scale * found["lower"], scale * found["upper"])
-            cells.append(Cell(number(scale * found["median"]), between=quartiles))
-        lines.append(tuple(cells))
-    header = ("case", "method", "touches", "free", "right", *(text for _, _, text, _ in _MEDIANS))
+            texts.append(number(scale * found["median"]))
+        lines.append(tuple(map(Cell, texts)))
+    header = ("case", "method", "tou-\nches", "right", *(text for _, _, text, _ in _MEDIANS))
     note = (
         "Of the best hypothesis. Residual: mean |SDF| of all touches; held out: that of a random "
         "half, registered on the other. Right: within 5 mm and 5 degrees of the published pose, "
         "modulo symmetries."
     )
-    return Table("Medians [quartiles] over seeds", header, tuple(lines), labels=2, note=note)
+    return Table("Medians over seeds", header, tuple(lines), labels=2, note=note)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from chsel.errors import SettingError, require_choice
 from chsel.problem.settings import build_settings, settings_mapping
-from replay.console import Console
+from replay.console import Console, print_written
 from replay.files import whole_file
 from runners.command.program import command, plain
 from runners.reporting.against_baseline import against_baseline
@@ -57,7 +57,7 @@ def main(config: DictConfig) -> None:
             console.print()
     with drawing(), waiting.status("drawing") if waiting.is_terminal else nullcontext():
         sections = sections_of(subject)
-        _write(out, subject, sections, checked)
+        files = _write(out, subject, sections, checked)
     if subject.evaluation.is_steered:
         for table in (table for section in sections[1:] for table in section.tables):
             print_table(console, table)
@@ -66,21 +66,27 @@ def main(config: DictConfig) -> None:
         if section.missing:
             line = f"no picture of {section.title}: {section.missing}"
             console.print(line, soft_wrap=True)
-    for name in (HTML, MARKDOWN):
-        console.print(str(out / name), soft_wrap=True)
+    print_written(*files)
 
 
-def _write(out: Path, subject: Subject, sections: list[Section], config: ReportConfig) -> None:
-    """The files, each in the place of that of an earlier report."""
-    contents = {}
+def _write(
+    out: Path, subject: Subject, sections: list[Section], config: ReportConfig
+) -> list[Path]:
+    """Write the files, each in the place of that of an earlier report, and return them."""
+    contents: dict[str, bytes] = {}
+    files: list[Path] = []
     for section in sections:
         if (picture := section.picture) is not None:
             set_title(picture.figure, f"{section.title}, {subject.evaluation.name}")
-            contents[picture.name] = write_picture(picture, out, config.format, accepted=_ACCEPTED)
+            drawn = write_picture(picture, out, config.format, accepted=_ACCEPTED)
+            contents[picture.name] = drawn[0].read_bytes()
+            files += drawn
     page = page_of(subject.evaluation, sections, _command(config), config.format)
     for name, text in ((MARKDOWN, as_markdown(page)), (HTML, as_html(page, contents))):
         with whole_file(out / name, _ACCEPTED) as beside:
             beside.write_text(text, encoding="utf-8")
+        files.append(out / name)
+    return files
 
 
 def _command(config: ReportConfig) -> str:

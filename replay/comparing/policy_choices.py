@@ -140,13 +140,13 @@ def recorded_policy_name(recording: Recording) -> str:
 
 def choice_table(actions: Actions, choices: Sequence[PolicyChoice], title: str) -> Table:
     """A row for each choice: the action with start and direction, and what it promises."""
-    numbers = ("action", "start\nm", "along", "score", "hit\nchance", "then\nmm")
+    numbers = ("action", "start, mm\nalong", "score", "hit\nchance", "then\nmm")
     table = plain_table(title, texts=["step", "policy"], numbers=numbers)
-    table.columns[0].no_wrap, table.columns[1].min_width = True, 14
+    table.columns[0].no_wrap = True
     for choice in choices:
         label, _, recorded = choice.label.partition(": ")
         style = "dim" if recorded else ""
-        cells = _cells(actions, choice.decision) if choice.decision else ["failed", *[""] * 5]
+        cells = _cells(actions, choice.decision) if choice.decision else ["failed", *[""] * 4]
         table.add_row(str(choice.step), label, *cells, style=style)
     table.caption = "then: spread of the belief, expected after the action; as it is at a stop"
     return table
@@ -211,12 +211,12 @@ def _cells(actions: Actions, made: Decision) -> list[str]:
     """Those of an action that is taken, or why none is."""
     index = made.chosen
     if index < 0:
-        return [f"stop: {made.stop}", *["-"] * 4, f"{1000.0 * made.spread:.1f}"]
+        return [f"stop: {made.stop}", *["-"] * 3, f"{1000.0 * made.spread:.1f}"]
     pose = actions.world_from_hand[index]
     return [
         str(index),
-        " ".join(f"{value:.2f}" for value in pose[:3, 3].tolist()),
-        _direction(pose[:3, 2]),
+        " ".join(f"{1000.0 * value:.0f}" for value in pose[:3, 3].tolist())
+        + _direction(pose[:3, 2]),
         f"{made.score[index]:.3g}",
         f"{made.hit_chance[index]:.2f}",
         f"{1000.0 * made.expected_spread[index]:.1f}",
@@ -224,8 +224,8 @@ def _cells(actions: Actions, made: Decision) -> list[str]:
 
 
 def _direction(axis: np.ndarray) -> str:
-    """A unit vector (3,): "+x", or three numbers."""
+    """A unit vector (3,): " +x", or three numbers on a line of their own."""
     largest = int(np.abs(axis).argmax())
     if abs(axis[largest]) > 1.0 - 1e-9:
-        return ("-" if axis[largest] < 0.0 else "+") + "xyz"[largest]
-    return " ".join(f"{value:.2f}" for value in axis.tolist())
+        return (" -" if axis[largest] < 0.0 else " +") + "xyz"[largest]
+    return "\n" + " ".join(f"{value:.2f}" for value in axis.tolist())

@@ -60,30 +60,25 @@ def _facts(info: LogInfo) -> Table:
 
 def _topic_table(info: LogInfo, *, all_: bool) -> Table:
     table = Table(box=SIMPLE_HEAD, collapse_padding=True)
-    table.add_column("topic", overflow="fold")
-    table.add_column("type", overflow="fold")
+    table.add_column("topic\n  type, frames", overflow="fold")  # names are long: below each other
     for name in ("messages", "Hz"):
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("frames", overflow="fold")
     shown = info.topics if all_ else info.topics[:_MOST_TOPICS]
     for topic in shown:
         rate = "" if topic.rate is None else f"{topic.rate:.4g}"
-        table.add_row(topic.topic, _type(topic), str(topic.count), rate, _frames(topic))
+        table.add_row(f"{topic.topic}\n  {_contents(topic)}", str(topic.count), rate)
     if len(shown) < len(info.topics):
         table.caption = f"{len(info.topics) - len(shown)} more topics (--steps shows all)"
         table.caption_justify = "left"
     return table
 
 
-def _type(topic: TopicInfo) -> str:
-    """The schema's name, with an encoding that names do not imply."""
+def _contents(topic: TopicInfo) -> str:
+    """The schema's name, with an encoding that names do not imply, and the frames."""
     usual = topic.encoding in ("cdr", "protobuf")
     name = topic.type.replace("/msg/", "/")
-    return name if usual and name else f"{name} ({topic.encoding})".strip()
-
-
-def _frames(topic: TopicInfo) -> str:
-    return ", ".join([*topic.frames, *["..."] * topic.more_frames])
+    shown = name if usual and name else f"{name} ({topic.encoding})".strip()
+    return ", ".join([shown, *topic.frames, *["..."] * topic.more_frames])
 
 
 def _seconds(info: LogInfo) -> str:

@@ -37,12 +37,12 @@ def run(given: argparse.Namespace) -> int:
     console = Console(soft_wrap=True)
     paths = recordings_in(given.files)
     begun, status, equal, total = time.perf_counter(), 0, 0, 0
-    waiting = Console(stderr=True)
-    with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as progress:
-        task = progress.add_task("verifying", total=len(paths))
+    # One console for both, so that results are printed above the bar.
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("verifying", total=len(paths) if len(paths) > 1 else None)
         for file in verified_files(paths, given.step, jobs=given.jobs):
-            _print(console, file)
             progress.advance(task)
+            _print(console, file)
             status = max(status, file.status)
             equal += file.equal
             total += len(file.registrations)

@@ -19,7 +19,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import NullObserver, RegistrationProblem
 from chsel.problem.search_space import search_space
-from replay.console import print_error
+from replay.console import print_error, print_written
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.figures import FORMATS, Picture, drawing, new_figure, write_picture
 from runners.reporting.silhouette import (
@@ -139,7 +139,7 @@ def main() -> int:
         settings = AnchoredSettings(size=given.size)
         with drawing():
             picture = picture_of_stages(recording, step, settings, view=given.view, name=name)
-            write_picture(picture, folder, kind, small=True)
+            print_written(*write_picture(picture, folder, kind, small=True))
     except (ChselError, OSError) as error:
         print_error(str(error))
         return 2

@@ -27,7 +27,7 @@ from chsel.problem.registration_problem import Trust
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.problem.trust import trust_in
-from replay.console import Console, print_error
+from replay.console import Console, print_error, print_written
 from replay.events import Probe
 from runners.evaluation.trial_configurations import object_values
 from runners.objects.loader import ObjectConfig, load_object
@@ -209,8 +209,10 @@ def main() -> int:
         for level in given.levels:
             case = faulty_case(level, *where, AnchoredSettings())
             with drawing():
-                write_picture(picture_of(case, level), given.folder, given.format, small=True)
+                drawn = picture_of(case, level)
+                files = write_picture(drawn, given.folder, given.format, small=True)
             Console().print(f"{level}: {case.trust}; {case.truth_in_set}", soft_wrap=True)
+            print_written(*files)
     except (ChselError, OSError) as error:
         print_error(str(error))
         return 2

@@ -122,20 +122,20 @@ def write_picture(
     *,
     accepted: str = "a folder that can be written",
     small: bool = False,
-) -> bytes:
+) -> tuple[Path, Path]:
     """Write the figure as a file of one of the FORMATS, and its data as CSV beside it.
 
     accepted: the end of the error if the folder cannot be written. small: a PNG file of few
-    colours. Returns the content of the figure's file.
+    colours. Returns both files.
     """
     content = file_content(picture.figure, kind)
     content = small_png(content) if small and kind == "png" else content
-    path = folder / f"{picture.name}.{kind}"
+    path, data = folder / f"{picture.name}.{kind}", folder / f"{picture.name}.csv"
     with whole_file(path, accepted) as beside:
         beside.write_bytes(content)
-    with whole_file(path.with_suffix(".csv"), accepted) as beside:
+    with whole_file(data, accepted) as beside:
         picture.data.to_csv(beside, index=False, lineterminator="\n")
-    return content
+    return path, data
 
 
 def legend_of_methods(figure: Figure, styles: Sequence[MethodStyle]) -> None:

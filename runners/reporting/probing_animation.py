@@ -24,7 +24,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.plausible.surface_distance import SurfaceDistance, surface_points
 from chsel.problem.poses import inverse
 from chsel.problem.streams import StreamKey
-from replay.console import print_error
+from replay.console import print_error, print_written
 from replay.events import Probe, SessionStarted
 from replay.files import whole_file
 from replay.mcap.reader import Recording, read_recording
@@ -304,6 +304,7 @@ def main() -> int:
             frames, times = zip(*ProbingAnimation(sessions).frames(), strict=True)
         with whole_file(given.out, "a folder that can be written") as beside:
             beside.write_bytes(animation(frames, times))
+        print_written(given.out)
     except (ChselError, OSError) as error:
         print_error(str(error))
         return 2

@@ -136,7 +136,7 @@ def print_table(console: Console, table: Table) -> None:
     else:
         console.print(shown)
     if table.note:
-        console.print(table.note, soft_wrap=True)
+        console.print(table.note, soft_wrap=not console.is_terminal)
 
 
 def _plain_text(cell: Cell) -> str:

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import io
 import json
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -67,6 +68,25 @@ def test_only_one_file_writes_to_a_terminal(room: str) -> None:
 def written(width: int = 300) -> tuple[io.StringIO, Console]:
     text = io.StringIO()
     return text, Console(file=text, width=width)
+
+
+class Screen(io.StringIO):
+    """A terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_results_stand_on_lines_of_their_own_above_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Screen()
+    monkeypatch.setattr("sys.stdout", screen)
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    assert main(["verify", str(REPLAY), str(REPLAY)]) == 0
+    plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.getvalue())
+    told = [line for line in re.split(r"[\r\n]+", plain) if "steps equal" in line]
+    assert len(told) == 3
+    assert all(line.startswith((f"{REPLAY}: ", "2 recordings: ")) for line in told)
 
 
 def test_what_is_printable_stays_and_all_else_is_escaped() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import tracemalloc
@@ -12,9 +13,11 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from replay.__main__ import main
+from replay.console import Console
 from replay.raw import log_info as module
 from replay.raw.channels import Channel
 from replay.raw.frames import frames
+from replay.raw.log_display import show_log
 from replay.raw.log_info import LogInfo, TopicInfo, is_other_programs, log_info
 from tests.runners.sensors.small_logs import (
     BEGIN,
@@ -204,6 +207,20 @@ def test_hostile_names_are_shown_as_they_are_and_many_topics_are_cut(
     assert "30 more topics" in output
     assert main(["info", "--steps", str(path)]) == 0
     assert "/[bold]129" in capsys.readouterr().out
+
+
+def test_no_name_is_broken_on_a_narrow_terminal() -> None:
+    frames = ("camera_front_left_depth_optical_frame", "world > pad_of_the_left_finger")
+    names = (f"/{frames[0]}/depth/camera_info", "/arm/left_hand/finger_pads/image_raw")
+    topics = tuple(
+        TopicInfo(name, "sensor_msgs/msg/CameraInfo", "cdr", 123456, 1999.0, frames)
+        for name in names
+    )
+    text = io.StringIO()
+    info = LogInfo(Path("log.mcap"), 1, topics, 0, 1, (), {}, True)
+    show_log(Console(file=text, width=80), info, all_=False)
+    for name in (*names, "sensor_msgs/CameraInfo", *frames):
+        assert " ".join(text.getvalue().split()).count(name) >= 1, name
 
 
 def test_json_and_lines_of_several_files(

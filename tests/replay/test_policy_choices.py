@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
+import io
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +13,18 @@ import numpy as np
 import pytest
 
 from chsel.errors import RecordingError, SettingError
+from chsel.next_probe.decision_problem import Actions
 from chsel.policies.policy_registry import build_policy
+from chsel.problem.poses import axis_angle, compose
 from replay.__main__ import main
-from replay.comparing.policy_choices import decision_problem, policy_choices, policy_contenders
+from replay.comparing.policy_choices import (
+    PolicyChoice,
+    choice_table,
+    decision_problem,
+    policy_choices,
+    policy_contenders,
+)
+from replay.console import Console
 from replay.events import Decided, Event
 from replay.mcap.reader import read_recording
 from tests.tools.small_recordings import STEERED, registered_session, steered_session
@@ -79,11 +90,38 @@ def test_step_shows_a_row_for_each_policy(path: Path, capsys: pytest.CaptureFixt
     words = ["--policy", "information", "policy.noise=0.5", "--policy", "information"]
     assert main(["step", str(path), "--step", "1", *words]) == 0
     shown = capsys.readouterr().out
-    assert "after step 1 by information: 4 poses, 6 of 8 actions available" in shown
+    title = "after step 1 by information: 4 poses, 6 of 8 actions available"
+    assert title in " ".join(shown.split())
     rows = [line.split() for line in shown.splitlines() if re.match(r" *1 ", line)]
     assert [row[1] for row in rows] == ["recorded", "information", "information#2"]
     assert rows[0][2:] == rows[2][2:] != rows[1][2:]
     assert "information with policy.noise=0.5" in shown
+
+
+def test_every_number_is_whole_on_a_narrow_terminal(path: Path) -> None:
+    recording = read_recording(path)
+    assert recording.offered is not None
+    actions, choices = recording.offered.actions, []
+    turn = axis_angle(np.array([0.0, 1.0, 0.0]), 2.5)
+    turned = Actions(compose(turn, [-0.4, -0.3, -0.5]) @ actions.world_from_hand, actions.length)
+    for label in ("hypothesis_pruning", "expected_loss"):
+        made = recording.decision(0).decision
+        scores = np.full(len(turned), -1.234e-5)
+        changed = dataclasses.replace(
+            made, score=scores, expected_spread=np.full(len(turned), 0.0654)
+        )
+        choices.append(PolicyChoice(12, label, changed))
+    text = io.StringIO()
+    Console(file=text, width=80).print(choice_table(turned, choices, "each step"))
+    rows = [line for line in text.getvalue().splitlines() if line.startswith("12 ")]
+    pose = turned.world_from_hand[changed.chosen]
+    start = " ".join(f"{1000.0 * value:.0f}" for value in pose[:3, 3])
+    hits = f"{made.hit_chance[made.chosen]:.2f}"
+    for row, choice in zip(rows, choices, strict=True):
+        expected = f"12 {choice.label} {made.chosen} {start} -1.23e-05 {hits} 65.4"
+        assert row.split() == expected.split()
+    direction = " ".join(f"{value:.2f}" for value in pose[:3, 2])
+    assert text.getvalue().count(direction) == len(choices)
 
 
 def test_compare_counts_agreement_and_writes_a_table(

@@ -97,13 +97,17 @@ def test_a_recording_that_does_not_exist_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [TimeoutError, ConnectionError, RuntimeError])
 def test_a_viewer_that_does_not_paint_in_its_time_is_asked_again(
-    error: type[Exception], rrd: Path, viewer: Viewer
+    error: type[Exception],
+    rrd: Path,
+    viewer: Viewer,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     late = error("the viewer has not painted within 15 s")
     viewer(_SILENT, lambda _: client)
     client = Client(late, late, b"first", late, b"png")
     out = rrd.with_name("new") / "out.png"
-    save_screenshot(rrd, out, step=7)
+    assert main([str(rrd), str(out), "--step", "7"]) == 0
+    assert capsys.readouterr().out == f"written: {out}\n"
     assert out.read_bytes() == b"png"
     assert client.times == [{"timeline": "probe", "sequence": 7, "play_state": "paused"}]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +41,9 @@ def test_the_picture_is_a_small_file_of_poses_in_the_world(tmp_path: Path) -> No
     recording = read_recording(REPLAYS / "mustard_chsel.mcap")
     step = recording.steps[0]
     picture = picture_of_stages(recording, step, SMALL_SEARCH, view="xz", name="stages")
-    content = write_picture(picture, tmp_path, "png", small=True)
-    assert len(content) < 200_000
-    assert Image.open(io.BytesIO(content)).width == 1440
+    file, _ = write_picture(picture, tmp_path, "png", small=True)
+    assert file.stat().st_size < 200_000
+    assert Image.open(file).width == 1440
     chosen = stages_of(recording.problem(step), SMALL_SEARCH)[-1]
     axes = picture.figure.axes[-1]
     start, poses = recording.start, inverse(chosen.poses)
@@ -75,7 +74,7 @@ def test_pictures_are_of_levels_that_differ_in_kind() -> None:
 def test_a_picture_marks_contacts_off_the_object_and_free_voxels_in_it(tmp_path: Path) -> None:
     case = faulty_case("mixed", *WHERE, SMALL_SEARCH)
     drawn = picture_of(case, "mixed")
-    picture = Image.open(io.BytesIO(write_picture(drawn, tmp_path, "png", small=True)))
+    picture = Image.open(write_picture(drawn, tmp_path, "png", small=True)[0])
     assert (picture.format, picture.mode, picture.width) == ("PNG", "P", 1440)
     assert case.off.shape == (2, len(case.contacts))
     far = np.abs(case.off[0]) > 0.01
@@ -105,7 +104,9 @@ def test_the_command_writes_a_small_file_for_each_level(
     file = folder / "clean.png"
     assert file.read_bytes().startswith(b"\x89PNG")
     assert file.stat().st_size < 80_000
-    assert capsys.readouterr().out.startswith("clean: ")
+    told, *written = capsys.readouterr().out.splitlines()
+    assert told.startswith("clean: ")
+    assert written == [f"written: {file}", f"written: {file.with_suffix('.csv')}"]
 
 
 @pytest.mark.parametrize(

@@ -319,7 +319,7 @@ def test_without_the_package_everything_shown_is_in_the_file(tmp_path: Path) -> 
         assert did[f"ours, {preset}"]["poses_descended"] == 30 * done_steps["descent"]
     assert f"paper {30 * done_steps['descent']}, default " in done.stdout
     assert report["machine"]["load_after"] is not None
-    assert str(folder) in done.stdout
+    assert all(f"written: {folder / name}\n" in done.stdout for name in names)
 
 
 def test_with_the_package_it_is_measured_in_the_same_run(stand_in: Path, tmp_path: Path) -> None:

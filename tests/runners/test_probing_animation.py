@@ -90,12 +90,15 @@ def test_the_hand_is_drawn_where_it_is_and_its_forecast_ahead_of_it() -> None:
     assert "." not in [line.get_marker() for line in after.lines]
 
 
-def test_the_command_writes_an_animation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_an_animation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(probing_animation, "_ON_THE_WAY", (1.0,))
     monkeypatch.setattr(probing_animation, "_DPI", 40)
     out = tmp_path / "a.webp"
     monkeypatch.setattr(sys, "argv", ["probing_animation", str(out), f"chsel={CHSEL}"])
     assert probing_animation.main() == 0
+    assert capsys.readouterr().out == f"written: {out}\n"
     with Image.open(out) as picture:
         assert (picture.format, picture.size) == ("WEBP", (360, 264))
         assert picture.n_frames == 5  # type: ignore[attr-defined]

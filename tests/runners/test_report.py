@@ -89,6 +89,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = run(report.main, str(folder))
     assert (done.returncode, done.stderr) == (0, "")
     assert "no picture" not in done.stdout
+    written = {line for line in done.stdout.splitlines() if line.startswith("written: ")}
+    assert written == {f"written: {path}" for path in (folder / "report").iterdir()}
     return folder
 
 
