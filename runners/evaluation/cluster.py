@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -159,6 +160,7 @@ def _local_cluster(workers: int, *, dashboard: bool) -> Any:
         threads_per_worker=1,
         memory_limit=0,
         host=_LOOPBACK,
+        security=True,  # TLS with keys of this run: other users of the machine can reach the ports
         dashboard_address=_LOCAL_PORT,
         scheduler_kwargs={"dashboard": dashboard},
         silence_logs=logging.CRITICAL,
@@ -196,8 +198,10 @@ class _LocalWorkers:
 @contextmanager
 def _client_of(address: str) -> Iterator[Any]:
     from distributed import Client
+    from distributed.comm import get_address_host_port
 
-    try:
+    try:  # Dask's client would try for long, and wait for a minute when it is given up
+        socket.create_connection(get_address_host_port(address), timeout=_CONNECT).close()
         client = Client(address, set_as_default=False, timeout=_CONNECT)
     except (OSError, ValueError) as error:
         raise SettingError(

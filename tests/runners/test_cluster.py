@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
+import ssl
 import subprocess
 import sys
 import time
@@ -16,6 +18,7 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 import requests
+from distributed.comm import connect
 
 from chsel.errors import SettingError
 from runners.evaluation import cluster
@@ -137,10 +140,11 @@ def test_a_job_of_slurm_asks_for_what_is_configured() -> None:
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "ftp://a:1"])
-def test_a_scheduler_that_is_not_there_is_one_line(
+def test_a_scheduler_that_is_not_there_is_one_line_at_once(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "_CONNECT", 0.5)
+    """Without a client of Dask, which waits for a minute when it is given up."""
+    monkeypatch.setattr("distributed.Client", lambda *_, **__: pytest.fail("it has a client"))
     config = LocalConfig("local", address, False)
     with (
         pytest.raises(SettingError, match=r"cluster\.scheduler is .*; accepted: the address of"),
@@ -157,6 +161,8 @@ def test_the_address_of_the_dashboard_is_printed(
 ) -> None:
     with connected(LocalConfig("local", None, dashboard), 1, print) as connection:
         assert connection.client.nthreads()
+        check_needs_keys(connection.client.cluster.scheduler_address)
+        check_needs_keys(*connection.client.nthreads())
         served = connection.client.cluster.scheduler_info["services"]["dashboard"]
         assert served != 8787, "Dask's own port is for other clusters, and for all machines"
         assert connection.client.cluster.dashboard_link.startswith("http://127.0.0.1:")
@@ -164,6 +170,17 @@ def test_the_address_of_the_dashboard_is_printed(
         assert re.fullmatch(shown, printed)
         if dashboard:
             assert requests.get(printed.split()[1], timeout=30).status_code == 200
+
+
+def check_needs_keys(*addresses: str) -> None:
+    """Nobody without the keys of the run can connect, such as another user of the machine."""
+    trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # has no key, and asks for none
+    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+    for address in addresses:
+        plain = address.replace("tls://", "tcp://")
+        for where, keys in ((plain, {}), (address, {"ssl_context": trusting})):
+            with pytest.raises(OSError, match=where):
+                asyncio.run(connect(where, timeout=1, **keys))
 
 
 class Unreadable:
