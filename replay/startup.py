@@ -5,6 +5,7 @@ And a check that `chsel` is this project's package: the authors' published one h
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -23,9 +24,14 @@ WRONG_PACKAGE = (
 
 
 def begin() -> None:
-    """For a command, before its imports: Ctrl-C ends it at once, and `chsel` must be ours."""
+    """For a command, before its imports: Ctrl-C ends it at once, and `chsel` must be ours.
+
+    A console script imports nothing from the current folder, nor does a Python that it starts.
+    """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if sys.argv[:1] != ["-m"]:
+        os.environ["PYTHONSAFEPATH"] = "1"
     if not chsel_is_ours():
         sys.stderr.write(f"error: {WRONG_PACKAGE}\n")
         sys.exit(2)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from chsel.numerics.threads import core_count
 from replay.startup import WRONG_PACKAGE
 from replay.verbs import VERBS
 
@@ -72,6 +73,19 @@ def test_help_of_replay_waits_for_no_heavy_import(verb: str, tmp_path: Path) -> 
     assert "usage: replay" in done.stdout
 
 
+HELPED = """
+from replay.startup import begin
+
+if __name__ == "__main__":
+    begin()
+    from multiprocessing import get_context
+    from chsel.background_rehearsal import rehearse_beside
+
+    worker = get_context("spawn").Process(target=print)
+    worker.start()
+    (compiling,) = rehearse_beside(None)  # no method: nothing to compile
+    assert (compiling.wait(), worker.join()) == (0, None)
+"""
 REGISTERED = """
 import sys
 import numpy as np
@@ -138,6 +152,22 @@ def test_ctrl_c_stays_ignored_where_it_was(tmp_path: Path) -> None:
     done = ran(["replay", "verify", "x.mcap"], tmp_path, code)
     assert done.returncode == 2
     assert "x.mcap does not exist" in done.stderr
+
+
+@pytest.mark.skipif(core_count() < 2, reason="one core starts no other process")
+def test_processes_of_a_console_script_import_nothing_from_the_current_folder(
+    tmp_path: Path,
+) -> None:
+    """Neither that which compiles nor those of multiprocessing, such as Dask's."""
+    script, folder = tmp_path / "bin" / "chsel-probe", tmp_path / "here"
+    script.parent.mkdir()
+    folder.mkdir()
+    script.write_text(HELPED)
+    for name in ("numba", "multiprocessing"):
+        (folder / f"{name}.py").write_text(f"open('{name} was executed', 'w')\n")
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    subprocess.run([sys.executable, script], cwd=folder, env=environment, check=True)
+    assert sorted(path.name for path in folder.iterdir()) == ["multiprocessing.py", "numba.py"]
 
 
 def test_the_published_package_in_our_place_is_named(tmp_path: Path) -> None:
