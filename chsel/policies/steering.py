@@ -83,9 +83,18 @@ class Steering:
         return self.last
 
     def belief(self, points: KnownPoints, hypotheses: Hypotheses | None, key: StreamKey) -> Belief:
-        """The poses that a decision weighs up."""
+        """The poses that a decision weighs up.
+
+        Raises SettingError before any registration if the floor is above the workspace.
+        """
         settings = self.policy.settings.belief
         if hypotheses is None or len(hypotheses.cost) == 0:
+            top = self._workspace.upper[2]
+            if settings.floor is not None and settings.floor > top:
+                raise SettingError(
+                    f"policy.belief.floor is {settings.floor:g}, above the workspace; accepted: a "
+                    f"height below its top at {top:g} m, or null"
+                )
             return belief_before(self._sdf, points, self._workspace, key, settings)
         return belief_after(hypotheses, settings)
 

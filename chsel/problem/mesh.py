@@ -173,7 +173,8 @@ def _check_size(name: str, extents: np.ndarray) -> None:
     accepted = f"accepted: a largest extent of {SMALLEST} m to {LARGEST:g} m"
     if largest > LARGEST:
         raise MeshError(
-            f"{name} is {size}; looks like millimetres; pass scale=0.001 ({accepted} after scaling)"
+            f"{name} is {size}; looks like millimetres; pass scale=0.001, to commands "
+            f"object.scale=0.001 ({accepted} after scaling)"
         )
     if float(extents.min()) == 0.0:
         raise MeshError(f"{name} is {size}: flat; accepted: a solid, with three extents above 0")

@@ -17,7 +17,7 @@ from chsel.errors import SessionError
 from replay.mcap.schemas import PROFILE
 from replay.raw.channels import Channel
 from replay.raw.frames import frames
-from replay.raw.raw_file import RawFile
+from replay.raw.raw_file import ROS1_BAG, RawFile
 from replay.raw.raw_reading import RawMessage
 
 _HEADER = struct.Struct("<BQI")  # opcode, length, length of the profile's name
@@ -97,7 +97,7 @@ class LogInfo:
 
 
 def is_other_programs(path: str | Path) -> bool:
-    """Whether a file is an MCAP file, and by its header not one of this project's recordings."""
+    """Whether a file is a robot's: a ROS 1 bag, or MCAP, by its header not a recording of ours."""
     path = Path(path).expanduser()
     if not path.is_file():
         return False
@@ -106,6 +106,8 @@ def is_other_programs(path: str | Path) -> bool:
             start = file.read(len(MCAP0_MAGIC) + _HEADER.size + _LONGEST_PROFILE)
     except OSError:
         return False
+    if start.startswith(ROS1_BAG):
+        return True
     if len(start) < len(MCAP0_MAGIC) + _HEADER.size or not start.startswith(MCAP0_MAGIC):
         return False
     opcode, _, length = _HEADER.unpack_from(start, len(MCAP0_MAGIC))

@@ -17,6 +17,11 @@ from replay.raw.channels import Channels
 from replay.raw.raw_reading import LIMITS, ChunkPlace, Fault, RawMessage, RawReading, Wanted
 
 ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
+ROS1_BAG = b"#ROSBAG "  # as long as MCAP0_MAGIC
+_CONVERT = (
+    "convert it with `pip install rosbags`, `rosbags-convert --src LOG.bag --dst LOG "
+    "--dst-storage mcap`, and pass the folder LOG"
+)
 MOST_HELD = 2**28  # bytes of messages that wait for their turn
 _COMPARED = 64  # chunks that are looked at before an index is believed
 
@@ -37,7 +42,10 @@ class RawFile:
         self._chunks: list[ChunkPlace] = []
         try:
             with path.open("rb") as file:
-                if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                start = file.read(len(MCAP0_MAGIC))
+                if start == ROS1_BAG or (path.suffix == ".bag" and start != MCAP0_MAGIC):
+                    raise SessionError(f"log {path} is a ROS 1 bag; {ACCEPTED}: {_CONVERT}")
+                if start != MCAP0_MAGIC:
                     raise SessionError(f"log {path} is no MCAP file; {ACCEPTED}")
                 self.size = file.seek(0, 2)
                 self._read_index(file)

@@ -94,7 +94,7 @@ def cluster_config(values: Mapping[str, Any], workers: int | None) -> ClusterCon
             f"workers is {workers}, which is of this machine; accepted with another cluster: null"
         )
     if kind == "slurm" and importlib.util.find_spec("dask_jobqueue") is None:
-        raise SettingError("cluster=slurm needs dask-jobqueue: pip install '.[slurm]'")
+        raise SettingError("cluster=slurm needs dask-jobqueue: pip install -e '.[slurm]'")
     return config
 
 

@@ -30,14 +30,15 @@ def read_robot(path: Path, where: str) -> Any:
     where: names the file in messages. Raises SettingError for a file that is no URDF or out of
     bounds, and if the package yourdfpy is missing.
     """
+    content = _content(path, where)
+    _check_xml(content, where)
     try:
         from yourdfpy import URDF  # optional: rigs of boxes need none
     except ImportError:
         raise SettingError(
-            f"{where} needs the package yourdfpy; install it: pip install chsel-replay[urdf]"
+            f"{where} needs the package yourdfpy; install it where the project is: "
+            "pip install -e '.[urdf]'"
         ) from None
-    content = _content(path, where)
-    _check_xml(content, where)
     try:
         model = URDF.load(io.BytesIO(content), build_scene_graph=False, load_meshes=False)
     except Exception as error:  # it raises whatever it stumbles over

@@ -94,6 +94,6 @@ def stood_on_shelf(mesh: trimesh.Trimesh, configuration: CabinetConfiguration) -
         room = " x ".join(f"{side:.3g}" for side in np.subtract(box.upper, box.lower))
         raise SessionError(
             f"the object takes {size} m where {configuration.name} puts it, more than the cabinet "
-            f"has; accepted: an object of real size (scale=1) that fits in {room} m"
+            f"has; accepted: an object of real size (object.scale=1) that fits in {room} m"
         )
     return world_from_object

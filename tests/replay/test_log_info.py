@@ -250,6 +250,18 @@ def test_what_is_no_log_is_refused_as_before(
     assert capsys.readouterr().err.startswith("error: recording ")
 
 
+def test_a_ros_1_bag_is_an_error_that_names_the_converter(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "log.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n")
+    assert main(["info", str(path)]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"log {path} is a ROS 1 bag; accepted: " in told
+    assert "`rosbags-convert --src LOG.bag" in told
+
+
 def test_many_faults_are_counted_in_bounded_memory() -> None:
     found = module._Gathered()
     for n in range(1000):

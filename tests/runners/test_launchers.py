@@ -55,7 +55,7 @@ def needs(launcher: str) -> None:
         found = None
     if found is None:
         extra = launcher.partition("_")[0]
-        pytest.skip(f"needs {plugin}: pip install '.[sweep-{extra}]', see docs/sweeps.md")
+        pytest.skip(f"needs {plugin}: pip install -e '.[sweep-{extra}]', see docs/sweeps.md")
 
 
 def sweep(launcher: str, folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:

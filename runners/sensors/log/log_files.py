@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import MCAP0_MAGIC
-
 from chsel.errors import SessionError
 from replay.mcap.texts import one_line
 from replay.raw.raw_file import ACCEPTED
@@ -18,7 +16,6 @@ from replay.raw.raw_reading import RawMessage
 from runners.sensors.yaml_file import read_yaml
 
 _METADATA = "metadata.yaml"
-_ROS1_BAG = b"#ROSBAG "  # as long as MCAP0_MAGIC
 _LONGEST_METADATA = 2**20  # bytes
 
 
@@ -31,7 +28,6 @@ def log_files(path: Path, warnings: list[str]) -> list[Path]:
         raise SessionError(f"log {path} does not exist; {ACCEPTED}")
     if path.is_file():
         _require_mcap([path])
-        _refuse_ros1_bag(path)
         return [path]
     if not path.is_dir():
         raise SessionError(f"log {path} is neither a file nor a folder; {ACCEPTED}")
@@ -92,16 +88,6 @@ def _require_mcap(files: list[Path]) -> None:
             raise SessionError(
                 f"log {file} is compressed as a whole; accepted: .mcap: unpack it with `zstd -d`"
             )
-
-
-def _refuse_ros1_bag(path: Path) -> None:
-    with path.open("rb") as file:
-        start = file.read(len(_ROS1_BAG))
-    if start == _ROS1_BAG or (path.suffix == ".bag" and start != MCAP0_MAGIC):
-        raise SessionError(
-            f"log {path} is a ROS 1 bag; {ACCEPTED}: convert it with `pip install rosbags`, "
-            "`rosbags-convert --src LOG.bag --dst LOG --dst-storage mcap`, and pass the folder LOG"
-        )
 
 
 def _natural(path: Path) -> list[Any]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chsel.errors import ChselError
+from chsel.errors import ChselError, SettingError
 from chsel.next_probe.belief import BeliefSettings, belief_after, belief_before
 from chsel.next_probe.decision_problem import Decision, DecisionProblem
 from chsel.next_probe.surprise import surprise
@@ -113,6 +113,14 @@ def test_what_is_no_decision_is_refused(changes: dict[str, Any], message: str) -
     available = np.array([True, False, True])
     with pytest.raises(ChselError, match=message):
         steering(_Somebody(**changes)).decide(0, KnownPoints(), None, available)
+
+
+def test_a_floor_above_the_workspace_is_an_error() -> None:
+    session = steering(build_policy("grid", {"belief": {"floor": 7.0}}))
+    with pytest.raises(
+        SettingError, match=r"policy\.belief\.floor is 7, above .*; accepted: .* null"
+    ):
+        session.decide(0, KnownPoints(), None, np.ones(3, dtype=bool))
 
 
 def test_an_outcome_follows_a_choice() -> None:
