@@ -21,7 +21,13 @@ _FILES = {"align": "file", "plausible": "file", "report": "dir"}
 """Of a command: the setting that its first word without a key is."""
 _MORE = {"plausible": "steps"}
 """Of a command: the setting that further such words are together; also --SETTING VALUE."""
-_OPEN_GROUPS = {"evaluate": ("settings.", "outside.", "policy.")}
+_OPEN_GROUPS = {
+    command: tuple(name + sign for name in names for sign in ".=")
+    for command, names in {
+        "evaluate": ("settings", "outside", "policy"),
+        "real": ("settings",),
+    }.items()
+}
 """Of a command: groups that may have any key, which Hydra wants to have ++ before it."""
 _TAKES_VALUE = ("-c", "--cfg", "-p", "--package", "-cp", "-cn", "-cd", "-i", "--info")
 _PATH_KEYS = (

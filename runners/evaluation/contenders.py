@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from chsel.errors import SettingError, require_choice
+from chsel.errors import SettingError, require_choice, require_instance
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.problem.settings import build_settings, changed_settings, settings_mapping
@@ -64,6 +64,7 @@ def chosen_contenders(
     by label, for all entries that these fit; an entry's own come last. preset: where an entry has
     none. Raises SettingError for what does not exist, and for a label that is taken.
     """
+    require_instance("settings", settings, Mapping, "a group of settings by method")
     entries = [_entry(value) for value in _listed(methods)]
     labels = [entry.label or entry.name for entry in entries]
     for label in labels:

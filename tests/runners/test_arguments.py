@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from omegaconf import OmegaConf
 
 from chsel.errors import SettingError
 from replay.__main__ import main as replay
-from runners import plausible, probe
+from runners import evaluate, plausible, probe, real
 from runners.command.arguments import hydra_arguments, is_setting, quoted
 from tests.runners.in_process import run
 
@@ -176,3 +177,23 @@ def test_any_key_of_an_open_group_is_taken() -> None:
         "++outside.mine='~x'",
         "seeds=0",
     ]
+
+
+@pytest.mark.parametrize("command", [evaluate.main, real.main])
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("settings.chsel.archive.bins=x", "settings.chsel.archive.bins is 'x'; accepted: "),
+        ("settings={chsel: {archive: {bins: x}}}", "settings.chsel.archive.bins is 'x'; "),
+        ("settings={chsl: {archive: {bins: 20}}}", "settings of a method is 'chsl'; accepted: "),
+        ("settings=null", "settings is None; accepted: a group of settings by method"),
+    ],
+)
+def test_settings_of_methods_are_taken_dotted_and_as_a_group(
+    command: Callable[[], None], word: str, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / "real").mkdir()
+    folders = [f"data={tmp_path}"] if command is real.main else ["session=kinematic"]
+    done = run(command, word, *folders, f"out={tmp_path / 'out'}")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.startswith(f"error: {message}")
