@@ -37,8 +37,8 @@ _KINDS = {
 }
 
 
-def cost_gradients(subject: Subject) -> Section:
-    """Of the recording of the shown trial, by CHSEL if that is recorded."""
+def cost_gradients(subject: Subject) -> Section | None:
+    """Of the recording of the shown trial, by CHSEL if that is recorded; None as the sequence."""
     text = (
         "Where the negative gradient of the relaxed cost pushes a point, on the X-Z "
         "cross-section of the object (in its own frame) that holds most of it: free points in "
@@ -55,7 +55,10 @@ def cost_gradients(subject: Subject) -> Section:
                 return picture_of_gradients(path)
         raise NotDrawn(f"there is no recording of {trial[0]}, seed {trial[1]}")
 
-    return Section("gradients", "Gradients of the cost", text, *drawn(draw))
+    picture, missing = drawn(draw)
+    if picture is None and not subject.asks:
+        return None
+    return Section("gradients", "Gradients of the cost", text, picture, missing)
 
 
 def picture_of_gradients(path: Path) -> Picture:

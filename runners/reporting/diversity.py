@@ -10,24 +10,25 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from runners.reporting.figures import (
-    NotDrawn,
     Picture,
     draw_quartiles,
     legend_of_methods,
     panels,
     positive_scale,
 )
-from runners.reporting.section import LAST_HALF, Section, Styles, Subject, drawn
+from runners.reporting.section import LAST_HALF, Section, Styles, Subject
 from runners.reporting.statistics import DIVERSITY, spreads
 from runners.reporting.tables import method_table
 
 _COLUMNS = 3  # of panels
 
 
-def over_probes(subject: Subject) -> Section:
-    """PD at every step, by object."""
+def over_probes(subject: Subject) -> Section | None:
+    """PD at every step, by object; None without any."""
     rows, styles = subject.evaluation.rows, subject.styles
-    picture, missing = drawn(lambda: picture_over_probes(rows, styles, "pd_over_probes"))
+    if rows[DIVERSITY].isna().all():
+        return None
+    picture = picture_over_probes(rows, styles, "pd_over_probes")
     text = (
         "Median (line) and 25th to 75th percentile (band) over the trials of an object, all of "
         "its configurations and seeds, at every step. Lower is better. Configurations have more "
@@ -38,13 +39,15 @@ def over_probes(subject: Subject) -> Section:
         for name, some in rows[rows["step"].notna()].groupby("object")
     )
     title = "Plausible diversity over the probes"
-    return Section("over-probes", title, text, picture, missing, tuple(tables))
+    return Section("over-probes", title, text, picture, tables=tuple(tables))
 
 
-def boxes(subject: Subject) -> Section:
-    """PD of the last half of all trials."""
+def boxes(subject: Subject) -> Section | None:
+    """PD of the last half of all trials; None without any."""
     half, styles = subject.evaluation.last_half, subject.styles
-    picture, missing = drawn(lambda: picture_of_boxes(half, styles, "pd_boxes"))
+    if half[DIVERSITY].isna().all():
+        return None
+    picture = picture_of_boxes(half, styles, "pd_boxes")
     text = (
         f"{LAST_HALF} Boxes span the 25th to the 75th percentile, white lines are medians; "
         "whiskers reach the least and greatest numbers apart from outliers, which are diamonds "
@@ -54,10 +57,10 @@ def boxes(subject: Subject) -> Section:
         method_table(f"PD in mm² by {by}", half, by, styles) for by in ("object", "configuration")
     )
     title = "Plausible diversity by object and method"
-    return Section("boxes", title, text, picture, missing, tuple(tables))
+    return Section("boxes", title, text, picture, tables=tuple(tables))
 
 
-def of_medial_constraint(subject: Subject) -> Section:
+def of_medial_constraint(subject: Subject) -> Section | None:
     """The Medial Constraint with and without quality diversity."""
     return _of_methods(
         subject,
@@ -69,7 +72,7 @@ def of_medial_constraint(subject: Subject) -> Section:
     )
 
 
-def of_cvo(subject: Subject) -> Section:
+def of_cvo(subject: Subject) -> Section | None:
     """CVO with and without free space."""
     return _of_methods(
         subject,
@@ -82,20 +85,23 @@ def of_cvo(subject: Subject) -> Section:
 
 def _of_methods(
     subject: Subject, methods: tuple[str, ...], name: str, title: str, text: str
-) -> Section:
-    """PD over the probes of a few methods."""
+) -> Section | None:
+    """PD over the probes of a few methods; None unless two of them have it."""
     styles, evaluation = subject.styles_of(methods), subject.evaluation
+    with_diversity = evaluation.rows.dropna(subset=DIVERSITY)["method"]
+    if with_diversity[with_diversity.isin(list(styles))].nunique() < 2:
+        return None
     text += " Median and 25th to 75th percentile over the trials of an object at every step."
-    picture, missing = drawn(lambda: picture_over_probes(evaluation.rows, styles, name))
+    picture = picture_over_probes(evaluation.rows, styles, name)
     rows = evaluation.last_half
     rows = rows[rows["method"].isin(list(styles))]
     heading = "PD in mm² by object, of these methods"
     table = method_table(heading, rows, "object", styles, note=LAST_HALF)
-    return Section(name, title, text, picture, missing, (table,))
+    return Section(name, title, text, picture, tables=(table,))
 
 
 def picture_over_probes(rows: pd.DataFrame, styles: Styles, name: str) -> Picture:
-    """A line and a band for every method; NotDrawn where no step of theirs has a PD."""
+    """A line and a band for every method; some step of theirs has a PD."""
     rows = _with_diversity(rows, styles)
     found = spreads(rows, ["object", "method", "step"], DIVERSITY)
     figure, axes = _object_panels(
@@ -115,7 +121,7 @@ def picture_over_probes(rows: pd.DataFrame, styles: Styles, name: str) -> Pictur
 
 
 def picture_of_boxes(rows: pd.DataFrame, styles: Styles, name: str) -> Picture:
-    """A box for every method; NotDrawn where no step of theirs has a PD."""
+    """A box for every method; some step of theirs has a PD."""
     rows = _with_diversity(rows, styles)
     by_object = dict(list(rows.groupby("object")))
     figure, axes = _object_panels(
@@ -134,10 +140,7 @@ def picture_of_boxes(rows: pd.DataFrame, styles: Styles, name: str) -> Picture:
 
 
 def _with_diversity(rows: pd.DataFrame, styles: Styles) -> pd.DataFrame:
-    rows = rows[rows["method"].isin(list(styles)) & rows[DIVERSITY].notna()]
-    if rows.empty:
-        raise NotDrawn("no step of these methods has a PD")
-    return rows
+    return rows[rows["method"].isin(list(styles)) & rows[DIVERSITY].notna()]
 
 
 def _object_panels(

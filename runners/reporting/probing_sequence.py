@@ -42,13 +42,13 @@ _APPROACH = 0.05  # metres of the gripper's way that are drawn before a contact
 _MOVED = 0.005  # metres, less is shaking
 
 
-def probing_sequence(subject: Subject) -> Section:
-    """Of the shown trial."""
+def probing_sequence(subject: Subject) -> Section | None:
+    """Of the shown trial; None where none is recorded, and none was asked for."""
     title, evaluation, sequence = "A probing sequence", subject.evaluation, subject.sequence
     try:
         trial, why = shown_trial(subject)
     except NotDrawn as reason:
-        return Section("sequence", title, "", missing=str(reason))
+        return Section("sequence", title, "", missing=str(reason)) if subject.asks else None
     asked = sequence.methods or _METHODS
     paths = {m: evaluation.recording(trial, m) for m in asked}
     if sequence.methods is None and not any(paths.values()):
@@ -170,7 +170,7 @@ def _draw_contacts(axes: Axes, probes: Sequence[Probe], frame: Frame) -> None:
 
 
 def _direction(path: FloatArray, contact: FloatArray) -> FloatArray:
-    """Task vector (3,) of the gripper's last way (P, 4, 4) to a contact, zero where unknown."""
+    """Unit vector (3,) of the gripper's last way (P, 4, 4) to a contact, zero where unknown."""
     places = path[:, :3, 3]
     if len(places) == 0:
         return np.zeros(3)

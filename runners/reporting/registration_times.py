@@ -6,23 +6,25 @@ from typing import Any
 
 import pandas as pd
 
-from runners.reporting.figures import NotDrawn, Picture, new_figure, positive_scale
-from runners.reporting.section import Section, Styles, Subject, drawn
+from runners.reporting.figures import Picture, new_figure, positive_scale
+from runners.reporting.section import Section, Styles, Subject
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import Cell, Table, number, range_text, table_of
 
 
-def registration_times(subject: Subject) -> Section:
-    """A picture of means, and a table."""
+def registration_times(subject: Subject) -> Section | None:
+    """A picture of means, and a table; None where no registration has a time."""
     times = times_of(subject.evaluation.rows, subject.styles)
-    picture, missing = drawn(lambda: picture_of_times(times, subject.styles))
+    if times.empty:
+        return None
+    picture = picture_of_times(times, subject.styles)
     text = (
         "Wall-clock time of the registration alone on one thread, after a warm-up, over all "
         "trials and steps: bars are means, lines one standard deviation to either side, as far as "
         "the axis goes. Several workers on one machine slow each other down."
     )
     table = table_of_times(times, subject.styles)
-    return Section("times", "Time per registration", text, picture, missing, (table,))
+    return Section("times", "Time per registration", text, picture, tables=(table,))
 
 
 def times_of(rows: pd.DataFrame, styles: Styles) -> pd.DataFrame:
@@ -52,9 +54,7 @@ def table_of_times(times: pd.DataFrame, styles: Styles) -> Table:
 
 
 def picture_of_times(times: pd.DataFrame, styles: Styles) -> Picture:
-    """Mean and standard deviation; NotDrawn where no registration was timed."""
-    if times.empty:
-        raise NotDrawn("no registration has a time")
+    """Mean and standard deviation."""
     figure = new_figure(1.2 + 0.42 * len(times))
     axes = figure.add_subplot()
     floor = max(0.5 * times["least"].min(), 1e-3)

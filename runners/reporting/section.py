@@ -45,6 +45,11 @@ class Subject:
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
     baseline: str | None = None  # a method, or policy, to compare all others with
 
+    @property
+    def asks(self) -> bool:
+        """Whether pictures of a single trial were asked for."""
+        return self.sequence != SequenceConfig()
+
     @cached_property
     def styles(self) -> Styles:
         """All methods in the order in which figures and tables have them, with their looks."""

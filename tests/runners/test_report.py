@@ -172,47 +172,51 @@ def test_figures_are_files_of_a_format_the_same_each_time_with_the_evaluations_n
         files = sorted((tmp_path / name).iterdir())
         contents.append([path.read_bytes() for path in files if path.suffix == f".{kind}"])
     assert contents[0] == contents[1]
-    assert len(contents[0]) == 4
+    assert len(contents[0]) == 3
     assert {path.suffix for path in files} == {f".{kind}", ".csv", ".html", ".md"}
     assert all(content.startswith(begins) for content in contents[0])
     if kind == "svg":
-        assert b"<!-- Plausible diversity by object and method, $own$ 1 -->" in contents[0][1]
+        assert b"<!-- Plausible diversity by object and method, $own$ 1 -->" in contents[0][0]
     sources = [
         attributes["src"] or ""
         for tag, attributes in page_of(tmp_path / "first").tags
         if tag == "img"
     ]
-    assert [source.split(";")[0] for source in sources] == [f"data:{on_page}"] * 4
+    assert [source.split(";")[0] for source in sources] == [f"data:{on_page}"] * 3
     text = (tmp_path / "again" / "report.md").read_text("utf-8")
     assert f"](pd_boxes.{kind})" in text
     assert f"format={kind}" in text.split("How it was made")[1]
 
 
 @pytest.mark.parametrize(
-    ("rows", "drawn"),
+    ("rows", "sections"),
     [
         ([], []),
         ([row("can", 0, "chsel", 4) | {"status": "failed: no reason"}], []),
         (
             [row("can", 0, "chsel", 4, diversity=0.0, seconds=0.0)],
-            ["pd_boxes.png", "pd_over_probes.png", "times.png", "medial.png"],
+            ["over-probes", "boxes", "times"],
         ),
-        ([row("can", 0, "our own @#$1", 4, seconds=2.0)], ["times.png"]),
+        (
+            [row("can", 0, name, 4, diversity=0.0) for name in ("cvo", "icp")],
+            ["over-probes", "boxes", "cvo"],
+        ),
+        ([row("can", 0, "our own @#$1", 4, seconds=2.0)], ["times"]),
     ],
-    ids=["nothing", "all failed", "one zero", "no PD"],
+    ids=["nothing", "all failed", "one zero", "no time", "no PD"],
 )
-def test_pictures_that_cannot_be_drawn_say_why(tmp_path: Path, rows: list, drawn: list) -> None:
+def test_there_are_only_sections_of_what_the_rows_have(
+    tmp_path: Path, rows: list, sections: list
+) -> None:
     write_evaluation(tmp_path, rows)
     done = run(report.main, str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
-    found = {path.name for path in (tmp_path / "report").glob("*.png")}
-    assert found == set(drawn)
-    html = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
-    reasons = html.count('<p class="missing">No picture: ')
-    assert reasons == done.stdout.count("no picture of ") == len(PICTURES) - len(drawn)
-    assert "experiment=paper_qd" in html
-    assert "there are no recordings" in html
-    page_of(tmp_path / "report")
+    assert "no picture" not in done.stdout
+    page = page_of(tmp_path / "report")
+    names = [attributes["id"] for tag, attributes in page.tags if tag == "section"]
+    assert names == ["what-was-run", *sections, "made"]
+    done = run(report.main, str(tmp_path), "sequence.view=xy")
+    assert done.stdout.count("there are no recordings") == 2  # as they were asked for
 
 
 def test_settings_of_the_sequence_choose_trial_methods_and_steps(
