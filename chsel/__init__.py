@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 if os.path.exists(os.path.join(os.path.dirname(__file__), "wrapper.py")):  # a file of theirs
     raise ImportError(
-        "package chsel of PyPI is installed beside this one, chsel-replay, and files of both are "
-        "mixed, as both are imported as chsel; to mend it: pip uninstall -y chsel chsel-replay, "
-        "and install chsel-replay again (each needs an environment of its own)"
+        f"the package chsel in {os.path.dirname(__file__)} is not this project's, or has files of "
+        "PyPI's chsel among its own, as both have one name; to mend it: pip uninstall -y chsel "
+        "chsel-replay, and install this project again, in an environment of its own"
     )
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from pathlib import Path
 THEIRS = "wrapper.py"  # a file of the published package that ours does not have
 OURS = "api.py"
 WRONG_PACKAGE = (
-    "package chsel of PyPI is installed beside this one, chsel-replay, and files of both are "
-    "mixed, as both are imported as chsel; to mend it: pip uninstall -y chsel chsel-replay, "
-    "and install chsel-replay again (each needs an environment of its own)"
+    "the package chsel in {} is not this project's, or has files of PyPI's chsel among its own, as "
+    "both have one name; to mend it: pip uninstall -y chsel chsel-replay, and install this project "
+    "again, in an environment of its own"
 )
 
 
@@ -32,8 +32,9 @@ def begin() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     if sys.argv[:1] != ["-m"]:
         os.environ["PYTHONSAFEPATH"] = "1"
-    if not chsel_is_ours():
-        sys.stderr.write(f"error: {WRONG_PACKAGE}\n")
+    places = _places_of_chsel()
+    if not is_ours(places):
+        sys.stderr.write(f"error: {WRONG_PACKAGE.format(places[0] if places else 'no folder')}\n")
         sys.exit(2)
 
 
@@ -57,12 +58,15 @@ def importing() -> Iterator[None]:
         ready()
 
 
-def chsel_is_ours() -> bool:
-    """Whether the package that `import chsel` finds is this project's, and whole."""
-    spec = find_spec("chsel")  # finds it, and imports nothing
-    folders = spec.submodule_search_locations if spec else None
-    places = [Path(folder) for folder in folders or ()]
+def is_ours(places: list[Path]) -> bool:
+    """Whether a package in these folders is this project's chsel, and whole."""
     return any(_is_file(places, OURS)) and not any(_is_file(places, THEIRS))
+
+
+def _places_of_chsel() -> list[Path]:
+    """The folders of the package that `import chsel` finds; it is not imported."""
+    spec = find_spec("chsel")
+    return [Path(folder) for folder in (spec.submodule_search_locations if spec else None) or ()]
 
 
 def package_version(package: str = "chsel-replay") -> str:

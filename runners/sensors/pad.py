@@ -245,7 +245,7 @@ class Pad:
         return True
 
     def _normals(self, depth: FloatArray) -> FloatArray:
-        """Task normals (H, W, 3) of a depth image's surface, towards the camera; 0 if unknown."""
+        """Unit normals (H, W, 3) of a depth image's surface, towards the camera; 0 if unknown."""
         points = self._camera.back_project(depth)
         normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
         away = (normals * points).sum(axis=-1, keepdims=True) > 0.0

@@ -202,6 +202,6 @@ class Faults:
 
 
 def _directions(stream: np.random.Generator, count: int) -> FloatArray:
-    """Task vectors (count, 3), uniform over directions."""
+    """Unit vectors (count, 3), uniform over directions."""
     drawn = normals(stream, (count, 3))
     return drawn / np.sqrt((drawn**2).sum(axis=1, keepdims=True))

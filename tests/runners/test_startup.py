@@ -179,14 +179,15 @@ def test_the_published_package_in_our_place_is_named(tmp_path: Path) -> None:
     for words in (["runners.probe"], ["runners.report", "--help"], ["replay", "info", "x"]):
         done = ran(words, tmp_path, "")
         assert (done.returncode, done.stdout) == (2, "")
-        assert done.stderr == f"error: {WRONG_PACKAGE}\n"
+        assert done.stderr == f"error: {WRONG_PACKAGE.format(theirs)}\n"
 
 
 def test_files_of_the_published_package_among_ours_are_named(tmp_path: Path) -> None:
     shutil.copytree(REPOSITORY / "chsel", tmp_path / "chsel")
     (tmp_path / "chsel" / "wrapper.py").touch()
     done = ran(["replay", "info", "x.mcap"], tmp_path, "")
-    assert (done.returncode, done.stderr) == (2, f"error: {WRONG_PACKAGE}\n")
+    told = WRONG_PACKAGE.format(tmp_path / "chsel")
+    assert (done.returncode, done.stderr) == (2, f"error: {told}\n")
     code = "try:\n    import chsel\nexcept ImportError as error:\n    print(error)"
     (tmp_path / "library.py").write_text(code)
-    assert ran(["library"], tmp_path, "").stdout == f"{WRONG_PACKAGE}\n"
+    assert ran(["library"], tmp_path, "").stdout == f"{told}\n"
