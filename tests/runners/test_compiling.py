@@ -164,7 +164,7 @@ def test_nothing_is_said_where_nothing_is_compiled(capsys: pytest.CaptureFixture
 def test_the_console_numbers_probes_as_the_recording_on_eighty_columns(
     points: tuple[str, ...], tmp_path: Path
 ) -> None:
-    done = run(probe.main, *points, *QUICK, f"logs={tmp_path}", columns=80)
+    done = run(probe.main, *points, "method=chsel", *QUICK, f"logs={tmp_path}", columns=80)
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     assert lines[1] == "probes 0 to 2, numbered as the steps of the recording"
