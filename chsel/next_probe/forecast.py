@@ -29,6 +29,7 @@ class _Gains(NamedTuple):
     # (A,), metres: root mean square distance of the surface in the pose that shows the outcome
     # from that in a pose drawn from what is left of the belief after it
     expected_spread: FloatArray
+    loss: FloatArray  # (A,), metres: the mean of the same distance, for its root mean square
     surviving: FloatArray  # (A,): expected weight of the poses that the outcome does not rule out
 
 
@@ -81,13 +82,13 @@ class Forecast:
     def gains(self) -> _Gains:
         """What is gained by each action."""
         count = len(self.problem.actions)
-        gains = _Gains(np.zeros(count), np.full(count, self.spread), np.ones(count))
-        weights, squares = np.array(self.problem.belief.weights), self.distances**2
+        gains = _Gains(np.zeros(count), np.empty(count), np.empty(count), np.ones(count))
+        weights, distances = np.array(self.problem.belief.weights), self.distances
         contacts = self.first  # before threads begin, which must not wait for each other
         size = len(weights)
 
         def run(first: int, last: int, scratch: Any) -> None:
-            overlap(contacts, weights, squares, self.noise, gains, scratch, (first, last))
+            overlap(contacts, weights, distances, self.noise, gains, scratch, (first, last))
 
         spread(run, count, lambda: np.empty((4, size)), least=20)
         return gains
@@ -99,7 +100,7 @@ class Forecast:
 
 @compiled
 def overlap(
-    first: Any, weights: Any, squares: Any, noise: Any, gains: Any, scratch: Any, some: Any
+    first: Any, weights: Any, distances: Any, noise: Any, gains: Any, scratch: Any, some: Any
 ) -> None:
     """Fill `gains` of some actions (first, last) from how alike their outcomes are.
 
@@ -110,10 +111,10 @@ def overlap(
     """
     count = len(weights)
     scale = 1.0 / (8.0 * noise * noise)
-    alike, alive, far = scratch[0], scratch[1], scratch[2]
+    alike, alive, far, farther = scratch[0], scratch[1], scratch[2], scratch[3]
     for a in range(some[0], some[1]):
         for i in range(count):
-            alike[i], alive[i], far[i] = weights[i], weights[i], 0.0
+            alike[i], alive[i], far[i], farther[i] = weights[i], weights[i], 0.0, 0.0
         for i in range(count):
             hit = first.travel[i, a] < np.inf
             for j in range(i + 1, count):
@@ -133,14 +134,19 @@ def overlap(
                 alike[j] += weights[i] * b
                 alive[i] += weights[j] * g
                 alive[j] += weights[i] * g
-                far[i] += weights[j] * g * squares[i, j]
-                far[j] += weights[i] * g * squares[i, j]
-        information, left, surviving = 0.0, 0.0, 0.0
+                d = distances[i, j]
+                far[i] += weights[j] * g * d
+                far[j] += weights[i] * g * d
+                farther[i] += weights[j] * g * d * d
+                farther[j] += weights[i] * g * d * d
+        information, left, loss, surviving = 0.0, 0.0, 0.0, 0.0
         for i in range(count):
             if weights[i] > 0.0:
                 information -= weights[i] * log(alike[i])
-                left += weights[i] * far[i] / alive[i]
+                left += weights[i] * farther[i] / alive[i]
+                loss += weights[i] * far[i] / alive[i]
                 surviving += weights[i] * alive[i]
         gains.information[a] = max(information, 0.0)
         gains.expected_spread[a] = np.sqrt(left)
+        gains.loss[a] = loss
         gains.surviving[a] = surviving

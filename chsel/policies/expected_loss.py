@@ -10,6 +10,7 @@ from chsel.next_probe.decision_problem import DecisionProblem
 from chsel.next_probe.forecast import Forecast
 from chsel.numerics.arrays import FloatArray
 from chsel.policies.policy import ConfiguredPolicy, PolicySettings
+from chsel.problem.outline import in_order
 
 
 @dataclass(frozen=True)
@@ -18,10 +19,12 @@ class ExpectedLossSettings(PolicySettings):
 
 
 class ExpectedLoss(ConfiguredPolicy[ExpectedLossSettings]):
-    """Rates actions by how much smaller they make the spread of the belief, metres."""
+    """Rates actions by how much smaller they make the mean distance of two surfaces, metres."""
 
     settings_class = ExpectedLossSettings
 
     def rate(self, problem: DecisionProblem, forecast: Forecast) -> FloatArray:
-        """Expected decrease (A,) of the belief's spread, metres; 0 where it would grow."""
-        return np.maximum(forecast.spread - forecast.gains.expected_spread, 0.0)
+        """Expected decrease (A,) of the mean distance of two surfaces; 0 where it would grow."""
+        weights = problem.belief.weights
+        loss = float(in_order(weights * in_order(weights * forecast.distances)))
+        return np.maximum(loss - forecast.gains.loss, 0.0)

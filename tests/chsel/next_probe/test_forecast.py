@@ -96,13 +96,15 @@ def test_information_is_that_of_the_formula() -> None:
         inner = np.log(np.einsum("j,ija->ia", weights, alike))
     expected = -np.einsum("i,ia->a", weights, np.where(weights[:, None] > 0.0, inner, 0.0))
     left = weights[:, None] * alike**2 / np.einsum("j,ija->ia", weights, alike**2)[:, None]
-    squares = np.einsum("i,ija,ij->a", weights, left, Forecast(problem, NOISE).distances ** 2)
+    distances = Forecast(problem, NOISE).distances
+    loss, squares = (np.einsum("i,ija,ij->a", weights, left, distances**n) for n in (1, 2))
     surviving = np.einsum("i,ija,j->a", weights, alike**2, weights)
     gains = Forecast(problem, NOISE).gains
     assert (expected > 0.5).sum() >= 2
     assert gains.information == pytest.approx(expected, abs=1e-9)
     assert gains.surviving == pytest.approx(surviving, abs=1e-9)
     assert gains.expected_spread == pytest.approx(np.sqrt(squares), abs=1e-9)
+    assert gains.loss == pytest.approx(loss, abs=1e-9)
 
 
 @pytest.mark.parametrize("weight", [0.5, 0.9, 1.0])

@@ -52,13 +52,13 @@ def test_the_action_between_two_places(name: str, best: int) -> None:
     ("name", "certain"),
     [
         ("information", np.log(2.0)),
-        ("expected_loss", None),  # all of the spread
+        ("expected_loss", None),  # d / 2, all of it; the spread of two poses is d / sqrt(2)
         ("hypothesis_pruning", 0.5),
     ],
 )
 def test_what_tells_two_poses_apart_is_worth_most(name: str, certain: float | None) -> None:
     decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES)))
-    certain = decision.spread if certain is None else certain
+    certain = decision.spread / np.sqrt(2.0) if certain is None else certain
     assert decision.score[:3] == pytest.approx([certain] * 3, rel=0.06)
     assert decision.score[3] == pytest.approx(0.0, abs=1e-12)
     agreed = build_policy(name).decide(ball_problem(TWO[[0, 0]], along_x(PLACES)))
