@@ -69,6 +69,7 @@ class RerunRecorder(Recorder):
         self._search = SearchPlot(self._stream)
         self._decisions = Decisions(self._stream)
         self._started: events.SessionStarted | None = None
+        self._known = 0  # points of known signed distance in the last problem
         self._early: list[events.Probe | events.Logged] = []  # before the first registration
         self._follow = live or follow
         self._archive_frame: Frame | None = USUAL_ARCHIVE
@@ -139,8 +140,10 @@ class RerunRecorder(Recorder):
         if event.topic in NUMBERS:
             for name, value in step_numbers(event).items():
                 self._curves.add_measured(name, value)
-        if isinstance(event, events.Measured) and (text := verdict_markdown(event.values)):
-            self._stream.log("verdict", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        if isinstance(event, events.Measured):
+            text = verdict_markdown(event.values, self._known)
+            if text:
+                self._stream.log("verdict", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     @_draw.register
     def _(self, event: events.SessionStarted) -> None:
@@ -186,6 +189,7 @@ class RerunRecorder(Recorder):
 
     @_draw.register
     def _(self, event: events.ProblemPosed) -> None:
+        self._known = len(event.problem.points.known)
         if not self._clock.registering:
             self._begin_registrations()
         self._clock.start_registration()

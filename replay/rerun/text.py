@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from chsel.problem.noise import FREEDOMS
 from chsel.problem.registration_problem import VERDICTS, Trust
 from replay.events import SessionStarted
 
@@ -45,14 +46,17 @@ def session_markdown(started: SessionStarted) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def verdict_markdown(values: Mapping[str, float]) -> str:
-    """How far to trust a result, by its measured values: the verdict large; "" without one."""
+def verdict_markdown(values: Mapping[str, float], known: int) -> str:
+    """How far to trust a result, by its measured values: the verdict large; "" without one.
+
+    known: the number of points of known signed distance.
+    """
     names = ("estimated_noise", "outlier_share", "misfit", "modes", "set_spread", "verdict")
     noise, outliers, misfit, modes, spread, verdict = (values.get(n, math.nan) for n in names)
     if verdict not in range(len(VERDICTS)) or not math.isfinite(modes):
         return ""
-    named = VERDICTS[int(verdict)]
-    trust = Trust(noise, outliers, misfit, int(modes), spread, named, redundancy=1)  # not recorded
+    named, redundancy = VERDICTS[int(verdict)], max(known - FREEDOMS, 0)
+    trust = Trust(noise, outliers, misfit, int(modes), spread, named, redundancy)
     _, _, reasons = str(trust).partition("(")
     return f"# {trust.verdict}\n\n{reasons.rstrip(')')}\n"
 

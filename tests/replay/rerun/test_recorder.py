@@ -47,6 +47,7 @@ from replay.recorder import BackgroundRecorder
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.hypotheses import LEVELS, MOST
 from replay.rerun.rerun_recorder import RerunRecorder
+from replay.rerun.text import verdict_markdown
 from tests.tools.rrd_rows import (
     Row,
     at_probe,
@@ -394,7 +395,9 @@ def test_the_verdict_is_a_text_of_its_own(tmp_path: Path) -> None:
     told = [started(), *(Measured(step, values) for step, values in enumerate(numbers))]
     (row,) = read(write(tmp_path / "session.rrd", told))["/verdict"]
     reasons = "3 modes, spread 4.2 mm, noise 0.5 mm, 2 % outliers, misfit 1.5 noise levels"
-    assert row[1]["TextDocument:text"] == [f"# several modes\n\n{reasons}\n"]
+    few = ": no evidence, a pose can fit so few contacts exactly"
+    assert row[1]["TextDocument:text"] == [f"# several modes\n\n{reasons}{few}\n"]
+    assert verdict_markdown(trust.numbers, 7) == f"# several modes\n\n{reasons}\n"
 
 
 def test_without_a_true_pose_no_object_is_drawn(tmp_path: Path) -> None:
