@@ -136,7 +136,7 @@ def test_how_far_a_result_is_trusted_is_computed_again(write: Write) -> None:
     method = recorded_method(read_recording(DESCENT)).method
     events = measured_again(events_of(DESCENT), method)
     places = [i for i, event in enumerate(events) if isinstance(event, Measured)]
-    for change, place in zip(({}, {"verdict": 3.5}, {"modes": 0.0}, {}), places, strict=True):
+    for change, place in zip(({}, {"verdict": 3.5}, {"modes": 9.0}, {}), places, strict=True):
         event = events[place]
         assert isinstance(event, Measured)
         events[place] = Measured(event.step, {**event.values, **change})
@@ -148,7 +148,7 @@ def test_how_far_a_result_is_trusted_is_computed_again(write: Write) -> None:
     assert [verdict.outcome for verdict in found] == [EQUAL, DIFFERS, DIFFERS, DIFFERS]
     assert {verdict.stage for verdict in found[1:]} == {"the measured values"}
     assert found[1].differences[0].startswith("measured verdict: 3.5 -> ")
-    assert found[2].differences[0].startswith("measured modes: 0.0 -> ")
+    assert found[2].differences[0].startswith("measured modes: 9.0 -> ")
     assert found[3].differences[0].startswith("measured outlier_share: absent -> ")
 
 

@@ -173,9 +173,9 @@ def test_the_console_numbers_probes_as_the_recording_on_eighty_columns(
     rows = [line.split() for line in lines if re.match(r" +\d+ +\d+ +\d", line)]
     assert [row[0] for row in rows] == ["0", "1", "2"]
     paths = [line for line in lines if str(tmp_path) in line]
-    assert len(paths) == 2
+    assert len(paths) == 3  # the folder, how to look at it, how to export from it
     assert all(len(line) <= 80 for line in lines if line not in paths)
-    assert all(line.startswith(("/", "rerun", ".venv")) for line in paths)
+    assert all(line.startswith(("/", "rerun", "python", ".venv")) for line in paths)
 
 
 def test_a_first_session_begins_at_once_and_its_times_hold_no_compiling(

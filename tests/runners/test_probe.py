@@ -130,7 +130,7 @@ def test_a_run_ends_with_the_best_pose_and_the_command_that_exports_all(
         np.testing.assert_allclose(row["world_from_object"], world[0], atol=1e-12)
         modes = world[[*trust.best_of_modes]]
         np.testing.assert_allclose(row["modes_world_from_object"], modes, atol=1e-12)
-        assert len(modes) == trust.modes
+        assert len(modes) == max(trust.modes, 1)
     np.testing.assert_allclose(shown_pose(done, 2), rows[2]["world_from_object"], atol=2e-4)
     command = shlex.split(after(done, "all hypotheses as arrays:")[0])
     monkeypatch.chdir(tmp_path)
@@ -397,4 +397,4 @@ def test_real_measurements_are_registered(
     problem = recording.problem(step)
     moved = apply(recording.hypotheses(step).object_from_world[0], problem.points.known)
     sdf, _ = problem.sdf.at(moved, lookup="trilinear")
-    assert float(sdf.abs().mean()) < limit
+    assert float(np.abs(sdf).mean()) < limit

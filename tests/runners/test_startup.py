@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from chsel.numerics.threads import core_count
 from replay.startup import WRONG_PACKAGE
 from replay.verbs import VERBS
 
@@ -154,7 +153,6 @@ def test_ctrl_c_stays_ignored_where_it_was(tmp_path: Path) -> None:
     assert "x.mcap does not exist" in done.stderr
 
 
-@pytest.mark.skipif(core_count() < 2, reason="one core starts no other process")
 def test_processes_of_a_console_script_import_nothing_from_the_current_folder(
     tmp_path: Path,
 ) -> None:
@@ -165,7 +163,7 @@ def test_processes_of_a_console_script_import_nothing_from_the_current_folder(
     script.write_text(HELPED)
     for name in ("numba", "multiprocessing"):
         (folder / f"{name}.py").write_text(f"open('{name} was executed', 'w')\n")
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "2"}
     subprocess.run([sys.executable, script], cwd=folder, env=environment, check=True)
     assert sorted(path.name for path in folder.iterdir()) == ["multiprocessing.py", "numba.py"]
 

@@ -13,8 +13,8 @@ import pytest
 
 from chsel.errors import SettingError
 from chsel.methods.anchored.anchored import Anchored
-from chsel.problem.outline import outline_distances
-from chsel.problem.poses import Poses, inverse
+from chsel.problem.outline import outline_in_world
+from chsel.problem.poses import Poses, apply, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe, report
@@ -85,9 +85,18 @@ def test_every_probe_has_a_row_that_the_recording_confirms(folder: Path) -> None
 
 
 def mean_error(start: Any, poses: np.ndarray) -> np.ndarray:
-    """Distances (B,) of poses (B, 4, 4) from the true one, by the table of all distances."""
-    every = np.concatenate([poses, inverse(start.world_from_object[None])])
-    return outline_distances(start.sdf, Poses.of(every))[-1, :-1]
+    """Distances (B,) of poses (B, 4, 4) from the true one, over points of both surfaces."""
+    truth = inverse(start.world_from_object[None])
+    places = outline_in_world(start.sdf, Poses.of(np.concatenate([poses, truth])))
+
+    def squares(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        return start.sdf.at(apply(pose, points), lookup="trilinear")[0] ** 2
+
+    both = [
+        [squares(truth[0], there), squares(pose, places[-1])]
+        for pose, there in zip(poses, places[:-1], strict=True)
+    ]
+    return np.sqrt(np.mean(both, axis=(1, 2)))
 
 
 def check_decision(row: dict[str, Any], recording: Any) -> None:

@@ -57,7 +57,7 @@ _OBJECTS = {  # with the preset of CHSEL, CHSEL with CMA-ME, gradient descent
 _LARGE = {f"{name}_{method}" for name in ("drill", "hammer") for method in _BASELINES}
 _LARGE -= {"drill_svgd", "hammer_icp"}
 _FULL = ("chsel", "chsel_cma_me", "gradient_descent", "svgd", "cvo", "cvo_no_free_space")
-_FULL += (*_MEDIAL, "anchored")  # not brief in any other
+_FULL += (*_MEDIAL, "anchored", "icp")  # not brief in any other
 
 
 def cases() -> dict[str, list[str]]:

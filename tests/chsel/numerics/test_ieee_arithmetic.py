@@ -40,11 +40,11 @@ def test_no_registration_runs_with_another_rounding() -> None:
     ball = ball_grid(0.025, 0.01, 4)
     points = {"surface": np.array([[0.025, 0.0, 0.0]]), "free": np.array([[0.1, 0.0, 0.0]])}
     settings = {"descent": {"restarts": 1, "iterations": 1}, "emitter": {"iterations": 1}}
-    chsel.register(ball, **points, settings=settings)
+    chsel.register(ball, **points, method="chsel", settings=settings)
     library = ctypes.CDLL(None)
     library.fesetround(MODES["up"])
     try:
         with pytest.raises(EngineError, match="does not round"):
-            chsel.register(ball, **points, settings=settings)
+            chsel.register(ball, **points, method="chsel", settings=settings)
     finally:
         library.fesetround(NEAREST)

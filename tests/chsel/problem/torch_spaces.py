@@ -27,7 +27,11 @@ def decode(space: SearchSpace, vectors: Tensor) -> tuple[Tensor, Tensor]:
 def _gram_schmidt(rows: Tensor) -> Tensor:
     """Rotations (B, 3, 3) of raw 6-D vectors (B, 6) by Gram-Schmidt on two rows (Zhou et al.)."""
     first, second = rows[:, 0:3], rows[:, 3:6]
-    b1 = first / first.norm(dim=1, keepdim=True)
+    b1 = _unit(first)
     b2 = second - (b1 * second).cumsum(dim=1)[:, 2:] * b1
-    b2 = b2 / b2.norm(dim=1, keepdim=True)
+    b2 = _unit(b2)
     return torch.stack([b1, b2, torch.linalg.cross(b1, b2)], dim=1)
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-12)
