@@ -10,7 +10,7 @@ import numpy as np
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.objective import Objective
-from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
+from chsel.methods.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.gradient_descent import DescentSettings, descend
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray

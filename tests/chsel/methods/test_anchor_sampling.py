@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from chsel.methods.anchored.anchor_sampling import (
-    AnchorSampler,
-    AnchorSettings,
-    most_informative_first,
-)
+from chsel.methods.anchor_kernels import NO_POSE, UNIT, Box32, CoarseScore, keep_best
+from chsel.methods.anchor_sampling import AnchorSampler, AnchorSettings, most_informative_first
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints
-from chsel.problem.poses import apply, axis_angle, compose
+from chsel.problem.poses import apply, axis_angle, compose, random_rotations, rotated
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.search_space import PlaneSettings, origin_bounds, search_space
 from chsel.problem.streams import StreamKey
@@ -31,6 +30,7 @@ def drawn(
     most: int = 3000,
     plane: PlaneSettings | None = None,
     index: int = 0,
+    left_out: int = 0,
 ) -> FloatArray:
     """The best poses (K, 12); all of them where most is as many."""
     problem = RegistrationProblem(
@@ -38,7 +38,7 @@ def drawn(
     )
     space, known = search_space(plane, BOX_GRID), most_informative_first(points)
     sampler = AnchorSampler(problem, known, space, settings)
-    return sampler.best(samples, most, index=index).numbers
+    return sampler.best(samples, most, index=index, left_out=left_out).numbers
 
 
 def distances(poses: FloatArray, points: FloatArray, lookup: str = "trilinear") -> FloatArray:
@@ -92,14 +92,15 @@ def test_rotations_are_rigid_and_objects_within_bounds() -> None:
 def test_the_best_are_the_first_of_all_and_do_not_depend_on_threads() -> None:
     free = np.random.default_rng(0).uniform(-0.1, 0.5, (3000, 3))
     points = KnownPoints(free=free, known=CONTACTS)
-    every = drawn(points, AnchorSettings(), 12_000, 12_000)
+    count = 70_000  # more than are drawn at once
+    every = drawn(points, AnchorSettings(), count, count)
     with threads(1):
-        one = drawn(points, AnchorSettings(), 12_000, 40)
+        one = drawn(points, AnchorSettings(), count, 40)
     with threads(2):
-        two = drawn(points, AnchorSettings(), 12_000, 40)
+        two = drawn(points, AnchorSettings(), count, 40)
     np.testing.assert_array_equal(one, two)
     np.testing.assert_array_equal(one, every[:40])
-    assert np.abs(drawn(points, AnchorSettings(), 12_000, 40, index=1) - one).max() > 1e-3
+    assert np.abs(drawn(points, AnchorSettings(), count, 40, index=1) - one).max() > 1e-3
 
 
 def test_the_best_fit_better_than_the_others() -> None:
@@ -151,3 +152,77 @@ def test_poses_come_in_the_order_of_their_plain_scores() -> None:
     assert np.ptp(scores) > 0.05
     assert np.corrcoef(scores, np.sort(scores))[0, 1] > 0.97  # the kernel takes some nodes
     assert (scores[:30] < np.quantile(scores, 0.1)).all()
+
+
+@pytest.mark.parametrize("left_out", [0, 1])
+def test_kept_are_the_lowest_scores(left_out: int) -> None:
+    random = np.random.default_rng(0)
+    count, most = 3000, 30
+    grid, voxels = box((6, 5, 4), 20.0), box((4, 6, 5), 10.0)
+    score = CoarseScore(
+        lower=single(random, 0.0, 0.1, 3),
+        upper=single(random, 0.6, 0.7, 3),
+        grid=grid,
+        values=random.integers(-400, 400, 6 * 5 * 4).astype(np.int16),
+        contacts=single(random, -0.1, 0.5, 3, 7),
+        known_sdf=single(random, -200.0, 200.0, 7),
+        reach=np.float32(900.5),
+        left_out=left_out,
+        inside=single(random, 0.0, 0.2, 40, 3),
+        weights=random.integers(0, 300, 40).astype(np.int32),
+        voxels=voxels,
+        is_free=random.random(4 * 6 * 5) < 0.5,
+    )
+    turns = random_rotations(random, count).astype(np.float32)
+    shifts = single(random, -0.5, 0.5, count, 3)
+    heap = np.full(most, NO_POSE)
+    poses = np.concatenate([turns.reshape(-1, 9), shifts], axis=1)
+    keep_best(score, poses, 5, heap)
+    # The same in plain numpy, all sums in the order of the kernel.
+    steps = (
+        rotated(turns[:, None], score.contacts.T) + shifts[:, None] - grid.first
+    ) * grid.inverse
+    within = np.clip(steps, 0, grid.most)
+    beyond = np.abs(steps - within)
+    beyond = (beyond[..., 0] + beyond[..., 1] + beyond[..., 2]) * (1 / grid.inverse / UNIT)
+    off = np.abs(score.values[nodes(grid, within)] + (beyond - score.known_sdf))
+    costs = np.minimum(off, score.reach).astype(np.int64)
+    back = turns.transpose(0, 2, 1) * voxels.inverse
+    start = -rotated(back, shifts) - np.array(voxels.first) * voxels.inverse
+    places = np.clip(rotated(back[:, None], score.inside) + start[:, None], 0, voxels.most)
+    totals = costs.sum(axis=1) - left_out * costs.max(axis=1)
+    totals += (score.is_free[nodes(voxels, places)] * score.weights).sum(axis=1)
+    origins = -rotated(turns.transpose(0, 2, 1), shifts)
+    is_in = ((origins >= score.lower) & (origins <= score.upper)).all(axis=1)
+    assert 0.05 < is_in.mean() < 0.5
+    keys = (totals << 32) + 5 + np.arange(count)
+    np.testing.assert_array_equal(np.sort(heap), np.sort(keys[is_in])[:most])
+
+
+def box(shape: tuple[int, int, int], inverse: float) -> Box32:
+    """A grid that begins at 0.05 m."""
+    first, most = (np.float32(0.05),) * 3, tuple(np.float32(n - 1) for n in shape)
+    across, along = np.int32(shape[1] * shape[2]), np.int32(shape[2])
+    return Box32(first, np.float32(inverse), most, across, along)
+
+
+def single(random: np.random.Generator, low: float, high: float, *shape: int) -> Any:
+    return random.uniform(low, high, shape).astype(np.float32)
+
+
+def nodes(grid: Box32, steps: Any) -> Any:
+    x, y, z = np.moveaxis((steps + np.float32(0.5)).astype(np.int64), -1, 0)
+    return x * grid.across + y * grid.along + z
+
+
+def test_the_worst_contact_can_be_left_out() -> None:
+    """One of six contacts is 80 mm off: the poses come in the order of what the others cost."""
+    contacts = CONTACTS[:6] + np.array([[0.0, 0.0, 0.08]] + [[0.0, 0.0, 0.0]] * 5)
+    points = KnownPoints(known=contacts)
+    poses = drawn(points, AnchorSettings(), 20_000, 300, left_out=1)
+    costs = np.minimum(np.abs(distances(poses, contacts, "nearest")), 0.06)
+    trimmed = costs.sum(axis=1) - costs.max(axis=1)
+    np.testing.assert_allclose(trimmed, np.sort(trimmed), atol=6 * UNIT)
+    others = drawn(points, AnchorSettings(), 20_000, 300)
+    costs = np.minimum(np.abs(distances(others, contacts, "nearest")), 0.06)
+    assert trimmed[0] < (costs.sum(axis=1) - costs.max(axis=1))[0]

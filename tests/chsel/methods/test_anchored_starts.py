@@ -8,7 +8,7 @@ import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
 from chsel.methods import build_method, preset_settings
-from chsel.methods.anchored.anchor_sampling import AnchoredStarts, anchored_starts
+from chsel.methods.anchor_sampling import AnchoredStarts, anchored_starts
 from chsel.methods.chsel import Chsel
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, axis_angle, compose, inverse

@@ -1,0 +1,429 @@
+"""Poses that put the object's surface onto contacts, as starts beside E_0 (Alg. 1, line 1).
+
+Poses are drawn and scored in 32 bits, around the contacts. Arrays of them have the poses last, so
+that numpy goes along them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
+
+import numpy as np
+
+from chsel.cost.cost_settings import uncertain_depth
+from chsel.errors import SettingError
+from chsel.methods.anchor_kernels import NO_POSE, UNIT, Box32, CoarseScore, keep_best
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.threads import spread
+from chsel.numerics.voxels import bounds_of, set_voxels
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import Poses, product, rotated, rotation_matrices
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.search_space import SE2Space, SE3Space, SearchSpace, origin_bounds
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
+from chsel.problem.streams import Purpose, StreamKey
+from chsel.problem.subset import farthest_points
+from chsel.problem.surface import has_surface, surface_points
+
+_MOST_SAMPLES = 100_000_000
+_MOST_KEPT = 100_000
+_SURFACE_POINTS = 400  # of which 80 000 pairs are of all lengths
+_MOST_ANCHORS = 48  # contacts that the surface is put onto: more are close to these
+_MOST_CONTACTS = 32  # that poses are scored by: more are close to these, and take time
+_MOST_ORDERED = 64  # known points that are put in order: no fewer than of both above
+_MOST_INSIDE = 150  # points inside the object that poses are scored by
+_SHARES = 6  # random numbers of a pose, from 0 to 1
+_DRAWN_AT_ONCE = 65_536  # poses whose first shares come from a stream before all second ones, ...
+_PLACED_AT_ONCE = 8192  # so that their arrays stay in a processor's cache
+_SAMPLES_PER_THREAD = 5_000  # fewer take less time than to wake another thread
+_LENGTHS_ALIKE = 0.004  # metres, about half of the distance between surface points
+_LEAST_LENGTH = 0.01  # metres between two contacts that give a direction
+_ROUNDING = 2e-6  # of coordinates in 32 bits, generously
+_FARTHEST = 1e6  # metres: coordinates beyond are taken for it, so that no sum overflows
+_REACH = 0.06  # metres beyond which known points cost no more, as they may be outliers
+_DEEP = 0.3  # of the greatest depth: points inside are at least so deep, as the rest may be noise
+_MOST_NODES = 4000  # of which they are chosen; the time for that grows with them
+_WEIGHT, _BEYOND = 5.0, 20.0  # of their mean depths in free space, all and those beyond tolerance
+_MOST_COST = 2**30  # of all points inside, so that no sum overflows
+_MOST_VOXELS = 20_000_000  # of free space: bytes
+_HALF = np.float32(0.5)
+_FAR = np.float32(0.6)  # from an axis: more than 1 / sqrt(3), so that any direction is far from one
+_SHORTEST_SQUARED = np.float32(1e-9)  # of vectors that give a direction
+_SIGNS = np.array([1, 1, -1, -1, 1, 1], dtype=np.float32)  # of sines in quarters of a turn
+
+
+@dataclass(frozen=True)
+class AnchorSettings(CheckedSettings):
+    """How poses are drawn: on pairs of contacts, on single ones, or uniform in the workspace."""
+
+    pairs: Annotated[float, not_negative] = 0.5  # share with two surface points on a pair's line
+    contacts: Annotated[float, not_negative] = 0.4  # share with one surface point on a contact
+    margin: Annotated[float, not_negative] = 0.15  # of the workspace for object origins, metres
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.pairs + self.contacts > 1.0:
+            raise SettingError(
+                f"pairs and contacts are {self.pairs} and {self.contacts}; accepted: shares whose "
+                "sum is at most 1"
+            )
+
+
+@dataclass(frozen=True)
+class AnchoredStarts(CheckedSettings):
+    """How many poses on contacts CHSEL descends from, beside E_0."""
+
+    samples: Annotated[int, positive, at_most(_MOST_SAMPLES)] = 20_000  # poses that are drawn
+    kept: Annotated[int, positive, at_most(_MOST_KEPT)] = 60  # those of them that score best
+    anchors: AnchorSettings = field(default_factory=AnchorSettings)
+
+
+def anchored_starts(
+    problem: RegistrationProblem, space: SearchSpace, settings: AnchoredStarts, index: int
+) -> Poses:
+    """K poses, best first; none of an object too thin to have a surface on its grid.
+
+    index: of the pass, each of which draws its own.
+    """
+    if not has_surface(problem.sdf):
+        return Poses(np.zeros((0, 12)))
+    known = most_informative_first(problem.points)
+    sampler = AnchorSampler(problem, known, space, settings.anchors)
+    return sampler.best(settings.samples, settings.kept, index=index)
+
+
+def most_informative_first(points: KnownPoints) -> KnownPoints:
+    """The points, with known ones in the order of farthest points.
+
+    So sums over them rule out poses that do not fit after a few.
+    """
+    first = farthest_points(points.known, _MOST_ORDERED)
+    order = np.concatenate([first, np.setdiff1d(np.arange(len(points.known)), first)])
+    return replace(points, known=points.known[order], known_sdf=points.sdf[order])
+
+
+class AnchorSampler:
+    """Draws poses for one problem."""
+
+    def __init__(
+        self,
+        problem: RegistrationProblem,
+        known: KnownPoints,
+        space: SearchSpace,
+        settings: AnchorSettings,
+    ) -> None:
+        """known: the problem's points, see most_informative_first."""
+        self._problem, self._known, self._space, self._settings = problem, known, space, settings
+        lower, upper = problem.workspace.bounds
+        middle = 0.5 * (lower + upper)
+        if len(known.known):  # the median of contacts, so that 32 bits are enough around it
+            median = np.sort(known.known, axis=0)[len(known.known) // 2]
+            middle = np.minimum(np.maximum(median, lower), upper)
+        self._middle = middle
+        lower, upper = origin_bounds(problem.workspace, space, settings.margin)
+        inset = _ROUNDING * (1.0 + np.abs([lower - middle, upper - middle]).max(axis=0))
+        inset = np.minimum(inset, 0.25 * (upper - lower))
+        self._lower = _in_32_bits(lower + inset - middle)
+        self._upper = _in_32_bits(upper - inset - middle)
+        self._free = _free_voxels(problem, settings.margin + problem.sdf.diameter)
+        self._set_anchors()
+
+    def _set_anchors(self) -> None:
+        """Take contacts, and the surface points that can be put onto them."""
+        sdf, known, middle, space = self._problem.sdf, self._known, self._middle, self._space
+        surface, normals, lengths, pairs = sdf.derived("surface pairs", lambda: _surface_pairs(sdf))
+        contacts, values = known.known[:_MOST_ANCHORS], known.sdf[:_MOST_ANCHORS]
+        order, contact_pairs = np.arange(len(surface)), np.zeros((0, 2), dtype=np.int64)
+        if isinstance(space, SE2Space):
+            heights = (surface * space.axis).sum(axis=1)
+            order = np.argsort(heights, kind="stable")
+            wanted = (contacts * space.upward).sum(axis=1) + space.offset
+            spans = _spans(heights[order], wanted, _LENGTHS_ALIKE + np.abs(values))
+            pair_spans = contact_pairs
+        else:
+            spans = np.tile([0, len(surface)], (len(contacts), 1))
+            contact_pairs, pair_spans = _pairs_of_contacts(contacts, values, lengths)
+        met = spans[:, 1] > 0
+        self._surface, self._normals = _in_32_bits(surface.T), _in_32_bits(normals.T)  # (3, Q)
+        self._surface_pairs = pairs  # (2 P,), of indices, by their lengths
+        self._surface_order = order  # (Q,), by heights over a plane
+        self._contacts = _in_32_bits((contacts[met] - middle).T)  # (3, C)
+        self._values = _in_32_bits(values[met])
+        self._contact_spans, self._pair_spans = spans[met].T.copy(), pair_spans.T.copy()  # (2, ...)
+        self._frames = _in_32_bits(_frames(contacts[contact_pairs] - middle).T)  # (12, pairs)
+
+    def best(
+        self,
+        samples: int,
+        most: int,
+        *,
+        index: int = 0,
+        tolerance: float = 0.0,
+        left_out: int = 0,
+    ) -> Poses:
+        """The best of so many random poses by their coarse score: K poses, best first.
+
+        The score is the mean distance of contacts, and depths of points inside in free space. Of
+        equal scores the first is better, so that the result does not depend on threads.
+        most: K at most; fewer where the object is out of its bounds too often. index: of the
+        stream. tolerance: depth in metres up to which points in free space cost little, at least
+        half of a voxel, as voxels are coarse. left_out: 1 for scores without the contact that costs
+        a pose the most, as it may be a contact with another object; else 0.
+        """
+        score, settings = self._coarse_score(tolerance, left_out), self._settings
+        pairs = round(settings.pairs * samples) if self._frames.size else 0
+        anchored = round((settings.pairs + settings.contacts) * samples)
+        ends = np.array([pairs, anchored if self._values.size else pairs])
+        stream = self._problem.key.stream(Purpose.ANCHORS, index)
+        keys, poses = np.zeros(0, dtype=np.int64), dict[int, Any]()
+        for first in range(0, samples, _DRAWN_AT_ONCE):
+            count = min(_DRAWN_AT_ONCE, samples - first)
+            shares = stream.random((_SHARES, count), dtype=np.float32)
+            keys = self._best_keys(score, shares, first, ends, keys, min(most, samples))
+            numbers = keys % 2**32
+            new = np.sort(numbers[numbers >= first])
+            placed = self._placed(shares[:, new - first], new, ends)
+            poses.update(zip(new.tolist(), placed, strict=True))
+        chosen = [poses[number] for number in (keys % 2**32).tolist()]
+        return self._exact(np.array(chosen, dtype=np.float64).reshape(-1, 12))
+
+    def _best_keys(
+        self, score: CoarseScore, shares: Any, first: int, ends: IntArray, keys: IntArray, most: int
+    ) -> IntArray:
+        """Keys of the best, in ascending order, of those before and poses numbered from `first`."""
+        heaps: list[IntArray] = []
+        worst_first = np.concatenate([np.full(most - len(keys), NO_POSE), keys[::-1]])
+
+        def scratch() -> IntArray:
+            heap = worst_first.copy()
+            heaps.append(heap)  # another thread may append its own before this one goes on
+            return heap
+
+        def run(start: int, stop: int, heap: IntArray) -> None:
+            for at in range(start, stop, _PLACED_AT_ONCE):
+                part = slice(at, min(at + _PLACED_AT_ONCE, stop))
+                numbers = np.arange(first + part.start, first + part.stop)
+                keep_best(score, self._placed(shares[:, part], numbers, ends), first + at, heap)
+
+        spread(run, shares.shape[1], scratch, least=_SAMPLES_PER_THREAD)
+        found = np.unique(np.concatenate(heaps))
+        return found[found < NO_POSE][:most]
+
+    def _placed(self, shares: Any, numbers: IntArray, ends: IntArray) -> Any:
+        """Poses (N, 12) from their shares (_SHARES, N), and numbers (N,) in ascending order."""
+        pairs, singles, others = np.split(shares, np.searchsorted(numbers, ends), axis=1)
+        parts = self._on_pairs(pairs), self._on_contacts(singles), self._anywhere(others)
+        return np.concatenate(parts, axis=1).T
+
+    def _on_pairs(self, shares: Any) -> Any:
+        """Poses that put two surface points onto the line of two contacts, turned about it.
+
+        R = G^T F, with the frames' vectors as rows.
+        """
+        pair = _chosen(shares[0], self._pair_spans.shape[1])
+        first, count = self._pair_spans.take(pair, axis=1)
+        at, flip = 2 * (first + _chosen(shares[1], count)), shares[2] < _HALF
+        p = self._surface.take(self._surface_pairs.take(at + flip), axis=1)
+        q = self._surface.take(self._surface_pairs.take(at + ~flip), axis=1)
+        x, y, z = along = _unit(q - p)
+        none = np.zeros_like(x)  # the cross product with an axis that the line is far from
+        a, b, c = across = _unit(np.where(np.abs(x) < _FAR, [none, -z, y], [z, none, -x]))
+        other = np.array([y * c - z * b, z * a - x * c, x * b - y * a])
+        sine, cosine = _sines_cosines(shares[3])
+        turned = np.array([along, cosine * across + sine * other, cosine * other - sine * across])
+        frame = self._frames.take(pair, axis=1)
+        rotation = product(turned.T, frame[:9].reshape(3, 3, -1).transpose(2, 0, 1))
+        return self._poses(rotation, frame[9:], _HALF * (p + q))
+
+    def _on_contacts(self, shares: Any) -> Any:
+        """Poses that put a surface point onto a contact, or one at its distance."""
+        contact = _chosen(shares[0], len(self._values))
+        first, count = self._contact_spans.take(contact, axis=1)
+        at = self._surface_order[first + _chosen(shares[1], count)]
+        outward = self._values[contact] * self._normals.take(at, axis=1)
+        met, contacts = (
+            self._surface.take(at, axis=1) + outward,
+            self._contacts.take(contact, axis=1),
+        )
+        return self._poses(self._rotations(shares), contacts, met)
+
+    def _anywhere(self, shares: Any) -> Any:
+        """Poses that put the object's origin anywhere in its bounds."""
+        origins = self._lower[:, None] + shares[:3] * (self._upper - self._lower)[:, None]
+        return self._poses(self._rotations(shares), origins, np.zeros_like(origins))
+
+    def _rotations(self, shares: Any) -> Any:
+        """Rotations (N, 3, 3) about the plane's axis, or uniform on SO(3) (Shoemake, 1992)."""
+        s, c = _sines_cosines(shares[3])
+        if isinstance(self._space, SE2Space):  # Rodrigues' formula
+            arrays = self._space.arrays
+            rows = [arrays.resting, arrays.turning, arrays.turning_squared]
+            resting, turning, squared = _in_32_bits(np.array(rows))[..., None]
+            rotations = resting + s * turning + (1 - c) * squared
+            return rotations.reshape(3, 3, -1).transpose(2, 0, 1)
+        sine, cosine = _sines_cosines(shares[4])
+        small, large = np.sqrt(1 - shares[5]), np.sqrt(shares[5])
+        return rotation_matrices(np.array([small * c, large * sine, large * cosine, small * s]).T)
+
+    def _poses(self, rotation: Any, points: Any, onto: Any) -> Any:
+        """Poses (12, N) that move points (3, N) onto points of the object: t = q - R p."""
+        shift = onto - rotated(rotation, points.T).T
+        space = self._space
+        if isinstance(space, SE2Space):  # along the plane's axis until a . t = o
+            a, b, c = axis = _in_32_bits(space.axis)
+            offset = _in_32_bits(space.offset + float((space.upward * self._middle).sum()))
+            off = offset - (a * shift[0] + b * shift[1] + c * shift[2])
+            shift = shift + off * axis[:, None]
+        return np.concatenate([rotation.transpose(1, 2, 0).reshape(9, -1), shift])
+
+    def _exact(self, numbers: FloatArray) -> Poses:
+        """Poses in the world from those (K, 12) in 32 bits around its middle."""
+        rigid = SE3Space()
+        turned = rigid.poses(rigid.encode(Poses(numbers)))
+        shift = turned.translations - rotated(turned.rotations, self._middle)
+        poses = Poses(np.concatenate([turned.numbers[:, :9], shift], axis=1))
+        return self._space.poses(self._space.encode(poses))
+
+    def _coarse_score(self, tolerance: float, left_out: int) -> CoarseScore:
+        sdf, known, (first, is_free) = self._problem.sdf, self._known, self._free
+        side = self._problem.free_resolution
+        tolerance = max(tolerance, uncertain_depth(sdf, 0.5 * side))
+        inside, costs = sdf.derived(("inside", tolerance), lambda: _inside(sdf, tolerance))
+        if is_free.size == 1:
+            inside, costs = inside[:0], costs[:0]
+        contacts = known.known[:_MOST_CONTACTS]
+        costs = max(len(contacts), 1) / (max(len(costs), 1) * UNIT) * costs
+        return CoarseScore(
+            lower=self._lower,
+            upper=self._upper,
+            grid=_box(sdf.origin, sdf.resolution, sdf.shape),
+            values=sdf.derived("coarse values", lambda: _in_units(sdf.values)),
+            contacts=_in_32_bits(contacts - self._middle).T.copy(),
+            known_sdf=_in_32_bits(known.sdf[:_MOST_CONTACTS] / UNIT),
+            reach=np.float32(_REACH / UNIT),
+            left_out=left_out,
+            inside=_in_32_bits(inside),
+            weights=np.rint(np.minimum(costs, _MOST_COST / max(len(costs), 1))).astype(np.int32),
+            voxels=_box(first - self._middle, side, is_free.shape),
+            is_free=is_free.reshape(-1),
+        )
+
+
+def _chosen(shares: Any, sizes: Any) -> IntArray:
+    """Which of so many things shares from 0 to 1 choose."""
+    return np.minimum((shares * np.float32(sizes)).astype(np.int64), np.subtract(sizes, 1))
+
+
+def _unit(vectors: Any) -> Any:
+    """Vectors (3, N) of length 1."""
+    x, y, z = vectors
+    return vectors * (1.0 / np.sqrt(np.maximum(x * x + y * y + z * z, _SHORTEST_SQUARED)))
+
+
+def _sines_cosines(shares: Any) -> tuple[Any, Any]:
+    """Sines and cosines of shares of a turn, to about seven digits (Taylor)."""
+    quarters = 4 * shares
+    nearest = (quarters + _HALF).astype(np.int32)
+    r = (quarters - nearest.astype(np.float32)) * np.float32(0.5 * np.pi)
+    z = r * r
+    sine = r + r * z * ((-1 / 5040 * z + 1 / 120) * z - 1 / 6)
+    cosine = 1 + z * (((1 / 40320 * z - 1 / 720) * z + 1 / 24) * z - 1 / 2)
+    odd = (nearest & 1).astype(np.bool_)
+    a, b = np.where(odd, cosine, sine), np.where(odd, sine, cosine)
+    return a * _SIGNS.take(nearest), b * _SIGNS.take(nearest + 1)
+
+
+def _in_32_bits(values: Any) -> Any:
+    return np.clip(values, -_FARTHEST, _FARTHEST).astype(np.float32)
+
+
+def _in_units(metres: FloatArray) -> Any:
+    """Distances in UNITs, flat, 16 bits."""
+    return np.clip(np.rint(metres / UNIT), -32767, 32767).astype(np.int16).reshape(-1)
+
+
+def _box(first: FloatArray, resolution: float, shape: Sequence[int]) -> Box32:
+    """The box of a grid of nodes (nx, ny, nz) whose first node is at `first` (3,)."""
+    x, y, z = _in_32_bits(first)
+    a, b, c = (np.float32(count - 1) for count in shape)
+    inverse, (_, along, last) = np.float32(1.0 / resolution), shape
+    return Box32((x, y, z), inverse, (a, b, c), np.int32(along * last), np.int32(last))
+
+
+def _inside(sdf: SdfGrid, tolerance: float) -> tuple[FloatArray, FloatArray]:
+    """Points (P, 3) inside of the object, the deepest first, and costs (P,) of them all, metres."""
+    deep = np.argwhere(sdf.values <= _DEEP * min(float(sdf.values.min()), 0.0))
+    if len(deep) > _MOST_NODES:
+        deep = deep[np.arange(_MOST_NODES) * len(deep) // _MOST_NODES]
+    nodes = deep[farthest_points(deep.astype(np.float64), _MOST_INSIDE)]
+    depths = -sdf.values[tuple(nodes.T)]
+    order = np.argsort(-depths, kind="stable")
+    nodes, depths = nodes[order], depths[order]
+    costs = _WEIGHT * depths + _BEYOND * np.maximum(depths - tolerance, 0.0)
+    return sdf.origin + nodes * sdf.resolution, costs
+
+
+def _free_voxels(problem: RegistrationProblem, reach: float) -> tuple[FloatArray, Any]:
+    """Centre (3,) of the first voxel, and which voxels (nx, ny, nz) have a free point.
+
+    Of free points at most `reach` metres beyond the workspace, where the object can be. With a
+    layer of empty voxels around; a single empty one if there are none, or too many.
+    """
+    free, side = problem.points.free, problem.free_resolution
+    lower, upper = problem.workspace.bounds
+    free = free[((free >= lower - reach) & (free <= upper + reach)).all(axis=1)]
+    if len(free):
+        bounds = bounds_of(free)
+        first, counts = bounds[0] - side, np.rint((bounds[1] - bounds[0]) / side) + 3.0
+        if math.prod(counts.tolist()) < _MOST_VOXELS:
+            is_free = np.zeros(counts.astype(np.int64) + 1, dtype=np.bool_)
+            set_voxels(free, first, side, is_free)  # the first is (1, 1, 1) to it
+            return first, is_free[1:, 1:, 1:]
+    return np.zeros(3), np.zeros((1, 1, 1), dtype=np.bool_)
+
+
+def _frames(pairs: FloatArray) -> FloatArray:
+    """Of pairs of points (C, 2, 3): a frame along their line, row by row, then their middle."""
+    along = pairs[:, 1] - pairs[:, 0]
+    along = along / np.sqrt((along**2).sum(axis=1, keepdims=True))
+    axis = np.eye(3)[np.argmin(np.abs(along), axis=1)]
+    across = np.cross(along, axis)
+    across = across / np.sqrt((across**2).sum(axis=1, keepdims=True))
+    middle = 0.5 * (pairs[:, 0] + pairs[:, 1])
+    return np.concatenate([along, across, np.cross(along, across), middle], axis=1)
+
+
+def _surface_pairs(sdf: SdfGrid) -> tuple[FloatArray, FloatArray, FloatArray, Any]:
+    """Surface points and normals (Q, 3), and pairs (2 P,) of them in the order of lengths (P,)."""
+    stream = StreamKey(0, 0).stream(Purpose.MESH_SAMPLES)
+    surface = surface_points(sdf, _SURFACE_POINTS, stream)
+    normals = sdf.at(surface, lookup="trilinear")[1]
+    normals = normals / np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-12)
+    i, j = np.triu_indices(len(surface), 1)
+    lengths = np.sqrt(((surface[i] - surface[j]) ** 2).sum(axis=1))
+    order = np.argsort(lengths, kind="stable")
+    pairs = np.stack([i, j], axis=1)[order].astype(np.int16)
+    return surface, normals, lengths[order], pairs.reshape(-1)
+
+
+def _pairs_of_contacts(
+    contacts: FloatArray, values: FloatArray, lengths: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Pairs of contacts (C, 2), and the spans (C, 2) of surface pairs of their length."""
+    touching = np.flatnonzero(values == 0.0)
+    pairs = touching[np.stack(np.triu_indices(len(touching), 1), axis=1)]
+    apart = np.sqrt(((contacts[pairs[:, 0]] - contacts[pairs[:, 1]]) ** 2).sum(axis=1))
+    spans = _spans(lengths, apart, _LENGTHS_ALIKE)
+    good = (apart >= _LEAST_LENGTH) & (spans[:, 1] > 0)
+    return pairs[good], spans[good]
+
+
+def _spans(ascending: FloatArray, wanted: FloatArray, reach: FloatArray | float) -> IntArray:
+    """First, and how many (N, 2) of the ascending values are near to wanted ones (N,)."""
+    first = np.searchsorted(ascending, wanted - reach)
+    last = np.searchsorted(ascending, wanted + reach, side="right")
+    return np.stack([first, last - first], axis=1)
