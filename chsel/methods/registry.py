@@ -25,7 +25,7 @@ from chsel.problem.named_choices import NamedChoices
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.settings import PRESETS, in_preset
-from chsel.problem.trust import SENSOR_NOISE, has_pose, trust_in
+from chsel.problem.trust import DETERMINED, MANY_CONTACTS, SENSOR_NOISE, has_pose, trust_in
 
 _OURS: dict[str, tuple[Callable[[Any], Method], Any]] = {
     "chsel": (Chsel, ChselSettings()),
@@ -95,7 +95,18 @@ def noise_of(method: Method) -> float:
 
 
 def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypotheses) -> Trust | None:
-    """How far to trust what a method found, by the noise in its settings; None without a pose."""
+    """How far to trust what a method found, by the noise in its settings; None without a pose.
+
+    A single mode has to stand beside what a search for other poses finds, among them turns under
+    which the object looks nearly alike, and poses that leave out one of few contacts. Of many
+    contacts, `anchored` has done this search itself.
+    """
     if not has_pose(hypotheses):
         return None
-    return trust_in(problem, hypotheses, noise_of(method))
+    noise = noise_of(method)
+    trust = trust_in(problem, hypotheses, noise)
+    searched = isinstance(method, Anchored) and len(problem.points.known) >= MANY_CONTACTS
+    if trust.verdict == DETERMINED and not searched:
+        rivals = Anchored(AnchoredSettings(noise=noise)).minima(problem)
+        trust = trust_in(problem, hypotheses, noise, rivals)
+    return trust

@@ -247,6 +247,12 @@ def _fill_sines_cosines(x: FloatArray, sine: FloatArray, cosine: FloatArray) -> 
 
 
 @compiled
+def _fill_exps(x: FloatArray, out: FloatArray) -> None:
+    for i in range(x.size):
+        out[i] = exp(x[i])
+
+
+@compiled
 def _fill_logs(x: FloatArray, out: FloatArray) -> None:
     for i in range(x.size):
         out[i] = log(x[i])
@@ -264,6 +270,14 @@ def sines_cosines(x: FloatArray | float) -> tuple[FloatArray, FloatArray]:
     sine, cosine = np.empty(x.size), np.empty(x.size)
     _fill_sines_cosines(x.flatten(), sine, cosine)
     return sine.reshape(x.shape), cosine.reshape(x.shape)
+
+
+def exps(x: FloatArray | float) -> FloatArray:
+    """e^x, of the shape of x."""
+    x = np.asarray(x, dtype=np.float64)
+    out = np.empty(x.size)
+    _fill_exps(x.flatten(), out)
+    return out.reshape(x.shape)
 
 
 def logs(x: FloatArray | float) -> FloatArray:

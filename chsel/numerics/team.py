@@ -89,18 +89,6 @@ def replace(context: Any, words: Any, at: Any, old: Any, new: Any) -> Any:
 
 
 @_intrinsic
-def increase(context: Any, words: Any, at: Any) -> Any:
-    """Add 1 to words[at], as other threads may do at the same time."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        place = _place(context, builder, signature.args[0], *values)
-        builder.atomic_rmw("add", place, ir.Constant(ir.IntType(64), 1), "seq_cst")
-        return context.get_dummy_value()
-
-    return types.void(words, types.int64), generate
-
-
-@_intrinsic
 def pause(context: Any) -> Any:
     """Take some 10 ns without work for the processor's units."""
 

@@ -13,39 +13,37 @@ import math
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.noise import FOREIGN
+from chsel.problem.noise import LIMIT, NoiseModel, noise_model
 from chsel.problem.outline import (
     in_order,
     outline_distances_to,
     outline_in_world,
     signed_distances,
 )
-from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, compose, product, rotated, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.subset import evenly_spaced
 
-MOST_WORSE = 12.6  # fall of twice the log-likelihood: 95 % of chi-squared, 6 degrees of freedom
 _SOFT = 1e-4  # added to A: of (m / m)^2
 _ROUNDS = 4  # of the subspace iteration
 _LEAST_LENGTH = 1e-3  # of a motion of the surface, of the object's motion
 _MOST_KNOWN, _MOST_FREE = 1000, 5000
 
 
-def can_be_moved(problem: RegistrationProblem, pose: Poses, sigma: float, distance: float) -> bool:
+def can_be_moved(
+    problem: RegistrationProblem, pose: Poses, sensor_noise: float, distance: float
+) -> bool:
     """Whether the points stay about as likely if the object's surface moves by a distance, metres.
 
-    pose: one. sigma: standard deviation of known points, metres; that of free and occupied points
-    is larger by half a voxel. Likely in the sense of Wilks (1938): by a likelihood ratio.
+    pose: one. Likely in the sense of Wilks (1938): by a likelihood ratio, see `LIMIT`.
     """
     motions = _loosest_motions(problem, pose)
     if len(motions) == 0:
         return False
     moved = _moved(problem, pose, distance * np.concatenate([motions, -motions]))
-    poses = Poses.joined([pose, moved])
-    unlikely = _unlikelihood(problem, poses, sigma)
+    energies = pose_energies(problem, Poses.joined([pose, moved]), noise_model(sensor_noise))
     apart = outline_distances_to(problem.sdf, moved, pose)  # near for turns that are symmetries
-    likely = (unlikely[1:] - unlikely[0] <= MOST_WORSE) & (apart >= 0.5 * distance)
+    likely = (energies[1:] - energies[0] <= LIMIT) & (apart >= 0.5 * distance)
     return bool(likely.any())
 
 
@@ -98,32 +96,19 @@ def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Pos
     return Poses.of(compose(turned, rotated(turn, pose.translations) + shift))
 
 
-def _unlikelihood(problem: RegistrationProblem, poses: Poses, sigma: float) -> FloatArray:
-    """Minus twice the log-likelihood (B,) of the points in poses, up to a constant.
+def pose_energies(problem: RegistrationProblem, poses: Poses, noise: NoiseModel) -> FloatArray:
+    """Minus the log-likelihood (B,) of the points in poses, nats, see `chsel.problem.noise`.
 
-    Distances are normal up to FOREIGN deviations, and constant from there on.
+    Of many points by some, which count for all.
     """
-    points, coarse = problem.points, math.sqrt(sigma**2 + (0.5 * problem.free_resolution) ** 2)
-    total = np.zeros(len(poses))
-    for group, levels, most, deviation, sides in _groups(points, sigma, coarse):
-        some = evenly_spaced(len(group), most)
-        off = signed_distances(problem.sdf, poses, group[some]) - levels[some]
-        off = np.abs(off) if sides == 0.0 else np.maximum(sides * off, 0.0)
-        squares = np.minimum(off / deviation, FOREIGN) ** 2
-        total += in_order(squares) * (len(group) / max(len(some), 1))
-    return total
-
-
-def _groups(
-    points: KnownPoints, sigma: float, coarse: float
-) -> list[tuple[FloatArray, FloatArray, int, float, float]]:
-    """Points, levels, how many to take, deviation, and the sign of distances that are errors."""
-    zeros = np.zeros(max(len(points.free), len(points.occupied)))
-    return [
-        (points.known, points.sdf, _MOST_KNOWN, sigma, 0.0),
-        (points.free, zeros, _MOST_FREE, coarse, -1.0),
-        (points.occupied, zeros, _MOST_FREE, coarse, 1.0),
-    ]
+    points, sdf = problem.points, problem.sdf
+    known = evenly_spaced(len(points.known), _MOST_KNOWN)
+    residuals = signed_distances(sdf, poses, points.known[known]) - points.sdf[known]
+    free, occupied = (
+        group[evenly_spaced(len(group), _MOST_FREE)] for group in (points.free, points.occupied)
+    )
+    depths = [-signed_distances(sdf, poses, free), signed_distances(sdf, poses, occupied)]
+    return noise.energies(residuals, np.concatenate(depths, axis=1))
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:

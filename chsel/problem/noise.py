@@ -1,18 +1,41 @@
-"""The noise of contacts, estimated from how far they are from a surface."""
+"""What points are off: a model of their errors, and the energy of poses by it.
+
+    E(X) = -log sum_k w_k prod_i [(1 - e) N(r_i; 0, s_k) + e / D]^t
+           + t F(sum_j min(d_j^2 / 2 f^2, c))
+
+in nats, up to a constant: minus the log-likelihood of a pose by all points. Known points have
+residuals r_i = s(X p_i) - v_i, free points depths d_j below the surface, occupied ones heights d_j
+above it. Contacts are off by s_k^2 = n^2 + m_k^2: the noise n of the sensor, and errors m_k of
+mesh, hand and camera, of which only a prior w_k is known; so the sum over k is the evidence for
+the pose. A share e of the contacts is on other objects, anywhere within D. The border of a free
+voxel is off by f, and one in exp(c) is wrong; where one is, others are likelier to be, so beyond c
+costs count less (F). Many points have errors in common: with N > INDEPENDENT known ones, t is
+INDEPENDENT / N.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.elementary import exps, logs
 
 PRIOR_CONTACTS = 4.0  # that the sensor's noise counts for
 PRIOR_OUTLIERS = 0.02  # the share of outliers in them
 FOREIGN = 4.0  # noise levels beyond which a contact is an outlier
 FREEDOMS = 6  # of a pose: it can make so many distances small whatever the noise
+LIMIT = 9.0  # nats above the best pose up to which others are likely, too
+LEVELS = 8  # K
+_LEAST_ERROR, _MOST_ERROR = 0.0006, 0.008  # metres: m_1 and m_K, in geometric steps
+_USUAL_ERROR, _WIDTH = 0.002, 0.6  # of w: centre in metres, standard deviation of ln m
+SHARE, EXTENT = 0.03, 0.15  # e, and D in metres
+SOFTNESS, WRONG = 0.002, 7.0  # f in metres, and c
+LATER = 0.2  # of the costs beyond c
+INDEPENDENT = 30.0  # known points: of more, errors are alike
 _MEDIAN = 1.4826  # standard deviations of normal numbers by the median of their sizes
 _ROUNDS = 20
 
@@ -46,3 +69,45 @@ def estimate_noise(distances: FloatArray, sensor_noise: float) -> Noise:
         sigma = math.sqrt((PRIOR_CONTACTS * sensor_noise**2 + squares) / weight)
     foreign = PRIOR_CONTACTS * PRIOR_OUTLIERS + count - max(within, 0)
     return Noise(max(sigma, sensor_noise), foreign / (PRIOR_CONTACTS + count))
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """How inexact points are."""
+
+    sigmas: tuple[float, ...]  # s_k, metres, ascending
+    weights: tuple[float, ...]  # w_k, whose sum is 1
+    softness: float = SOFTNESS  # f, metres
+    wrong: float = WRONG  # c, nats
+    shared: float = 0.0  # metres, of residuals and of depths, that cost nothing
+
+    def costs(self, residuals: FloatArray) -> FloatArray:
+        """-log of the density (..., K) of residuals (...), metres; 0 at best, at 0 and s_1."""
+        sigmas = np.array(self.sigmas)
+        peak = (1.0 - SHARE) / (math.sqrt(2.0 * math.pi) * sigmas)
+        sizes = np.maximum(np.abs(residuals) - self.shared, 0.0)[..., None]
+        density = peak * exps(-0.5 * (sizes / sigmas) ** 2) + SHARE / EXTENT
+        return logs((peak[0] + SHARE / EXTENT) / density)
+
+    def energies(self, residuals: FloatArray, depths: FloatArray) -> FloatArray:
+        """E (B,) of poses by residuals (B, N) and depths (B, M), metres."""
+        costs, power = self.costs(residuals).sum(axis=1), self.power(residuals.shape[1])
+        levels = power * costs - logs(np.array(self.weights))  # (B, K)
+        least = levels.min(axis=1)
+        known = least - logs(exps(least[:, None] - levels).sum(axis=1))
+        deep = np.maximum(depths - self.shared, 0.0)
+        wrong = np.minimum(0.5 * (deep / self.softness) ** 2, self.wrong).sum(axis=1)
+        return known + power * np.minimum(wrong, self.wrong + LATER * (wrong - self.wrong))
+
+    def power(self, known: int) -> float:
+        """t, for so many known points."""
+        return min(1.0, INDEPENDENT / max(known, 1))
+
+
+def noise_model(sensor_noise: float, shared: float = 0.0) -> NoiseModel:
+    """What is known of a sensor whose contacts are off by so much, standard deviation in metres."""
+    ratio = (_MOST_ERROR / _LEAST_ERROR) ** (1.0 / (LEVELS - 1))
+    errors = [_LEAST_ERROR * ratio**k for k in range(LEVELS)]
+    prior = [math.exp(-0.5 * (math.log(m / _USUAL_ERROR) / _WIDTH) ** 2) for m in errors]
+    sigmas = tuple(math.sqrt(sensor_noise**2 + m**2) for m in errors)
+    return NoiseModel(sigmas, tuple(p / math.fsum(prior) for p in prior), shared=shared)

@@ -54,9 +54,13 @@ def outline_distances_to(sdf: SdfGrid, poses: Poses, other: Poses) -> FloatArray
 
 def outline_in_world(sdf: SdfGrid, poses: Poses) -> FloatArray:
     """Points (B, Q, 3) on the object's surface in each pose; Q is 0 for a grid without surface."""
-    outline = sdf.derived("outline", lambda: _outline(sdf))
     turns = np.swapaxes(poses.rotations, 1, 2)
-    return rotated(turns[:, None], outline - poses.translations[:, None])
+    return rotated(turns[:, None], outline_in_object(sdf) - poses.translations[:, None])
+
+
+def outline_in_object(sdf: SdfGrid) -> FloatArray:
+    """Points (Q, 3) on the object's surface, object frame."""
+    return sdf.derived("outline", lambda: _outline(sdf))
 
 
 def signed_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Protocol
@@ -111,6 +112,9 @@ class Trust:
     verdict: str  # one of VERDICTS
     redundancy: int  # known points beyond the six that a pose can fit; at 0, misfit is no evidence
     best_of_modes: tuple[int, ...] = (0,)  # indices of hypotheses, one a mode, the best first
+    # Largest angle (radians) between modes whose surfaces are as near as those of one mode, and
+    # the distance of these surfaces (m); None for other modes.
+    twins: tuple[float, float] | None = None
 
     def __str__(self) -> str:
         """One line for people."""
@@ -118,8 +122,12 @@ class Trust:
         exact = ": no evidence, a pose can fit so few contacts exactly"
         if self.redundancy or self.verdict == "nothing fits":
             exact = ""
+        verdict = self.verdict
+        if self.twins is not None:
+            angle, apart = math.degrees(self.twins[0]), 1000.0 * self.twins[1]
+            verdict = f"determined up to a turn of {angle:.0f} degrees, {apart:.1f} mm apart"
         return (
-            f"{self.verdict} ({modes}spread {1000.0 * self.spread:.1f} mm, noise "
+            f"{verdict} ({modes}spread {1000.0 * self.spread:.1f} mm, noise "
             f"{1000.0 * self.noise:.1f} mm, {100.0 * self.outliers:.0f} % outliers, misfit "
             f"{self.misfit:.1f} noise levels{exact})"
         )

@@ -8,8 +8,8 @@ import numpy as np
 
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import Box, Region, box_of, clearance_of
-from chsel.numerics.compiler import compiled, leaf
-from chsel.numerics.pose_tuples import moved, pose_at
+from chsel.numerics.compiler import leaf
+from chsel.numerics.pose_tuples import moved
 from chsel.problem.sdf_grid import SdfGrid
 
 
@@ -113,28 +113,6 @@ def distance_at(field, pose, x, y, z):
         _, nx, ny, nz = _row_in_cell(box, table, cell)
         s = distance_beyond_box(field.box_distance, box, (s, nx, ny, nz), a, b, c)[0]
     return s
-
-
-@compiled
-def add_depths(field, poses, points, limits, depths, counts, first, last):
-    """Fill depths and counts (B,) for poses (B, 12), first to last, by world points (N, 3).
-
-    The sum of the depths of those that are deeper than a tolerance, and their number. limits: the
-    sign of depths, 1 for those outside of the object; the tolerance; and the greatest depth.
-    """
-    low, high = field.box.first, field.box.last
-    sign, tolerance, most = limits
-    for b in range(first, last):
-        pose, depth, count = pose_at(poses, b), 0.0, 0
-        for n in range(len(points)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            p, q, r = moved(pose, x, y, z)
-            is_near = low[0] <= p <= high[0] and low[1] <= q <= high[1] and low[2] <= r <= high[2]
-            if is_near or sign > 0.0:  # beyond the box, all is outside of the object
-                deep = sign * min(distance_at(field, pose, x, y, z), most)
-                if deep > tolerance:
-                    depth, count = depth + deep, count + 1
-        depths[b], counts[b] = depth, count
 
 
 @leaf

@@ -7,26 +7,24 @@ docs/trust.md has the model, and what its limits were chosen on.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from chsel.errors import PointsWarning, PoseError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.threads import spread
-from chsel.problem.freedom import can_be_moved
-from chsel.problem.noise import FOREIGN, FREEDOMS, estimate_noise
+from chsel.problem.freedom import can_be_moved, pose_energies
+from chsel.problem.noise import FOREIGN, FREEDOMS, LIMIT, estimate_noise, noise_model
 from chsel.problem.outline import (
     in_order,
     outline_distances,
+    outline_in_object,
     signed_distances,
     surface_spread,
 )
-from chsel.problem.poses import Poses
+from chsel.problem.poses import Poses, compose, product, rotated, rotation_angle
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem, Trust
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
-from chsel.problem.sdf_lookup import add_depths, distance_field
-from chsel.problem.subset import evenly_spaced, poses_per_thread
+from chsel.problem.subset import evenly_spaced
 
 SENSOR_NOISE = 0.0005  # metres, of known points, where nothing is known about the sensor
 DETERMINED, SEVERAL, WIDE, NOTHING = VERDICTS
@@ -42,59 +40,120 @@ MOST_LEVELS = 10.0  # sensor noise levels that errors may have without a warning
 LEAST_LEVELS = 3.0  # sensor noise levels that errors and widths may have on small objects
 LEAST_GAP = 2.0  # noise levels, as estimated, between modes
 SYSTEMATIC = 0.5  # correlation of the errors of neighbours
-ALIKE = 2.0  # times the error of the best hypothesis: those of more do not count as explanations
+MOST_NOISE = 0.015  # metres: contacts that are off by more, or three times the sensor's noise
+TURN = 0.5  # radians: poses turned by more are different modes, unless by a symmetry
+SYMMETRIC = 0.0085  # root mean square of what a symmetry moves the surface by, in diameters
+MANY_CONTACTS = 10  # among which one on another object would show
+FOREIGN_CONTACT = 4.0  # nats beyond LIMIT that a pose costs which leaves out one of few contacts
 _GRID_ERROR = 0.3  # of interpolated distances, in spacings of nodes
 _NEIGHBOURS = 3
 _LEAST_CORRELATED = 8  # points
 
 _MOST_HYPOTHESES = 100  # that are compared, the best ones
-_MOST_KNOWN, _MOST_FREE = 1000, 5000  # points that they are compared by
 _MOST_CORRELATED = 300
 
 
 def trust_in(
-    problem: RegistrationProblem, hypotheses: Hypotheses, sensor_noise: float = SENSOR_NOISE
+    problem: RegistrationProblem,
+    hypotheses: Hypotheses,
+    sensor_noise: float = SENSOR_NOISE,
+    rivals: Poses | None = None,
 ) -> Trust:
     """How far to trust the hypotheses of a problem; a pure function, the same bits everywhere.
 
-    sensor_noise: standard deviation of known points by the sensor's datasheet, metres.
+    sensor_noise: standard deviation of known points by the sensor's datasheet, metres. rivals:
+    further poses, which speak against the best hypothesis where they fit; with less than
+    MANY_CONTACTS, also where they leave out one.
     Raises PoseError if there is no hypothesis or the best is not finite, and SettingError for noise
     that is not above 0.
     """
     require_positive("sensor_noise", sensor_noise)
-    (poses, indices), sdf = _compared(hypotheses), problem.sdf
-    off = signed_distances(sdf, poses[:1], problem.points.known)[0] - problem.points.sdf
+    (poses, indices), sdf, points = _compared(hypotheses), problem.sdf, problem.points
+    off = signed_distances(sdf, poses[:1], points.known)[0] - points.sdf
     noise = estimate_noise(off, sensor_noise)
     most = FOREIGN * noise.sigma
-    error = float(_mean_errors(problem, poses[:1], sensor_noise, most)[0])
-    alike = correlation(problem.points.known, np.clip(off, -most, most)) > SYSTEMATIC
+    error = float(_mean_error(problem, poses[:1], sensor_noise, most))
+    alike = correlation(points.known, np.clip(off, -most, most)) > SYSTEMATIC
     share = MOST_SYSTEMATIC if alike else MOST_OFF
     limit = max(share * sdf.diameter, _GRID_ERROR * sdf.resolution, LEAST_LEVELS * sensor_noise)
 
-    errors = _mean_errors(problem, poses, sensor_noise, most, thinned=True)
-    least = max(float(errors[0]), sensor_noise, _GRID_ERROR * sdf.resolution / ALIKE)
-    explaining = errors <= ALIKE * least
+    own = len(poses)
+    if rivals is not None:
+        poses = Poses.joined([poses, rivals])
+        indices = np.concatenate([indices, np.full(len(rivals), -1)])
+    energies = pose_energies(problem, poses, noise_model(sensor_noise))
+    allowed = np.full(len(poses), energies.min() + LIMIT)
+    if len(points.known) < MANY_CONTACTS:
+        allowed[own:] += FOREIGN_CONTACT
+    explaining = energies <= allowed
+    explaining[0] = True
     poses, indices = poses[explaining], indices[explaining]
     apart = outline_distances(sdf, poses)
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
-    count, mode = _components(apart <= gap)
+    near = apart <= gap
+    count, mode = _components(near & ~turned(sdf, poses, near))
     parts = [np.flatnonzero(mode == one) for one in range(count)]
     redundancy = max(len(off) - FREEDOMS, 0)
-    if error > limit or noise.outliers > MOST_OUTLIERS:
+    worst = max(MOST_NOISE, LEAST_LEVELS * sensor_noise)
+    if error > limit or noise.outliers > MOST_OUTLIERS or noise.sigma > worst:
         count, verdict = 0, NOTHING
     elif (
-        redundancy + len(problem.points.free) + len(problem.points.occupied) == 0
+        redundancy + len(points.free) + len(points.occupied) == 0
         or count > MOST_MODES
         or max(surface_spread(apart[np.ix_(part, part)]) for part in parts) > width
-        or any(can_be_moved(problem, poses[part[:1]], noise.sigma, width) for part in parts)
+        or any(can_be_moved(problem, poses[part[:1]], sensor_noise, width) for part in parts)
     ):
         count, verdict = 0, WIDE
     else:
         verdict = DETERMINED if count == 1 else SEVERAL
     misfit, spread = error / sensor_noise, surface_spread(apart)
-    best = tuple(int(indices[part[0]]) for part in parts[: max(count, 1)])
-    return Trust(noise.sigma, noise.outliers, misfit, count, spread, verdict, redundancy, best)
+    firsts = [int(indices[part[0]]) for part in parts[: max(count, 1)]]
+    best = tuple(index for index in firsts if index >= 0)
+    twins = _largest_turn(poses, apart, parts) if verdict == SEVERAL and near.all() else None
+    return Trust(
+        noise.sigma, noise.outliers, misfit, count, spread, verdict, redundancy, best, twins
+    )
+
+
+def turned(sdf: SdfGrid, poses: Poses, pairs: BoolArray) -> BoolArray:
+    """Which of some pairs (B, B) of poses are turned against each other, and by no symmetry.
+
+    By more than TURN, and so that the turn about the object's middle moves its surface, root mean
+    square, by more than SYMMETRIC of the diameter.
+    """
+    one, other = np.nonzero(np.triu(pairs & (_angles(poses) > TURN), 1))
+    result = np.zeros_like(pairs)
+    turns = product(poses.rotations[one], np.swapaxes(poses.rotations[other], 1, 2))
+    outline, centre = outline_in_object(sdf), sdf.derived("middle", lambda: _middle(sdf))
+    about = Poses.of(compose(turns, centre - rotated(turns, centre)))
+    squares = in_order(signed_distances(sdf, about, outline) ** 2) / max(len(outline), 1)
+    moved = np.sqrt(squares) > SYMMETRIC * sdf.diameter
+    result[one[moved], other[moved]] = True
+    return result | result.T
+
+
+def _middle(sdf: SdfGrid) -> FloatArray:
+    """Centroid (3,) of the object's volume, which every symmetry leaves where it is."""
+    share = np.clip(0.5 - sdf.values / sdf.resolution, 0.0, 1.0)  # of the cell around each node
+    inside = np.argwhere(share > 0.0)
+    if len(inside) == 0:
+        return np.asarray(sdf.bounds.mean(axis=0))
+    weights = share[tuple(inside.T)]
+    return sdf.origin + sdf.resolution * in_order(weights * inside.T) / in_order(weights)
+
+
+def _angles(poses: Poses) -> FloatArray:
+    """The angles (B, B), radians, between poses."""
+    return rotation_angle(product(poses.rotations[:, None], np.swapaxes(poses.rotations, 1, 2)))
+
+
+def _largest_turn(poses: Poses, apart: FloatArray, parts: list[IntArray]) -> tuple[float, float]:
+    """Angle (radians) and distance (m) between the best of the two modes that differ most."""
+    firsts = [int(part[0]) for part in parts]
+    angles = _angles(poses[np.array(firsts)])
+    one, other = np.unravel_index(int(np.argmax(angles)), angles.shape)
+    return float(angles[one, other]), float(apart[firsts[one], firsts[other]])
 
 
 def check_trust(trust: Trust, sensor_noise: float = SENSOR_NOISE) -> list[PointsWarning]:
@@ -162,51 +221,24 @@ def _compared(hypotheses: Hypotheses) -> tuple[Poses, IntArray]:
     return poses[indices], indices
 
 
-def _mean_errors(
-    problem: RegistrationProblem,
-    poses: Poses,
-    sensor_noise: float,
-    most: float,
-    *,
-    thinned: bool = False,
-) -> FloatArray:
-    """Average error (B,), metres, of known points, and of all others that contradict a pose.
+def _mean_error(
+    problem: RegistrationProblem, pose: Poses, sensor_noise: float, most: float
+) -> float:
+    """Average error of a pose, metres, of known points, and of all others that contradict it.
 
     most: that a known point counts for. A free point contradicts a pose if it is deeper in the
     object than a voxel and noise explain, an occupied one if it is as far outside; it counts with
-    its depth. thinned: by some of the points of each class, which count for all.
+    its depth.
     """
     points, sdf = problem.points, problem.sdf
-    known = evenly_spaced(len(points.known), _MOST_KNOWN if thinned else len(points.known))
-    off = np.abs(signed_distances(sdf, poses, points.known[known]) - points.sdf[known])
-    total, count = in_order(np.minimum(off, most)), np.full(len(poses), float(len(known)))
+    off = np.abs(signed_distances(sdf, pose, points.known)[0] - points.sdf)
     tolerance = problem.free_resolution + LEAST_LEVELS * sensor_noise
-    known_share = len(known) / max(len(points.known), 1)
+    errors = [np.minimum(off, most)]
     for sign, group in ((-1.0, points.free), (1.0, points.occupied)):
-        some = evenly_spaced(len(group), _MOST_FREE if thinned else len(group))
-        depth, wrong = _contradictions(sdf, poses, group[some], sign, tolerance)
-        each = (known_share or 1.0) * len(group) / max(len(some), 1)
-        total += each * depth
-        count += each * wrong
-    return total / np.maximum(count, 1.0)
-
-
-def _contradictions(
-    sdf: SdfGrid, poses: Poses, points: FloatArray, sign: float, tolerance: float
-) -> tuple[FloatArray, FloatArray]:
-    """The sum of the depths (B,), metres, of points deeper than a tolerance, and their number (B,).
-
-    sign: 1 for depths outside of the object, -1 for those inside.
-    """
-    field, numbers = distance_field(sdf, "trilinear", "surface_point"), np.array(poses.numbers)
-    places, (depths, counts) = np.array(points), np.empty((2, len(poses)))
-    limits = sign, tolerance, FARTHEST
-
-    def run(first: int, last: int, _: Any) -> None:
-        add_depths(field, numbers, places, limits, depths, counts, first, last)
-
-    spread(run, len(poses), lambda: None, least=poses_per_thread(len(points)))
-    return depths, counts
+        depths = sign * signed_distances(sdf, pose, group)[0]
+        errors.append(depths[depths > tolerance])
+    every = np.concatenate(errors)
+    return float(in_order(every)) / max(len(every), 1)
 
 
 def _components(adjacent: BoolArray) -> tuple[int, IntArray]:

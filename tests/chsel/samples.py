@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.poses import compose, random_rotations
+from chsel.problem.noise import EXTENT, INDEPENDENT, LATER, SHARE, NoiseModel
+from chsel.problem.points import KnownPoints
+from chsel.problem.poses import Poses, apply, compose, random_rotations
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
 
@@ -25,6 +29,46 @@ def box_distance(points: FloatArray, sides: FloatArray) -> FloatArray:
     outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=-1))
     distance: FloatArray = outside + np.minimum(beyond.max(axis=-1), 0.0)
     return distance
+
+
+def plain_energy(noise: NoiseModel, residuals: FloatArray, depths: FloatArray) -> float:
+    """E of one pose as chsel.problem.noise has it, of residuals (N,) and depths (M,), metres."""
+
+    def density(size: float, sigma: float) -> float:
+        normal = math.exp(-0.5 * (size / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
+        return (1.0 - SHARE) * normal + SHARE / EXTENT
+
+    power = min(1.0, INDEPENDENT / max(len(residuals), 1))
+    sizes = [max(abs(r) - noise.shared, 0.0) for r in residuals]
+    best = density(0.0, noise.sigmas[0])
+    logs = [
+        math.log(w) + power * sum(math.log(density(size, s) / best) for size in sizes)
+        for s, w in zip(noise.sigmas, noise.weights, strict=True)
+    ]
+    most = max(logs)
+    wrong = sum(
+        min(max(depth - noise.shared, 0.0) ** 2 / (2.0 * noise.softness**2), noise.wrong)
+        for depth in depths
+    )
+    if wrong > noise.wrong:
+        wrong = noise.wrong + LATER * (wrong - noise.wrong)
+    return -most - math.log(sum(math.exp(one - most) for one in logs)) + power * wrong
+
+
+def plain_energies(
+    noise: NoiseModel, sdf: SdfGrid, points: KnownPoints, poses: Poses
+) -> FloatArray:
+    """The same (B,) of poses, by distances between the nodes of a grid."""
+    energies = []
+    for pose in poses.matrices:
+        known, free, occupied = (
+            sdf.at(apply(pose, group), lookup="trilinear")[0]
+            for group in (points.known, points.free, points.occupied)
+        )
+        depths = np.concatenate([-free, occupied])
+        wrong = depths[depths > 0.0]  # others cost nothing
+        energies.append(plain_energy(noise, known - points.sdf, wrong))
+    return np.array(energies)
 
 
 def random_poses(stream: np.random.Generator, count: int, reach: float) -> FloatArray:

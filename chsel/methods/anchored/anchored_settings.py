@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from chsel.errors import require_at_most
-from chsel.methods.anchored.anchor_sampling import AnchorSettings
+from chsel.methods.anchor_sampling import AnchorSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.search_space import PlaneSettings
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, one_of, positive
@@ -38,10 +38,8 @@ class Effort(CheckedSettings):
     polished: Annotated[int, not_negative, at_most(MOST_POSES)] = 16
     polish_moves: Annotated[int, not_negative, at_most(MOST_MOVES)] = 300
     # How many evaluations may be spent in rounds of all stages up to the descent: a second one, and
-    # further ones while the last found a new mode; 0: one round. While the lowest energy is above
-    # `enough` noise levels of the sensor, a round tries a larger penetration_tolerance.
+    # further ones while the last found a new mode; 0: one round.
     evaluations: Annotated[int, not_negative, at_most(MOST_SAMPLES)] = 0
-    enough: Annotated[float, positive] = 2.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,15 +49,16 @@ class Effort(CheckedSettings):
 
 
 _SMALL = Effort(
-    samples=60_000,
+    samples=40_000,
     kept=64,
-    first_steps=12,
+    first_steps=10,
     refined=40,
     descents=24,
     descent_moves=60,
     chains=24,
     moves=150,
     polished=8,
+    polish_moves=200,
 )
 _LARGE = Effort(
     samples=400_000,
@@ -76,7 +75,7 @@ EFFORTS = {
     "small": _SMALL,
     "medium": Effort(),
     "large": _LARGE,
-    "adaptive": replace(_SMALL, chains=96, moves=300, evaluations=800_000),
+    "adaptive": replace(_SMALL, chains=60, moves=400, evaluations=600_000),
 }
 
 
@@ -92,17 +91,8 @@ class AnchoredSettings(CheckedSettings):
     # Of the sensor, as in its data sheet: standard deviation of known points, metres. The noise
     # that is estimated from the points is no less.
     noise: Annotated[float, positive] = 0.0005
-    # tau, of free points, metres; None: none, unless nothing fits with less than half a voxel of
-    # free space, or one.
-    penetration_tolerance: Annotated[float | None, not_negative] = None
-    # Most candidates have energies below the larger of limit_noise noise levels, and
-    # limit_ratio x lowest energy + limit_slack noise levels.
-    limit_noise: Annotated[float, not_negative] = 1.0
-    limit_ratio: Annotated[float, not_negative] = 1.3
-    limit_slack: Annotated[float, not_negative] = 0.5
-    # Share of the chains whose limit is outer_noise noise levels higher.
-    outer_share: Annotated[float, not_negative, at_most(1.0)] = 0.25
-    outer_noise: Annotated[float, not_negative] = 1.0
+    # Candidates have energies at most so much above the lowest, nats.
+    limit: Annotated[float, positive] = 9.0
     # What contacts are off that no residual shows, metres: calibration of hand and camera, scale
     # of the mesh.
     shared_error: Annotated[float, not_negative] = 0.004

@@ -1,197 +1,294 @@
-"""The energy of poses, fits that lower it, and random walks below a limit."""
+"""The energy of poses (see `chsel.problem.noise`) in kernels: one pose at a time, up to a limit."""
 
 from __future__ import annotations
 
-from copy import copy
-from threading import get_ident
+import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_settings import CostSettings, uncertain_depth
-from chsel.methods.anchored.fine_cells import fine_cells_below
-from chsel.methods.anchored.fit_kernels import Fit, Loss, Twists, fit_for, fit_poses
-from chsel.methods.anchored.walk_kernels import (
-    Chains,
-    MoveDraws,
-    Stride,
-    Walk,
-    chains_from,
-    energies_below,
-    walk_below,
-    walk_for,
-)
-from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import triple
+from chsel.cost.cost_kernels import Model
+from chsel.cost.cost_settings import CostSettings
+from chsel.cost.free_kernels import is_apart, remember, travel
+from chsel.numerics.arrays import FloatArray, scratch
+from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.elementary import exp, exps, log, logs
+from chsel.numerics.near_points import NearPoints, gather, near_points_for, select, to_cells
+from chsel.numerics.pose_tuples import moved, pose_at, rigid
 from chsel.numerics.threads import spread
-from chsel.problem.noise import Noise, estimate_noise
+from chsel.problem.noise import EXTENT, LATER, SHARE, NoiseModel
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.search_space import SE2Space, SearchSpace
-from chsel.problem.streams import Purpose
-from chsel.problem.subset import distances_from_surface
-from chsel.problem.surface import object_centre
+from chsel.problem.sdf_lookup import distance_at, value_between_nodes
 
-_FIT_LEVEL = -0.003  # metres: free points at less depth do not push
-_LEVER = 0.15  # metres that a radian counts for
-_FOREIGN = 8.0  # noise levels beyond which a known point costs no more
-_WRONG = 20.0  # noise levels off that a known point costs as much as a free one can
-
-
-class NoiseLevel(NamedTuple):
-    """How inexact points are taken to be."""
-
-    sigma: float  # standard deviation of known points, metres
-    tolerance: float  # depth that free points may have at no cost, metres
-    least_cap: float  # distance beyond which known points cost no more, at least, metres
+_ROWS_PER_LEVEL = 4.0  # of tables, in the least s_k
+_BEYOND = 6.0  # of the greatest s_k: residuals beyond cost no more
+_AT_ONCE = 16  # known points between two looks at the limit
+_LEVELS = 8  # K, here because kernels take constants from kernel files alone
+_LOG_LEVELS = 2.0794415416798357  # ln K
+_ALL = -1  # instead of the number of packets that were gathered
 
 
-def tolerances_of(problem: RegistrationProblem, fixed: float | None) -> tuple[float, ...]:
-    """The depths (metres) that free points may have at no cost, the first unless nothing fits.
+class Likelihood(NamedTuple):
+    """A noise model as kernels read it: costs of residuals in tables, a row of K for each step."""
 
-    Voxels may be off by half of one, or by a whole one.
-    """
-    if fixed is not None:
-        return (fixed,)
-    if len(problem.points.free) == 0:
-        return (0.0,)
-    sdf, voxel = problem.sdf, problem.free_resolution
-    return tuple(dict.fromkeys(uncertain_depth(sdf, depth) for depth in (0.0, 0.5 * voxel, voxel)))
+    costs: FloatArray  # (rows K,), nats: 0 for a residual of 0 at the least noise
+    slopes: FloatArray  # (rows K,), derivatives of costs by half of the squared residual, 1/m^2
+    log_weights: FloatArray  # (K,)
+    per_metre: float  # rows
+    last: float  # row that can be interpolated to
+    shared: float  # metres
+    power: float  # t
+    softness: float  # metres
+    wrong: float  # nats
+    later: float  # share of costs beyond
+
+
+def likelihood_of(noise: NoiseModel, known: int) -> Likelihood:
+    """Tables for so many known points."""
+    step = noise.sigmas[0] / _ROWS_PER_LEVEL
+    rows = int(_BEYOND * noise.sigmas[-1] / step) + 2
+    sizes, sigmas = step * np.arange(rows, dtype=np.float64), np.array(noise.sigmas)
+    costs = replace(noise, shared=0.0).costs(sizes)
+    peak = (1.0 - SHARE) / (math.sqrt(2.0 * math.pi) * sigmas[0])
+    foreign = SHARE / EXTENT / (peak + SHARE / EXTENT)
+    slopes = (1.0 - foreign * exps(costs)) / sigmas**2
+    return Likelihood(
+        costs=costs.reshape(rows * _LEVELS),
+        slopes=slopes.reshape(rows * _LEVELS),
+        log_weights=logs(np.array(noise.weights)),
+        per_metre=1.0 / step,
+        last=rows - 1.000001,
+        shared=noise.shared,
+        power=noise.power(known),
+        softness=noise.softness,
+        wrong=noise.wrong,
+        later=LATER,
+    )
+
+
+class Scratch(NamedTuple):
+    """Of one thread."""
+
+    near: NearPoints  # the free points gathered
+    memory: FloatArray  # (12,), where the object was then, see remember
+    sums: FloatArray  # (K,), of costs, then posterior weights
 
 
 class Energy:
-    """E(X) = mean loss of s - v over known points + a sum of depths over free ones, in metres.
+    """The energy of poses by the points of a problem."""
 
-    The loss is quadratic up to the noise, then linear, then constant; a free point costs its depth
-    beyond a tolerance, but at most as much as some known points that are off; occupied points are
-    the mirror image of free ones. N / sigma times it is a negative log-likelihood of the pose, with
-    N known points of noise sigma.
-    """
-
-    def __init__(
-        self,
-        problem: RegistrationProblem,
-        known: KnownPoints,
-        space: SearchSpace,
-        bounds: tuple[FloatArray, FloatArray],
-        level: NoiseLevel,
-    ) -> None:
-        """known: the problem's points, see most_informative_first.
-
-        bounds: where walks keep the object's origin.
-        """
-        settings = CostSettings(
-            penetration_tolerance=0.0, known_scale=1.0 / max(len(known.known), 1)
+    def __init__(self, problem: RegistrationProblem, known: KnownPoints, noise: NoiseModel) -> None:
+        """known: the problem's points, in the order in which they are looked up."""
+        self.known = known
+        cost = CompiledCost(
+            problem.sdf,
+            known,
+            CostSettings(penetration_tolerance=0.0),
+            free_resolution=problem.free_resolution,
         )
-        resolution = problem.free_resolution
-        self._sdf, self._known, self._key = problem.sdf, known, problem.key
-        self._cost = CompiledCost(
-            problem.sdf, known, settings, free_resolution=resolution, culling="octree"
-        )
-        basis, axis = np.eye(6), (0.0, 0.0, 0.0)
-        if isinstance(space, SE2Space):
-            basis, axis = np.zeros((3, 6)), triple(space.axis)
-            basis[0, :3], basis[1, 3:], basis[2, 3:] = space.axis, space.e_u, space.e_v
-        basis[:, :3] /= _LEVER
-        centre = triple(object_centre(problem.sdf))
-        self._twists = Twists(basis, centre)
-        self._stride = Stride(
-            planar=isinstance(space, SE2Space),
-            axis=axis,
-            pivot=centre,
-            lower=triple(bounds[0]),
-            upper=triple(bounds[1]),
-        )
-        self._set(level)
+        self._cost, self._sdf = cost, problem.sdf
+        self._set(noise)
 
-    def _set(self, level: NoiseLevel) -> None:
-        self.level = level
-        self._walks: dict[int, Walk] = {}
-        self._fits: dict[int, Fit] = {}
-        self._model = self._cost.at_level(self._sdf, -level.tolerance)
-        self._fitting = self._cost.at_level(self._sdf, _FIT_LEVEL - level.tolerance)
-        self._fine = fine_cells_below(self._sdf, self._model.alpha)
-        self._fine_of_fits = fine_cells_below(self._sdf, self._fitting.alpha)
-        cap = max(_FOREIGN * level.sigma, level.least_cap)
-        self.loss = Loss(level.sigma, cap, _WRONG * level.sigma / max(len(self._known.known), 1))
+    def _set(self, noise: NoiseModel) -> None:
+        self.model: Model = self._cost.at_level(self._sdf, -noise.shared)
+        self.likelihood = likelihood_of(noise, len(self.known.known))
 
-    def at(self, level: NoiseLevel) -> Energy:
-        """The energy at another level of noise."""
-        energy = copy(self)
-        energy._set(level)
-        return energy
+    def by(self, noise: NoiseModel) -> Energy:
+        """The energy by another noise model."""
+        other = object.__new__(Energy)
+        other.known, other._cost, other._sdf = self.known, self._cost, self._sdf
+        other._set(noise)
+        return other
 
-    def walk(self) -> Walk:
-        """Scratch of this thread for kernels of energies and walks."""
-        thread = get_ident()
-        if thread not in self._walks:
-            table = self._sdf.values.reshape(-1)
-            self._walks[thread] = walk_for(self._model, table, self._fine)
-        return self._walks[thread]
-
-    def _fit(self) -> Fit:
-        """Scratch of this thread for fits."""
-        thread = get_ident()
-        if thread not in self._fits:
-            dimension = len(self._twists.basis)
-            self._fits[thread] = fit_for(self._fitting, self._fine_of_fits, dimension)
-        return self._fits[thread]
-
-    def noise(self, pose: Poses, sensor_noise: float) -> Noise:
-        """What known points are off at a pose."""
-        places = self._known.known
-        distances = np.empty((1, len(places)))
-        distances_from_surface(self._model.field, pose.numbers, places, distances, 0, 1)
-        return estimate_noise(distances[0] - self._known.sdf, sensor_noise)
+    def scratch(self) -> Scratch:
+        """Scratch of one thread."""
+        near = near_points_for(self.model.free.rough, 1)
+        return Scratch(near, scratch(12), scratch(_LEVELS))
 
     def of(self, poses: Poses) -> FloatArray:
         """Energies (B,) of poses."""
         energies = np.empty(len(poses))
 
-        def run(first: int, last: int, walk: Any) -> None:
-            energies_below(
-                self._model, self.loss, poses.numbers, np.inf, energies, first, last, walk
-            )
+        def run(first: int, last: int, work: Any) -> None:
+            energies_of(self.model, self.likelihood, poses.numbers, energies, first, last, work)
 
-        spread(run, len(poses), self.walk, least=50)
+        spread(run, len(poses), self.scratch, least=50)
         return energies
 
-    def fitted(self, poses: Poses, steps: int, loss: Loss) -> Poses:
-        """Poses after at most so many Levenberg-Marquardt steps that lower a loss."""
-        moved = np.array(poses.numbers)
 
-        def run(first: int, last: int, fit: Any) -> None:
-            fit_poses(self._fitting, loss, self._twists, moved, steps, first, last, fit)
+@compiled
+def energies_of(model, likelihood, poses, out, first, last, work):
+    """Fill out (B,) with the energies of poses (B, 12), from `first` to before `last`."""
+    for n in range(first, last):
+        pose = pose_at(poses, n)
+        known = known_energy(model, likelihood, pose, np.inf, work.sums)
+        gather_free(model, pose, 0.0, work)
+        out[n] = energy_below(model, likelihood, pose, known, np.inf, work)[0]
 
-        spread(run, len(moved), self._fit, least=8)
-        return Poses(moved)
 
-    def walked(
-        self,
-        poses: Poses,
-        energies: FloatArray,
-        floor: float,
-        moves: int,
-        *,
-        kept: int,
-        index: int,
-    ) -> Chains:
-        """Chains from C poses with energies (C,), after so many moves.
+@leaf
+def known_energy(model, likelihood, pose, limit, sums):
+    """The energy of known points; infinite if it is surely above a limit.
 
-        floor: the limit that they stay below, or come down to. kept: states of each to keep.
-        index: of the stream.
-        """
-        chains = chains_from(poses.numbers, energies, kept)
-        if kept == 0 and (energies <= floor).all():
-            return chains
-        draws = MoveDraws(self._key.kernel_stream(Purpose.WALKS, index), moves)
+    sums (K,) become the posterior weights of the levels.
+    """
+    field, known, levels = model.field, model.known, np.uint64(_LEVELS)
+    costs, count = likelihood.costs, known.shape[1]
+    for k in range(levels):
+        sums[k] = 0.0
+    for first in range(0, count, _AT_ONCE):
+        for n in range(first, min(first + _AT_ONCE, count)):
+            s = distance_at(field, pose, known[0, n], known[1, n], known[2, n])
+            at, part = _row(likelihood, s - model.known_sdf[n])
+            for k in range(levels):
+                low = costs[at + k]
+                sums[k] += low + part * (costs[at + levels + k] - low)
+        least = np.inf
+        for k in range(levels):
+            least = min(least, likelihood.power * sums[k] - likelihood.log_weights[k])
+        if least - _LOG_LEVELS > limit:  # costs are not negative
+            return np.inf
+    least, total = np.inf, 0.0
+    for k in range(levels):
+        sums[k] = likelihood.power * sums[k] - likelihood.log_weights[k]
+        least = min(least, sums[k])
+    for k in range(levels):
+        sums[k] = exp(least - sums[k])
+        total += sums[k]
+    for k in range(levels):
+        sums[k] /= total
+    return least - log(total)
 
-        def run(first: int, last: int, walk: Any) -> None:
-            walk_below(
-                self._model, self.loss, self._stride, floor, chains, draws, first, last, walk
-            )
 
-        spread(run, len(poses), self.walk, least=2)
-        return chains
+@leaf
+def _row(likelihood, residual):
+    """Where the row of a residual begins in tables, and the part of the step beyond it."""
+    size = max(abs(residual) - likelihood.shared, 0.0)
+    row = min(size * likelihood.per_metre, likelihood.last)
+    at = np.uint64(row)
+    return at * np.uint64(_LEVELS), row - np.float64(at)
+
+
+@leaf
+def known_slope(likelihood, residual, weights):
+    """The derivative of the energy by half of a squared residual; weights: of the levels."""
+    at, part = _row(likelihood, residual)
+    slopes, levels, total = likelihood.slopes, np.uint64(_LEVELS), 0.0
+    for k in range(levels):
+        low = slopes[at + k]
+        total += weights[k] * (low + part * (slopes[at + levels + k] - low))
+    return likelihood.power * total
+
+
+@leaf
+def _depth_cost(likelihood, depth):
+    """What a free or occupied point costs that is so deep on the wrong side, metres."""
+    ratio = depth / likelihood.softness
+    return min(0.5 * ratio * ratio, likelihood.wrong)
+
+
+@leaf
+def _of_depths(likelihood, costs):
+    """The energy of all points on the wrong side, whose costs have this sum."""
+    beyond = likelihood.later * (costs - likelihood.wrong)
+    return likelihood.power * min(costs, likelihood.wrong + beyond)
+
+
+@leaf
+def depth_slope(likelihood, depth, costs):
+    """The derivative of _of_depths by half of one squared depth."""
+    ratio, softness = depth / likelihood.softness, likelihood.softness
+    if 0.5 * ratio * ratio >= likelihood.wrong:
+        return 0.0
+    share = 1.0 if costs <= likelihood.wrong else likelihood.later
+    return share * likelihood.power / (softness * softness)
+
+
+@leaf
+def energy_below(model, likelihood, pose, known, limit, work):
+    """An energy of known points plus that of occupied and of gathered free ones.
+
+    Infinite above a limit. Also the sum of the costs of the latter.
+    """
+    occupied, table, costs = model.occupied, model.field.table, 0.0
+    for n in range(occupied.shape[1]):
+        s = distance_at(model.field, pose, occupied[0, n], occupied[1, n], occupied[2, n])
+        costs += _depth_cost(likelihood, max(s + model.alpha, 0.0))
+    across, along = np.int64(model.field.box.across), np.int64(model.field.box.along)
+    total = known + _of_depths(likelihood, costs)
+    for n in range(look_around(model, pose, work)):
+        if not total <= limit:
+            break
+        cell, u, v, w = place_of(model, pose, free_point(model, work, n))
+        if cell >= 0:
+            s = value_between_nodes(table, cell, across, along, u, v, w)
+            costs += _depth_cost(likelihood, max(model.alpha - s, 0.0))
+            total = known + _of_depths(likelihood, costs)
+    return total if total <= limit else np.inf, costs
+
+
+@inner
+def gather_free(model, pose, slack, work):
+    """Gather the free points that can matter until the object moves by a slack, metres."""
+    free, points = model.free, work.near
+    remember(free, pose, work.memory)
+    to_cell, rounding = to_cells(free.rough, free.cells.box, pose)
+    if len(free.tree.order) == 0 or is_apart(free, pose, slack + free.margin):
+        points.number[0] = 0
+    elif rounding < 0.0 or not rigid(pose):
+        points.number[0] = _ALL
+    else:
+        gather(free.rough, free.cells, to_cell, slack + free.margin + rounding, points, 0)
+
+
+@leaf
+def travel_since_gathering(model, pose, work):
+    """How far in the world any point of the object moved at most since then, metres."""
+    return travel(model.free, pose, work.memory)
+
+
+@leaf
+def look_around(model, pose, work):
+    """Fill hits with those gathered that may cost something at a pose; returns how many."""
+    free, points = model.free, work.near
+    if points.number[0] == 0:
+        return 0
+    to_cell, rounding = to_cells(free.rough, free.cells.box, pose)
+    if points.number[0] != _ALL and rounding >= 0.0:
+        return select(free.rough, free.cells, to_cell, rounding + free.margin, points, 0)
+    count = len(free.tree.order)
+    for at in range(count):
+        points.hits[at] = at
+    return count
+
+
+@leaf
+def free_point(model, work, n):
+    """The n-th of the hits: a point of the world."""
+    free = model.free
+    at, spheres = np.uint64(len(free.tree.starts) - 1 + work.near.hits[n]), free.tree.spheres
+    return spheres[0, at], spheres[1, at], spheres[2, at]
+
+
+@leaf
+def place_of(model, pose, point):
+    """Where a point of the world lies in the grid: the lowest node of its cell, or -1.
+
+    With the fractions u, v, w of the cell's sides. -1: where free points cost nothing.
+    """
+    box = model.field.box
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    x, y, z = moved(pose, point[0], point[1], point[2])
+    a = min(max(first[0], x), last[0])
+    b = min(max(first[1], y), last[1])
+    c = min(max(first[2], z), last[2])
+    u, v, w = (a - first[0]) * inverse, (b - first[1]) * inverse, (c - first[2]) * inverse
+    i, j, k = min(np.floor(u), most[0]), min(np.floor(v), most[1]), min(np.floor(w), most[2])
+    cell = int(i * box.across + j * box.along + k)
+    if a != x or b != y or c != z or model.free.region.clearance[np.uint64(cell)] >= 0.0:
+        cell = -1
+    return cell, u - i, v - j, w - k

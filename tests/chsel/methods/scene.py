@@ -8,11 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
+from chsel.methods.anchor_sampling import most_informative_first
+from chsel.methods.anchored.energy import Energy
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
+from chsel.problem.noise import NoiseModel
 from chsel.problem.online_registration import pose_problem
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import apply, axis_angle, compose, inverse, product
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, product
 from chsel.problem.registration_problem import (
     ArchiveSnapshot,
     Hypotheses,
@@ -45,6 +48,37 @@ BOX_GRID = SdfGrid.from_mesh(BOX, 0.01)
 def contacts_on(mesh: trimesh.Trimesh, count: int) -> FloatArray:
     """Points (count, 3) all over a body at TRUTH."""
     return apply(TRUTH, np.asarray(trimesh.sample.sample_surface(mesh, count, seed=1)[0]))
+
+
+def on_faces(count: int, height: FloatArray | float = 0.0) -> FloatArray:
+    """Points (count, 3) over the middles of the faces of BOX in turn, in its frame.
+
+    height: above the surface, metres. Nearby, distances change as those from planes.
+    """
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (count, 3)) * BOX_SIDES
+    n = np.arange(count)
+    sides = np.where(n // 3 % 2, 1.0, -1.0)
+    points[n, n % 3] = sides * (0.5 * BOX_SIDES[n % 3] + height)
+    return points
+
+
+def box_problem(points: KnownPoints) -> RegistrationProblem:
+    """Points of BOX, whatever its pose."""
+    return RegistrationProblem(BOX_GRID, points, np.eye(4)[None], WORKSPACE, 0.03, StreamKey(5, 2))
+
+
+def energy_of(points: KnownPoints, noise: NoiseModel) -> Energy:
+    """The energy of poses of BOX."""
+    return Energy(box_problem(points), most_informative_first(points), noise)
+
+
+def poses_around_truth(count: int, shift: float, turn: float) -> Poses:
+    """Poses turned by an angle, radians, and shifted in any direction by a length, metres."""
+    random = np.random.default_rng(count)
+    axes, ways = random.standard_normal((2, count, 3))
+    axes /= np.sqrt((axes**2).sum(axis=1, keepdims=True))
+    ways *= shift / np.sqrt((ways**2).sum(axis=1, keepdims=True))
+    return Poses.of(inverse(TRUTH @ compose(axis_angle(axes, turn), ways)))
 
 
 def known_points(world_from_object: FloatArray, contacts: int) -> KnownPoints:

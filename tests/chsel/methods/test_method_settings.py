@@ -12,7 +12,7 @@ import pytest
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import SettingError
 from chsel.methods import OURS, build_method, preset_settings
-from chsel.methods.anchored.anchor_sampling import AnchoredStarts, AnchorSettings
+from chsel.methods.anchor_sampling import AnchoredStarts, AnchorSettings
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.methods.cvo.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
@@ -30,12 +30,8 @@ REFUSED: dict[type[Any], list[tuple[dict[str, Any], str]]] = {
     AnchoredSettings: [
         ({"size": "huge"}, "^size is .*accepted: "),
         ({"noise": 0.0}, "^noise is "),
-        ({"penetration_tolerance": -0.001}, "^penetration_tolerance is "),
-        ({"limit_noise": INF}, "^limit_noise is "),
-        ({"limit_ratio": -1.0}, "^limit_ratio is "),
-        ({"limit_slack": NAN}, "^limit_slack is "),
-        ({"outer_share": 1.1}, "^outer_share is "),
-        ({"outer_noise": -1.0}, "^outer_noise is "),
+        ({"limit": 0.0}, "^limit is "),
+        ({"shared_error": -0.001}, "^shared_error is "),
     ],
     Effort: [
         ({"samples": 0}, "^samples is "),
@@ -47,7 +43,6 @@ REFUSED: dict[type[Any], list[tuple[dict[str, Any], str]]] = {
         ({"moves": -1}, "^moves is "),
         ({"polished": -3}, "^polished is "),
         ({"polish_moves": -1}, "^polish_moves is "),
-        ({"enough": 0.0}, "^enough is "),
         ({"evaluations": NAN}, "^evaluations is "),
     ],
     AnchorSettings: [

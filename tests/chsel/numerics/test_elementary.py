@@ -17,6 +17,7 @@ from chsel.numerics.elementary import (
     arctangent,
     arctangents,
     exp,
+    exps,
     log,
     logs,
     sine_cosine,
@@ -187,12 +188,13 @@ def test_zeros_and_infinities_of_the_arctangent_are_those_of_c() -> None:
 @pytest.mark.parametrize(
     ("arrays", "scalar"),
     [
+        (exps, exp),
         (logs, log),
         (lambda x: sines_cosines(x)[0], sine),
         (lambda x: sines_cosines(x)[1], cosine),
         (lambda x: arctangents(x, 0.3), lambda x: arctangent(x, 0.3)),
     ],
-    ids=["logs", "sines", "cosines", "arctangents"],
+    ids=["exps", "logs", "sines", "cosines", "arctangents"],
 )
 def test_arrays_keep_their_shape_and_hold_the_scalars(
     arrays: Callable[[FloatArray | float], FloatArray], scalar: Callable[[float], float]

@@ -8,10 +8,12 @@ import trimesh
 
 import chsel
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.freedom import can_be_moved
+from chsel.problem.freedom import can_be_moved, pose_energies
+from chsel.problem.noise import noise_model
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
+from tests.chsel.samples import plain_energies
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.16))
 CAN = trimesh.creation.cylinder(0.04, 0.12, sections=64)
@@ -22,12 +24,15 @@ BEST = Poses.of(inverse(POSE[None]))
 SIGMA, DISTANCE = 0.001, 0.006
 
 
-def movable(mesh: trimesh.Trimesh, sigma: float = SIGMA, **points: FloatArray) -> bool:
-    """Of points in the object's frame."""
+def touched(mesh: trimesh.Trimesh, **points: FloatArray) -> RegistrationProblem:
+    """By points in the object's frame."""
     known = chsel.KnownPoints(**{name: apply(POSE, group) for name, group in points.items()})
     sdf, room = chsel.SdfGrid.from_mesh(mesh, 0.004), chsel.Workspace((-1, -1, -1), (1, 1, 1))
-    problem = RegistrationProblem(sdf, known, BEST.matrices, room, 0.01, StreamKey(0, 0))
-    return can_be_moved(problem, BEST, sigma, DISTANCE)
+    return RegistrationProblem(sdf, known, BEST.matrices, room, 0.01, StreamKey(0, 0))
+
+
+def movable(mesh: trimesh.Trimesh, sigma: float = SIGMA, **points: FloatArray) -> bool:
+    return can_be_moved(touched(mesh, **points), BEST, sigma, DISTANCE)
 
 
 def on(mesh: trimesh.Trimesh, count: int) -> FloatArray:
@@ -67,3 +72,19 @@ def test_free_space_holds_an_object_too() -> None:
 
 def test_nothing_known_nearby_holds_nothing() -> None:
     assert movable(BOX, free=np.full((3, 3), 0.5))
+
+
+@pytest.mark.parametrize("contacts", [5, 40])
+def test_energies_of_poses_are_the_plain_formula(contacts: int) -> None:
+    random = np.random.default_rng(contacts)
+    problem = touched(
+        BOX,
+        known=on(BOX, contacts),
+        free=on(BOX, 30) * random.uniform(0.8, 1.2, (30, 1)),
+        occupied=on(BOX, 9) * random.uniform(0.9, 1.1, (9, 1)),
+    )
+    turns = axis_angle(np.array([0.0, 0.6, 0.8]), np.array([0.0, 0.05, 0.5]))
+    poses = Poses.of(inverse(POSE @ compose(turns, random.normal(0.0, 0.01, (3, 3)))))
+    noise = noise_model(SIGMA)
+    expected = plain_energies(noise, problem.sdf, problem.points, poses)
+    np.testing.assert_allclose(pose_energies(problem, poses, noise), expected, rtol=1e-9)

@@ -1,11 +1,21 @@
-"""The noise of contacts and the share of outliers, from distances at the best pose."""
+"""What points are off: estimated at the best pose, and the likelihood of poses by it."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from chsel.problem.noise import PRIOR_CONTACTS, PRIOR_OUTLIERS, estimate_noise
+from chsel.problem.noise import (
+    INDEPENDENT,
+    LATER,
+    LEVELS,
+    PRIOR_CONTACTS,
+    PRIOR_OUTLIERS,
+    WRONG,
+    estimate_noise,
+    noise_model,
+)
+from tests.chsel.samples import plain_energy
 
 SENSOR = 0.0005
 
@@ -44,3 +54,44 @@ def test_one_contact_far_off_among_five_is_an_outlier() -> None:
 def test_neither_order_nor_sign_matters() -> None:
     distances = np.random.default_rng(1).normal(0.0, 0.003, 40)
     assert estimate_noise(distances, SENSOR) == estimate_noise(-distances[::-1], SENSOR)
+
+
+@pytest.mark.parametrize(("known", "shared"), [(0, 0.0), (3, 0.0), (12, 0.004), (50, 0.0)])
+def test_energies_are_the_formula(known: int, shared: float) -> None:
+    """Of contacts, one of which is 30 cm off, and of 40 voxels: none, some or most are wrong."""
+    random, noise = np.random.default_rng(known), noise_model(SENSOR, shared)
+    residuals = random.normal(0.0, 0.004, (9, known))
+    residuals[4:, :1] = 0.3
+    depths = random.normal(np.repeat([-0.03, -0.003, 0.01], 3)[:, None], 0.004, (9, 40))
+    expected = [plain_energy(noise, *row) for row in zip(residuals, depths, strict=True)]
+    np.testing.assert_allclose(noise.energies(residuals, depths), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_levels_of_noise_are_those_of_the_sensor_and_of_all_else() -> None:
+    one, other = noise_model(0.0), noise_model(0.003)
+    assert len(one.sigmas) == LEVELS
+    assert sum(one.weights) == pytest.approx(1.0)
+    squares = np.square(other.sigmas) - np.square(one.sigmas)
+    np.testing.assert_allclose(squares, 0.003**2)
+    logs = np.log(one.sigmas)
+    np.testing.assert_allclose(np.diff(logs), np.diff(logs)[0])
+    assert one.sigmas[0] < 0.001 < 0.005 < one.sigmas[-1]
+
+
+def test_wrong_points_cost_a_bounded_amount_and_later_ones_less() -> None:
+    noise, none = noise_model(SENSOR), np.zeros((5, 0))
+    depths = np.zeros((5, 4))
+    depths[1, 0], depths[2, 0], depths[3, :2], depths[4] = 0.05, 0.5, 0.5, 0.5
+    costs = np.diff(noise.energies(none, depths))
+    np.testing.assert_allclose(costs, [WRONG, 0.0, LATER * WRONG, 2.0 * LATER * WRONG])
+    foreign = noise.energies(np.array([[0.0], [0.05], [0.5]]), np.zeros((3, 0)))
+    assert 5.0 < foreign[1] - foreign[0] < 9.0  # of a contact on another object
+    assert foreign[2] == pytest.approx(foreign[1], abs=0.01)
+
+
+def test_many_alike_points_count_as_few() -> None:
+    noise, count = noise_model(SENSOR), int(INDEPENDENT)
+    rows = np.random.default_rng(2).normal(0.0, 0.003, (4, count))
+    once = noise.energies(rows, np.zeros((4, 0)))
+    many = noise.energies(np.tile(rows, (1, 7)), np.zeros((4, 0)))
+    np.testing.assert_allclose(many, once, rtol=1e-9)

@@ -12,19 +12,27 @@ import trimesh
 import chsel
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.threads import threads
-from chsel.problem.outline import outline_distances, signed_distances
+from chsel.problem.freedom import pose_energies
+from chsel.problem.noise import LIMIT, noise_model
+from chsel.problem.outline import outline_distances
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
 from chsel.problem.trust import (
+    FOREIGN_CONTACT,
+    LEAST_GAP,
+    LEAST_LEVELS,
+    MANY_CONTACTS,
+    MOST_NOISE,
     MOST_OFF,
     MOST_SYSTEMATIC,
-    _contradictions,
+    MOST_WIDTH,
+    SYMMETRIC,
     check_trust,
     correlation,
     has_pose,
     trust_in,
+    turned,
 )
 from tests.chsel.samples import hypotheses_at
 
@@ -120,6 +128,18 @@ def test_errors_of_whole_sides_may_be_less(height: float, fits: bool) -> None:
     assert told.verdict != "nothing fits"
 
 
+@pytest.mark.parametrize(("levels", "fits"), [(0.9, True), (1.1, False)])
+def test_contacts_may_not_be_off_by_more_than_any_sensor_is(levels: float, fits: bool) -> None:
+    sizes = np.random.default_rng(0).standard_normal(len(NORMALS))
+    heights = levels * MOST_NOISE / np.sqrt((sizes**2).mean()) * sizes
+    posed = problem(chsel.KnownPoints(known=at_height(*heights)))
+    trust = trust_in(posed, ball(), NOISE)
+    assert trust.noise == pytest.approx(levels * MOST_NOISE, rel=0.03)
+    assert (trust.verdict != "nothing fits") is fits
+    stated = 1.2 * levels * MOST_NOISE / LEAST_LEVELS
+    assert trust_in(posed, ball(), stated).verdict != "nothing fits"
+
+
 @pytest.mark.parametrize("scale", [1.2, 1.0 / 1.2])
 def test_a_wrong_scale_fits_nothing(scale: float) -> None:
     sdf = chsel.SdfGrid.from_mesh(BOX.copy().apply_scale(scale), 0.004)
@@ -198,6 +218,134 @@ def test_samples_of_a_continuum_are_no_modes(shifts: list[float]) -> None:
     assert str(trust).startswith("wide (spread ")
 
 
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No pose can be moved, so that the verdict depends on the poses of the set."""
+    monkeypatch.setattr("chsel.problem.trust.can_be_moved", lambda *_: False)
+
+
+def lying(z: float = 0.0) -> FloatArray:
+    """The box with its side across y where that across x is at POSE, shifted along it."""
+    quarter = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(-0.5 * np.pi))
+    return np.asarray(POSE @ compose(quarter, np.array([0.02, 0.0, z])))
+
+
+def touched_on_one_side() -> RegistrationProblem:
+    side = np.array([[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.0, 0.04)])
+    return problem(chsel.KnownPoints(known=apply(POSE, side)), GRID)
+
+
+@pytest.mark.usefixtures("held")
+def test_a_set_is_wide_where_any_mode_is() -> None:
+    steps, posed = np.arange(0.0, 0.041, 0.01), touched_on_one_side()
+    narrow, wide = [POSE, moved(z=0.01)], [moved(z=step) for step in steps]
+    others = [lying(), lying(0.01)]
+    for poses, verdict in (
+        ([*narrow, *others], "several modes"),
+        (wide, "wide"),
+        ([*wide, *others], "wide"),
+        ([*narrow, *(lying(step) for step in steps)], "wide"),
+    ):
+        assert trust_in(posed, hypotheses(*poses)).verdict == verdict
+
+
+@pytest.mark.parametrize("movable", [0, 1])
+def test_a_set_is_wide_where_any_mode_can_be_moved(
+    monkeypatch: pytest.MonkeyPatch, movable: int
+) -> None:
+    found = hypotheses(POSE, lying())
+
+    def can_be_moved(_: RegistrationProblem, pose: Poses, *__: float) -> bool:
+        return np.array_equal(pose.matrices[0], found.object_from_world[movable])
+
+    monkeypatch.setattr("chsel.problem.trust.can_be_moved", can_be_moved)
+    assert trust_in(touched_on_one_side(), found).verdict == "wide"
+
+
+@pytest.mark.usefixtures("held")
+def test_poses_within_the_noise_are_one_mode() -> None:
+    """A ball whose distances are known to points on a ring is on one side of the ring or another.
+
+    The noise is the same on both sides.
+    """
+    half, count = 0.01, 30  # of the way between the two places, across the ring
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    ring = 0.014 * np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+    distances = np.sqrt((ring**2).sum(axis=1) + half**2) - RADIUS
+    places = [compose(np.eye(3), CENTRE + np.array([0.0, 0.0, z])) for z in (half, -half)]
+    apart = outline_distances(BALL, Poses.of(inverse(np.array(places))))[0, 1]
+    assert MOST_WIDTH * BALL.diameter < apart < 1.2 * MOST_WIDTH * BALL.diameter
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], count)
+    for noise, modes in ((0.8 * apart / LEAST_GAP, 2), (1.2 * apart / LEAST_GAP, 1)):
+        points = chsel.KnownPoints(known=CENTRE + ring, known_sdf=distances + noise * signs)
+        trust = trust_in(problem(points), hypotheses(*places), NOISE)
+        assert trust.noise == pytest.approx(noise, rel=0.1)
+        assert trust.modes == modes
+
+
+@pytest.mark.usefixtures("held")
+def test_poses_that_leave_out_one_of_few_contacts_are_rivals() -> None:
+    """A box slid until one contact is in the air, and off the others by as much as is allowed."""
+    side = [[0.05, y, z] for y in (-0.02, 0.0, 0.02) for z in (-0.04, 0.04)]
+    known = np.array([*side, [0.02, 0.03, -0.03], [0.0, 0.0, 0.08], [-0.02, 0.03, 0.03]])
+    assert len(known) == MANY_CONTACTS - 1
+    slid = np.array([moved(x=x, z=0.03) for x in np.arange(0.0, 0.005, 0.0001)])
+    rivals, noise = Poses.of(inverse(slid)), noise_model(NOISE)
+    for contacts, few in ((known, True), (np.concatenate([known, [[0.05, 0.01, 0.02]]]), False)):
+        posed = problem(chsel.KnownPoints(known=apply(POSE, contacts)), GRID)
+        energies = pose_energies(
+            posed, Poses.joined([Poses.of(inverse(POSE[None])), rivals]), noise
+        )
+        above = energies[1:] - energies[0]
+        n = int(np.argmin(np.abs(above - LIMIT - 0.5 * FOREIGN_CONTACT)))
+        assert LIMIT < above[n] < LIMIT + FOREIGN_CONTACT
+        alone, found = hypotheses(POSE), hypotheses(POSE, slid[n])
+        assert trust_in(posed, alone, NOISE).verdict == "determined"
+        assert trust_in(posed, found, NOISE).verdict == "determined"  # it is too unlikely itself
+        beside = trust_in(posed, alone, NOISE, rivals[n : n + 1])
+        assert beside.verdict == ("several modes" if few else "determined")
+        assert beside.best_of_modes == (0,)  # rivals have no index
+        apart = Poses.of(inverse(moved(x=0.03)[None]))
+        assert trust_in(posed, alone, NOISE, apart).verdict == "determined"
+
+
+def test_twins_are_told_apart_and_true_symmetries_are_not() -> None:
+    """A quarter turn of a box moves its sides by 3 mm; contacts lie half of that off in both."""
+    sdf = chsel.SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.106, 0.16)), 0.004)
+    corners = [[y, z] for y in (-0.03, 0.03) for z in (-0.06, 0.06)]
+    sides = np.array([[x, y, z] for x in (-0.0515, 0.0515) for y, z in corners])
+    ends = [[x, y, z] for x in (-0.02, 0.02) for y in (-0.02, 0.02) for z in (-0.08, 0.08)]
+    known = np.concatenate([sides, sides[:, [1, 0, 2]], ends])
+    posed = problem(chsel.KnownPoints(known=apply(POSE, known)), sdf)
+    quarter, half = moved(about_z=0.5 * math.pi), moved(about_z=math.pi)
+    alike = trust_in(posed, hypotheses(POSE, half), NOISE)
+    assert (alike.verdict, alike.modes, alike.twins) == ("determined", 1, None)
+    quarters = Poses.of(inverse(quarter[None]))
+    for trust, best in (
+        (trust_in(posed, hypotheses(POSE, half, quarter), NOISE), (0, 2)),
+        (trust_in(posed, hypotheses(POSE), NOISE, quarters), (0,)),
+    ):
+        assert (trust.verdict, trust.modes, trust.best_of_modes) == ("several modes", 2, best)
+        assert trust.twins is not None
+        assert trust.twins[0] == pytest.approx(0.5 * math.pi)
+        assert trust.twins[1] == pytest.approx(0.003 * math.sqrt(0.066 / 0.087), rel=0.15)
+        start = f"determined up to a turn of 90 degrees, {1000.0 * trust.twins[1]:.1f} mm apart (2 "
+        assert str(trust).startswith(start)
+
+
+def test_turns_count_beyond_symmetries() -> None:
+    """A box with sides 0.1 and 0.106: a quarter turn moves 3 mm, one of 0.1 and 0.101 less."""
+    for other, expected in ((0.106, True), (0.101, False)):
+        sdf = chsel.SdfGrid.from_mesh(trimesh.creation.box((0.1, other, 0.16)), 0.004)
+        assert (0.5 * (other - 0.1) * 0.87 > SYMMETRIC * sdf.diameter) is expected
+        some = [POSE, moved(about_z=0.3), moved(about_z=0.5 * math.pi), moved(about_z=math.pi)]
+        poses = Poses.of(inverse(np.array([*some, moved(about_z=1.0)])))
+        flags = turned(sdf, poses, np.ones((5, 5), dtype=bool))
+        np.testing.assert_array_equal(flags, flags.T)
+        assert flags[0].tolist() == [False, False, expected, False, True]
+        assert not turned(sdf, poses, np.eye(5, dtype=bool)).any()
+
+
 def test_the_spread_is_the_root_mean_square_of_surfaces_of_all_pairs() -> None:
     """Of balls d apart, each point of a surface is d |cos| off the other, d / sqrt(3) on average.
 
@@ -271,27 +419,10 @@ def test_an_object_thinner_than_its_grid_is_judged_too() -> None:
     sdf = chsel.SdfGrid.from_mesh(plate, 0.0085)
     assert sdf.values.min() > 0.0
     known = apply(POSE, trimesh.sample.sample_surface(plate, 20, seed=0)[0])
-    trust = trust_in(problem(chsel.KnownPoints(known=known), sdf), hypotheses(POSE, moved(x=0.05)))
-    assert trust.spread > 0.005
+    middle = known[np.abs(apply(inverse(POSE), known)[:, 0]) < 0.03]
+    posed = problem(chsel.KnownPoints(known=middle), sdf)
+    trust = trust_in(posed, hypotheses(POSE, moved(x=0.02)))  # slid along itself
+    assert trust.spread > 0.002
     nowhere = chsel.SdfGrid(np.zeros(3), 0.01, np.ones((4, 4, 4)), np.ones((4, 4, 4, 3)))
     trust = trust_in(problem(chsel.KnownPoints(known=known), nowhere), hypotheses(POSE))
     assert (trust.verdict, trust.modes) == ("nothing fits", 0)
-
-
-@pytest.mark.parametrize("count", [1, 3])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_contradictions_are_by_the_distances_that_the_grid_gives(sign: float, count: int) -> None:
-    random = np.random.default_rng(1)
-    world_from_object = [moved(*random.uniform(-0.05, 0.05, 4)) for _ in range(7)]
-    poses, tolerance = Poses.of(inverse(np.array(world_from_object))), 0.003
-    points = CENTRE + random.uniform(-0.15, 0.15, (5000, 3))  # the grid's box ends among them
-    places = [apply(pose, points) for pose in poses.matrices]
-    expected = np.array([GRID.at(place, lookup="trilinear")[0] for place in places])
-    with threads(count):
-        found = signed_distances(GRID, poses, points)
-        depths, counts = _contradictions(GRID, poses, points, sign, tolerance)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
-    wrong = sign * expected > tolerance
-    assert (wrong.sum(axis=1) > 100).all()
-    assert counts.tolist() == wrong.sum(axis=1).tolist()
-    np.testing.assert_allclose(depths, (sign * expected * wrong).sum(axis=1), rtol=1e-9)

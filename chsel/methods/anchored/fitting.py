@@ -1,34 +1,41 @@
-"""Levenberg-Marquardt steps that fit poses to known points and out of free space.
+"""Levenberg-Marquardt steps that lower the energy of poses.
 
-The residuals are s - v of every known point, the depth below a level of every free point that is
-deeper, and the height above it of every occupied point that is higher. Each costs a robust loss,
-by iteratively reweighted least squares (Holland and Welsch, 1977).
+The normal equations are those of the energy's residuals, each weighed by the derivative of what it
+costs: iteratively reweighted least squares (Holland and Welsch, 1977), and for the mixture over
+levels of noise a step of expectation maximisation.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.cost.cost_kernels import Model
-from chsel.methods.anchored.fine_cells import FineCells
-from chsel.methods.anchored.surrounding_kernels import (
-    Surrounding,
-    gather,
-    hit,
+from chsel.methods.anchored.energy import (
+    Energy,
+    Scratch,
+    depth_slope,
+    energy_below,
+    free_point,
+    gather_free,
+    known_energy,
+    known_slope,
     look_around,
     place_of,
-    surrounding_for,
     travel_since_gathering,
 )
 from chsel.numerics.arrays import FloatArray, scratch
+from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
+from chsel.numerics.threads import spread
+from chsel.problem.poses import Poses
 from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
+from chsel.problem.search_space import SE2Space, SearchSpace
 
+_LEVER = 0.15  # metres that a radian counts for
 _MOST_SHIFT, _MOST_TURN = 0.08, 0.5  # of a step, metres and radians
-_SLACK = 0.02  # metres that a pose may move before they are gathered again
+_SLACK = 0.02  # metres that a pose may move before free points are gathered again
 _FIRST_DAMPING = 1e-2  # of the mean of the diagonal
 _LESS, _MORE = 0.3, 5.0  # factors of the damping, after a step that was good or bad
 _MOST_DAMPING = 1e6
@@ -42,81 +49,78 @@ class Twists(NamedTuple):
     pivot: tuple[float, float, float]  # the point of the object about which it turns
 
 
-class Loss(NamedTuple):
-    """What residuals cost: quadratic up to a knee (Huber, 1964), then linear, then a constant."""
-
-    knee: float  # metres
-    cap: float  # metres; at least the knee
-    most_wrong: float  # what a free or occupied point costs an energy at most, metres
+def twists_of(space: SearchSpace, pivot: FloatArray) -> Twists:
+    """All of SE(3) or SE(2), about a point (3,) of the object."""
+    basis = np.eye(6)
+    if isinstance(space, SE2Space):
+        basis = np.zeros((3, 6))
+        basis[0, :3], basis[1, 3:], basis[2, 3:] = space.axis, space.e_u, space.e_v
+    basis[:, :3] /= _LEVER
+    return Twists(basis, triple(pivot))
 
 
 class Fit(NamedTuple):
     """Scratch of one thread. Only the lower triangles of matrices are used."""
 
-    near: Surrounding
+    work: Scratch
     sums: FloatArray  # (8, 6): over residuals, of products of their rates of change by twists, of
     # these rates times the residuals; and the rates of one
-    normal: FloatArray  # (2, d, d), of the normal equations at a pose and at one that is tried
-    right: FloatArray  # (2, d)
+    normal: FloatArray  # (d, d), of the normal equations
+    right: FloatArray  # (d,)
     factor: FloatArray  # (d, d), of Cholesky
     row: FloatArray  # (d,), the solution
     twist: FloatArray  # (6,)
 
 
-def fit_for(model: Model, fine: FineCells, d: int) -> Fit:
-    """Scratch for one thread, for twists of d dimensions. fine: see surrounding_for."""
-    normal, right, factor = scratch(2, d, d), scratch(2, d), scratch(d, d)
-    sums, row, twist = scratch(8, 6), scratch(d), scratch(6)
-    return Fit(surrounding_for(model, fine), sums, normal, right, factor, row, twist)
+def fitted(energy: Energy, twists: Twists, poses: Poses, steps: int) -> Poses:
+    """Poses after at most so many steps that lower their energies."""
+    result, d = np.array(poses.numbers), len(twists.basis)
 
+    def own() -> Fit:
+        normal, right, factor = scratch(d, d), scratch(d), scratch(d, d)
+        return Fit(energy.scratch(), scratch(8, 6), normal, right, factor, scratch(d), scratch(6))
 
-@leaf
-def cost_of_residual(loss, residual):
-    """The loss, in metres: the size of a residual less half a knee, where that is linear."""
-    size = min(abs(residual), loss.cap)
-    return size - 0.5 * loss.knee if size > loss.knee else 0.5 * size * size / loss.knee
+    def run(first: int, last: int, fit: Any) -> None:
+        fit_poses(energy.model, energy.likelihood, twists, result, steps, first, last, fit)
 
-
-@leaf
-def _weight(loss, residual):
-    """The derivative of the loss by half of the residual's square."""
-    size = abs(residual)
-    return 1.0 / max(size, loss.knee) if size < loss.cap else 0.0
+    spread(run, len(result), own, least=8)
+    return Poses(result)
 
 
 @compiled
-def fit_poses(model, loss, twists, poses, iterations, first, last, fit):
+def fit_poses(model, likelihood, twists, poses, steps, first, last, fit):
     """Move poses (B, 12) from `first` to `last` by up to so many steps."""
     for n in range(first, last):
-        pose = _fitted(model, loss, twists, pose_at(poses, n), iterations, fit)
+        pose = _fitted(model, likelihood, twists, pose_at(poses, n), steps, fit)
         for i in range(12):
             poses[n, i] = pose[i]
 
 
 @inner
-def _fitted(model, loss, twists, pose, iterations, fit):
-    dimension = len(twists.basis)
-    gather(model, pose, _SLACK, fit.near)
-    at, damping = 0, _FIRST_DAMPING
-    losses = _losses(model, loss, twists, pose, fit, at)
-    for _ in range(iterations):
-        if losses == 0.0:
-            break
+def _fitted(model, likelihood, twists, pose, steps, fit):
+    dimension, damping = len(twists.basis), _FIRST_DAMPING
+    gather_free(model, pose, _SLACK, fit.work)
+    known = known_energy(model, likelihood, pose, np.inf, fit.work.sums)
+    energy, costs = energy_below(model, likelihood, pose, known, np.inf, fit.work)
+    _linearise(model, likelihood, twists, pose, costs, fit)
+    for _ in range(steps):
         trace = 0.0
         for i in range(dimension):
-            trace += fit.normal[at, i, i]
-        if not _solve(fit, at, damping * trace / dimension + 1e-12):
+            trace += fit.normal[i, i]
+        if not _solve(fit, damping * trace / dimension + 1e-12):
             break
         trial = _moved_by(twists, pose, fit)
-        if travel_since_gathering(model, trial, fit.near) > _SLACK:
-            gather(model, trial, _SLACK, fit.near)
-        tried = _losses(model, loss, twists, trial, fit, 1 - at)
-        if tried < losses:
-            gain = losses - tried
-            pose, losses, at = trial, tried, 1 - at
+        if travel_since_gathering(model, trial, fit.work) > _SLACK:
+            gather_free(model, trial, _SLACK, fit.work)
+        known = known_energy(model, likelihood, trial, energy, fit.work.sums)
+        tried, costs = energy_below(model, likelihood, trial, known, energy, fit.work)
+        if tried < energy:
+            gain = energy - tried
+            pose, energy = trial, tried
             damping *= _LESS
             if gain < _ENOUGH * tried:
                 break
+            _linearise(model, likelihood, twists, pose, costs, fit)
         else:
             damping *= _MORE
             if damping > _MOST_DAMPING:
@@ -125,36 +129,35 @@ def _fitted(model, loss, twists, pose, iterations, fit):
 
 
 @inner
-def _losses(model, loss, twists, pose, fit, at):
-    """The sum of the losses; fills the normal equations at a place, 0 or 1."""
-    field, sums, total = model.field, fit.sums, 0.0
+def _linearise(model, likelihood, twists, pose, costs, fit):
+    """Fill the normal equations at a pose; costs: of free and occupied points, see energy_below."""
+    field, sums, work = model.field, fit.sums, fit.work
     for i in range(7):
         for j in range(6):
             sums[i, j] = 0.0
-    for n in range(look_around(model, pose, fit.near)):
-        point = hit(model, fit.near, n)
-        cell, u, v, w = place_of(model, pose, point)
-        if cell >= 0:
-            looked_up = distance_between_nodes(field.box, field.table, cell, u, v, w)
-            residual = looked_up[0] - model.alpha
-            if residual < 0.0:
-                total += cost_of_residual(loss, residual)
-                _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
     for n in range(model.known.shape[1]):
         point = model.known[0, n], model.known[1, n], model.known[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
         residual = looked_up[0] - model.known_sdf[n]
-        total += cost_of_residual(loss, residual)
-        _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
+        slope = known_slope(likelihood, residual, work.sums)
+        _add(sums, twists.pivot, pose, point, looked_up, residual, slope)
+    for n in range(look_around(model, pose, work)):
+        point = free_point(model, work, n)
+        cell, u, v, w = place_of(model, pose, point)
+        if cell >= 0:
+            looked_up = distance_between_nodes(field.box, field.table, cell, u, v, w)
+            depth = model.alpha - looked_up[0]
+            if depth > 0.0:
+                slope = depth_slope(likelihood, depth, costs)
+                _add(sums, twists.pivot, pose, point, looked_up, -depth, slope)
     for n in range(model.occupied.shape[1]):
         point = model.occupied[0, n], model.occupied[1, n], model.occupied[2, n]
         looked_up = distance_with_gradient(field, pose, point[0], point[1], point[2])
-        residual = looked_up[0] + model.alpha
-        if residual > 0.0:
-            total += cost_of_residual(loss, residual)
-            _add(sums, twists.pivot, pose, point, looked_up, residual, _weight(loss, residual))
-    _restrict(twists, fit, at)
-    return total
+        height = looked_up[0] + model.alpha
+        if height > 0.0:
+            slope = depth_slope(likelihood, height, costs)
+            _add(sums, twists.pivot, pose, point, looked_up, height, slope)
+    _restrict(twists, fit)
 
 
 @leaf
@@ -174,7 +177,7 @@ def _add(sums, pivot, pose, point, looked_up, residual, weight):
 
 
 @inner
-def _restrict(twists, fit, at):
+def _restrict(twists, fit):
     """Fill the normal equations from sums over all twists: B N B^T and B r."""
     basis, sums, product = twists.basis, fit.sums, fit.sums[7]
     for i in range(6):
@@ -189,21 +192,21 @@ def _restrict(twists, fit, at):
             total = 0.0
             for k in range(6):
                 total += product[k] * basis[j, k]
-            fit.normal[at, i, j] = total
+            fit.normal[i, j] = total
         total = 0.0
         for k in range(6):
             total += basis[i, k] * sums[6, k]
-        fit.right[at, i] = total
+        fit.right[i] = total
 
 
 @inner
-def _solve(fit, at, damping):
+def _solve(fit, damping):
     """Fill row with -(N + damping I)^-1 r by Cholesky; False if N is not positive definite so."""
     count = len(fit.row)
     lower, row = fit.factor, fit.row
     for i in range(count):
         for j in range(i + 1):
-            total = fit.normal[at, i, j] + (damping if i == j else 0.0)
+            total = fit.normal[i, j] + (damping if i == j else 0.0)
             for k in range(j):
                 total -= lower[i, k] * lower[j, k]
             if i == j:
@@ -213,7 +216,7 @@ def _solve(fit, at, damping):
             else:
                 lower[i, j] = total / lower[j, j]
     for i in range(count):
-        total = -fit.right[at, i]
+        total = -fit.right[i]
         for k in range(i):
             total -= lower[i, k] * row[k]
         row[i] = total / lower[i, i]
