@@ -1,7 +1,8 @@
 """What recordings leave out of the settings of their method, and what they mean by it.
 
 A recording holds all settings that there were when it was made. Those that came later have the
-value here, with which the library does what it did then; today's default may be another one.
+value here, with which the library does what it did then; today's default may be another one. Those
+of `anchored` that no longer exist are dropped: its energy changed, and so did every result.
 """
 
 from __future__ import annotations
@@ -22,12 +23,14 @@ LEFT_OUT: Mapping[type, Mapping[str, Any]] = {
     ChselSettings: {"starts": None},
     DescentSettings: {"race": None},
     # The search changed with these; recordings without them were accepted anew at these values.
-    AnchoredSettings: {"outer_share": 0.25, "outer_noise": 1.0, "shared_error": 0.004},
+    AnchoredSettings: {"shared_error": 0.004, "limit": 9.0},
 }
+_LIMIT = {"limit_noise", "limit_ratio", "limit_slack", "outer_share", "outer_noise"}
+DROPPED = {AnchoredSettings: {"penetration_tolerance", *_LIMIT}}
 
 
 def completed(recorded: Mapping[str, Any], default: Any) -> dict[str, Any]:
-    """A recorded mapping of settings with what it leaves out, groups in it included.
+    """A recorded mapping of today's settings with what it leaves out, groups in it included.
 
     default: settings of the same class, which show the classes of the groups.
     """
@@ -36,4 +39,6 @@ def completed(recorded: Mapping[str, Any], default: Any) -> dict[str, Any]:
         for name, value in recorded.items()
         if isinstance(value, Mapping) and is_dataclass(getattr(default, name, None))
     }
-    return {**LEFT_OUT.get(type(default), {}), **recorded, **groups}
+    dropped = DROPPED.get(type(default), set())
+    kept = {name: value for name, value in recorded.items() if name not in dropped}
+    return {**LEFT_OUT.get(type(default), {}), **kept, **groups}

@@ -25,7 +25,7 @@ STORED = {
     "points_two_passes": _LATER,
     "clamp_medial_constraint_cma_me": {"output.choice", "output.margin"},
     "cracker_box_gradient_descent": {"descent.race", "online.update"},
-    "mustard_anchored": {"outer_share", "outer_noise", "shared_error"},
+    "mustard_anchored": {"shared_error", "limit"},
     "points_default_chsel": set(),
 }
 """Stored recordings, and what each leaves out."""
@@ -74,6 +74,14 @@ def test_what_a_recording_has_stays() -> None:
     settings = settings_mapping(preset_settings("chsel"))
     assert completed(settings, preset_settings("chsel")) == settings
     assert completed({"free_scale": 2.0}, CostSettings()) == {"free_scale": 2.0}
+
+
+def test_settings_that_no_longer_exist_are_dropped_where_they_were() -> None:
+    recorded = {"penetration_tolerance": None, "outer_share": 0.25, "noise": 0.002}
+    made = build_method("anchored", completed(recorded, preset_settings("anchored")))
+    assert settings_mapping(made.settings)["noise"] == 0.002
+    tolerance = {"penetration_tolerance": -0.01}
+    assert completed(tolerance, CostSettings()) == tolerance
 
 
 @pytest.mark.parametrize("name", STORED)
