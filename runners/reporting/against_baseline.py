@@ -15,9 +15,7 @@ from runners.reporting.statistics import DIVERSITY
 from runners.reporting.tables import Cell, Table, number, range_text, table_of
 
 LEAST_PD = 1.0  # mm^2: a PD below counts as this in geometric means, which a 0 would make 0
-MISSED = 0.003  # m: a best energy above this is not of the right pose
 _WORSE = 1.0 + 1e-9  # a ratio above; the rounding of a geometric mean makes no PD worse
-_ENERGY = ("anchored",)  # methods whose cost is an energy in metres
 _PLACE = [*TRIAL, "step"]
 
 
@@ -71,17 +69,11 @@ class _Compared:
     title: str
     rows: pd.DataFrame  # of the method, with ratios
     is_baseline: bool
-    has_energy: bool  # its cost is an energy in metres
 
 
 def _worse(of: _Compared) -> str:
     ratios = of.rows["ratio"].dropna()
     return "-" if of.is_baseline else _percent((ratios > _WORSE).mean())
-
-
-def _misses(of: _Compared) -> str:
-    energies = of.rows["best_cost"].dropna()
-    return _percent((energies > MISSED).mean()) if of.has_energy else "-"
 
 
 def _count(of: _Compared) -> Cell:
@@ -115,24 +107,18 @@ def _summary(evaluation: Evaluation, styles: Styles, baseline: str, rows: pd.Dat
         "worse": _worse,
         "members": lambda of: _percent(of.rows["exact_members"].mean()),
         "distinct [least]": _distinct,
-        "misses": _misses,
         "s, median": lambda of: of.rows["seconds"].dropna().median(),
         "s, mean": lambda of: of.rows["seconds"].mean(),
     }
     note = (
         "Ratio: the geometric mean of all. Members: the mean share of hypotheses that are members "
         f"of the plausible set by its definition, {evaluation.definition_text}. Distinct: poses, "
-        f"on average. Misses: registrations whose best energy is above {1000.0 * MISSED:g} mm, "
-        "where the cost is an energy."
+        "on average."
     )
-    asked = evaluation.experiment.get("methods")
-    asked = asked if isinstance(asked, Mapping) else {}
-    compared = []
-    for method, style in styles.items():
-        about = asked.get(method)
-        energy = isinstance(about, Mapping) and about.get("name") in _ENERGY
-        own = rows[rows["method"] == method]
-        compared.append(_Compared(style.title, own, method == baseline, energy))
+    compared = [
+        _Compared(style.title, rows[rows["method"] == method], method == baseline)
+        for method, style in styles.items()
+    ]
     title = f"PD and its ratios over all registrations, by {evaluation.definition}"
     return table_of(title, columns, compared, note=note)
 

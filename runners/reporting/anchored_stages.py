@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError, require_choice
-from chsel.methods.anchored.anchor_sampling import AnchorSampler, most_informative_first
+from chsel.methods.anchor_sampling import AnchorSampler, most_informative_first
 from chsel.methods.anchored.anchored import Anchored, Search
 from chsel.methods.anchored.anchored_settings import EFFORTS, AnchoredSettings
 from chsel.numerics.arrays import FloatArray
@@ -37,27 +37,26 @@ _OUTLINES = 30  # of each stage, evenly from the lowest energy to the highest
 _COLOR = "#0072b2"
 _MARGIN = 0.05  # metres around what is in view
 _IN_VIEW = (0.02, 0.98)  # quantiles of the sampled poses' corners
-_LEAST = 0.01  # millimetres: below it a median energy is not written as a number
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Poses object_from_world (B, 4, 4) and energies (B,) in metres, the lowest first."""
+    """Poses object_from_world (B, 4, 4) and energies (B,) in nats, the lowest first."""
 
     title: str
     poses: FloatArray
     energies: FloatArray
 
 
-class _LastTraces(NullObserver):
-    """Keeps the last trace of each stage of a registration."""
+class _FirstTraces(NullObserver):
+    """Keeps the first trace of each stage of a registration."""
 
     def __init__(self) -> None:
         self.of_stage: dict[str, tuple[FloatArray, FloatArray]] = {}
 
     def trace(self, stage: str, iteration: int, vectors: FloatArray, cost: FloatArray) -> None:
         """Keep it."""
-        self.of_stage[stage] = vectors, cost
+        self.of_stage.setdefault(stage, (vectors, cost))
 
 
 def stages_of(problem: RegistrationProblem, settings: AnchoredSettings) -> list[Stage]:
@@ -67,7 +66,7 @@ def stages_of(problem: RegistrationProblem, settings: AnchoredSettings) -> list[
     known, anchors = most_informative_first(problem.points), settings.anchors
     sampled = AnchorSampler(problem, known, space, anchors).best(effort.samples, effort.kept)
     energy = Search(problem, settings, NullObserver()).energy
-    traces = _LastTraces()
+    traces = _FirstTraces()
     found = Anchored(settings).register(problem, traces)
     stages = [_sorted("sampled on contacts", sampled.matrices, energy.of(sampled))]
     for name, title in (("fit", "fitted"), ("spread", "spread below the limit")):
@@ -103,13 +102,12 @@ def picture_of_stages(
         if truth is not None:
             silhouettes.draw(panel, truth, TRUE_POSE, width=2.0, style="dashed")
         panel.plot(*frame.flat(contacts).T, **CONTACT, zorder=6.0)
-        median = 1e3 * float(np.median(stage.energies))
-        energy = f"{median:.2g} mm" if median >= _LEAST else f"below {_LEAST:g} mm"
-        panel.set_title(f"{len(stage.poses)} {stage.title}\nmedian energy {energy}")
+        median = float(np.median(stage.energies))
+        panel.set_title(f"{len(stage.poses)} {stage.title}\nmedian energy {median:.1f} nats")
         frame.set_on(panel, left=column == 0)
         panel.tick_params(labelleft=column == 0)
-        energies = 1e3 * stage.energies[evenly]
-        data.append(pose_table(poses, kind=stage.title, energy_mm=energies))
+        energies = stage.energies[evenly]
+        data.append(pose_table(poses, kind=stage.title, energy_nats=energies))
     handles = [
         Line2D([], [], color=_COLOR, label=f"poses: at most {_OUTLINES} a panel"),
         Line2D([], [], **CONTACT, label="contacts"),

@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from chsel.errors import ChselError, SettingError, require_choice
+from chsel.methods import trust_by
 from chsel.methods.anchored.anchored import Anchored
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.numerics.arrays import BoolArray, FloatArray
@@ -26,7 +27,6 @@ from chsel.problem.poses import Poses, apply, inverse
 from chsel.problem.registration_problem import Trust
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
-from chsel.problem.trust import trust_in
 from replay.console import Console, print_error, print_written
 from replay.events import Probe
 from runners.evaluation.trial_configurations import object_values
@@ -116,6 +116,8 @@ def faulty_case(
     if truth is None or len(contacts) == 0:
         raise SettingError(f"probe is {probe}; accepted: one with a contact up to it")
     found, true_pose = method.register(problem), inverse(truth[None])
+    trust = trust_by(method, problem, found)
+    assert trust is not None
     probed = probed_mesh(model.mesh, LEVELS[level])
     both = Poses.of(np.concatenate([true_pose, found.object_from_world[:1]]))
     return FaultyCase(
@@ -127,7 +129,7 @@ def faulty_case(
         contacts=contacts,
         off=signed_distances(sdf, both, contacts),
         wrong=free[mesh_sdf(probed, apply(true_pose[0], free))[0] < 0.0],
-        trust=trust_in(problem, found, settings.noise),
+        trust=trust,
         held=bool(method.holds(problem, found, true_pose)[0]),
     )
 
