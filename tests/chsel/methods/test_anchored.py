@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from chsel.errors import ChselError
+from chsel.methods.anchor_sampling import AnchorSampler
 from chsel.methods.anchored.anchored import Anchored, Search
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.methods.registry import build_method, trust_by
@@ -227,6 +228,22 @@ def test_the_truth_stays_beside_a_foreign_contact_among_few(contacts: int) -> No
     trust = trust_by(method, problem, found)
     assert trust is not None
     assert off[0] < 0.01 or trust.verdict != "determined"
+
+
+@pytest.mark.parametrize(("contacts", "expected"), [(3, {0}), (4, {0, 1})])
+def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(
+    monkeypatch: pytest.MonkeyPatch, contacts: int, expected: set[int]
+) -> None:
+    left_out, best = set(), AnchorSampler.best
+
+    def watched(*arguments: Any, **named: Any) -> Poses:
+        left_out.add(named["left_out"])
+        return best(*arguments, **named)
+
+    monkeypatch.setattr(AnchorSampler, "best", watched)
+    method = anchored(replace(EFFORT, evaluations=100_000))
+    method.register(posed(method, KnownPoints(known=POINTS.known[:contacts])))
+    assert left_out == expected
 
 
 def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other() -> None:
