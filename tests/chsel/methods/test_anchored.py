@@ -247,14 +247,14 @@ def test_rounds_of_more_than_three_contacts_leave_one_out_in_turn(
 
 
 def test_the_twin_of_a_nearly_symmetric_object_is_found_from_the_other() -> None:
-    """Contacts lie half way between a box and the same box turned, and nothing is sampled."""
+    """Contacts lie half way between a box and the same box turned; one pose is sampled."""
     sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.106, 0.16)), 0.005)
     between = trimesh.creation.box((0.103, 0.103, 0.16))
     contacts = apply(TRUTH, np.asarray(trimesh.sample.sample_surface(between, 40, seed=1)[0]))
     quarter = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5 * np.pi)), np.zeros(3))
     both = Poses.of(inverse(np.stack([TRUTH, TRUTH @ quarter])))
     assert outline_distances_to(sdf, both[:1], both[1:])[0] > 0.002
-    method, start = anchored(replace(EFFORT, samples=10)), np.repeat(both.matrices[:1], 9, axis=0)
+    method, start = anchored(replace(EFFORT, samples=1)), np.repeat(both.matrices[:1], 9, axis=0)
     problem = posed(method, KnownPoints(known=contacts), sdf=sdf, initial_set=start)
     found = Poses.of(registered(method, problem).object_from_world)
     for one in (both[:1], both[1:]):
