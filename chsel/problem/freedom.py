@@ -99,7 +99,7 @@ def _moved(problem: RegistrationProblem, pose: Poses, twists: FloatArray) -> Pos
 def pose_energies(problem: RegistrationProblem, poses: Poses, noise: NoiseModel) -> FloatArray:
     """Minus the log-likelihood (B,) of the points in poses, nats, see `chsel.problem.noise`.
 
-    Of many points by some, which count for all.
+    Of many points by some; those left out count for nothing.
     """
     points, sdf = problem.points, problem.sdf
     known = evenly_spaced(len(points.known), _MOST_KNOWN)
