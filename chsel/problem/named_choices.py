@@ -51,7 +51,7 @@ class NamedChoices(Generic[Made]):
         return in_own_preset(preset) if in_own_preset else in_preset(default, preset)
 
     def build(self, name: str, settings: Any = None) -> Made:
-        """A choice by name.
+        """A choice, such as a method or a policy, by name.
 
         settings: its settings, or a mapping of changes to those of the preset `default`. Raises
         SettingError for names and values that do not exist, and for a name of ours that an
