@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 from chsel.errors import require_choice
@@ -21,13 +19,13 @@ from chsel.methods.medial_constraint import (
 )
 from chsel.methods.method import Method
 from chsel.methods.svgd import Svgd, SvgdSettings
-from chsel.problem.named_choices import NamedChoices
+from chsel.problem.named_choices import Entry, NamedChoices
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
-from chsel.problem.settings import PRESETS, in_preset
+from chsel.problem.settings import PRESETS
 from chsel.problem.trust import DETERMINED, MANY_CONTACTS, SENSOR_NOISE, has_pose, trust_in
 
-_OURS: dict[str, tuple[Callable[[Any], Method], Any]] = {
+_OURS: dict[str, Entry[Method]] = {
     "chsel": (Chsel, ChselSettings()),
     "chsel_cma_me": (Chsel, ChselSettings(search="cma_me")),
     "gradient_descent": (GradientDescent, GradientDescentSettings()),
@@ -55,37 +53,13 @@ _CHOICES = NamedChoices[Method](
     "method", "chsel.methods", "docs/writing_a_method.md", _OURS, _lacks
 )
 METHODS = _CHOICES.names
+build_method, preset_settings = _CHOICES.build, _CHOICES.settings
 
 
 def default_method(preset: str = "default") -> str:
     """The method for points of one's own; of presets that are the paper's, the paper's method."""
     require_choice("preset", preset, PRESETS)
     return "anchored" if preset == "default" else "chsel"
-
-
-def preset_settings(name: str, preset: str = "default") -> Any:
-    """The settings of a method by name in a preset, one of PRESETS."""
-    make, default = _CHOICES.entry(name)
-    require_choice("preset", preset, PRESETS)
-    if name in _OURS:
-        return _ours_in_preset(name, preset)
-    own = getattr(make, "preset", None)
-    return own(preset) if own else in_preset(default, preset)
-
-
-@cache
-def _ours_in_preset(name: str, preset: str) -> Any:
-    return in_preset(_OURS[name][1], preset)
-
-
-def build_method(name: str, settings: Any = None) -> Method:
-    """A method by name.
-
-    settings: its settings, or a mapping of changes to those of the preset `default`. Raises
-    SettingError for names and values that do not exist, and for a name of ours that an installed
-    package gives to a method, too.
-    """
-    return _CHOICES.build(name, settings, preset_settings(name))
 
 
 def noise_of(method: Method) -> float:

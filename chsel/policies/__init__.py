@@ -1,5 +1,5 @@
-"""Which action to take next: a file for each policy."""
+"""Which action to take next."""
 
-from chsel.policies.policy_registry import OURS, POLICIES, build_policy, policy_settings
+from chsel.policies.policies import OURS, POLICIES, build_policy, policy_settings
 
 __all__ = ["OURS", "POLICIES", "build_policy", "policy_settings"]

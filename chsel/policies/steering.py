@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -27,34 +28,28 @@ class Choice(NamedTuple):
     decision: Decision
 
 
+@dataclass(eq=False, repr=False)
 class Steering:
-    """Chooses the actions of one session, by what its registrations find.
+    """Chooses the actions of one session, by what its registrations find."""
 
-    last: the decision made last, None before the first. surprise: of the last outcome, nats.
-    """
+    policy: Policy
+    sdf: SdfGrid
+    workspace: Workspace
+    free_resolution: float  # voxel side of free space, metres
+    actions: Actions
+    hand: HandShape
+    _: KW_ONLY
+    seed: int = 0  # of the random streams
+    last: Choice | None = field(default=None, init=False)  # the last decision
+    surprise: float = field(default=0.0, init=False)  # of the last outcome, nats
 
-    def __init__(
-        self,
-        policy: Policy,
-        sdf: SdfGrid,
-        workspace: Workspace,
-        free_resolution: float,
-        actions: Actions,
-        hand: HandShape,
-        *,
-        seed: int = 0,
-    ) -> None:
-        """free_resolution: voxel side of free space, metres. seed: of the random streams."""
-        if not callable(getattr(policy, "decide", None)):
-            raise SettingError(f"policy is {quoted(policy)}; accepted: chsel.build_policy(name)")
-        require_parts(sdf=sdf, workspace=workspace)
-        require_instance("actions", actions, Actions, "chsel.Actions(world_from_hand, length)")
-        require_instance("hand", hand, HandShape, "chsel.HandShape.of(mesh)")
-        self.policy, self.actions, self.hand = policy, actions, hand
-        self._sdf, self._workspace, self._free_resolution = sdf, workspace, free_resolution
-        self._seed = seed
-        self.last: Choice | None = None
-        self.surprise = 0.0
+    def __post_init__(self) -> None:
+        if not callable(getattr(self.policy, "decide", None)):
+            given = quoted(self.policy)
+            raise SettingError(f"policy is {given}; accepted: chsel.build_policy(name)")
+        require_parts(sdf=self.sdf, workspace=self.workspace)
+        require_instance("actions", self.actions, Actions, "chsel.Actions(world_from_hand, length)")
+        require_instance("hand", self.hand, HandShape, "chsel.HandShape.of(mesh)")
 
     def decide(
         self, done: int, points: KnownPoints, hypotheses: Hypotheses | None, available: BoolArray
@@ -65,12 +60,12 @@ class Steering:
         ChselError if the policy, of another package, gives something else than a decision.
         """
         require_parts(points=points)
-        key = StreamKey(self._seed, done)
+        key = StreamKey(self.seed, done)
         problem = DecisionProblem(
-            self._sdf,
+            self.sdf,
             points,
-            self._workspace,
-            self._free_resolution,
+            self.workspace,
+            self.free_resolution,
             self.belief(points, hypotheses, key),
             self.actions,
             available,
@@ -89,13 +84,13 @@ class Steering:
         """
         settings = self.policy.settings.belief
         if hypotheses is None or len(hypotheses.cost) == 0:
-            top = self._workspace.upper[2]
+            top = self.workspace.upper[2]
             if settings.floor is not None and settings.floor > top:
                 raise SettingError(
                     f"policy.belief.floor is {settings.floor:g}, above the workspace; accepted: a "
                     f"height below its top at {top:g} m, or null"
                 )
-            return belief_before(self._sdf, points, self._workspace, key, settings)
+            return belief_before(self.sdf, points, self.workspace, key, settings)
         return belief_after(hypotheses, settings)
 
     def felt(self, contacts: FloatArray) -> bool:

@@ -7,7 +7,7 @@ about the workspace's occupancy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -16,11 +16,12 @@ from chsel.next_probe.decision_problem import DecisionProblem
 from chsel.next_probe.first_contact import moves_by_orientation, touched_points
 from chsel.next_probe.forecast import Forecast
 from chsel.next_probe.hand_shape import HandFront
-from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.compiler import compiled
+from chsel.numerics.elementary import logs
 from chsel.policies.policy import ConfiguredPolicy, PolicySettings
-from chsel.policies.sweep_kernels import Reach, VoxelBox, entropies, occupy, sweep
-from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import Poses
+from chsel.problem.points import Workspace
+from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import FARTHEST, SdfGrid
 from chsel.problem.settings import positive
 from chsel.problem.subset import evenly_spaced
@@ -46,16 +47,39 @@ class VoxelEntropy(ConfiguredPolicy[VoxelEntropySettings]):
     def rate(self, problem: DecisionProblem, forecast: Forecast) -> FloatArray:
         """Entropy (A,) over voxels that are not known, each by the chance to get there."""
         box = voxel_box(problem.workspace, self.settings.voxel)
-        entropy = occupancy_entropy(problem, box)  # (V,)
-        uncertain = np.flatnonzero(entropy)
-        voxels = np.stack(np.unravel_index(uncertain, tuple(box.counts.tolist())), axis=1)
-        centres = box.lower + (voxels + 0.5) * box.side
+        entropy = occupancy_entropy(problem, box)
+        uncertain = np.nonzero(entropy)
+        centres = box.lower + (np.stack(uncertain, axis=1) + 0.5) * box.side  # (M, 3), world
         front = _widened(problem.hand.front, box.side)
-        reach = _reach(forecast.first.travel, np.array(problem.belief.weights))
+        reach = _reach(forecast.first.travel, problem.belief.weights)
         swept = np.zeros(len(problem.actions))
         for moves in moves_by_orientation(problem.actions):
-            sweep(centres, entropy[uncertain], box.side, moves, front, reach, swept)
+            seen = rotated(moves.rotation.reshape(3, 3), centres)
+            low = seen[:, 0].min(initial=np.inf)
+            row = np.floor((seen[:, 0] - low) / box.side)  # across the hand
+            order = np.argsort(row, kind="stable")
+            lower = moves.starts[:, 0] + front.lower[0] - low
+            upper = lower + len(front.heights) * front.cell
+            begin = np.searchsorted(row[order], np.floor(lower / box.side))
+            end = np.searchsorted(row[order], upper / box.side + 1.0)
+            voxels = seen[order], entropy[uncertain][order], begin, end
+            sweep(voxels, moves, front, reach, swept)
         return swept
+
+
+class VoxelBox(NamedTuple):
+    """Voxels of a box."""
+
+    lower: FloatArray  # (3,): the box's corner, metres
+    side: float  # of a voxel, metres
+    counts: IntArray  # (3,): voxels along each axis
+
+    def holding(self, places: FloatArray) -> tuple[IntArray, ...]:
+        """Indices along each axis of the voxels that hold places (N, 3), of those in the box."""
+        x, y, z = ((places - self.lower) / self.side).T
+        inside = (x >= 0.0) & (y >= 0.0) & (z >= 0.0)
+        inside &= (x < self.counts[0]) & (y < self.counts[1]) & (z < self.counts[2])
+        return tuple(cells[inside].astype(np.int64) for cells in (x, y, z))
 
 
 def voxel_box(workspace: Workspace, side: float) -> VoxelBox:
@@ -64,20 +88,24 @@ def voxel_box(workspace: Workspace, side: float) -> VoxelBox:
     extent = np.minimum(upper - lower, FARTHEST)
     while np.prod(np.ceil(extent / side)) > _MOST_VOXELS:
         side *= 1.25
-    counts = np.maximum(np.ceil(extent / side), 1.0).astype(np.int64)
-    return VoxelBox(lower, side, counts)
+    return VoxelBox(lower, side, np.maximum(np.ceil(extent / side), 1.0).astype(np.int64))
 
 
 def occupancy_entropy(problem: DecisionProblem, box: VoxelBox) -> FloatArray:
-    """Entropy (V,), nats, of whether the object fills each voxel; 0 for those that are known."""
-    poses = np.array(Poses.of(problem.belief.object_from_world).numbers)
-    weights = np.array(problem.belief.weights)
-    chance = np.zeros(int(np.prod(box.counts)))
-    latest = np.full(len(chance), -1)
-    occupy(box, filled_points(problem.sdf, box.side), poses, weights, chance, latest)
-    chance[known_voxels(problem.points, box)] = 0.0
-    entropy = np.empty(len(chance))
-    entropies(chance, entropy)
+    """Entropy (X, Y, Z), nats, of whether the object fills each voxel; 0 for those known."""
+    filled = np.ascontiguousarray(filled_points(problem.sdf, box.side).T)
+    poses = Poses.of(problem.belief.object_from_world).numbers
+    chance = np.zeros(box.counts)
+    for pose, weight in zip(poses, problem.belief.weights, strict=True):
+        turn, (x, y, z) = pose[:9].reshape(3, 3, 1), filled - pose[9:, None]
+        places = turn[0] * x + turn[1] * y + turn[2] * z  # (3, N), world
+        chance[box.holding(places.T)] += weight
+    for known in (problem.points.free, problem.points.known, problem.points.occupied):
+        chance[box.holding(known)] = 0.0
+    uncertain = (chance > 0.0) & (chance < 1.0)
+    p = chance[uncertain]
+    entropy = np.zeros_like(chance)
+    entropy[uncertain] = -(p * logs(p) + (1.0 - p) * logs(1.0 - p))
     return entropy
 
 
@@ -89,16 +117,6 @@ def filled_points(sdf: SdfGrid, side: float) -> FloatArray:
     return np.concatenate([touched_points(sdf).points, sdf.origin + inside * sdf.resolution])
 
 
-def known_voxels(points: KnownPoints, box: VoxelBox) -> BoolArray:
-    """Flags (V,) of the voxels that hold a known point."""
-    known = np.zeros(tuple(box.counts.tolist()), dtype=bool)
-    for places in (points.free, points.known, points.occupied):
-        cells = np.floor((places - box.lower) / box.side)
-        i, j, k = cells[((cells >= 0.0) & (cells < box.counts)).all(axis=1)].astype(np.int64).T
-        known[i, j, k] = True
-    return known.reshape(-1)
-
-
 def _widened(front: HandFront, side: float) -> HandFront:
     """The front of a hand that sweeps every voxel of which it touches the square ahead of it."""
     margin = min(int(0.5 * side / front.cell), _WIDEST)
@@ -107,10 +125,33 @@ def _widened(front: HandFront, side: float) -> HandFront:
     return HandFront(heights, front.lower - margin * front.cell, front.cell)
 
 
-def _reach(travel: FloatArray, weights: FloatArray) -> Reach:
-    """How far the hands get, from the ways (K, A) to first contacts."""
+def _reach(travel: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Ways (A, K) to first contacts from (K, A), ascending; weights (A, K + 1) of those to come."""
     order = np.argsort(travel, axis=0, kind="stable")
-    ascending = np.take_along_axis(travel, order, axis=0)
     left = np.zeros((len(weights) + 1, travel.shape[1]))
     left[:-1] = np.cumsum(weights[order][::-1], axis=0)[::-1]
-    return Reach(np.ascontiguousarray(ascending.T), np.ascontiguousarray(left.T))
+    return np.sort(travel.T, axis=1), np.ascontiguousarray(left.T)
+
+
+@compiled
+def sweep(voxels: Any, moves: Any, front: Any, reach: Any, out: Any) -> None:
+    """Fill `out` (A,) at some actions with the entropy that the hand is expected to sweep.
+
+    voxels: centres (M, 3) in axes of the hand, entropy (M,), and where those begin and end (A')
+    that an action can meet. front: HandFront, as wide as a voxel around the hand. reach: `_reach`.
+    A voxel counts by the chance that the first contact comes after it.
+    """
+    seen, entropy, begin, end = voxels
+    nx, ny = front.heights.shape
+    for a in range(len(moves.which)):
+        action = moves.which[a]
+        x, y = moves.starts[a, 0] + front.lower[0], moves.starts[a, 1] + front.lower[1]
+        travel, left = reach[0][action], reach[1][action]
+        total = 0.0
+        for m in range(begin[a], end[a]):
+            i, j = (seen[m, 0] - x) / front.cell, (seen[m, 1] - y) / front.cell
+            if i >= 0.0 and i < nx and j >= 0.0 and j < ny:
+                depth = seen[m, 2] - moves.starts[a, 2] - front.heights[int(i), int(j)]
+                if depth >= 0.0 and depth <= moves.length[a]:
+                    total += entropy[m] * left[np.searchsorted(travel, depth)]
+        out[action] = total

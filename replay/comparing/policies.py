@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from chsel.errors import RecordingError, SettingError
+from chsel.policies import build_policy, policy_settings
 from chsel.policies.policy import Policy
-from chsel.policies.policy_registry import build_policy, policy_settings
 from chsel.problem.settings import changed_settings, settings_mapping
 from replay.mcap.reader import Recording
 from replay.registration import setting_change

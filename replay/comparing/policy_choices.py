@@ -14,7 +14,7 @@ from rich.table import Table
 
 from chsel.errors import ChselError, RecordingError, SettingError
 from chsel.next_probe.decision_problem import Actions, Decision, DecisionProblem
-from chsel.policies.policy_registry import POLICIES, policy_settings
+from chsel.policies import POLICIES, policy_settings
 from chsel.policies.steering import Steering
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey

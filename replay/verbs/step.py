@@ -18,7 +18,7 @@ from rich.table import Table
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import SettingError
 from chsel.methods import METHODS
-from chsel.policies.policy_registry import POLICIES
+from chsel.policies import POLICIES
 from replay.arguments import path_argument
 from replay.comparing.comparison import common_cost, numbers_under, recorded_label
 from replay.comparing.policy_choices import (

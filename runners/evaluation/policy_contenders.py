@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from chsel.errors import SettingError
+from chsel.policies import POLICIES, build_policy, policy_settings
 from chsel.policies.policy import Policy
-from chsel.policies.policy_registry import POLICIES, build_policy, policy_settings
 from chsel.problem.settings import build_settings, changed_settings, settings_mapping
 from runners.evaluation.contenders import require_label
 

@@ -117,7 +117,7 @@ def test_its_kernel_is_checked_as_all_are(copy: Path) -> None:
 
 def test_a_policy_scores_by_how_far_the_hand_gets(copy: Path) -> None:
     recording = recorded(copy, "clamp_gradient_descent")
-    assert recording.start.config["policy"]["limit"] == 0.2
+    assert recording.start.config["policy"]["name"] == "depth_scatter"
     decisions = [event for event in recording.events() if isinstance(event, Decided)]
     assert [event.step for event in decisions] == [-1, 0, 1, 2]
     for event in decisions:
@@ -125,7 +125,7 @@ def test_a_policy_scores_by_how_far_the_hand_gets(copy: Path) -> None:
         first = Forecast(problem, 0.002).first
         way = np.minimum(first.travel, problem.actions.length)
         mean = problem.belief.weights @ way
-        scatter = np.sqrt(problem.belief.weights @ np.minimum(np.abs(way - mean), 0.2) ** 2)
+        scatter = np.sqrt(problem.belief.weights @ (way - mean) ** 2)
         taken = np.isfinite(score)
         assert score[taken] == pytest.approx(scatter[taken], abs=1e-9)
         assert taken.sum() > 50

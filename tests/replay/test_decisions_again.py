@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from chsel.errors import RecordingError
-from chsel.policies import information
+from chsel.policies import build_policy
 from replay.__main__ import main
 from replay.comparing.verification import DIFFERS, EQUAL, Verdict, verify
 from replay.events import Decided, Event, ProblemPosed
@@ -134,11 +134,17 @@ def test_another_belief_and_surprise_are_named(steered: list[Event], write: Writ
     assert any(line.startswith("surprise: ") for line in found.differences)
 
 
+def rate_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have `information` rate every action half as high again."""
+    policy = type(build_policy("information"))
+    rate = policy.rate
+    monkeypatch.setattr(policy, "rate", lambda _, *given: 1.5 * rate(*given))
+
+
 def test_a_policy_that_rates_otherwise_differs_in_its_scores(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rate = information.Information.rate
-    monkeypatch.setattr(information.Information, "rate", lambda *a: 1.5 * rate(*a))
+    rate_more(monkeypatch)
     assert {verdict.stage[:20] for verdict in differing(path)} == {"the score of action "}
 
 
@@ -178,8 +184,7 @@ def test_accepted_decisions_are_those_that_verify_then_expects(
     assert main(["accept", str(path), "--yes"]) == 0
     assert "nothing to change" in capsys.readouterr().out
     assert path.read_bytes() == before
-    rate = information.Information.rate
-    monkeypatch.setattr(information.Information, "rate", lambda *a: 1.5 * rate(*a))
+    rate_more(monkeypatch)
     assert main(["accept", str(path), "--yes"]) == 0
     shown = capsys.readouterr().out
     assert "0 of 3 results and 4 of 4 decisions are new" in shown

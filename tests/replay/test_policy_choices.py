@@ -14,7 +14,7 @@ import pytest
 
 from chsel.errors import RecordingError, SettingError
 from chsel.next_probe.decision_problem import Actions
-from chsel.policies.policy_registry import build_policy
+from chsel.policies import build_policy
 from chsel.problem.poses import axis_angle, compose
 from replay.__main__ import main
 from replay.comparing.policy_choices import (

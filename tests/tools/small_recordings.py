@@ -15,7 +15,7 @@ from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.hand_shape import HandShape
 from chsel.plausible.pose_metrics import result_numbers
-from chsel.policies.policy_registry import build_policy
+from chsel.policies import build_policy
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration, pose_problem
 from chsel.problem.points import KnownPoints, Workspace

@@ -201,9 +201,7 @@ def _paths(settings: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             yield (name,)
 
 
-def test_an_installed_class_may_give_the_settings_of_each_preset(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_installed_class_may_give_the_settings_of_each_preset() -> None:
     class Theirs(Icp):
         @staticmethod
         def preset(name: str) -> IcpSettings:
@@ -211,7 +209,6 @@ def test_an_installed_class_may_give_the_settings_of_each_preset(
 
     theirs = {"theirs": (Theirs, IcpSettings())}
     choices = NamedChoices("method", "chsel.methods", "", theirs, lambda _: None)
-    monkeypatch.setattr("chsel.methods.registry._CHOICES", choices)
-    assert [preset_settings("theirs", name).iterations for name in PRESETS] == [7, 8, 9]
-    changed = build_method("theirs", {"redraw": "registration"}).settings
+    assert [choices.settings("theirs", name).iterations for name in PRESETS] == [7, 8, 9]
+    changed = choices.build("theirs", {"redraw": "registration"}).settings
     assert changed == IcpSettings(iterations=7, redraw="registration")

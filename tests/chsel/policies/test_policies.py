@@ -40,33 +40,34 @@ def test_a_decision_is_a_function_of_its_problem(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "best"),
-    [("hit_chance", 2), ("nearest_mean", 2), ("grid", 0)],
+    ("name", "scores"),
+    [
+        ("grid", [0.0, -1.0, -2.0, -3.0]),
+        ("hit_chance", [0.5, 0.5, 1.0, 0.0]),
+        ("hypothesis_pruning", [0.5, 0.5, 0.5, 0.0]),
+        ("information", [np.log(2.0)] * 3 + [0.0]),
+        ("expected_loss", None),  # d / 2, all of it; the spread of two poses is d / sqrt(2)
+    ],
 )
-def test_the_action_between_two_places(name: str, best: int) -> None:
+def test_scores_of_two_places(name: str, scores: list[float] | None) -> None:
     decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES)))
-    assert decision.chosen == best
+    scores = scores or [decision.spread / np.sqrt(2.0)] * 3 + [0.0]
+    assert decision.score == pytest.approx(scores, rel=0.06, abs=1e-12)
+    assert decision.chosen == np.argmax(decision.score)
 
 
 @pytest.mark.parametrize(
-    ("name", "certain"),
-    [
-        ("information", np.log(2.0)),
-        ("expected_loss", None),  # d / 2, all of it; the spread of two poses is d / sqrt(2)
-        ("hypothesis_pruning", 0.5),
-    ],
+    "name", ["hypothesis_pruning", "information", "expected_loss", "voxel_entropy"]
 )
-def test_what_tells_two_poses_apart_is_worth_most(name: str, certain: float | None) -> None:
-    decision = build_policy(name).decide(ball_problem(TWO, along_x(PLACES)))
-    certain = decision.spread / np.sqrt(2.0) if certain is None else certain
-    assert decision.score[:3] == pytest.approx([certain] * 3, rel=0.06)
-    assert decision.score[3] == pytest.approx(0.0, abs=1e-12)
+def test_what_all_poses_agree_on_is_worth_nothing(name: str) -> None:
     agreed = build_policy(name).decide(ball_problem(TWO[[0, 0]], along_x(PLACES)))
     assert agreed.score == pytest.approx(np.zeros(4), abs=1e-12)
 
 
-def test_the_nearest_way_ends_where_the_action_ends() -> None:
+def test_the_nearest_way_is_to_the_mean_and_ends_where_the_action_ends() -> None:
     policy = build_policy("nearest_mean")
+    between = policy.decide(ball_problem(TWO, along_x(PLACES)))
+    assert between.score == pytest.approx([-0.06, -0.06, 0.0, -np.hypot(0.25, 0.25)], abs=3e-3)
     problem = ball_problem(at((0.2, 0.0, 0.0)), along_x([(0.0, 0.0), (0.05, 0.0)]))
     assert policy.decide(problem).score == pytest.approx([0.0, -0.05], abs=3e-3)
     short = ball_problem(at((0.2, 0.0, 0.0)), along_x([(0.0, 0.0), (0.05, 0.0)], length=0.2))

@@ -8,20 +8,19 @@ from pathlib import Path
 import pytest
 
 from chsel.errors import SettingError
-from chsel.policies.grid import Grid, GridSettings
-from chsel.policies.policy_registry import _lacks
+from chsel.policies.policies import _lacks
+from chsel.policies.policy import ConfiguredPolicy, PolicySettings
 from chsel.problem.named_choices import NamedChoices
 
 POLICY = """
 from dataclasses import dataclass
-from chsel.policies.grid import Grid
-from chsel.policies.policy import PolicySettings
+from chsel.policies.policy import ConfiguredPolicy, PolicySettings
 
 @dataclass(frozen=True)
 class MineSettings(PolicySettings):
     weight: float = 2.0
 
-class Mine(Grid):
+class Mine(ConfiguredPolicy):
     settings_class = MineSettings
 
 class Plain:
@@ -54,7 +53,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
             )
         (tmp_path / f"{module}.py").write_text(POLICY.replace("{settings}", settings))
         monkeypatch.syspath_prepend(str(tmp_path))
-        ours = {"grid": (Grid, GridSettings())}
+        ours = {"grid": (ConfiguredPolicy, PolicySettings())}
         return NamedChoices("policy", "chsel.policies", "docs/page.md", ours, _lacks)
 
     return done
@@ -63,12 +62,11 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 def test_a_choice_of_a_package_is_built_as_ours_are(install: Install) -> None:
     choices = install("mine = mine:Mine")
     assert choices.names == ("grid", "mine")
-    assert choices.packages("mine") == ("mine0",)
     make, default = choices.entry("mine")
     assert (make.__name__, default.weight) == ("Mine", 2.0)
-    built = choices.build("mine", {"weight": 3.0, "stop": {"spread": 0.1}}, default)
+    built = choices.build("mine", {"weight": 3.0, "stop": {"spread": 0.1}})
     assert (built.settings.weight, built.settings.stop.spread) == (3.0, 0.1)
-    assert choices.build("grid", None, GridSettings()).settings == GridSettings()
+    assert choices.build("grid").settings == PolicySettings()
 
 
 @pytest.mark.parametrize(
@@ -91,11 +89,11 @@ def test_what_cannot_be_taken_is_one_line(
         choices.entry("mine")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert choices.build("grid", None, GridSettings())  # others go on as ever
+    assert choices.build("grid")  # others go on as ever
 
 
 def test_a_name_of_ours_is_not_taken_from_us(install: Install) -> None:
     choices = install("grid = mine:Mine")
     assert choices.names == ("grid",)
     with pytest.raises(SettingError, match="policy grid is of package mine0, too; accepted: one"):
-        choices.build("grid", None, GridSettings())
+        choices.build("grid")
