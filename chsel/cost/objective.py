@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import Model, Work, evaluate, gradient_of, put_pose, work_of
-from chsel.cost.descent import Course, abandon, course_from, descend, groups_for
+from chsel.cost.descent import descend
 from chsel.cost.free_kernels import SEARCH_SLACK
 from chsel.cost.pose_lanes import LANES, SUMS
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, implements, spliced
 from chsel.numerics.pose_tuples import all_finite, decode, pull_back
-from chsel.numerics.threads import helped, spread, team_size
+from chsel.numerics.threads import spread
 from chsel.problem.search_space import SearchSpace
 
 
@@ -100,39 +98,32 @@ class Objective:
         self, vectors: FloatArray, divisor: float, rate: float, iterations: int
     ) -> FloatArray:
         """Vectors (B, d) after some iterations of Adam; gradients are divided by `divisor`."""
-        course = course_from(
-            vectors,
-            np.zeros(len(vectors)),
-            1,
-            threads=team_size(),
-            iterations=iterations,
-            rate=rate,
-            divisor=divisor,
-        )
-        with self.descents(len(vectors)) as run:
-            run(course)
-        return course.vectors[1]
+        return self._descended(vectors, divisor, rate, iterations, ends_on_poses=False)[0]
 
-    @contextmanager
-    def descents(self, starts: int) -> Iterator[Callable[[Course], None]]:
-        """Within this context, what takes one course after the other to its end, on all threads.
+    def block(
+        self, vectors: FloatArray, divisor: float, rate: float, iterations: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same, as vectors of poses again, with their costs (B,)."""
+        if not self.space_arrays.planar:
+            return self._descended(vectors, divisor, rate, iterations, ends_on_poses=True)
+        moved = self.descended(vectors, divisor, rate, iterations)
+        moved = self.space.encode(self.space.poses(moved))
+        return moved, self.costs(moved)
 
-        starts: of the largest course.
-        """
-        current: list[Course] = []
+    def _descended(
+        self,
+        vectors: FloatArray,
+        divisor: float,
+        rate: float,
+        iterations: int,
+        *,
+        ends_on_poses: bool,
+    ) -> tuple[FloatArray, FloatArray]:
+        moved, costs = vectors.copy(), np.empty(len(vectors))
+        adam = iterations, float(rate), float(divisor), ends_on_poses
 
-        def assist(work: Work) -> None:
-            descend(self.model, self.space_arrays, current[-1], work, False)
+        def run(first: int, last: int, work: Any) -> None:
+            descend(self.model, self.space_arrays, moved, costs, *adam, first, last, work)
 
-        def run(course: Course) -> None:
-            current.append(course)
-            descend(self.model, self.space_arrays, course, work, True)
-
-        def end() -> None:
-            abandon(current[-1])
-
-        current.append(course_from(np.zeros((0, self.space.dimension)), np.zeros(0), 0))
-        work = self.work()
-        groups = len(groups_for(starts, team_size())) - 1
-        with helped(assist, self.work, groups - 1, end):
-            yield run
+        spread(run, len(vectors), self.work, multiple=LANES)
+        return moved, costs

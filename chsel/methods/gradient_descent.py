@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.descent import Course, blocks_done, course_from
 from chsel.cost.objective import Objective
 from chsel.errors import SettingError, require_at_most
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.threads import team_size
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
@@ -31,7 +28,6 @@ from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negati
 from chsel.qd.selection import ranked_hypotheses
 
 MOST_ITERATIONS = 1_000_000
-_AT_ONCE = 1_000  # iterations after which an observer hears of them
 
 
 @dataclass(frozen=True)
@@ -68,13 +64,6 @@ class DescentSettings(CheckedSettings):
             return starts
         return math.ceil(self.race[min(block, len(self.race) - 1)] * starts)
 
-    def blocks_alike(self, block: int, starts: int) -> int:
-        """How many blocks, from one on, the same starts descend in; only some at once."""
-        most = max(1, _AT_ONCE // self.iterations)
-        following = range(block, min(self.restarts, block + most))
-        runners = self.runners(block, starts)
-        return sum(1 for _ in takewhile(lambda n: self.runners(n, starts) == runners, following))
-
     def ends_after(self, gain: float) -> bool:
         """Whether no block follows one of such a mean gain."""
         return self.stop_below is not None and gain <= self.stop_below
@@ -83,51 +72,6 @@ class DescentSettings(CheckedSettings):
 def _falls_from_1(shares: tuple[float, ...]) -> bool:
     falling = all(share <= before for before, share in pairwise((1.0, *shares)))
     return bool(shares) and falling and shares[-1] > 0.0
-
-
-def _course(
-    objective: Objective,
-    vectors: FloatArray,
-    costs: FloatArray,
-    settings: DescentSettings,
-    block: int,
-    starts: int,
-) -> Course:
-    """As many of the next blocks as are for the same of so many starts, vectors (S, d)."""
-    is_planar = objective.space.arrays.planar
-    return course_from(
-        vectors,
-        costs,
-        1 if is_planar else settings.blocks_alike(block, starts),
-        threads=team_size(),
-        iterations=settings.iterations,
-        rate=settings.rate,
-        divisor=starts,
-        ends_on_poses=not is_planar,
-        stop_below=settings.stop_below,
-    )
-
-
-def _costs(vectors: FloatArray, run: Callable[[Course], None]) -> FloatArray:
-    """Costs (S,) of vectors (S, d), by those who descend."""
-    count, threads = len(vectors), team_size()
-    course = course_from(vectors, np.zeros(count), 1, threads=threads, ends_on_poses=True)
-    run(course)
-    return course.costs[1]
-
-
-def _blocks(
-    objective: Objective, course: Course, run: Callable[[Course], None]
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Vectors (S, d) and costs (S,) after each block of a course, at least one."""
-    space = objective.space
-    run(course)
-    for block in range(1, blocks_done(course) + 1):
-        vectors, costs = course.vectors[block], course.costs[block]
-        if not course.ends_on_poses:
-            vectors = space.encode(space.poses(vectors))
-            costs = objective.costs(vectors)
-        yield vectors, costs
 
 
 def descend(
@@ -139,26 +83,22 @@ def descend(
     """
     space, total = objective.space, settings.restarts * settings.iterations
     vectors = space.encode(starts)
-    running, block, gain = np.arange(len(starts)), 0, np.inf
-    with objective.descents(len(starts)) as run:
-        costs = _costs(vectors, run)
-        _show(observer, 0, vectors, costs)
-        while block < settings.restarts and not settings.ends_after(gain):
-            lowest = np.argsort(costs[running], kind="stable")
-            running = np.sort(running[lowest[: settings.runners(block, len(starts))]])
-            course = _course(
-                objective, vectors[running], costs[running], settings, block, len(starts)
-            )
-            for after in _blocks(objective, course, run):
-                if settings.stop_below is not None:
-                    gain = _mean_gain(costs[running], after[1])
-                vectors[running], costs[running] = after
-                block += 1
-                done = block * settings.iterations
-                _show(observer, done, vectors, costs)
-                observer.progress("descent", done, total)
-                if settings.ends_after(gain):
-                    break
+    costs = objective.costs(vectors)
+    running = np.arange(len(starts))
+    _show(observer, 0, vectors, costs)
+    for block in range(settings.restarts):
+        lowest = np.argsort(costs[running], kind="stable")
+        running = np.sort(running[lowest[: settings.runners(block, len(starts))]])
+        moved, after = objective.block(
+            vectors[running], len(starts), settings.rate, settings.iterations
+        )
+        gain = _mean_gain(costs[running], after)
+        vectors[running], costs[running] = moved, after
+        done = (block + 1) * settings.iterations
+        _show(observer, done, vectors, costs)
+        observer.progress("descent", done, total)
+        if settings.ends_after(gain):
+            break
     return space.poses(vectors), costs
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -84,52 +83,6 @@ def spread(
         wait(others)
     for other in others:
         other.result()
-
-
-def team_size() -> int:
-    """How many threads `helped` has at most, the calling one included."""
-    if hasattr(_thread, "is_worker"):  # all threads have work
-        return 1
-    return min(thread_count(), _processors())
-
-
-@contextmanager
-def helped(
-    assist: Callable[[Any], None],
-    scratch: Callable[[], Any],
-    most: int,
-    end: Callable[[], None],
-) -> Iterator[None]:
-    """Within this context, call assist(scratch) again and again on up to `most` other threads.
-
-    Of `thread_count()`, and no more than there are processors, as such threads do not sleep.
-    assist: returns where there is nothing to do, and soon after end() was called; its last call may
-    outlast the context. scratch: makes the scratch of one thread.
-    """
-    failures: list[BaseException] = []
-    is_open = True
-
-    def work() -> None:
-        try:
-            require_ieee_arithmetic()
-            mine = scratch()
-            while is_open:
-                assist(mine)
-                time.sleep(0.0)  # whoever waits for this processor goes first
-        except BaseException as error:
-            failures.append(error)
-
-    count = min(most, team_size() - 1)
-    helpers = [_pool(count).submit(work) for _ in range(count)]
-    try:
-        yield
-    finally:
-        is_open = False
-        end()
-        for helper in helpers:
-            helper.cancel()
-    if failures:
-        raise failures[0]
 
 
 def require_threads(name: str, count: object) -> None:

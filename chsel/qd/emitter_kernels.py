@@ -11,7 +11,6 @@ from chsel.cost.objective import cost_and_gradient_of, costs_of
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.pose_tuples import all_finite
-from chsel.numerics.team import NONE, Team, awaited, claimed, done, is_first, publish
 from chsel.qd.archive import (
     Batch,
     Cells,
@@ -34,15 +33,6 @@ class Landscape(NamedTuple):
     space: Any
     measure: Any  # MeasureCode
     work: Any  # scratch
-
-
-class BatchShare(NamedTuple):
-    """The share of one thread in the evaluation of batches."""
-
-    team: Team
-    leads: bool  # it runs the search; the others evaluate pieces of its batches until it ends
-    objectives: FloatArray  # (S,), scratch for a piece of a batch, of S solutions
-    measures: FloatArray  # (S, k)
 
 
 class SearchDraws(NamedTuple):
@@ -90,12 +80,8 @@ def cma_mega(
     draws: SearchDraws,
     first: int,
     last: int,
-    share: BatchShare,
 ) -> None:
     """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`."""
-    if not share.leads:
-        _assist(landscape, search.branches, share)
-        return
     model, space, measure, work = landscape
     theta, measures, gradient = search.theta, search.measures, search.gradient
     measure_gradients, directions = search.measure_gradients, search.directions
@@ -112,7 +98,7 @@ def cma_mega(
             _normalise(measure_gradients[i], 1.0, directions[i + 1])
         ask(strategy, draws.normals[iteration], coefficients)
         _branch(theta, directions, coefficients, branches.vectors)
-        _evaluate(landscape, branches, share)
+        _evaluate(landscape, branches)
         insert(archive, branches)
         parents = rank(branches.status, branches.value, branches.order)
         tell(strategy, coefficients, branches.order, parents)
@@ -133,16 +119,12 @@ def cma_me(
     draws: SearchDraws,
     first: int,
     last: int,
-    share: BatchShare,
 ) -> None:
     """Iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`."""
-    if not share.leads:
-        _assist(landscape, search.samples, share)
-        return
     samples, strategy = search.samples, search.strategy
     for iteration in range(first, last):
         ask(strategy, draws.normals[iteration], samples.vectors)
-        _evaluate(landscape, samples, share)
+        _evaluate(landscape, samples)
         insert(archive, samples)
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
@@ -152,48 +134,16 @@ def cma_me(
 
 
 @spliced
-def _evaluate(landscape: Landscape, batch: Batch, share: BatchShare) -> None:
-    """Fill objectives and measures, with those who help."""
-    pieces = -(-len(batch.objectives) // len(share.objectives))
-    number = publish(share.team, pieces)
-    _evaluate_pieces(landscape, batch, share, number, pieces)
-
-
-@spliced
-def _assist(landscape: Landscape, batch: Batch, share: BatchShare) -> None:
-    """Evaluate pieces of one batch after the other, until no further one comes for a while."""
-    number, pieces = awaited(share.team, 0)
-    while number > 0:
-        _evaluate_pieces(landscape, batch, share, number, pieces)
-        number, pieces = awaited(share.team, number)
-
-
-@spliced
-def _evaluate_pieces(
-    landscape: Landscape, batch: Batch, share: BatchShare, number: int, pieces: int
-) -> None:
-    """Evaluate pieces that nobody else does; a vector that is not finite is looked up nowhere."""
+def _evaluate(landscape: Landscape, batch: Batch) -> None:
+    """Fill objectives and measures; a vector that is not finite is looked up nowhere."""
     model, space, measure, work = landscape
-    team, leads, objectives, measures = share
-    total = len(batch.objectives)
-    piece = claimed(team, number, pieces, leads)
-    while piece != NONE:
-        first, last = piece * total // pieces, (piece + 1) * total // pieces
-        vectors = batch.vectors[first:last]
-        costs_of(model, space, vectors, objectives, work)
-        for i in range(len(vectors)):
-            if all_finite(vectors[i]):
-                objectives[i] = -objectives[i]
-                measures_of(space, measure, vectors[i], measures[i])
-            else:
-                objectives[i] = -np.inf
-        if is_first(team, number, piece, leads):
-            for i in range(last - first):
-                batch.objectives[first + i] = objectives[i]
-                for j in range(measures.shape[1]):
-                    batch.measures[first + i, j] = measures[i, j]
-            done(team, number, piece)
-        piece = claimed(team, number, pieces, leads)
+    costs_of(model, space, batch.vectors, batch.objectives, work)
+    for n in range(len(batch.vectors)):
+        if all_finite(batch.vectors[n]):
+            batch.objectives[n] = -batch.objectives[n]
+            measures_of(space, measure, batch.vectors[n], batch.measures[n])
+        else:
+            batch.objectives[n] = -np.inf
 
 
 @inner

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from chsel.cost.descent import EPSILON
 from chsel.cost.objective import Objective
-from chsel.cost.pose_lanes import LANES
-from chsel.numerics.arrays import FloatArray, scratch
-from chsel.numerics.team import close, new_team, piece_size
-from chsel.numerics.threads import helped
+from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import NullObserver, Observer
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd import emitter_kernels as kernels
 from chsel.qd.archive import GridArchive, SearchObjective, batch_of
-from chsel.qd.emitter_kernels import Adam, BatchShare, Landscape, MegaSearch, MeSearch, SearchDraws
+from chsel.qd.emitter_kernels import Adam, Landscape, MegaSearch, MeSearch, SearchDraws
 from chsel.qd.evolution_kernels import strategy_around
 
 MOST_ITERATIONS = 1_000_000
@@ -148,32 +144,17 @@ def _iterate(
 ) -> None:
     """Run the iterations of a kernel, segment by segment."""
     batch, dimension = search.strategy.batch, len(search.strategy.mean)
-    measure, team = archive.measure, new_team()
-    size = piece_size(batch, LANES)
-
-    def thread(leads: bool) -> tuple[Landscape, BatchShare]:
-        own = scratch(size), scratch(size, measure.count)
-        landscape = Landscape(
-            objective.model, objective.space_arrays, measure.code, objective.work()
-        )
-        return landscape, BatchShare(team, leads, *own)
-
-    def assist(thread: tuple[Landscape, BatchShare]) -> None:
-        landscape, share = thread
-        kernel(landscape, archive.cells, search, block, 0, 0, share)
-
-    landscape, share = thread(leads=True)
+    model, space = objective.model, objective.space_arrays
+    landscape = Landscape(model, space, archive.measure.code, objective.work())
     normals, elites = draws.blocks(iterations, batch, dimension), draws.elites(iterations)
     drawn = draws.block(batch, dimension)
-    block = SearchDraws(np.zeros((0, batch, dimension)), elites[:0])  # helpers need no more
     watch.start(archive)
-    with helped(assist, lambda: thread(leads=False), -(-batch // size) - 1, partial(close, team)):
-        for first, last in watch.segments(iterations, drawn):
-            if first % drawn == 0:
-                block = SearchDraws(next(normals), elites[first : first + drawn])
-            before = first - first % drawn
-            kernel(landscape, archive.cells, search, block, first - before, last - before, share)
-            watch.after(last, iterations, archive)
+    for first, last in watch.segments(iterations, drawn):
+        if first % drawn == 0:
+            block = SearchDraws(next(normals), elites[first : first + drawn])
+        before = first - first % drawn
+        kernel(landscape, archive.cells, search, block, first - before, last - before)
+        watch.after(last, iterations, archive)
 
 
 class ArchiveWatch:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.descent import Course, blocks_done
 from chsel.cost.objective import Objective
 from chsel.errors import require_positive
 from chsel.methods import build_method, preset_settings
@@ -68,20 +67,15 @@ def method(name: str, steps: Steps, search: int) -> Method:
 def descents_counted() -> Iterator[list[int]]:
     """Collects how many poses each call of Adam evaluates with their gradients."""
     counts: list[int] = []
-    descents = Objective.descents
+    block = Objective.block
 
-    @contextmanager
-    def counted(objective: Objective, starts: int) -> Iterator[Callable[[Course], None]]:
-        with descents(objective, starts) as run:
+    def counted(
+        objective: Objective, vectors: FloatArray, divisor: float, rate: float, iterations: int
+    ) -> tuple[FloatArray, FloatArray]:
+        counts.append(len(vectors) * iterations)
+        return block(objective, vectors, divisor, rate, iterations)
 
-            def count(course: Course) -> None:
-                run(course)
-                poses = course.vectors.shape[1]
-                counts.append(poses * course.iterations * blocks_done(course))
-
-            yield count
-
-    with patch.object(Objective, "descents", counted):
+    with patch.object(Objective, "block", counted):
         yield counts
 
 

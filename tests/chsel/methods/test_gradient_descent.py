@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +10,10 @@ import trimesh
 from torch import Tensor
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
-from chsel.cost import descent
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.objective import Objective
 from chsel.methods.gradient_descent import DescentSettings, descend
-from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import NullObserver
 from chsel.problem.search_space import PlaneSettings, SE2Space, SE3Space, SearchSpace
@@ -150,35 +148,6 @@ def test_no_restart_returns_the_starts() -> None:
     np.testing.assert_allclose(poses.matrices, starts(3), atol=1e-15)
     np.testing.assert_array_equal(costs, objective.costs(SE3Space().encode(poses)))
     assert (costs > 0.0).all()
-
-
-def test_a_thread_that_is_late_begins_no_block_behind_the_last(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Another thread ends the last block after this one has chosen the group to go on with."""
-    course = descent.course_from(np.zeros((4, 9)), np.zeros(4), 1, ends_on_poses=True)
-    at, chosen = descent._GROUPS, [0]
-
-    def choose(course: descent.Course, is_open: bool) -> int:
-        course.words[at] = descent.STATES + descent.OPEN
-        return chosen.pop() if chosen else descent.NONE
-
-    def replace(words: IntArray, at: int, old: int, new: int) -> bool:
-        words[at], before = (new if words[at] == old else words[at]), words[at]
-        return bool(before == old)
-
-    for name, stand_in in {
-        "_least_advanced": choose,
-        "_members": lambda course, group: (0, 4),
-        "_descend_block": lambda *_: True,
-        "load": lambda words, at: words[at],
-        "store": lambda words, at, value: words.__setitem__(at, value),
-        "replace": replace,
-    }.items():
-        monkeypatch.setattr(descent, name, stand_in)
-    work = SimpleNamespace(lanes=np.zeros(1000))
-    descent.descend.py_func(None, None, course, work, True)  # an IndexError, if it wrote there
-    assert course.words[at] == descent.STATES + descent.OPEN
 
 
 def test_each_start_descends_as_if_it_were_alone() -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from chsel.numerics.arrays import FloatArray, digest
-from chsel.numerics.team import new_team
 from chsel.problem.registration_problem import ArchiveSnapshot, NullObserver
 from chsel.problem.streams import StreamKey
 from chsel.qd import emitter_kernels as kernels
@@ -139,8 +138,7 @@ class Stepper:
         landscape = kernels.Landscape(Landscape(kind), 0, MEASURE.code, 0)
         draws = kernels.SearchDraws(self._normals, self.elites)
         span = self.iteration, self.iteration + 1
-        share = kernels.BatchShare(new_team(), True, np.zeros(8), np.zeros((8, 2)))
-        self._loop(landscape, self.archive.cells, self.search, draws, *span, share)
+        self._loop(landscape, self.archive.cells, self.search, draws, *span)
         self.iteration += 1
 
 
