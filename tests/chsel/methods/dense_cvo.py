@@ -8,9 +8,8 @@ import numba
 import numpy as np
 import trimesh
 
-from chsel.methods.cvo.cvo_kernels import Product, flow_at
-from chsel.methods.cvo.gaussian_blur import Kernel
-from chsel.methods.cvo.rkhs_fields import free_field, surface_field
+from chsel.methods.cvo.cvo import flow_at
+from chsel.methods.cvo.rkhs_fields import Kernel, Product, free_field, surface_field
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.pose_tuples import pose_at
 from chsel.problem.points import KnownPoints
@@ -146,9 +145,9 @@ def nearby(count: int, seed: int, reach: float = 0.08) -> FloatArray:
 
 
 @numba.njit(error_model="numpy")
-def flows(product, poses, out, places):  # type: ignore[no-untyped-def]
+def flows(product, poses, out):  # type: ignore[no-untyped-def]
     """Fill out (B, 7) with F, sum x_i x h_i and sum h_i, h = R^T grad f, at poses (B, 12)."""
     for n in range(len(poses)):
-        flow = flow_at(product, pose_at(poses, n), places)
+        flow = flow_at(product, pose_at(poses, n))
         for i in range(7):
             out[n, i] = flow[i]
