@@ -2,7 +2,8 @@
 
 A recording holds all settings that there were when it was made. Those that came later have the
 value here, with which the library does what it did then; today's default may be another one. Those
-of `anchored` that no longer exist are dropped: its energy changed, and so did every result.
+of `anchored` and of CMA-ES that no longer exist are dropped: its energy and the ends of its runs
+changed, and so did every result.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.chsel import ChselSettings
 from chsel.methods.gradient_descent import DescentSettings
+from chsel.methods.medial_constraint.medial_constraint import CmaEsSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.qd.selection import OutputSettings
 
@@ -26,7 +28,10 @@ LEFT_OUT: Mapping[type, Mapping[str, Any]] = {
     AnchoredSettings: {"shared_error": 0.004, "limit": 9.0},
 }
 _LIMIT = {"limit_noise", "limit_ratio", "limit_slack", "outer_share", "outer_noise"}
-DROPPED = {AnchoredSettings: {"penetration_tolerance", *_LIMIT}}
+DROPPED = {
+    AnchoredSettings: {"penetration_tolerance", *_LIMIT},
+    CmaEsSettings: {"tolfunhist", "tolx"},
+}
 
 
 def completed(recorded: Mapping[str, Any], default: Any) -> dict[str, Any]:

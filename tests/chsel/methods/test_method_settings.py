@@ -17,7 +17,7 @@ from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.methods.cvo.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.methods.icp import Icp, IcpSettings
-from chsel.methods.medial_constraint.cma_es import CmaEsSettings
+from chsel.methods.medial_constraint.medial_constraint import CmaEsSettings
 from chsel.methods.medial_constraint.medial_cost import MedialCostSettings
 from chsel.methods.svgd import SvgdSettings
 from chsel.problem.named_choices import NamedChoices
