@@ -18,7 +18,6 @@ from chsel.methods.cvo.rkhs_fields import (
     Kernel,
     Product,
     cloud_norm,
-    cube_kernel,
     free_field,
     full_cubes,
     moments_at,
@@ -28,12 +27,13 @@ from chsel.methods.cvo.rkhs_fields import (
 )
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, log, sine_cosine
-from chsel.numerics.pose_tuples import composed, pose_at, turned_back
+from chsel.numerics.pose_tuples import Triple, composed, moved, pose_at, turned_back
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.online_registration import OnlineSettings
-from chsel.problem.poses import Poses, rotated
+from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
     Hypotheses,
     NullObserver,
@@ -157,29 +157,22 @@ class Cvo(ConfiguredMethod[CvoSettings]):
         """Hypotheses for the known points of a problem, best first."""
         require_ieee_arithmetic()
         observer = observer or NullObserver()
-        settings, points = self.settings, problem.points
-        initial = estimates = Poses.of(problem.initial_set)
-        if len(points.contacts) == 0 and not (settings.free_space and len(points.free)):
-            costs = np.ones(len(estimates))
-            observer.trace("ascent", 0, estimates.vectors, costs.copy())
-            return ranked(estimates.matrices, costs)
+        settings, estimates = self.settings, Poses.of(problem.initial_set)
         centre = np.zeros(3)
         if settings.origin == "workspace":
             centre = (problem.workspace.bounds[0] + problem.workspace.bounds[1]) / 2.0
-        poses, ascent = _seen_from(centre, initial).numbers, self._ascent()
-        moved = np.zeros(len(poses), dtype=bool)
+        poses, ascent = estimates.numbers, self._ascent(centre)
         total = settings.max_iterations * len(settings.levels)
         ends = [*range(0, settings.max_iterations, _BLOCK), settings.max_iterations]
         for level, ell in enumerate(settings.levels):
-            product, norm = self._clouds(problem, ell, centre)
+            product, norm = self._clouds(problem, ell)
             climbers = climbers_at(poses, values_of(product, poses))
             if level == 0:
                 observer.trace("ascent", 0, estimates.vectors, _costs(climbers.value, norm))
             for first, last in pairwise(ends):
                 run = partial(climb, product, ascent, climbers, last - first)
                 spread(run, len(poses), lambda: None)
-                moved |= climbers.moved
-                estimates = _in_world(climbers.poses, moved, centre, initial)
+                estimates = Poses(climbers.poses.copy())
                 done = level * settings.max_iterations + last
                 observer.trace("ascent", done, estimates.vectors, _costs(climbers.value, norm))
                 observer.progress("ascent", done, total)
@@ -188,18 +181,17 @@ class Cvo(ConfiguredMethod[CvoSettings]):
             poses = climbers.poses
         return ranked(estimates.matrices, _costs(climbers.value, norm))
 
-    def _ascent(self) -> Ascent:
-        """The settings of `climb`; steps grow by a fixed factor."""
+    def _ascent(self, centre: FloatArray) -> Ascent:
+        """The settings of `climb`, about `centre` (3,); steps grow by a fixed factor."""
         settings = self.settings
         growth = log(settings.max_step / settings.min_step) / (STEPS - 1)
         steps = np.array([settings.min_step * exp(growth * k) for k in range(STEPS)])
         stop_below = -1.0 if settings.stop_below is None else settings.stop_below
-        return Ascent(np.minimum(steps, settings.max_step), settings.c, settings.d, stop_below)
+        steps = np.minimum(steps, settings.max_step)
+        return Ascent(steps, triple(centre), settings.c, settings.d, stop_below)
 
-    def _clouds(
-        self, problem: RegistrationProblem, ell: float, centre: FloatArray
-    ) -> tuple[Product, float]:
-        """F, the observed cloud as seen from `centre` (3,), and |f_x| |f_z|."""
+    def _clouds(self, problem: RegistrationProblem, ell: float) -> tuple[Product, float]:
+        """F, and |f_x| |f_z|."""
         settings, sdf, lattice = self.settings, problem.sdf, problem.free_resolution
         kernel = Kernel.above(ell, 1.0, settings.sp_thres / settings.amplitude)
         band = sdf.resolution if settings.surface_band is None else settings.surface_band
@@ -215,15 +207,12 @@ class Cvo(ConfiguredMethod[CvoSettings]):
         if settings.free_space:
             observed += cloud_norm(free, kernel, lattice)
             of_object += free_z.norm
-        alone, cubes, cube_z = free, np.zeros((0, 3)), free_z
-        if settings.sp_thres == 0.0:
-            alone, cubes, side = full_cubes(free, ell, lattice)
-            if side > 1:
-                cube_z = free_field(sdf, cube_kernel(kernel, lattice, side), band)
+        alone, cubes, wide = full_cubes(free, kernel, lattice)
+        cube_z = free_field(sdf, wide, band) if len(cubes) else free_z
         product = Product(
-            free=free_z.term(alone - centre, 1.0),
-            cubes=cube_z.term(cubes - centre, 1.0),
-            surface=surface_z.term(contacts - centre, weight),
+            free=free_z.term(alone, 1.0),
+            cubes=cube_z.term(cubes, 1.0),
+            surface=surface_z.term(contacts, weight),
         )
         return product, float(np.sqrt(observed * of_object))
 
@@ -233,22 +222,11 @@ def _costs(values: FloatArray, norm: float) -> FloatArray:
     return 1.0 - values / norm if norm > 0.0 else np.ones(len(values))
 
 
-def _seen_from(centre: FloatArray, poses: Poses) -> Poses:
-    """The same poses in a world whose origin is at `centre` (3,)."""
-    shifted = poses.translations + rotated(poses.rotations, centre)
-    return Poses(np.concatenate([poses.numbers[:, :9], shifted], axis=1))
-
-
-def _in_world(poses: FloatArray, moved: BoolArray, centre: FloatArray, initial: Poses) -> Poses:
-    """Poses (B, 12) seen from `centre` (3,) back in the world; of E_0 those that never moved."""
-    back = _seen_from(-centre, Poses(poses))
-    return Poses(np.where(moved[:, None], back.numbers, initial.numbers))
-
-
 class Ascent(NamedTuple):
     """How to climb."""
 
     steps: FloatArray  # (16,), tau, ascending
+    centre: Triple  # that the flow turns about, world
     c: float  # scale of the flow's rotation
     d: float  # and of its translation
     stop_below: float  # relative gain of F that counts as none; negative: every gain counts
@@ -262,14 +240,12 @@ class Climbers(NamedTuple):
     step: IntArray  # (B,), index of the last step's length
     stalled: IntArray  # (B,), iterations in a row that gained nothing
     done: BoolArray  # (B,)
-    moved: BoolArray  # (B,)
 
 
 def climbers_at(poses: FloatArray, value: FloatArray) -> Climbers:
     """Climbers at copies of poses (B, 12) with their F (B,), before the first step."""
-    counts = np.zeros((2, len(poses)), dtype=np.int64)
-    flags = np.zeros((2, len(poses)), dtype=np.bool_)
-    return Climbers(poses.copy(), value.copy(), *counts, *flags)
+    step, stalled = np.zeros((2, len(poses)), dtype=np.int64)
+    return Climbers(poses.copy(), value.copy(), step, stalled, np.zeros(len(poses), dtype=bool))
 
 
 @compiled
@@ -288,11 +264,12 @@ def climb(product, ascent, climbers, iterations, first, last, _):
 
 @inner
 def _direction(product, ascent, pose):
-    """The flow xi = (omega, u) as a unit vector, and the slope of F along it; 0 without overlap.
+    """The flow xi = (omega, u), and the slope of F along it; 0 without overlap.
 
-    omega = 1/c sum x_i x h_i, u = 1/d sum h_i.
+    omega = 1/c sum x_i x h_i, u = 1/d sum h_i, made a unit vector, with x_i from the centre; then u
+    is that of the same flow about the world's origin.
     """
-    flow = flow_at(product, pose)
+    flow = flow_at(product, pose, ascent.centre)
     a, b, c = flow[1] / ascent.c, flow[2] / ascent.c, flow[3] / ascent.c
     d, e, f = flow[4] / ascent.d, flow[5] / ascent.d, flow[6] / ascent.d
     size = np.sqrt(a * a + b * b + c * c + d * d + e * e + f * f)
@@ -302,7 +279,9 @@ def _direction(product, ascent, pose):
     slope = 0.0
     for i in range(6):
         slope += xi[i] * flow[i + 1]
-    return xi, slope
+    a, b, c, d, e, f = xi
+    x, y, z = ascent.centre
+    return (a, b, c, d - (b * z - c * y), e - (c * x - a * z), f - (a * y - b * x)), slope
 
 
 @inner
@@ -352,7 +331,7 @@ def _step(product, ascent, pose, xi, slope, climbers, n):
     while k > 0 and steps[k] > tau:
         k -= 1
     small = value - before <= ascent.stop_below * before
-    climbers.value[n], climbers.step[n], climbers.moved[n] = value, k, True
+    climbers.value[n], climbers.step[n] = value, k
     climbers.stalled[n] = climbers.stalled[n] + 1 if small else 0
     climbers.done[n] = climbers.stalled[n] >= _PATIENCE
 
@@ -377,7 +356,7 @@ def _crest(tau, gain, other, other_gain, slope):
 
 @leaf
 def _moved_along(pose, xi, tau):
-    """G Exp(tau xi) of a pose G = (R, t) and a unit vector xi = (omega, u).
+    """G Exp(tau xi) of a pose G = (R, t) and a flow xi = (omega, u).
 
     Exp has the rotation I + sin(a) W + (1 - cos(a)) W^2, a = tau |omega|, W the hat of omega /
     |omega|, and the translation tau (u + (1 - cos a)/a W u + (a - sin a)/a W^2 u).
@@ -421,15 +400,14 @@ def _rest_of_sine(angle, sine):
 
 
 @inner
-def flow_at(product, pose):
-    """F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), in the world."""
+def flow_at(product, pose, centre):
+    """F, sum x_i x h_i and sum h_i with h_i = R^T grad f(R x_i + t), x_i from the centre."""
     value = x = y = z = p = q = r = 0.0
     for term in product:
         f, gx, gy, gz, a, b, c = moments_at(term, pose)
         value, x, y, z = value + f, x + gx, y + gy, z + gz
         p, q, r = p + a, q + b, r + c
-    # R (x_i x h_i) = (p_i - t) x grad f(p_i)
-    p -= pose[10] * z - pose[11] * y
-    q -= pose[11] * x - pose[9] * z
-    r -= pose[9] * y - pose[10] * x
+    # R (x_i x h_i) = (p_i - R c - t) x grad f(p_i)
+    a, b, c = moved(pose, centre[0], centre[1], centre[2])
+    p, q, r = p - (b * z - c * y), q - (c * x - a * z), r - (a * y - b * x)
     return (value, *turned_back(pose, p, q, r), *turned_back(pose, x, y, z))

@@ -17,20 +17,20 @@ import numpy as np
 from chsel.errors import SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Box, box_of
-from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.compiler import compiled, inner
 from chsel.numerics.elementary import exp, exps, log
 from chsel.numerics.pose_tuples import moved, pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import cell_of, distance_between_nodes
+from chsel.problem.sdf_lookup import cell_of, distance_between_nodes, value_between_nodes
 
 MOST_NODES = 30_000_000
 FINENESS = 10  # at least so many nodes of a field per ell, if the SDF has them
 TRUNCATION = 3.5  # ell; beyond it lie 0.02 % of a Gaussian on either side
 _FEW, _MANY = 2000, 50_000  # points that are, and that may be, taken one by one
 _FAR = 8.0  # ell; nothing is left of a kernel there
-_SHARED_FINENESS = 4  # nodes per ell that points are shared out among
+_SNAPPED_FINENESS = 4  # nodes per ell that points are moved to
 _ON_LATTICE = 1e-6  # spacings that a point may be away from a node
 
 
@@ -49,19 +49,21 @@ class Kernel:
             return cls(ell, amplitude)
         return cls(ell, amplitude, ell * math.sqrt(2.0 * log(amplitude / least)))
 
+    def widened(self, variance: float, mass: float = 1.0) -> Kernel:
+        """Spread by that variance along each axis, m^2, which may be negative; `mass` of them."""
+        ell = math.sqrt(self.ell * self.ell + variance)
+        ratio = self.ell / ell
+        return Kernel(ell, self.amplitude * (mass * ratio * ratio * ratio), self.radius)
+
     def reach(self, spacing: float, stride: int = 1) -> int:
         """K: how many nodes it reaches, a multiple of the stride."""
         nodes = math.ceil(min(self.radius, TRUNCATION * self.ell) / spacing)
         return -(-nodes // stride) * stride
 
-    def weights(self, spacing: float, reach: int) -> tuple[FloatArray, FloatArray]:
-        """Along an axis at x = -K .. K spacings (2 K + 1,), without the amplitude.
-
-        exp(-x^2 / (2 ell^2)), and -x times that: its derivative by x, times ell^2.
-        """
+    def weights(self, spacing: float, reach: int) -> FloatArray:
+        """exp(-x^2 / (2 ell^2)) at x = -K .. K spacings (2 K + 1,)."""
         x = np.arange(-reach, reach + 1) * spacing
-        values = exps(-0.5 * (x / self.ell) * (x / self.ell))
-        return values, -x * values
+        return exps(-0.5 * (x / self.ell) * (x / self.ell))
 
 
 class ClassTerm(NamedTuple):
@@ -110,25 +112,10 @@ def _sum_at(term, pose):
     points, total = term.points, 0.0
     for n in range(points.shape[1]):
         a, b, c = moved(pose, points[0, n], points[1, n], points[2, n])
-        (at, across, along, u, v, w), is_beyond = cell_of(term.box, a, b, c)
+        cell, is_beyond = cell_of(term.box, a, b, c)
         if not is_beyond:
-            near = _side_between(term.table, at, along, v, w)
-            total += _between(near, _side_between(term.table, at + across, along, v, w), u)
+            total += value_between_nodes(term.table, *cell)
     return term.weight * total
-
-
-@leaf
-def _side_between(table, at, along, v, w):
-    """f between the four nodes around, of those that share the first index."""
-    low, high = np.uint64(4 * at), np.uint64(4 * (at + along))
-    step = np.uint64(4)
-    near = _between(table[low], table[low + step], w)
-    return _between(near, _between(table[high], table[high + step], w), v)
-
-
-@leaf
-def _between(near, far, share):
-    return np.float64(near) + share * (np.float64(far) - np.float64(near))
 
 
 @inner
@@ -183,11 +170,13 @@ def _class_field(sdf: SdfGrid, members: BoolArray, kernel: Kernel) -> ClassField
             f"ell {kernel.ell} m makes a field of {math.prod(shape):.1e} nodes around an SDF of "
             f"resolution {spacing} m; accepted: at most {MOST_NODES:.0e}, so a smaller ell"
         )
-    table = np.empty((math.prod(shape), 4), dtype=np.float32)
-    parts = _blurred_with_gradient(members.astype(np.float64), kernel, spacing, shape, stride)
-    for channel, part in enumerate(parts):
-        scale = kernel.amplitude / (kernel.ell * kernel.ell if channel else 1.0)
-        table[:, channel] = scale * part.reshape(-1)
+    source, table = members.astype(np.float64), np.empty((*shape, 4), dtype=np.float32)
+    table[..., 0] = value = kernel.amplitude * _blurred(source, kernel, spacing, shape, stride)
+    for axis in range(3):  # ell^2 grad f = sum k(., z) z - f p
+        z, p = (np.ogrid[tuple(map(slice, counts))][axis] for counts in (sdf.shape, shape))
+        moment = kernel.amplitude * _blurred(source * z, kernel, spacing, shape, stride)
+        slope = moment - (p * stride - reach) * value
+        table[..., axis + 1] = spacing / (kernel.ell * kernel.ell) * slope
     box = box_of(sdf.origin - reach * spacing, stride * spacing, shape, between=True)
     field = ClassField(box, table.reshape(-1), 0.0)
     nothing = field.term(np.zeros((0, 3)), 0.0)
@@ -200,23 +189,26 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
     """<f, f> of a cloud (N, 3): the sum over all pairs, one by one if they are few.
 
     Of more, the sum over a grid: of spacing `lattice`, metres, if every point is at a node, which
-    is as exact as a field; else of a quarter of ell, with points shared out among the nodes
-    around, within 1 %. Points that span too large a grid are taken one by one, too.
+    is as exact as a field; else of a quarter of ell, with points moved to the nearest nodes,
+    within 1 %. Points that span too large a grid are taken one by one, too.
     """
     if len(points) <= _FEW:
         return _pair_by_pair(points, kernel)
     first, spacing, narrow = points.min(axis=0), lattice, kernel
     nodes = _nodes_of(points, lattice)
     if nodes is None:
-        spacing = kernel.ell / _SHARED_FINENESS
-        narrow = _narrowed(kernel, spacing)
+        spacing = kernel.ell / _SNAPPED_FINENESS
+        narrow = kernel.widened(-spacing * spacing / 6.0)  # either point moves by half of it
     with np.errstate(over="ignore"):
-        sides = np.floor((points.max(axis=0) - first) / spacing + 0.5) + 2.0
-    if not math.prod((sides + 2.0 * narrow.reach(spacing)).tolist()) <= MOST_NODES:
+        steps = np.rint((points - first) / spacing)
+    sides, reach = steps.max(axis=0) + 1.0, narrow.reach(spacing)
+    if not math.prod((sides + 2.0 * reach).tolist()) <= MOST_NODES:
         return _pair_by_pair(points, kernel)
-    grid = np.zeros([int(side) for side in sides])
-    _share_out((points - first) * (1.0 / spacing) if nodes is None else nodes, grid)
-    terms = (grid * _blurred(grid, narrow, spacing)).reshape(-1)
+    grid = np.zeros(sides.astype(np.int64))
+    np.add.at(grid, tuple(steps.astype(np.int64).T), 1.0)
+    around = [side + 2 * reach for side in grid.shape]
+    inside = tuple(slice(reach, reach + side) for side in grid.shape)
+    terms = (grid * _blurred(grid, narrow, spacing, around, 1)[inside]).reshape(-1)
     return narrow.amplitude * float(np.cumsum(terms)[-1])  # added in their order
 
 
@@ -248,26 +240,6 @@ def _sum_of_pairs(points: FloatArray, ell: float, radius: float) -> float:
     return total
 
 
-def _narrowed(kernel: Kernel, spacing: float) -> Kernel:
-    """The kernel that is widened to this one by sharing out points among nodes.
-
-    Either point of a pair is spread with a variance of spacing^2 / 6 along an axis, on average.
-    """
-    ell = math.sqrt(kernel.ell * kernel.ell - spacing * spacing / 3.0)
-    widening = kernel.ell / ell
-    gain = widening * widening * widening
-    return Kernel(ell, kernel.amplitude * gain, kernel.radius)
-
-
-def _share_out(points: FloatArray | IntArray, grid: FloatArray) -> None:
-    """Add points (N, 3), in spacings from the first node, to the eight nodes around each."""
-    below = np.clip(np.floor(points).astype(np.int64), 0, np.array(grid.shape) - 2)
-    share = points - below
-    for corner in np.ndindex(2, 2, 2):
-        x, y, z = np.where(corner, share, 1.0 - share).T
-        np.add.at(grid, tuple((below + corner).T), x * y * z)
-
-
 def _nodes_of(points: FloatArray, lattice: float) -> IntArray | None:
     """Indices (N, 3) of lattice nodes from the first on, or None if points are elsewhere."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -279,80 +251,53 @@ def _nodes_of(points: FloatArray, lattice: float) -> IntArray | None:
 
 
 def full_cubes(
-    points: FloatArray, ell: float, lattice: float
-) -> tuple[FloatArray, FloatArray, int]:
-    """Points (N, 3) left alone, centres (C, 3) of full cubes of lattice points, points per side.
+    points: FloatArray, kernel: Kernel, lattice: float
+) -> tuple[FloatArray, FloatArray, Kernel]:
+    """Points (N, 3) left alone, centres (C, 3) of full cubes of lattice points, a cube's kernel.
 
-    A cube's side is at most half of ell, so that its sum of kernels is that of one wider kernel
-    (see `cube_kernel`). A cloud of few points, or off the lattice, has no cubes.
+    A cube counts as one point of a wider kernel, which has the variance of the kernel and of the
+    cube together, and differs in fourth moments: by less than 1e-3 of the cube's sum, as its side
+    is at most half of ell. A cloud of few points, or off the lattice, has no cubes, and none are
+    made for a kernel that ends at a radius.
     """
-    side = math.floor(0.5 * ell / lattice)
+    side = math.floor(0.5 * kernel.ell / lattice) if kernel.radius == math.inf else 1
     nodes = _nodes_of(points, lattice) if len(points) > _FEW and side > 1 else None
     if nodes is None:
-        return points, np.zeros((0, 3)), 1
-    cubes = nodes // side
-    _, count_y, count_z = cubes.max(axis=0) + 1
-    keys = (cubes[:, 0] * count_y + cubes[:, 1]) * count_z + cubes[:, 2]
-    _, first, cube, counts = np.unique(
-        keys, return_index=True, return_inverse=True, return_counts=True
+        return points, np.zeros((0, 3)), kernel
+    corners, cube, counts = np.unique(
+        nodes // side, axis=0, return_inverse=True, return_counts=True
     )
     full = counts == side**3
-    centres = (cubes[first[full]] * side + (side - 1) / 2.0) * lattice + points.min(axis=0)
-    return points[~full[cube]], centres, side
+    centres = (corners[full] * side + (side - 1) / 2.0) * lattice + points.min(axis=0)
+    wide = kernel.widened(lattice * lattice * (side * side - 1) / 12.0, side**3)
+    return points[~full[cube.reshape(-1)]], centres, wide
 
 
-def cube_kernel(kernel: Kernel, lattice: float, side: int) -> Kernel:
-    """The kernel of a cube of side^3 lattice points seen as one point at its centre.
-
-    Its variance is that of the kernel and of the cube together, which along every direction is
-    lattice^2 (side^2 - 1) / 12; its integral that of all. It differs in fourth moments, by less
-    than 1e-3 of the cube's sum while the cube's side is at most half of ell.
-    """
-    variance = lattice * lattice * (side * side - 1) / 12.0
-    ell = math.sqrt(kernel.ell * kernel.ell + variance)
-    narrowing = kernel.ell / ell
-    gain = side**3 * narrowing * narrowing * narrowing
-    return Kernel(ell, kernel.amplitude * gain)
-
-
-def _blurred_with_gradient(
+def _blurred(
     source: FloatArray, kernel: Kernel, spacing: float, shape: list[int], stride: int
-) -> list[FloatArray]:
-    """Value and gradient times ell^2, each of `shape` (3,), of a source (nx, ny, nz) blurred.
+) -> FloatArray:
+    """A source (nx, ny, nz) blurred, without the amplitude, at nodes of `shape` (3,).
 
-    Their nodes lie every `stride` nodes of the source, the first K nodes before its first.
+    These lie every `stride` nodes of the source, the first K nodes before its first.
     """
+    reach = kernel.reach(spacing, stride)
+    weights = kernel.weights(spacing, reach)
     if kernel.radius < math.inf:
-        return list(_blurred_in_ball(source, kernel, spacing, shape, stride))
-    value, slope = kernel.weights(spacing, kernel.reach(spacing, stride))
-    z, dz = (_along(2, source, weights, shape, stride) for weights in (value, slope))
-    zy, zdy = (_along(1, z, weights, shape, stride) for weights in (value, slope))
-    dzy = _along(1, dz, value, shape, stride)
-    parts = (zy, value), (zy, slope), (zdy, value), (dzy, value)
-    return [_along(0, part, weights, shape, stride) for part, weights in parts]
-
-
-def _blurred(source: FloatArray, kernel: Kernel, spacing: float) -> FloatArray:
-    """The source (nx, ny, nz) blurred, at its own nodes."""
-    reach = kernel.reach(spacing)
-    shape = [side + 2 * reach for side in source.shape]
-    inside = tuple(slice(reach, reach + side) for side in source.shape)
-    if kernel.radius < math.inf:
-        return _blurred_in_ball(source, kernel, spacing, shape, 1)[0][inside]
+        return _blurred_in_ball(source, weights, kernel.radius / spacing, shape, stride)
     for axis in (2, 1, 0):
-        source = _along(axis, source, kernel.weights(spacing, reach)[0], shape, 1)
-    return source[inside]
+        source = _along(axis, source, weights, shape[axis], stride)
+    return source
 
 
 def _along(
-    axis: int, source: FloatArray, weights: FloatArray, shape: list[int], stride: int
+    axis: int, source: FloatArray, weights: FloatArray, length: int, stride: int
 ) -> FloatArray:
-    """Source (nx, ny, nz) blurred along an axis, which then has the length that `shape` has."""
+    """Source (nx, ny, nz) blurred along an axis, which then has that length."""
     before, after = source.shape[:axis], source.shape[axis + 1 :]
     rows = source.reshape(math.prod(before), source.shape[axis], math.prod(after))
-    out = np.empty((len(rows), shape[axis], rows.shape[2]))
-    spread(partial(_blur_rows, rows, weights, stride, out), shape[axis], lambda: None)
-    return out.reshape(*before, shape[axis], *after)
+    out = np.empty((len(rows), length, rows.shape[2]))
+    spread(partial(_blur_rows, rows, weights, stride, out), length, lambda: None)
+    return out.reshape(*before, length, *after)
 
 
 @compiled
@@ -361,7 +306,7 @@ def _blur_rows(source, weights, stride, out, first, last, _):
 
     Row o of the result is at row o stride - K of the source. Rows add up in their order.
     """
-    reach = (len(weights) - 1) // 2
+    reach = len(weights) // 2
     across, rows, along = source.shape
     for a in range(across):
         for o in range(first, last):
@@ -376,53 +321,42 @@ def _blur_rows(source, weights, stride, out, first, last, _):
 
 
 def _blurred_in_ball(
-    source: FloatArray, kernel: Kernel, spacing: float, shape: list[int], stride: int
+    source: FloatArray, weights: FloatArray, radius: float, shape: list[int], stride: int
 ) -> FloatArray:
-    """Value and gradient times ell^2 (4, *shape) of a kernel that ends at a radius.
+    """Source (nx, ny, nz) blurred by a kernel that ends at a radius, in spacings.
 
     For every length that a column along z may have within the ball: the source blurred along z
     that far, then added up over the columns at the distances that leave this length.
     """
-    reach = kernel.reach(spacing, stride)
-    values, slopes = kernel.weights(spacing, reach)
+    reach = len(weights) // 2
     offsets = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - reach  # (P, 2)
-    squares = offsets * offsets
-    left = (kernel.radius / spacing) ** 2 - squares[:, 0] - squares[:, 1]
+    left = radius * radius - (offsets * offsets)[:, 0] - (offsets * offsets)[:, 1]
     length = np.ceil(np.sqrt(np.maximum(left, 0.0))) - 1.0  # the most spacings below the radius
-    columns, out = np.zeros((2, *source.shape[:2], shape[2])), np.zeros((4, *shape))
+    columns, out = np.zeros((*source.shape[:2], shape[2])), np.zeros(shape)
     padded = np.pad(source, ((0, 0), (0, 0), (2 * reach, 2 * reach + stride)))
     for depth in range(int(length.max(initial=-1.0)) + 1):
-        for offset in (depth, -depth)[: 1 + (depth > 0)]:
-            start = reach - offset
+        for start in (reach - depth, reach + depth)[: 1 + (depth > 0)]:
             part = padded[:, :, start : start + stride * (shape[2] - 1) + 1 : stride]
-            columns[0] += values[offset + reach] * part
-            columns[1] += slopes[offset + reach] * part
-        reached = offsets[length == depth]
-        add = partial(_add_columns, columns, reached, values, spacing, stride, out)
+            columns += weights[reach + depth] * part
+        add = partial(_add_columns, columns, offsets[length == depth], weights, stride, out)
         spread(add, shape[0], lambda: None)
     return out
 
 
 @compiled
-def _add_columns(columns, offsets, weights, spacing, stride, out, first, last, _):
-    """Add columns (2, nx, ny, mz), the source blurred along z by values and slopes, to those near.
+def _add_columns(columns, offsets, weights, stride, out, first, last, _):
+    """Add columns (nx, ny, mz) to out (mx, my, mz), from plane `first` to before `last`.
 
-    out (4, mx, my, mz): from plane `first` to before `last`. offsets (P, 2): spacings from a column
-    to those that it reaches.
+    offsets (P, 2): nodes of the source along x and y from a column to those that it reaches.
     """
-    reach = (len(weights) - 1) // 2
-    _, nx, ny, mz = columns.shape
+    reach = len(weights) // 2
+    nx, ny, mz = columns.shape
     for o in range(first, last):
-        for p in range(out.shape[2]):
+        for p in range(out.shape[1]):
             for n in range(len(offsets)):
                 dx, dy = offsets[n, 0], offsets[n, 1]
                 i, j = o * stride - reach - dx, p * stride - reach - dy
                 if 0 <= i < nx and 0 <= j < ny:
                     weight = weights[dx + reach] * weights[dy + reach]
-                    x, y = dx * spacing, dy * spacing
                     for k in range(mz):
-                        near = weight * columns[0, i, j, k]
-                        out[0, o, p, k] += near
-                        out[1, o, p, k] -= x * near
-                        out[2, o, p, k] -= y * near
-                        out[3, o, p, k] += weight * columns[1, i, j, k]
+                        out[o, p, k] += weight * columns[i, j, k]

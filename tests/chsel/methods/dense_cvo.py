@@ -148,6 +148,6 @@ def nearby(count: int, seed: int, reach: float = 0.08) -> FloatArray:
 def flows(product, poses, out):  # type: ignore[no-untyped-def]
     """Fill out (B, 7) with F, sum x_i x h_i and sum h_i, h = R^T grad f, at poses (B, 12)."""
     for n in range(len(poses)):
-        flow = flow_at(product, pose_at(poses, n))
+        flow = flow_at(product, pose_at(poses, n), (0.0, 0.0, 0.0))
         for i in range(7):
             out[n, i] = flow[i]

@@ -11,7 +11,6 @@ from chsel.methods.cvo.rkhs_fields import (
     Kernel,
     Product,
     cloud_norm,
-    cube_kernel,
     free_field,
     full_cubes,
     surface_field,
@@ -148,11 +147,11 @@ def test_points_all_over_the_world_are_summed_one_by_one(monkeypatch: pytest.Mon
 def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
     lattice = (np.indices((20, 20, 20)).reshape(3, -1).T - 10.0) * spacing
     points = lattice[~(np.abs(lattice) < 4.5 * spacing).all(axis=1)]
-    alone, centres, side = full_cubes(points, KERNEL.ell, spacing)
-    assert side == (5 if spacing == 0.01 else 2)
+    alone, centres, wide = full_cubes(points, KERNEL, spacing)
+    side = 5 if spacing == 0.01 else 2
     assert len(alone) + side**3 * len(centres) == len(points)
     assert len(alone) < 0.6 * len(points)
-    field, wide = free_field(SDF, KERNEL, 0.01), cube_kernel(KERNEL, spacing, side)
+    field = free_field(SDF, KERNEL, 0.01)
     nothing = field.term(np.zeros((0, 3)), 1.0)
     all_alone = Product(field.term(points, 1.0), nothing, nothing)
     cubes = free_field(SDF, wide, 0.01).term(centres, 1.0)
@@ -167,9 +166,9 @@ def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
 def test_cubes_are_made_of_full_lattices_alone() -> None:
     off = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
     for points in (off, off[:5], np.zeros((0, 3))):
-        alone, centres, _ = full_cubes(points, 0.1, 0.01)
+        alone, centres, _ = full_cubes(points, KERNEL, 0.01)
         np.testing.assert_array_equal(alone, points)
         assert len(centres) == 0
     twice = np.tile(np.indices((20, 20, 4)).reshape(3, -1).T * 0.02, (2, 1))
-    alone, centres, side = full_cubes(twice, 0.1, 0.02)
-    assert len(alone) + side**3 * len(centres) == len(twice)
+    alone, centres, _ = full_cubes(twice, KERNEL, 0.02)
+    assert len(alone) + 2**3 * len(centres) == len(twice)
