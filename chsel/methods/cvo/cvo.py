@@ -72,10 +72,6 @@ class CvoSettings(CheckedSettings):
     ell: Annotated[float, positive, between(FINEST, COARSEST)] = 0.1
     ell_min: Annotated[float, positive, between(FINEST, COARSEST)] = 0.025
     ell_decay: Annotated[float, positive] = 0.5
-    # Amplitudes of the kernels of places and of equal labels; unequal labels have a kernel of 0.
-    sigma: Annotated[float, positive] = 0.1
-    s_sigma: Annotated[float, positive] = 0.8
-    sp_thres: Annotated[float, not_negative] = 0.0  # products of kernels up to it count as 0
     # Nodes of the SDF within it of the surface make the object's surface, those farther outside its
     # free space, metres; null: the SDF's resolution (r_t).
     surface_band: Annotated[float | None, positive] = None
@@ -96,20 +92,11 @@ class CvoSettings(CheckedSettings):
     _AUTHORS: ClassVar = {"ell_min": 0.1, "c": 7.0, "origin": "world", "stop_below": None}
     presets: ClassVar[Presets] = {
         "paper": _AUTHORS,
-        "reference": {
-            **_AUTHORS,
-            "sp_thres": 6e-4,
-            "surface_band": 0.005,
-            "online": {"update": "own"},
-        },
+        "reference": {**_AUTHORS, "surface_band": 0.005, "online": {"update": "own"}},
     }
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.sp_thres < self.amplitude:
-            raise SettingError(
-                f"sp_thres is {self.sp_thres}; accepted: below sigma^2 s_sigma^2 = {self.amplitude}"
-            )
         if not self.min_step <= self.max_step <= 1.0:
             raise SettingError(
                 f"min_step is {self.min_step} and max_step {self.max_step}; accepted: min_step at "
@@ -122,11 +109,6 @@ class CvoSettings(CheckedSettings):
                 f"ell {self.ell}, ell_decay {self.ell_decay} and ell_min {self.ell_min} make more "
                 f"than {MOST_LEVELS} ascents; accepted: at most {MOST_LEVELS}"
             )
-
-    @property
-    def amplitude(self) -> float:
-        """The kernel of a point with itself."""
-        return self.sigma * self.sigma * self.s_sigma * self.s_sigma
 
     @property
     def levels(self) -> list[float]:
@@ -142,11 +124,11 @@ class Cvo(ConfiguredMethod[CvoSettings]):
 
     The observed cloud x: free points, and contacts; the object's z: nodes of the SDF grid within
     surface_band of the surface, and those farther outside. F(X) = sum_ij a(R x_i + t, z_j) over
-    pairs of one class, with a = exp(-|x - z|^2 / (2 ell^2)), in units of sigma^2 s_sigma^2. Cost:
-    1 - F / (|f_x| |f_z|), 1 minus the cosine between the clouds as functions, at the last ell; 1
-    where they do not meet. Such a start stays where it is, as does all of E_0 if there is no point
-    to use. Occupied points and points of a known distance that is not 0 are not used. A trace has
-    the costs at the ell of its ascent.
+    pairs of one class, as that of unequal labels is 1e-28 of it, with a = exp(-|x - z|^2 / (2
+    ell^2)). Cost: 1 - F / (|f_x| |f_z|), 1 minus the cosine between the clouds as functions, at the
+    last ell; 1 where they do not meet. Such a start stays where it is, as does all of E_0 if there
+    is no point to use. Occupied points and points of a known distance that is not 0 are not used. A
+    trace has the costs at the ell of its ascent.
     """
 
     settings_class = CvoSettings
@@ -192,8 +174,8 @@ class Cvo(ConfiguredMethod[CvoSettings]):
 
     def _clouds(self, problem: RegistrationProblem, ell: float) -> tuple[Product, float]:
         """F, and |f_x| |f_z|."""
-        settings, sdf, lattice = self.settings, problem.sdf, problem.free_resolution
-        kernel = Kernel.above(ell, 1.0, settings.sp_thres / settings.amplitude)
+        settings, sdf, kernel = self.settings, problem.sdf, Kernel(ell)
+        lattice = problem.free_resolution
         band = sdf.resolution if settings.surface_band is None else settings.surface_band
         contacts = problem.points.contacts
         free = problem.points.free if settings.free_space else np.zeros((0, 3))

@@ -18,7 +18,7 @@ from chsel.errors import SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Box, box_of
 from chsel.numerics.compiler import compiled, inner
-from chsel.numerics.elementary import exp, exps, log
+from chsel.numerics.elementary import exp, exps
 from chsel.numerics.pose_tuples import moved, pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses
@@ -36,28 +36,20 @@ _ON_LATTICE = 1e-6  # spacings that a point may be away from a node
 
 @dataclass(frozen=True)
 class Kernel:
-    """k(x, z) = amplitude exp(-|x - z|^2 / (2 ell^2)), metres; 0 from `radius` on."""
+    """k(x, z) = amplitude exp(-|x - z|^2 / (2 ell^2)), metres."""
 
     ell: float
-    amplitude: float
-    radius: float = math.inf
-
-    @classmethod
-    def above(cls, ell: float, amplitude: float, least: float) -> Kernel:
-        """0 where it is not above `least`: radius ell sqrt(2 ln(amplitude / least))."""
-        if least == 0.0:
-            return cls(ell, amplitude)
-        return cls(ell, amplitude, ell * math.sqrt(2.0 * log(amplitude / least)))
+    amplitude: float = 1.0
 
     def widened(self, variance: float, mass: float = 1.0) -> Kernel:
         """Spread by that variance along each axis, m^2, which may be negative; `mass` of them."""
         ell = math.sqrt(self.ell * self.ell + variance)
         ratio = self.ell / ell
-        return Kernel(ell, self.amplitude * (mass * ratio * ratio * ratio), self.radius)
+        return Kernel(ell, self.amplitude * (mass * ratio * ratio * ratio))
 
     def reach(self, spacing: float, stride: int = 1) -> int:
         """K: how many nodes it reaches, a multiple of the stride."""
-        nodes = math.ceil(min(self.radius, TRUNCATION * self.ell) / spacing)
+        nodes = math.ceil(TRUNCATION * self.ell / spacing)
         return -(-nodes // stride) * stride
 
     def weights(self, spacing: float, reach: int) -> FloatArray:
@@ -218,8 +210,7 @@ def _pair_by_pair(points: FloatArray, kernel: Kernel) -> float:
             f"{len(points)} points of one class are far apart; accepted: at most {_MANY:_}, or "
             "points within a box that is small beside ell"
         )
-    radius = min(kernel.radius, _FAR * kernel.ell)
-    return kernel.amplitude * _sum_of_pairs(points, kernel.ell, radius)
+    return kernel.amplitude * _sum_of_pairs(points, kernel.ell, _FAR * kernel.ell)
 
 
 @compiled
@@ -257,10 +248,9 @@ def full_cubes(
 
     A cube counts as one point of a wider kernel, which has the variance of the kernel and of the
     cube together, and differs in fourth moments: by less than 1e-3 of the cube's sum, as its side
-    is at most half of ell. A cloud of few points, or off the lattice, has no cubes, and none are
-    made for a kernel that ends at a radius.
+    is at most half of ell. A cloud of few points, or off the lattice, has no cubes.
     """
-    side = math.floor(0.5 * kernel.ell / lattice) if kernel.radius == math.inf else 1
+    side = math.floor(0.5 * kernel.ell / lattice)
     nodes = _nodes_of(points, lattice) if len(points) > _FEW and side > 1 else None
     if nodes is None:
         return points, np.zeros((0, 3)), kernel
@@ -280,10 +270,7 @@ def _blurred(
 
     These lie every `stride` nodes of the source, the first K nodes before its first.
     """
-    reach = kernel.reach(spacing, stride)
-    weights = kernel.weights(spacing, reach)
-    if kernel.radius < math.inf:
-        return _blurred_in_ball(source, weights, kernel.radius / spacing, shape, stride)
+    weights = kernel.weights(spacing, kernel.reach(spacing, stride))
     for axis in (2, 1, 0):
         source = _along(axis, source, weights, shape[axis], stride)
     return source
@@ -318,45 +305,3 @@ def _blur_rows(source, weights, stride, out, first, last, _):
                 line = source[a, s]
                 for c in range(along):
                     target[c] += weight * line[c]
-
-
-def _blurred_in_ball(
-    source: FloatArray, weights: FloatArray, radius: float, shape: list[int], stride: int
-) -> FloatArray:
-    """Source (nx, ny, nz) blurred by a kernel that ends at a radius, in spacings.
-
-    For every length that a column along z may have within the ball: the source blurred along z
-    that far, then added up over the columns at the distances that leave this length.
-    """
-    reach = len(weights) // 2
-    offsets = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - reach  # (P, 2)
-    left = radius * radius - (offsets * offsets)[:, 0] - (offsets * offsets)[:, 1]
-    length = np.ceil(np.sqrt(np.maximum(left, 0.0))) - 1.0  # the most spacings below the radius
-    columns, out = np.zeros((*source.shape[:2], shape[2])), np.zeros(shape)
-    padded = np.pad(source, ((0, 0), (0, 0), (2 * reach, 2 * reach + stride)))
-    for depth in range(int(length.max(initial=-1.0)) + 1):
-        for start in (reach - depth, reach + depth)[: 1 + (depth > 0)]:
-            part = padded[:, :, start : start + stride * (shape[2] - 1) + 1 : stride]
-            columns += weights[reach + depth] * part
-        add = partial(_add_columns, columns, offsets[length == depth], weights, stride, out)
-        spread(add, shape[0], lambda: None)
-    return out
-
-
-@compiled
-def _add_columns(columns, offsets, weights, stride, out, first, last, _):
-    """Add columns (nx, ny, mz) to out (mx, my, mz), from plane `first` to before `last`.
-
-    offsets (P, 2): nodes of the source along x and y from a column to those that it reaches.
-    """
-    reach = len(weights) // 2
-    nx, ny, mz = columns.shape
-    for o in range(first, last):
-        for p in range(out.shape[1]):
-            for n in range(len(offsets)):
-                dx, dy = offsets[n, 0], offsets[n, 1]
-                i, j = o * stride - reach - dx, p * stride - reach - dy
-                if 0 <= i < nx and 0 <= j < ny:
-                    weight = weights[dx + reach] * weights[dy + reach]
-                    for k in range(mz):
-                        out[o, p, k] += weight * columns[i, j, k]

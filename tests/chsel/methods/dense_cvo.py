@@ -53,7 +53,6 @@ class DenseClouds:
     z: FloatArray
     z_labels: FloatArray
     ell: float = 0.1
-    threshold: float = 0.0
 
     @classmethod
     def of(
@@ -63,7 +62,6 @@ class DenseClouds:
         band: float,
         *,
         ell: float = 0.1,
-        threshold: float = 0.0,
     ) -> DenseClouds:
         nodes = sdf.origin + np.argwhere(sdf.values > -np.inf) * sdf.resolution
         values = sdf.values.reshape(-1)
@@ -71,16 +69,16 @@ class DenseClouds:
         x = np.concatenate([points.free, points.contacts])
         x_labels = labels(len(points.free), len(points.contacts))
         z = np.concatenate([free, surface])
-        return cls(x, x_labels, z, labels(len(free), len(surface)), ell, threshold)
+        return cls(x, x_labels, z, labels(len(free), len(surface)), ell)
 
     def kernel(self, object_from_world: FloatArray) -> FloatArray:
-        """a_ij (N, M) = k(x_i, y_j) s(l_i, m_j); with a threshold, 0 where not above it."""
+        """a_ij (N, M) = k(x_i, y_j) s(l_i, m_j)."""
         moved = apply(object_from_world, self.x)
         apart = ((moved[:, None] - self.z) ** 2).sum(-1)
         labels_apart = ((self.x_labels[:, None] - self.z_labels) ** 2).sum(-1)
         a = SIGMA**2 * np.exp(-apart / (2 * self.ell**2))
-        a = a * S_SIGMA**2 * np.exp(-labels_apart / (2 * S_ELL**2))
-        return np.where(a > self.threshold, a, 0.0)
+        a *= S_SIGMA**2 * np.exp(-labels_apart / (2 * S_ELL**2))
+        return a
 
     def product(self, object_from_world: FloatArray) -> float:
         """F(X)."""
