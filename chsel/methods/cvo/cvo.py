@@ -29,7 +29,7 @@ from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import compiled, inner, leaf
-from chsel.numerics.elementary import exp, log, sine_cosine
+from chsel.numerics.elementary import sine_cosine
 from chsel.numerics.pose_tuples import Triple, composed, moved, pose_at, turned_back
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.online_registration import OnlineSettings
@@ -54,7 +54,6 @@ from chsel.qd.selection import ranked
 
 MOST_ITERATIONS = 1_000_000
 MOST_LEVELS = 20
-STEPS = 16
 _BLOCK = 10  # iterations between two traces
 _PATIENCE = 5
 _REFINEMENTS = 3
@@ -143,7 +142,15 @@ class Cvo(ConfiguredMethod[CvoSettings]):
         centre = np.zeros(3)
         if settings.origin == "workspace":
             centre = (problem.workspace.bounds[0] + problem.workspace.bounds[1]) / 2.0
-        poses, ascent = estimates.numbers, self._ascent(centre)
+        poses, stop_below = estimates.numbers, settings.stop_below
+        ascent = Ascent(
+            least=settings.min_step,
+            most=settings.max_step,
+            centre=triple(centre),
+            c=settings.c,
+            d=settings.d,
+            stop_below=-1.0 if stop_below is None else stop_below,
+        )
         total = settings.max_iterations * len(settings.levels)
         ends = [*range(0, settings.max_iterations, _BLOCK), settings.max_iterations]
         for level, ell in enumerate(settings.levels):
@@ -162,15 +169,6 @@ class Cvo(ConfiguredMethod[CvoSettings]):
                     break
             poses = climbers.poses
         return ranked(estimates.matrices, _costs(climbers.value, norm))
-
-    def _ascent(self, centre: FloatArray) -> Ascent:
-        """The settings of `climb`, about `centre` (3,); steps grow by a fixed factor."""
-        settings = self.settings
-        growth = log(settings.max_step / settings.min_step) / (STEPS - 1)
-        steps = np.array([settings.min_step * exp(growth * k) for k in range(STEPS)])
-        stop_below = -1.0 if settings.stop_below is None else settings.stop_below
-        steps = np.minimum(steps, settings.max_step)
-        return Ascent(steps, triple(centre), settings.c, settings.d, stop_below)
 
     def _clouds(self, problem: RegistrationProblem, ell: float) -> tuple[Product, float]:
         """F, and |f_x| |f_z|."""
@@ -207,7 +205,8 @@ def _costs(values: FloatArray, norm: float) -> FloatArray:
 class Ascent(NamedTuple):
     """How to climb."""
 
-    steps: FloatArray  # (16,), tau, ascending
+    least: float  # and
+    most: float  # tau of a step that is tried first
     centre: Triple  # that the flow turns about, world
     c: float  # scale of the flow's rotation
     d: float  # and of its translation
@@ -219,14 +218,14 @@ class Climbers(NamedTuple):
 
     poses: FloatArray  # (B, 12)
     value: FloatArray  # (B,), F
-    step: IntArray  # (B,), index of the last step's length
+    step: FloatArray  # (B,), tau of the last step, 0 before the first
     stalled: IntArray  # (B,), iterations in a row that gained nothing
     done: BoolArray  # (B,)
 
 
 def climbers_at(poses: FloatArray, value: FloatArray) -> Climbers:
     """Climbers at copies of poses (B, 12) with their F (B,), before the first step."""
-    step, stalled = np.zeros((2, len(poses)), dtype=np.int64)
+    step, stalled = np.zeros(len(poses)), np.zeros(len(poses), dtype=np.int64)
     return Climbers(poses.copy(), value.copy(), step, stalled, np.zeros(len(poses), dtype=bool))
 
 
@@ -273,21 +272,19 @@ def _step(product, ascent, pose, xi, slope, climbers, n):
     From the last step's length on: longer while F rises, or shorter until it has risen; then where
     polynomials are highest that have F and its slope at 0, and F at the lengths tried.
     """
-    steps, before = ascent.steps, climbers.value[n]
-    least, most = steps[0] / 1024.0, steps[STEPS - 1]
-    k = climbers.step[n]
-    tau, other, at_other = steps[k], 0.0, 0.0
+    before, most = climbers.value[n], ascent.most
+    tau, other, at_other = max(climbers.step[n], ascent.least), 0.0, 0.0
     value = product_at(product, _moved_along(pose, xi, tau))
     vertex = _vertex(tau, value - before, slope)
-    while value > before and vertex > tau and k + 1 < STEPS:
-        beyond = product_at(product, _moved_along(pose, xi, steps[k + 1]))
+    while value > before and vertex > tau and tau < most:
+        longer = min(2.0 * tau, most)
+        beyond = product_at(product, _moved_along(pose, xi, longer))
         if not beyond > value:
-            other, at_other = steps[k + 1], beyond
+            other, at_other = longer, beyond
             break
-        other, at_other = tau, value
-        k, tau, value = k + 1, steps[k + 1], beyond
+        other, at_other, tau, value = tau, value, longer, beyond
         vertex = _vertex(tau, value - before, slope)
-    while value <= before and tau > least:
+    while value <= before and tau > ascent.least / 1024.0:
         other, at_other = tau, value
         tau = max(min(vertex, 0.5 * tau), 0.1 * tau)
         value = product_at(product, _moved_along(pose, xi, tau))
@@ -310,10 +307,8 @@ def _step(product, ascent, pose, xi, slope, climbers, n):
     reached = _moved_along(pose, xi, tau)
     for i in range(12):
         climbers.poses[n, i] = reached[i]
-    while k > 0 and steps[k] > tau:
-        k -= 1
     small = value - before <= ascent.stop_below * before
-    climbers.value[n], climbers.step[n] = value, k
+    climbers.value[n], climbers.step[n] = value, tau
     climbers.stalled[n] = climbers.stalled[n] + 1 if small else 0
     climbers.done[n] = climbers.stalled[n] >= _PATIENCE
 

@@ -33,9 +33,7 @@ from tests.chsel.methods.dense_cvo import (
 from tests.chsel.methods.scene import Watcher
 
 WORKSPACE = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
-ASCENT = Ascent(
-    np.array([1e-4 * 8000.0 ** (k / 15) for k in range(16)]), (0.0, 0.0, 0.0), 7.0, 7.0, -1.0
-)
+ASCENT = Ascent(1e-4, 0.8, (0.0, 0.0, 0.0), 7.0, 7.0, -1.0)
 QUICK = CvoSettings(ell_min=0.1, c=7.0, origin="world", max_iterations=12)
 
 
