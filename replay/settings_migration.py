@@ -2,7 +2,8 @@
 
 A recording holds all settings that there were when it was made. Those that came later have the
 value here, with which the library does what it did then; today's default may be another one. Those
-of `anchored` that no longer exist are dropped: its energy changed, and so did every result.
+of `anchored`, CMA-ES and CVO that no longer exist are dropped: its energy, the ends of its runs and
+its kernel changed, and so did every result.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from typing import Any
 
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.chsel import ChselSettings
+from chsel.methods.cvo.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
+from chsel.methods.medial_constraint.medial_constraint import CmaEsSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.qd.selection import OutputSettings
 
@@ -26,7 +29,11 @@ LEFT_OUT: Mapping[type, Mapping[str, Any]] = {
     AnchoredSettings: {"shared_error": 0.004, "limit": 9.0},
 }
 _LIMIT = {"limit_noise", "limit_ratio", "limit_slack", "outer_share", "outer_noise"}
-DROPPED = {AnchoredSettings: {"penetration_tolerance", *_LIMIT}}
+DROPPED = {
+    AnchoredSettings: {"penetration_tolerance", *_LIMIT},
+    CmaEsSettings: {"tolfunhist", "tolx"},
+    CvoSettings: {"sigma", "s_sigma", "sp_thres"},
+}
 
 
 def completed(recorded: Mapping[str, Any], default: Any) -> dict[str, Any]:

@@ -18,13 +18,11 @@ from chsel.numerics.threads import spread
 from chsel.problem.search_space import SearchSpace
 
 
-def cost_of(model, space, vector, work):
-    """The cost of a search vector (d,), in kernels alone; see who implements it for a model."""
-    raise NotImplementedError
-
-
 def costs_of(model, space, vectors, costs, work):
-    """Fill the costs (B,) of search vectors (B, d), likewise; infinite if one is not finite."""
+    """Fill the costs (B,) of search vectors (B, d), infinite if one is not finite.
+
+    In kernels alone; see who implements it for a model.
+    """
     raise NotImplementedError
 
 

@@ -107,7 +107,7 @@ def distance_at(field, pose, x, y, z):
     """Interpolated signed distance at a world point."""
     box, table = field.box, field.table
     a, b, c = moved(pose, x, y, z)
-    cell, is_beyond = _cell_of(box, a, b, c)
+    cell, is_beyond = cell_of(box, a, b, c)
     s = value_between_nodes(table, *cell)
     if is_beyond:
         _, nx, ny, nz = _row_in_cell(box, table, cell)
@@ -120,7 +120,7 @@ def distance_with_gradient(field, pose, x, y, z):
     """Interpolated signed distance and gradient (s, n_x, n_y, n_z) at a world point."""
     box, table = field.box, field.table
     a, b, c = moved(pose, x, y, z)
-    cell, is_beyond = _cell_of(box, a, b, c)
+    cell, is_beyond = cell_of(box, a, b, c)
     s = value_between_nodes(table, *cell)
     _, nx, ny, nz = _row_in_cell(box, table, cell)
     if is_beyond:
@@ -129,7 +129,7 @@ def distance_with_gradient(field, pose, x, y, z):
 
 
 @leaf
-def _cell_of(box, a, b, c):
+def cell_of(box, a, b, c):
     """The arguments of `value_between_nodes`; and whether a point is beyond the box.
 
     Of the nearest point of the box, then.

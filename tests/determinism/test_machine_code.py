@@ -15,7 +15,6 @@ import pytest
 import trimesh
 from numba.core.registry import CPUDispatcher
 
-from chsel.methods.cvo.gaussian_blur import splat
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled
 from chsel.numerics.kernel_sources import kernel_sources
@@ -72,7 +71,6 @@ def code() -> dict[str, str]:
     decision_stages("bracket", grid("bracket"))
     archive = GridArchive(MEASURES["position_2"], np.zeros(2), np.ones(2), bins=2, dimension=9)
     archive.cells_of(np.zeros((1, 2)))
-    splat(np.zeros((1, 3)), np.zeros(3), 1.0, np.zeros((2, 2, 2)))
     where = scene(grid("bracket"), "bracket", ("contacts", "free"))
     key, first = StreamKey(11, 0), np.eye(4)[None]
     space, camera = FreeGrid(where.workspace, 0.05), PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5)

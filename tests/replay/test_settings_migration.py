@@ -80,6 +80,13 @@ def test_settings_that_no_longer_exist_are_dropped_where_they_were() -> None:
     recorded = {"penetration_tolerance": None, "outer_share": 0.25, "noise": 0.002}
     made = build_method("anchored", completed(recorded, preset_settings("anchored")))
     assert settings_mapping(made.settings)["noise"] == 0.002
+    run_ends = {"cma_es": {"tolfun": 1e-5, "tolfunhist": 1e-6, "tolx": 1e-11}}
+    default = preset_settings("medial_constraint")
+    made = build_method("medial_constraint", completed(run_ends, default))
+    assert made.settings.cma_es.tolfun == 1e-5
+    threshold = {"sigma": 0.1, "s_sigma": 0.8, "sp_thres": 6e-4, "ell": 0.2}
+    made = build_method("cvo", completed(threshold, preset_settings("cvo")))
+    assert made.settings.ell == 0.2
     tolerance = {"penetration_tolerance": -0.01}
     assert completed(tolerance, CostSettings()) == tolerance
 

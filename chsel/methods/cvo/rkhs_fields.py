@@ -1,37 +1,129 @@
 """Clouds of points as functions f = sum_j k(., z_j) of a reproducing kernel Hilbert space.
 
-A cloud in the object frame becomes a table of f on a grid; of the observed cloud the norm alone is
-needed, and cubes of free points in place of the points, which are many.
+A cloud in the object frame becomes a table of f on a grid: nodes of the SDF, blurred. Of the
+observed cloud the norm alone is needed, and cubes of free points in place of the points, which are
+many. Numbers of a field are of 32 bits, sums of 64.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.methods.cvo.cvo_kernels import Product, products
-from chsel.methods.cvo.field_kernels import ClassTerm, scratch
-from chsel.methods.cvo.gaussian_blur import (
-    Kernel,
-    blurred,
-    blurred_with_gradient,
-    splat,
-    sum_of_pairs,
-)
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import Box, box_of
+from chsel.numerics.compiler import compiled, inner
+from chsel.numerics.elementary import exp, exps
+from chsel.numerics.pose_tuples import moved, pose_at
+from chsel.numerics.threads import spread
+from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.sdf_lookup import cell_of, distance_between_nodes, value_between_nodes
 
 MOST_NODES = 30_000_000
 FINENESS = 10  # at least so many nodes of a field per ell, if the SDF has them
+TRUNCATION = 3.5  # ell; beyond it lie 0.02 % of a Gaussian on either side
 _FEW, _MANY = 2000, 50_000  # points that are, and that may be, taken one by one
 _FAR = 8.0  # ell; nothing is left of a kernel there
-_SHARED_FINENESS = 4  # nodes per ell that points are shared out among
+_SNAPPED_FINENESS = 4  # nodes per ell that points are moved to
 _ON_LATTICE = 1e-6  # spacings that a point may be away from a node
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """k(x, z) = amplitude exp(-|x - z|^2 / (2 ell^2)), metres."""
+
+    ell: float
+    amplitude: float = 1.0
+
+    def widened(self, variance: float, mass: float = 1.0) -> Kernel:
+        """Spread by that variance along each axis, m^2, which may be negative; `mass` of them."""
+        ell = math.sqrt(self.ell * self.ell + variance)
+        ratio = self.ell / ell
+        return Kernel(ell, self.amplitude * (mass * ratio * ratio * ratio))
+
+    def reach(self, spacing: float, stride: int = 1) -> int:
+        """K: how many nodes it reaches, a multiple of the stride."""
+        nodes = math.ceil(TRUNCATION * self.ell / spacing)
+        return -(-nodes // stride) * stride
+
+    def weights(self, spacing: float, reach: int) -> FloatArray:
+        """exp(-x^2 / (2 ell^2)) at x = -K .. K spacings (2 K + 1,)."""
+        x = np.arange(-reach, reach + 1) * spacing
+        return exps(-0.5 * (x / self.ell) * (x / self.ell))
+
+
+class ClassTerm(NamedTuple):
+    """One class of points and its field."""
+
+    points: FloatArray  # (3, N), world, metres
+    box: Box
+    table: Any  # (4 nodes,), f and its gradient at each node of the box; float32
+    weight: float  # W of the class
+
+
+class Product(NamedTuple):
+    """F(X) = sum over classes of W sum_i f(R x_i + t)."""
+
+    free: ClassTerm
+    cubes: ClassTerm  # centres of cubes of free points
+    surface: ClassTerm
+
+
+def values_of(product: Product, poses: FloatArray) -> FloatArray:
+    """F (B,) at poses (B, 12)."""
+    out = np.empty(len(poses))
+    spread(partial(_fill_values, product, poses, out), len(poses), lambda: None)
+    return out
+
+
+@compiled
+def _fill_values(product, poses, out, first, last, _):
+    """Fill out (B,) with F at poses (B, 12), from `first` to before `last`."""
+    for n in range(first, last):
+        out[n] = product_at(product, pose_at(poses, n))
+
+
+@inner
+def product_at(product, pose):
+    """F at a pose."""
+    total = 0.0
+    for term in product:
+        total += _sum_at(term, pose)
+    return total
+
+
+@inner
+def _sum_at(term, pose):
+    """W times the sum of f(p_i), p_i = R x_i + t; 0 beyond the field."""
+    points, total = term.points, 0.0
+    for n in range(points.shape[1]):
+        a, b, c = moved(pose, points[0, n], points[1, n], points[2, n])
+        cell, is_beyond = cell_of(term.box, a, b, c)
+        if not is_beyond:
+            total += value_between_nodes(term.table, *cell)
+    return term.weight * total
+
+
+@inner
+def moments_at(term, pose):
+    """W times sums of f, grad f and p x grad f at p_i = R x_i + t, in the object frame."""
+    points, table, m = term.points, term.table, term.weight
+    value = gx = gy = gz = p = q = r = 0.0
+    for n in range(points.shape[1]):
+        a, b, c = moved(pose, points[0, n], points[1, n], points[2, n])
+        (at, _, _, u, v, w), is_beyond = cell_of(term.box, a, b, c)
+        if not is_beyond:
+            s, nx, ny, nz = distance_between_nodes(term.box, table, at, u, v, w)
+            value += s
+            gx, gy, gz = gx + nx, gy + ny, gz + nz
+            p, q, r = p + (b * nz - c * ny), q + (c * nx - a * nz), r + (a * ny - b * nx)
+    return m * value, m * gx, m * gy, m * gz, m * p, m * q, m * r
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +131,12 @@ class ClassField:
     """f of one class of a cloud in the object frame."""
 
     box: Box
-    table: Any  # (nodes, 4), f and its gradient at the nodes of the box, 32 bit
-    values: Any  # (nodes,), f alone, 32 bit
+    table: Any  # (4 nodes,), see ClassTerm
     norm: float  # <f, f>
 
     def term(self, points: FloatArray, weight: float) -> ClassTerm:
         """Its part of F, for points (N, 3) of the same class in the world."""
-        return ClassTerm(points.T.copy(), self.box, self.table, self.values, weight)
+        return ClassTerm(points.T.copy(), self.box, self.table, weight)
 
 
 def surface_field(sdf: SdfGrid, kernel: Kernel, band: float) -> ClassField:
@@ -62,60 +153,54 @@ def free_field(sdf: SdfGrid, kernel: Kernel, band: float) -> ClassField:
 
 def _class_field(sdf: SdfGrid, members: BoolArray, kernel: Kernel) -> ClassField:
     """Of the nodes with a flag (nx, ny, nz)."""
-    stride = max(1, math.floor(kernel.ell / (FINENESS * sdf.resolution) + 1e-9))
-    weights = kernel.weights(sdf.resolution, stride)
-    shape = [-(-(count - 1 + 2 * weights.reach) // stride) + 1 for count in sdf.shape]
-    if not math.prod(shape) <= MOST_NODES:
+    spacing = sdf.resolution
+    stride = max(1, math.floor(kernel.ell / (FINENESS * spacing) + 1e-9))
+    reach = kernel.reach(spacing, stride)
+    shape = [-(-(count - 1 + 2 * reach) // stride) + 1 for count in sdf.shape]
+    if math.prod(shape) > MOST_NODES:
         raise SettingError(
             f"ell {kernel.ell} m makes a field of {math.prod(shape):.1e} nodes around an SDF of "
-            f"resolution {sdf.resolution} m; accepted: at most {MOST_NODES:.0e}, so a smaller ell"
+            f"resolution {spacing} m; accepted: at most {MOST_NODES:.0e}, so a smaller ell"
         )
-    table = np.empty((math.prod(shape), 4), dtype=np.float32)
-    parts = blurred_with_gradient(members.astype(np.float64), weights, shape, stride)
-    for channel, part in enumerate(parts):
-        scale = kernel.amplitude / (kernel.ell * kernel.ell if channel else 1.0)
-        table[:, channel] = scale * part.reshape(-1)
-    first = sdf.origin - weights.reach * sdf.resolution
-    box = box_of(first, stride * sdf.resolution, shape, between=True)
-    nodes = sdf.origin + np.argwhere(members) * sdf.resolution
-    values = table[:, 0].copy()
-    norm = _sum_over(ClassField(box, table, values, 0.0), nodes)
-    return ClassField(box, table, values, norm)
-
-
-def _sum_over(field: ClassField, points: FloatArray) -> float:
-    """Sum of a field over points (N, 3) of its frame."""
+    source, table = members.astype(np.float64), np.empty((*shape, 4), dtype=np.float32)
+    table[..., 0] = value = kernel.amplitude * _blurred(source, kernel, spacing, shape, stride)
+    for axis in range(3):  # ell^2 grad f = sum k(., z) z - f p
+        z, p = (np.ogrid[tuple(map(slice, counts))][axis] for counts in (sdf.shape, shape))
+        moment = kernel.amplitude * _blurred(source * z, kernel, spacing, shape, stride)
+        slope = moment - (p * stride - reach) * value
+        table[..., axis + 1] = spacing / (kernel.ell * kernel.ell) * slope
+    box = box_of(sdf.origin - reach * spacing, stride * spacing, shape, between=True)
+    field = ClassField(box, table.reshape(-1), 0.0)
     nothing = field.term(np.zeros((0, 3)), 0.0)
-    pose = np.concatenate([np.eye(3).reshape(-1), np.zeros(3)])[None]
-    out = np.empty(1)
-    products(Product(field.term(points, 1.0), nothing, nothing), pose, out, 0, 1, scratch())
-    return float(out[0])
+    own = field.term(sdf.origin + np.argwhere(members) * spacing, 1.0)
+    norm = values_of(Product(own, nothing, nothing), Poses.of(np.eye(4)[None]).numbers)
+    return ClassField(box, field.table, float(norm[0]))
 
 
 def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
     """<f, f> of a cloud (N, 3): the sum over all pairs, one by one if they are few.
 
     Of more, the sum over a grid: of spacing `lattice`, metres, if every point is at a node, which
-    is as exact as a field; else of a quarter of ell, with points shared out among the nodes
-    around, within 1 %. Points that span too large a grid are taken one by one, too.
+    is as exact as a field; else of a quarter of ell, with points moved to the nearest nodes,
+    within 1 %. Points that span too large a grid are taken one by one, too.
     """
     if len(points) <= _FEW:
         return _pair_by_pair(points, kernel)
-    nodes, spacing, narrow = _nodes_of(points, lattice), lattice, kernel
+    first, spacing, narrow = points.min(axis=0), lattice, kernel
+    nodes = _nodes_of(points, lattice)
     if nodes is None:
-        spacing = kernel.ell / _SHARED_FINENESS
-        narrow = _narrowed(kernel, spacing)
-    weights, first = narrow.weights(spacing), points.min(axis=0)
+        spacing = kernel.ell / _SNAPPED_FINENESS
+        narrow = kernel.widened(-spacing * spacing / 6.0)  # either point moves by half of it
     with np.errstate(over="ignore"):
-        sides = np.floor((points.max(axis=0) - first) / spacing + 0.5) + 2.0
-    if not math.prod((sides + 2.0 * weights.reach).tolist()) <= MOST_NODES:
+        steps = np.rint((points - first) / spacing)
+    sides, reach = steps.max(axis=0) + 1.0, narrow.reach(spacing)
+    if not math.prod((sides + 2.0 * reach).tolist()) <= MOST_NODES:
         return _pair_by_pair(points, kernel)
-    grid = np.zeros([int(side) for side in sides])
-    if nodes is None:
-        splat(points, first, 1.0 / spacing, grid)
-    else:
-        np.add.at(grid, tuple(nodes.T), 1.0)
-    terms = (grid * blurred(grid, weights)).reshape(-1)
+    grid = np.zeros(sides.astype(np.int64))
+    np.add.at(grid, tuple(steps.astype(np.int64).T), 1.0)
+    around = [side + 2 * reach for side in grid.shape]
+    inside = tuple(slice(reach, reach + side) for side in grid.shape)
+    terms = (grid * _blurred(grid, narrow, spacing, around, 1)[inside]).reshape(-1)
     return narrow.amplitude * float(np.cumsum(terms)[-1])  # added in their order
 
 
@@ -125,19 +210,25 @@ def _pair_by_pair(points: FloatArray, kernel: Kernel) -> float:
             f"{len(points)} points of one class are far apart; accepted: at most {_MANY:_}, or "
             "points within a box that is small beside ell"
         )
-    radius = min(kernel.radius, _FAR * kernel.ell)
-    return kernel.amplitude * sum_of_pairs(points, kernel.ell, radius)
+    return kernel.amplitude * _sum_of_pairs(points, kernel.ell, _FAR * kernel.ell)
 
 
-def _narrowed(kernel: Kernel, spacing: float) -> Kernel:
-    """The kernel that is widened to this one by sharing out points among nodes.
+@compiled
+def _sum_of_pairs(points: FloatArray, ell: float, radius: float) -> float:
+    """Sum over pairs of points (N, 3) closer than `radius` of exp(-|x - y|^2 / (2 ell^2)).
 
-    Either point of a pair is spread with a variance of spacing^2 / 6 along an axis, on average.
+    Of every point with itself and, twice, with those after it.
     """
-    ell = math.sqrt(kernel.ell * kernel.ell - spacing * spacing / 3.0)
-    widening = kernel.ell / ell
-    gain = widening * widening * widening
-    return Kernel(ell, kernel.amplitude * gain, kernel.radius)
+    total = 0.0
+    for i in range(len(points)):
+        total += 1.0
+        for j in range(i + 1, len(points)):
+            x, y = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]
+            z = points[i, 2] - points[j, 2]
+            squared = x * x + y * y + z * z
+            if squared < radius * radius:
+                total += 2.0 * exp(-0.5 * squared / (ell * ell))
+    return total
 
 
 def _nodes_of(points: FloatArray, lattice: float) -> IntArray | None:
@@ -151,37 +242,66 @@ def _nodes_of(points: FloatArray, lattice: float) -> IntArray | None:
 
 
 def full_cubes(
-    points: FloatArray, ell: float, lattice: float
-) -> tuple[FloatArray, FloatArray, int]:
-    """Points (N, 3) left alone, centres (C, 3) of full cubes of lattice points, points per side.
+    points: FloatArray, kernel: Kernel, lattice: float
+) -> tuple[FloatArray, FloatArray, Kernel]:
+    """Points (N, 3) left alone, centres (C, 3) of full cubes of lattice points, a cube's kernel.
 
-    A cube's side is at most half of ell, so that its sum of kernels is that of one wider kernel
-    (see `cube_kernel`). A cloud of few points, or off the lattice, has no cubes.
+    A cube counts as one point of a wider kernel, which has the variance of the kernel and of the
+    cube together, and differs in fourth moments: by less than 1e-3 of the cube's sum, as its side
+    is at most half of ell. A cloud of few points, or off the lattice, has no cubes.
     """
-    side, none = math.floor(0.5 * ell / lattice), np.zeros((0, 3))
+    side = math.floor(0.5 * kernel.ell / lattice)
     nodes = _nodes_of(points, lattice) if len(points) > _FEW and side > 1 else None
     if nodes is None:
-        return points, none, 1
-    cubes = nodes // side
-    _, count_y, count_z = cubes.max(axis=0) + 1
-    keys = (cubes[:, 0] * count_y + cubes[:, 1]) * count_z + cubes[:, 2]
-    _, first, cube, counts = np.unique(
-        keys, return_index=True, return_inverse=True, return_counts=True
+        return points, np.zeros((0, 3)), kernel
+    corners, cube, counts = np.unique(
+        nodes // side, axis=0, return_inverse=True, return_counts=True
     )
     full = counts == side**3
-    centres = (cubes[first[full]] * side + (side - 1) / 2.0) * lattice + points.min(axis=0)
-    return points[~full[cube]], centres, side
+    centres = (corners[full] * side + (side - 1) / 2.0) * lattice + points.min(axis=0)
+    wide = kernel.widened(lattice * lattice * (side * side - 1) / 12.0, side**3)
+    return points[~full[cube.reshape(-1)]], centres, wide
 
 
-def cube_kernel(kernel: Kernel, lattice: float, side: int) -> Kernel:
-    """The kernel of a cube of side^3 lattice points seen as one point at its centre.
+def _blurred(
+    source: FloatArray, kernel: Kernel, spacing: float, shape: list[int], stride: int
+) -> FloatArray:
+    """A source (nx, ny, nz) blurred, without the amplitude, at nodes of `shape` (3,).
 
-    Its variance is that of the kernel and of the cube together, which along every direction is
-    lattice^2 (side^2 - 1) / 12; its integral that of all. It differs in fourth moments, by less
-    than 1e-3 of the cube's sum while the cube's side is at most half of ell.
+    These lie every `stride` nodes of the source, the first K nodes before its first.
     """
-    spread = lattice * lattice * (side * side - 1) / 12.0
-    ell = math.sqrt(kernel.ell * kernel.ell + spread)
-    narrowing = kernel.ell / ell
-    gain = side**3 * narrowing * narrowing * narrowing
-    return Kernel(ell, kernel.amplitude * gain)
+    weights = kernel.weights(spacing, kernel.reach(spacing, stride))
+    for axis in (2, 1, 0):
+        source = _along(axis, source, weights, shape[axis], stride)
+    return source
+
+
+def _along(
+    axis: int, source: FloatArray, weights: FloatArray, length: int, stride: int
+) -> FloatArray:
+    """Source (nx, ny, nz) blurred along an axis, which then has that length."""
+    before, after = source.shape[:axis], source.shape[axis + 1 :]
+    rows = source.reshape(math.prod(before), source.shape[axis], math.prod(after))
+    out = np.empty((len(rows), length, rows.shape[2]))
+    spread(partial(_blur_rows, rows, weights, stride, out), length, lambda: None)
+    return out.reshape(*before, length, *after)
+
+
+@compiled
+def _blur_rows(source, weights, stride, out, first, last, _):
+    """Fill out (A, m, C), from row `first` to before `last`, with source (A, n, C) blurred.
+
+    Row o of the result is at row o stride - K of the source. Rows add up in their order.
+    """
+    reach = len(weights) // 2
+    across, rows, along = source.shape
+    for a in range(across):
+        for o in range(first, last):
+            at = o * stride - reach
+            target = out[a, o]
+            target[:] = 0.0
+            for s in range(max(at - reach, 0), min(at + reach + 1, rows)):
+                weight = weights[at - s + reach]
+                line = source[a, s]
+                for c in range(along):
+                    target[c] += weight * line[c]

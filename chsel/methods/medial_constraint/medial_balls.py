@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.clearance import squared_clearances
-from chsel.numerics.compiler import compiled, inner
+from chsel.numerics.compiler import compiled
 from chsel.problem.points import VoxelGrid, Workspace
 
 MOST_VOXELS = 30_000_000
@@ -46,90 +47,49 @@ def medial_balls(
     flags = VoxelGrid.around(inside, resolution, MOST_VOXELS).flags
     squared = np.empty(flags.shape, dtype=np.int64)
     squared_clearances(flags, squared, 1)
-    medial = np.zeros(squared.shape, dtype=np.bool_)
-    _mark_medial(squared, medial)
+    medial = _is_medial(squared)
     voxels = np.argwhere(medial)
     radii = np.sqrt(squared[medial].astype(np.float64))  # half sides
     order = np.argsort(-squared[medial], kind="stable")
-    chosen = _covering(voxels, radii, _row_starts(medial), order, 2.0 * inflation / resolution)
+    chosen = order[_covering(voxels[order], radii[order], 2.0 * inflation / resolution)]
     centres = inside.min(axis=0) + (voxels[chosen] - 1) * resolution
     return Balls(centres, radii[chosen] * (resolution / 2.0))
 
 
-def _row_starts(medial: BoolArray) -> IntArray:
-    """Where each row of voxels along the last axis starts (nx, ny + 1); the next entry ends it."""
-    in_row = np.count_nonzero(medial, axis=2)
-    ends = np.cumsum(in_row).reshape(in_row.shape)
-    return np.concatenate([ends[:, :1] - in_row[:, :1], ends], axis=1)
+def _is_medial(squared: IntArray) -> BoolArray:
+    """Flags (nx, ny, nz) of voxels of the set whose ball is in the ball of no neighbour.
 
-
-@compiled
-def _mark_medial(squared: IntArray, out: BoolArray) -> None:
-    """Fill out (nx, ny, nz): voxels of the set whose ball is in the ball of no neighbour.
-
-    squared (nx, ny, nz): squared clearances, 0 outside of the set and on the outermost layer.
+    squared (nx, ny, nz): squared clearances, 0 outside of the set and on the outermost layer. Ball
+    u holds ball v if |c_u - c_v| + r_v <= r_u.
     """
-    nx, ny, nz = squared.shape
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                out[i, j, k] = squared[i, j, k] > 0 and not _held(squared, i, j, k)
-
-
-@inner
-def _held(squared: IntArray, i: int, j: int, k: int) -> bool:
-    """Whether |c_u - c_v| + r_v <= r_u for any of the 26 neighbours u of a voxel v."""
-    radius = np.sqrt(float(squared[i, j, k]))
-    for a in range(-1, 2):
-        for b in range(-1, 2):
-            for c in range(-1, 2):
-                other = squared[i + a, j + b, k + c]
-                if other > squared[i, j, k]:
-                    apart = 2.0 * np.sqrt(float(a * a + b * b + c * c))
-                    if apart + radius <= np.sqrt(float(other)) + _TOLERANCE:
-                        return True
-    return False
+    inner = squared[1:-1, 1:-1, 1:-1]
+    radii, medial = np.sqrt(squared.astype(np.float64)), np.zeros(squared.shape, dtype=np.bool_)
+    own, kept = radii[1:-1, 1:-1, 1:-1], inner > 0
+    for offset in np.ndindex(3, 3, 3):
+        apart = 2.0 * math.sqrt(sum((step - 1) ** 2 for step in offset))
+        around = tuple(
+            slice(step, step + side) for step, side in zip(offset, inner.shape, strict=True)
+        )
+        if apart > 0.0:
+            kept &= (apart + own > radii[around] + _TOLERANCE) | (squared[around] <= inner)
+    medial[1:-1, 1:-1, 1:-1] = kept
+    return medial
 
 
 @compiled
-def _covering(
-    voxels: IntArray, radii: FloatArray, rows: IntArray, order: IntArray, inflation: float
-) -> IntArray:
+def _covering(voxels: IntArray, radii: FloatArray, inflation: float) -> IntArray:
     """Indices of balls that, inflated, cover all others: each the next that is not yet covered.
 
-    voxels (P, 3), ascending in row-major order, with radii (P,). rows: see `_row_starts`. order
-    (P,): in which balls are taken. Ball i covers ball j if |c_i - c_j| + r_j <= r_i + inflation.
+    voxels (P, 3) with radii (P,). Ball i covers ball j if |c_i - c_j| + r_j <= r_i + inflation.
     """
-    covered, chosen = np.zeros(len(order), dtype=np.bool_), np.empty(len(order), dtype=np.int64)
+    covered, chosen = np.zeros(len(radii), dtype=np.bool_), np.empty(len(radii), dtype=np.int64)
     count = 0
-    for i in order:
+    for i in range(len(radii)):
         if not covered[i]:
-            _cover(voxels, radii, rows, i, inflation, covered)
             chosen[count] = i
             count += 1
+            for j in range(i, len(radii)):
+                x, y = voxels[i, 0] - voxels[j, 0], voxels[i, 1] - voxels[j, 1]
+                z, margin = voxels[i, 2] - voxels[j, 2], radii[i] + inflation - radii[j]
+                covered[j] |= 4.0 * (x * x + y * y + z * z) <= margin * margin
     return chosen[:count].copy()
-
-
-@inner
-def _cover(
-    voxels: IntArray,
-    radii: FloatArray,
-    rows: IntArray,
-    i: int,
-    inflation: float,
-    covered: BoolArray,
-) -> None:
-    """Mark the balls that ball i covers; their centres are within reach = r_i + inflation."""
-    x, y, z = voxels[i, 0], voxels[i, 1], voxels[i, 2]
-    nx, ny, reach = len(rows), rows.shape[1] - 1, radii[i] + inflation
-    steps = int(min(0.5 * reach, float(nx + ny))) + 1
-    for row in range(max(x - steps, 0), min(x + steps + 1, nx)):
-        for column in range(max(y - steps, 0), min(y + steps + 1, ny)):
-            aside = (row - x) * (row - x) + (column - y) * (column - y)
-            if 4.0 * aside > reach * reach:
-                continue
-            for j in range(rows[row, column], rows[row, column + 1]):
-                apart = 4.0 * (aside + (voxels[j, 2] - z) * (voxels[j, 2] - z))
-                margin = reach - radii[j]
-                if margin >= 0.0 and apart <= margin * margin:
-                    covered[j] = True

@@ -1,14 +1,20 @@
-"""Quality-diversity search on the Medial Constraint cost (CHSEL, Sec. V-H)."""
+"""Search on the Medial Constraint cost: CMA-ES (CHSEL, Sec. V-D), and CMA-ME (Sec. V-H)."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-from chsel.methods.medial_constraint.cma_es import CmaEsSettings, evolved
+import numpy as np
+
+from chsel.cost.objective import costs_of
 from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods.method import ConfiguredMethod
-from chsel.numerics.arrays import FloatArray
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
+from chsel.numerics.compiler import compiled
+from chsel.numerics.elementary import logs
+from chsel.numerics.threads import spread
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import (
@@ -18,10 +24,11 @@ from chsel.problem.registration_problem import (
     RegistrationProblem,
 )
 from chsel.problem.search_space import PlaneSettings, search_space
-from chsel.problem.settings import Presets
-from chsel.problem.streams import Purpose
-from chsel.qd.archive import GridArchive, evaluated
+from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
+from chsel.problem.streams import Purpose, StreamKey, normals
+from chsel.qd.archive import Batch, GridArchive, batch_of, evaluated, rank
 from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me
+from chsel.qd.evolution_kernels import Strategy, ask, stopped, strategy_around, tell
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
@@ -31,6 +38,165 @@ from chsel.qd.selection import (
     select_elites,
     sized_archive,
 )
+
+MOST_GENERATIONS = 20_000
+MOST_SAMPLES = 100_000
+MOST_SIGMA = 1e6
+_BLOCK = 50  # generations that are drawn at a time, or fewer
+_MOST_DRAWN = 1_000_000  # normal draws held at once by a run, 8 bytes each
+_RUN, _FINAL = 0, 1  # of a single run: which stream its generations and its result come from
+
+
+@dataclass(frozen=True)
+class CmaEsSettings(CheckedSettings):
+    """Settings of CMA-ES."""
+
+    # "per_start" a run from each of E_0, of which each gives the best pose that it met; "single"
+    # one run from the first of E_0, whose last distribution gives all poses.
+    starts: Annotated[str, one_of("per_start", "single")] = "per_start"
+    # Samples of a generation; by default 4 + floor(3 ln d) in d dimensions, for a single run at
+    # least as many as there are hypotheses.
+    population: Annotated[int | None, positive, at_most(MOST_SAMPLES)] = None
+    # First step size, metres and entries of the 6-D rotation alike.
+    sigma0: Annotated[float, positive, at_most(MOST_SIGMA)] = 0.1
+    # At most; by default 100 + floor(150 (d + 3)^2 / sqrt(population)), as in pycma.
+    generations: Annotated[int | None, not_negative, at_most(MOST_GENERATIONS)] = None
+    # A run ends when no cost of a generation is above the lowest so far by more than this, m^2.
+    tolfun: Annotated[float, not_negative] = 1e-8
+
+    presets: ClassVar[Presets] = {
+        "paper": {"tolfun": 1e-5},
+        "reference": {"starts": "single", "tolfun": 1e-5},
+    }
+
+    def size(self, dimension: int, count: int) -> int:
+        """Samples of a generation in `dimension` dimensions, for `count` hypotheses."""
+        if self.population is not None:
+            return self.population
+        usual = 4 + math.floor(3.0 * float(logs(float(dimension))))
+        return max(usual, min(count, MOST_SAMPLES)) if self.starts == "single" else usual
+
+    def most_generations(self, dimension: int, size: int) -> int:
+        """Of a run in `dimension` dimensions, of so many samples each."""
+        if self.generations is not None:
+            return self.generations
+        return 100 + math.floor(150.0 * (dimension + 3.0) * (dimension + 3.0) / math.sqrt(size))
+
+
+class Run(NamedTuple):
+    """State of one run in d dimensions."""
+
+    strategy: Strategy
+    batch: Batch  # a generation; value (L,): minus the costs
+    best: FloatArray  # (d,), the vector of lowest cost so far
+    cost: FloatArray  # (1,), its cost
+    generations: IntArray  # (1,), so far
+    ended: BoolArray  # (1,)
+
+
+def evolved(
+    objective: MedialCost,
+    initial_set: Poses,
+    settings: CmaEsSettings,
+    key: StreamKey,
+    observer: Observer,
+) -> FloatArray:
+    """Search vectors (B, d) of the estimates that CMA-ES finds from E_0."""
+    vectors = objective.space.encode(initial_set)
+    starts = vectors[:1] if settings.starts == "single" else vectors
+    runs = run_all(objective, starts, len(vectors), settings, key, observer)
+    if settings.starts == "per_start":
+        return np.stack([run.best for run in runs])
+    samples = np.empty(vectors.shape)
+    _draw(runs[0].strategy, normals(key.stream(Purpose.CMA_ES, _FINAL), vectors.shape), samples)
+    return samples
+
+
+def run_all(
+    objective: MedialCost,
+    starts: FloatArray,
+    count: int,
+    settings: CmaEsSettings,
+    key: StreamKey,
+    observer: Observer,
+) -> list[Run]:
+    """A run from each of the starts (S, d), all to their ends, block by block.
+
+    count: how many hypotheses are wanted.
+    """
+    dimension = starts.shape[1]
+    size = settings.size(dimension, count)
+    total = settings.most_generations(dimension, size)
+    runs = [
+        Run(
+            strategy=strategy_around(start, size, settings.sigma0),
+            batch=batch_of(size, dimension, 0),
+            best=start.copy(),
+            cost=np.array([cost]),
+            generations=np.zeros(1, dtype=np.int64),
+            ended=np.zeros(1, dtype=np.bool_),
+        )
+        for start, cost in zip(starts, objective.costs(starts).tolist(), strict=True)
+    ]
+    streams = [key.stream(Purpose.CMA_ES, _RUN + index) for index in range(len(runs))]
+    block = max(1, min(_BLOCK, _MOST_DRAWN // (size * dimension)))
+    _trace(observer, runs)
+
+    def advance(first: int, last: int, work: Any) -> None:
+        for run, stream in zip(runs[first:last], streams[first:last], strict=True):
+            if not run.ended[0]:
+                count = min(block, total - int(run.generations[0]))
+                drawn = normals(stream, (count, size, dimension))
+                evolve(objective.model, objective.space_arrays, work, run, drawn, settings.tolfun)
+
+    for done in range(0, total, block):
+        spread(advance, len(runs), objective.work)
+        _trace(observer, runs)
+        observer.progress("cma_es", min(done + block, total), total)
+        if all(run.ended[0] for run in runs):
+            break
+    return runs
+
+
+def _trace(observer: Observer, runs: list[Run]) -> None:
+    """Show the observer the best vector of each run so far."""
+    generation = max(int(run.generations[0]) for run in runs)
+    vectors, costs = np.stack([run.best for run in runs]), np.array([run.cost[0] for run in runs])
+    observer.trace("cma_es", generation, vectors, costs)
+
+
+@compiled
+def evolve(
+    model: Any, space: Any, work: Any, run: Run, normals: FloatArray, tolerance: float
+) -> None:
+    """Generations of CMA-ES (Hansen, 2016), as many as normals (G, L, d), or to the end.
+
+    The better half of a generation are parents, weighted by rank, all weights positive.
+    """
+    strategy, batch = run.strategy, run.batch
+    vectors, costs, value, order = batch.vectors, batch.objectives, batch.value, batch.order
+    for generation in range(len(normals)):
+        if run.ended[0]:
+            break
+        ask(strategy, normals[generation], vectors)
+        costs_of(model, space, vectors, costs, work)
+        for i in range(len(costs)):
+            value[i] = -costs[i]
+        rank(batch.status, value, order)
+        if costs[order[0]] < run.cost[0]:
+            run.cost[0] = costs[order[0]]
+            for j in range(len(run.best)):
+                run.best[j] = vectors[order[0], j]
+        tell(strategy, vectors, order, max(len(costs) // 2, 1))
+        run.generations[0] += 1
+        is_level = not costs[order[len(order) - 1]] - run.cost[0] > tolerance  # NaN: all infinite
+        run.ended[0] = is_level or stopped(strategy, order, batch.status, value)
+
+
+@compiled
+def _draw(strategy: Strategy, normals: FloatArray, samples: FloatArray) -> None:
+    """Fill samples (S, d) of a strategy's distribution from normals (S, d)."""
+    ask(strategy, normals, samples)
 
 
 @dataclass(frozen=True)

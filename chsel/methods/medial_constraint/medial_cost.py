@@ -4,30 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel.methods.medial_constraint.least_distances import LeastDistances, least_distances
+from chsel.cost.objective import costs_of
 from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls
-from chsel.methods.medial_constraint.medial_kernels import (
-    MedialModel,
-    medial_costs_of_poses,
-    places_of,
-)
-from chsel.methods.medial_constraint.medial_search_kernels import (
-    MedialSearch,
-    SearchScratch,
-    search_scratch,
-)
-from chsel.methods.medial_constraint.narrow_field_kernels import NarrowField
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Places, triple
+from chsel.numerics.cell_set import Places, locate, places_for
+from chsel.numerics.compiler import compiled, implements, inner, spliced
+from chsel.numerics.pose_tuples import all_finite, decode, finite, pose_at
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
-from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE, SdfGrid
-from chsel.problem.sdf_lookup import distance_field
+from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
+from chsel.problem.sdf_lookup import DistanceField, distance_field, distance_in_place
 from chsel.problem.search_space import SE3Space, SearchSpace
 from chsel.problem.settings import CheckedSettings, Presets, not_negative, one_of
 
@@ -57,6 +48,18 @@ class MedialCostSettings(CheckedSettings):
     }
 
 
+class MedialModel(NamedTuple):
+    """All that determines the cost of a pose."""
+
+    field: DistanceField
+    centres: FloatArray  # (3, N_b), of the balls, world, metres
+    radii: FloatArray  # (N_b,)
+    known: FloatArray  # (3, N_k), world, metres
+    known_sdf: FloatArray  # (N_k,)
+    ball_scale: float
+    known_scale: float
+
+
 class MedialCost:
     """C_M(X) = mean_b max(0, r_b - s(R c_b + t))^2 + mean_k (s(R x_k + t) - v_k)^2, in m^2.
 
@@ -77,9 +80,20 @@ class MedialCost:
         settings = settings or MedialCostSettings()
         self.space = space or SE3Space()
         self.space_arrays = self.space.arrays
-        self.balls = _balls_of(problem, settings) if balls is None else balls
-        self._exact = _exact_model(problem, self.balls, settings)
-        self.model = _search_model(problem, self.balls, settings)
+        if balls is None:
+            free = problem.points.free if settings.ball_scale > 0.0 else np.zeros((0, 3))
+            resolution, inflation = problem.free_resolution, settings.inflation
+            balls = medial_balls(free, problem.workspace, resolution, inflation)
+        self.balls = balls
+        self.model = MedialModel(
+            field=distance_field(problem.sdf, settings.lookup, settings.outside),
+            centres=balls.centres.T.copy(),
+            radii=balls.radii,
+            known=problem.points.known.T.copy(),
+            known_sdf=problem.points.sdf.copy(),
+            ball_scale=settings.ball_scale,
+            known_scale=settings.known_scale,
+        )
 
     def costs(self, vectors: FloatArray) -> FloatArray:
         """Costs (B,) of vectors (B, d) of the search space."""
@@ -88,80 +102,64 @@ class MedialCost:
     def evaluate(self, poses: Poses) -> FloatArray:
         """Costs (B,) of poses; infinite for one that is not finite."""
         costs = np.empty(len(poses))
-        run = partial(medial_costs_of_poses, self._exact, poses.numbers, costs)
-        spread(run, len(poses), self._places, least=_POSES_PER_THREAD)
+        run = partial(_fill_costs, self.model, poses.numbers, costs)
+        spread(run, len(poses), self.work, least=_POSES_PER_THREAD)
         return costs
 
-    def work(self) -> SearchScratch:
-        """Scratch for one thread of a search, which looks up `model`."""
-        return search_scratch(self.model)
-
-    def _places(self) -> Places:
-        return places_of(self._exact)
+    def work(self) -> Places:
+        """Scratch for one thread."""
+        return places_for(max(len(self.model.radii), len(self.model.known_sdf)))
 
 
-def _exact_model(
-    problem: RegistrationProblem, balls: Balls, settings: MedialCostSettings
-) -> MedialModel:
-    return MedialModel(
-        field=distance_field(problem.sdf, settings.lookup, settings.outside),
-        centres=balls.centres.T.copy(),
-        radii=balls.radii,
-        known=problem.points.known.T.copy(),
-        known_sdf=problem.points.sdf.copy(),
-        ball_scale=settings.ball_scale,
-        known_scale=settings.known_scale,
-    )
+@compiled
+def _fill_costs(model, poses, out, first, last, places):
+    """Fill out (B,) with the costs of poses (B, 12), from `first` to before `last`."""
+    for n in range(first, last):
+        out[n] = _cost(model, pose_at(poses, n), places)
 
 
-def _search_model(
-    problem: RegistrationProblem, balls: Balls, settings: MedialCostSettings
-) -> MedialSearch:
-    sdf, radii, known = problem.sdf, balls.radii, problem.points.known
-    both = np.concatenate([balls.centres, known])
-    middle = (both.min(axis=0) + both.max(axis=0)) / 2.0 if len(both) else np.zeros(3)
-    bounds = least_distances(sdf, settings.outside, float(radii.max(initial=0.0)))
-    square = sdf.resolution * sdf.resolution
-    return MedialSearch(
-        field=_narrow_field(sdf, settings, bounds),
-        bounds=bounds,
-        middle=triple(middle),
-        span=float(np.abs(both - middle).max(initial=0.0)),
-        centres=(balls.centres - middle).T.astype(np.float32, order="C"),
-        radii=(radii / sdf.resolution).astype(np.float32),
-        steps=np.ceil(radii / bounds.step).astype(np.uint8),
-        known=(known - middle).T.astype(np.float32, order="C"),
-        known_sdf=(problem.points.sdf / sdf.resolution).astype(np.float32),
-        ball_scale=settings.ball_scale * square / max(len(radii), 1),
-        known_scale=settings.known_scale * square / max(len(known), 1),
-    )
+@implements(costs_of, MedialModel)
+def _medial_costs_of(model, space, vectors, costs, places):
+    for n in range(len(vectors)):
+        costs[n] = np.inf
+        if all_finite(vectors[n]):
+            costs[n] = _cost(model, decode(space, vectors[n]), places)
 
 
-def _narrow_field(
-    sdf: SdfGrid, settings: MedialCostSettings, bounds: LeastDistances
-) -> NarrowField:
-    """An SDF grid in 32 bits, for points in cells of the bounds."""
-
-    def rows() -> Any:
-        return (sdf.table / np.array([sdf.resolution, 1.0, 1.0, 1.0])).astype(np.float32)
-
-    in_cells = sdf.derived("rows in cells", rows)
-    _, ny, nz = sdf.shape
-    return NarrowField(
-        rows=in_cells,
-        values=sdf.derived("values in cells", lambda: in_cells[:, 0].copy()),
-        last=triple(np.array(sdf.shape) - 1.0),
-        across=ny * nz,
-        along=nz,
-        nearest=settings.lookup == "nearest",
-        surface=0.0 if settings.outside == "bounding_box" else 1.0,
-        side=1.0 / (bounds.inverse * sdf.resolution),
-        margin=float(np.rint((sdf.origin[0] - bounds.first[0]) * bounds.inverse)),
-    )
+@inner
+def _cost(model, pose, places):
+    """C_M, each mean scaled; infinite for a pose that is not finite."""
+    if not finite(pose):
+        return np.inf
+    cost = model.ball_scale * _ball_mean(model, pose, places)
+    cost += model.known_scale * _known_mean(model, pose, places)
+    return cost if cost < np.inf else np.inf  # NaN is infinite, too
 
 
-def _balls_of(problem: RegistrationProblem, settings: MedialCostSettings) -> Balls:
-    if settings.ball_scale == 0.0:
-        return Balls(np.zeros((0, 3)), np.zeros(0))
-    free, resolution = problem.points.free, problem.free_resolution
-    return medial_balls(free, problem.workspace, resolution, settings.inflation)
+@spliced
+def _ball_mean(model, pose, places):
+    """The mean square of how deep balls reach into the object."""
+    field, radii = model.field, model.radii
+    xs, ys, zs = model.centres[0], model.centres[1], model.centres[2]
+    locate(pose, field.box, xs, ys, zs, places, len(radii))
+    total = 0.0
+    for n in range(len(radii)):
+        if places.beyond[n] < radii[n] * radii[n]:
+            s = distance_in_place(field, pose, xs[n], ys[n], zs[n], places, n)[0]
+            depth = max(radii[n] - s, 0.0)
+            total += depth * depth
+    return total / max(len(radii), 1)
+
+
+@spliced
+def _known_mean(model, pose, places):
+    """The mean square of s - v over points of known signed distance v, 0 for contacts."""
+    field, known_sdf = model.field, model.known_sdf
+    xs, ys, zs = model.known[0], model.known[1], model.known[2]
+    locate(pose, field.box, xs, ys, zs, places, len(known_sdf))
+    total = 0.0
+    for n in range(len(known_sdf)):
+        s = distance_in_place(field, pose, xs[n], ys[n], zs[n], places, n)[0]
+        difference = s - known_sdf[n]
+        total += difference * difference
+    return total / max(len(known_sdf), 1)

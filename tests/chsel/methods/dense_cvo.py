@@ -8,9 +8,8 @@ import numba
 import numpy as np
 import trimesh
 
-from chsel.methods.cvo.cvo_kernels import Product, flow_at
-from chsel.methods.cvo.gaussian_blur import Kernel
-from chsel.methods.cvo.rkhs_fields import free_field, surface_field
+from chsel.methods.cvo.cvo import flow_at
+from chsel.methods.cvo.rkhs_fields import Kernel, Product, free_field, surface_field
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.pose_tuples import pose_at
 from chsel.problem.points import KnownPoints
@@ -54,7 +53,6 @@ class DenseClouds:
     z: FloatArray
     z_labels: FloatArray
     ell: float = 0.1
-    threshold: float = 0.0
 
     @classmethod
     def of(
@@ -64,7 +62,6 @@ class DenseClouds:
         band: float,
         *,
         ell: float = 0.1,
-        threshold: float = 0.0,
     ) -> DenseClouds:
         nodes = sdf.origin + np.argwhere(sdf.values > -np.inf) * sdf.resolution
         values = sdf.values.reshape(-1)
@@ -72,16 +69,16 @@ class DenseClouds:
         x = np.concatenate([points.free, points.contacts])
         x_labels = labels(len(points.free), len(points.contacts))
         z = np.concatenate([free, surface])
-        return cls(x, x_labels, z, labels(len(free), len(surface)), ell, threshold)
+        return cls(x, x_labels, z, labels(len(free), len(surface)), ell)
 
     def kernel(self, object_from_world: FloatArray) -> FloatArray:
-        """a_ij (N, M) = k(x_i, y_j) s(l_i, m_j); with a threshold, 0 where not above it."""
+        """a_ij (N, M) = k(x_i, y_j) s(l_i, m_j)."""
         moved = apply(object_from_world, self.x)
         apart = ((moved[:, None] - self.z) ** 2).sum(-1)
         labels_apart = ((self.x_labels[:, None] - self.z_labels) ** 2).sum(-1)
         a = SIGMA**2 * np.exp(-apart / (2 * self.ell**2))
-        a = a * S_SIGMA**2 * np.exp(-labels_apart / (2 * S_ELL**2))
-        return np.where(a > self.threshold, a, 0.0)
+        a *= S_SIGMA**2 * np.exp(-labels_apart / (2 * S_ELL**2))
+        return a
 
     def product(self, object_from_world: FloatArray) -> float:
         """F(X)."""
@@ -146,9 +143,9 @@ def nearby(count: int, seed: int, reach: float = 0.08) -> FloatArray:
 
 
 @numba.njit(error_model="numpy")
-def flows(product, poses, out, places):  # type: ignore[no-untyped-def]
+def flows(product, poses, out):  # type: ignore[no-untyped-def]
     """Fill out (B, 7) with F, sum x_i x h_i and sum h_i, h = R^T grad f, at poses (B, 12)."""
     for n in range(len(poses)):
-        flow = flow_at(product, pose_at(poses, n), places)
+        flow = flow_at(product, pose_at(poses, n), (0.0, 0.0, 0.0))
         for i in range(7):
             out[n, i] = flow[i]

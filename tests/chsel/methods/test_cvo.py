@@ -9,16 +9,9 @@ import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, Workspace
 from chsel.methods import preset_settings
-from chsel.methods.cvo import cvo_kernels as kernels
-from chsel.methods.cvo.cvo import Cvo, CvoSettings
-from chsel.methods.cvo.cvo_kernels import (
-    Ascent,
-    Product,
-    climb,
-    climbers_at,
-    products,
-)
-from chsel.methods.cvo.field_kernels import scratch
+from chsel.methods.cvo import cvo
+from chsel.methods.cvo.cvo import Ascent, Cvo, CvoSettings, climb, climbers_at
+from chsel.methods.cvo.rkhs_fields import Product, values_of
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
@@ -40,7 +33,7 @@ from tests.chsel.methods.dense_cvo import (
 from tests.chsel.methods.scene import Watcher
 
 WORKSPACE = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
-ASCENT = Ascent(np.array([1e-4 * 8000.0 ** (k / 15) for k in range(16)]), 7.0, 7.0, -1.0)
+ASCENT = Ascent(1e-4, 0.8, (0.0, 0.0, 0.0), 7.0, 7.0, -1.0)
 QUICK = CvoSettings(ell_min=0.1, c=7.0, origin="world", max_iterations=12)
 
 
@@ -51,15 +44,13 @@ def problem(
 
 
 def value(product: Product, object_from_world: FloatArray) -> float:
-    out = np.empty(1)
-    products(product, Poses.of(object_from_world[None]).numbers, out, 0, 1, scratch())
-    return float(out[0])
+    return float(values_of(product, Poses.of(object_from_world[None]).numbers)[0])
 
 
 def direction(product: Product, object_from_world: FloatArray) -> tuple[FloatArray, float]:
     """The unit flow (6,), and the slope of F along it."""
     out = np.empty((1, 7))
-    flows(product, Poses.of(object_from_world[None]).numbers, out, scratch())
+    flows(product, Poses.of(object_from_world[None]).numbers, out)
     xi = out[0, 1:] / 7.0
     xi = xi / np.sqrt((xi**2).sum())
     return xi, float((xi * out[0, 1:]).sum())
@@ -67,7 +58,7 @@ def direction(product: Product, object_from_world: FloatArray) -> tuple[FloatArr
 
 @numba.njit
 def moved_along(pose, xi, tau):  # type: ignore[no-untyped-def]
-    return kernels._moved_along(pose, xi, tau)
+    return cvo._moved_along(pose, xi, tau)
 
 
 @pytest.mark.parametrize("tau", [1e-9, 1e-3, 0.019, 0.021, 0.8])
@@ -112,7 +103,7 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
     for start in nearby(8, 6):
         before = value(product, start)
         climbers = climbers_at(Poses.of(start[None]).numbers, np.array([before]))
-        climb(product, ASCENT, climbers, 1, 0, 1, scratch())
+        climb(product, ASCENT, climbers, 1, 0, 1, None)
         xi, _ = direction(product, start)
         b, c, d, e = dense.quartic(start, xi)
         roots = np.roots([4 * e, 3 * d, 2 * c, b])
@@ -127,16 +118,14 @@ def test_a_step_gains_as_much_as_that_to_the_root_of_the_expansion() -> None:
 
 def test_the_inner_product_never_falls_and_is_that_of_the_pose() -> None:
     product, starts = product_of(scene(), KERNEL), nearby(5, 7, 0.2)
-    poses, now = Poses.of(starts).numbers, np.empty(5)
-    products(product, poses, now, 0, 5, scratch())
-    climbers = climbers_at(poses, now)
+    poses = Poses.of(starts).numbers
+    climbers = climbers_at(poses, values_of(product, poses))
     for _ in range(30):
         before = climbers.value.copy()
-        climb(product, ASCENT, climbers, 1, 0, 5, scratch())
+        climb(product, ASCENT, climbers, 1, 0, 5, None)
         assert (climbers.value >= before).all()
         assert ((climbers.value > before) | climbers.done).all()
-        products(product, climbers.poses, now, 0, 5, scratch())
-        np.testing.assert_array_equal(now, climbers.value)
+        np.testing.assert_array_equal(values_of(product, climbers.poses), climbers.value)
 
 
 @pytest.mark.parametrize("name", ["default", "paper", "reference"])

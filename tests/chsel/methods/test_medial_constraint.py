@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from chsel.methods import preset_settings
-from chsel.methods.medial_constraint.cma_es import CmaEsSettings
 from chsel.methods.medial_constraint.medial_constraint import (
+    CmaEsSettings,
     MedialConstraint,
     MedialConstraintCmaMe,
 )

@@ -93,17 +93,16 @@ def search(model, space, vectors, costs, work):  # type: ignore[no-untyped-def]
     costs_of(model, space, vectors, costs, work)
 
 
-@pytest.mark.parametrize("outside", OUTSIDE)
 @pytest.mark.parametrize("lookup", LOOKUPS)
-def test_searches_go_by_the_same_costs_in_32_bits(lookup: str, outside: str) -> None:
-    settings = MedialCostSettings(lookup=lookup, outside=outside)
-    for balls in (some_balls(), some_balls(600), Balls(np.zeros((0, 3)), np.zeros(0))):
-        cost = MedialCost(problem(contacts(70)), settings, balls=balls)
+def test_searches_go_by_the_same_costs(lookup: str) -> None:
+    for balls in (some_balls(), Balls(np.zeros((0, 3)), np.zeros(0))):
+        cost = MedialCost(problem(contacts()), MedialCostSettings(lookup=lookup), balls=balls)
         vectors = cost.space.encode(Poses.of(poses(80)))
-        vectors[-2:, 8] = 40.0, np.nan  # too far away for the bounds, and not finite
+        vectors[-2:, 8] = 40.0, np.nan  # far away, and not finite
         found = np.empty(len(vectors))
         search(cost.model, cost.space_arrays, vectors, found, cost.work())
-        np.testing.assert_allclose(found, cost.costs(vectors), rtol=2e-5)
+        np.testing.assert_array_equal(np.isinf(found), np.arange(80) == 79)
+        np.testing.assert_allclose(found, cost.costs(vectors), rtol=1e-12)
 
 
 def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() -> None:

@@ -17,7 +17,7 @@ from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
 from chsel.methods.cvo.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.methods.icp import Icp, IcpSettings
-from chsel.methods.medial_constraint.cma_es import CmaEsSettings
+from chsel.methods.medial_constraint.medial_constraint import CmaEsSettings
 from chsel.methods.medial_constraint.medial_cost import MedialCostSettings
 from chsel.methods.svgd import SvgdSettings
 from chsel.problem.named_choices import NamedChoices
@@ -76,7 +76,6 @@ REFUSED: dict[type[Any], list[tuple[dict[str, Any], str]]] = {
         ({"c": NAN}, "^c is nan"),
         ({"max_iterations": 0}, "^max_iterations is 0"),
         ({"max_iterations": 10_000_000}, "accepted: at most 1_000_000"),
-        ({"sp_thres": 0.0065}, "accepted: .*below sigma"),
         ({"min_step": 0.9}, "accepted: .*min_step at most max_step"),
         ({"max_step": 2.0}, "accepted: .*max_step at most 1"),
         ({"ell_decay": 1.0}, "accepted: .*below 1"),
