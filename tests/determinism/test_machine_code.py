@@ -18,7 +18,6 @@ from numba.core.registry import CPUDispatcher
 from chsel.methods.cvo.gaussian_blur import splat
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled
-from chsel.numerics.kernel_sources import kernel_sources
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
 from chsel.plausible.random_steps import stepped
@@ -31,6 +30,7 @@ from chsel.qd.archive import GridArchive
 from chsel.qd.measures import MEASURES
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
+from tests.chsel.kernel_files import kernel_files
 from tests.chsel.samples import hypotheses_at
 from tests.determinism.cases import CASES
 from tests.determinism.decisions import decision_stages
@@ -104,7 +104,7 @@ def code() -> dict[str, str]:
 def _from_python() -> dict[str, Any]:
     """The kernels by full name that Python calls; elementary functions are in their callers."""
     found = {}
-    for source in kernel_sources():
+    for source in kernel_files():
         module = ".".join(source.relative_to(REPOSITORY).with_suffix("").parts)
         for name, kernel in vars(importlib.import_module(module)).items():
             own = isinstance(kernel, CPUDispatcher) and kernel.__module__ == module

@@ -15,10 +15,10 @@ import yaml
 
 from chsel import CompiledCost
 from chsel.next_probe.forecast import Forecast
-from chsel.numerics.kernel_cache import cache_directory
 from replay.events import Decided
 from replay.mcap.reader import Recording, read_recording
 from runners.reporting.evaluation_folder import open_evaluation
+from tests.chsel.kernel_files import kernel_files
 from tests.docs.page import commands_in, named_blocks, section, shell, take_over
 from tests.runners.made_up_evaluations import made_up_rows, write_evaluation
 
@@ -37,7 +37,7 @@ REPORT_RECIPES = ("Adding a figure", "Adding a column")
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the repository in which all recipes were carried out, one after the other."""
+    """A copy of the repository in which all recipes were carried out."""
     return carried_out(RECIPES, tmp_path_factory.mktemp("copy"))
 
 
@@ -51,17 +51,16 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def carried_out(recipes: Sequence[str], folder: Path) -> Path:
-    """The folder, with a copy of the repository in which recipes were carried out in order."""
+    """The folder, with a copy of the repository in which recipes were carried out."""
     unwanted = shutil.ignore_patterns("__pycache__")
     for package in PACKAGES:
         shutil.copytree(REPOSITORY / package, folder / package, ignore=unwanted)
     shutil.copy(REPOSITORY / "pyproject.toml", folder)
-    for title in recipes:
-        recipe = section(PAGE, title)
-        assert take_over(recipe, folder)
-        if title == RECIPES[0]:  # which adds a kernel
-            take_kernels(folder)
-        for command in commands_in(recipe):
+    texts = [section(PAGE, title) for title in recipes]
+    for text in texts:
+        assert take_over(text, folder)
+    for text in texts:  # after all changes, as each would compile all kernels anew
+        for command in commands_in(text):
             run(command, folder)
     return folder
 
@@ -71,13 +70,6 @@ def run(command: str, folder: Path) -> str:
     done = shell(command, folder, PYTHONPATH=str(folder), CHSEL_CACHE_DIR=str(folder / "kernels"))
     assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
     return done.stdout
-
-
-def take_kernels(folder: Path) -> None:
-    """Copy the machine code of the kernels that the copy has unchanged, which spares a minute."""
-    code = "from chsel.numerics.kernel_cache import cache_directory; print(cache_directory())"
-    place = Path(run(f'python -c "{code}"', folder).strip())
-    shutil.copytree(cache_directory(), place, dirs_exist_ok=True)
 
 
 def path_of(folder: Path, name: str) -> Path:
@@ -110,8 +102,7 @@ def test_a_method_has_the_presets_of_its_groups(copy: Path) -> None:
 
 
 def test_its_kernel_is_checked_as_all_are(copy: Path) -> None:
-    code = "from chsel.numerics.kernel_sources import kernel_sources as k; print(*k(), sep='\\n')"
-    assert str(copy / "chsel" / "methods" / "annealing.py") in run(f'python -c "{code}"', copy)
+    assert copy / "chsel" / "methods" / "annealing.py" in kernel_files(copy)
     assert list((copy / "kernels").rglob("annealing.accepted*.nbc"))
 
 

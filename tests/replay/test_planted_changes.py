@@ -1,4 +1,4 @@
-"""A change of the code, planted into a copy of it, turns the stored replays red at its stage."""
+"""A change of the code turns the stored replays red at its stage."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ import re
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from chsel.numerics.kernel_cache import cache_directory
-
 REPOSITORY = Path(__file__).resolve().parents[2]
-REPLAYS = REPOSITORY / "tests" / "replays"
 
 
 @dataclass(frozen=True)
@@ -31,25 +27,6 @@ class Plant:
 
 
 PLANTS = {
-    "nothing": Plant(
-        "chsel/qd/selection.py", "def select_elites(", "def select_elites(", "cracker_box_chsel", ""
-    ),
-    "a constant of the cost": Plant(
-        "chsel/cost/pose_lanes.py",
-        "value = scale * excess",
-        "value = 1.0000000000001 * scale * excess",
-        "points_exact_descent",
-        "descent, iteration 0",
-    ),
-    "the order of a sum": Plant(
-        "chsel/cost/pose_lanes.py",
-        "xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
-        "    for n in range(len(xs)):\n",
-        "xs, ys, zs = model.known[0], model.known[1], model.known[2]\n"
-        "    for n in range(len(xs) - 1, -1, -1):\n",
-        "points_exact_descent",
-        "descent, iteration 0",
-    ),
     "the draws of the search": Plant(
         "chsel/qd/emitters.py",
         "self.key.stream(Purpose.EMITTER, self.refinement)",
@@ -87,72 +64,76 @@ PLANTS = {
     ),
 }
 
-
-RUN = """
+KERNEL = Plant(
+    "chsel/cost/pose_lanes.py",
+    "value = scale * excess",
+    "value = 1.0000000000001 * scale * excess",
+    "spam_can_gradient_descent",
+    "descent, iteration 0",
+)
+VERIFY = """
 import sys
+from importlib.machinery import SourceFileLoader
+module, line, planted, recording = sys.argv[1:]
+
+def planting(self, name, imported=SourceFileLoader.get_code):
+    if name != module:
+        return imported(self, name)
+    source = self.get_source(name)
+    assert source.count(line) == 1
+    return compile(source.replace(line, planted), self.path, "exec")
+
+SourceFileLoader.get_code = planting
 from replay.__main__ import main
-status = main(["verify", sys.argv[3]])
-assert sys.modules[sys.argv[1]].__file__ == sys.argv[2]
+status = main(["verify", recording])
+assert module in sys.modules
 sys.exit(status)
 """
 
 
-def verified_with(plant: Plant, folder: Path) -> subprocess.CompletedProcess[str]:
-    """`replay verify` in a copy of the code that has the plant.
-
-    A plant in a kernel is compiled into a folder of its own, which starts with the kept kernels:
-    those that can run what is planted are compiled anew.
-    """
-    original = (REPOSITORY / plant.file).read_text()
-    assert original.count(plant.line) == 1
-    for package in ("chsel", "replay"):
-        unwanted = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(REPOSITORY / package, folder / package, ignore=unwanted)
-    planted = folder / plant.file
-    planted.write_text(original.replace(plant.line, plant.planted))
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder)}
-    if "chsel.numerics.compiler" in original:
-        kept, unfinished = cache_directory(), shutil.ignore_patterns("*.lock", "*.tmp")
-        links = folder / "kept" / kept.name
-        shutil.copytree(kept, links, copy_function=os.symlink, ignore=unfinished)
-        environment["CHSEL_CACHE_DIR"] = str(folder / "kept")
+def verified_with(plant: Plant) -> subprocess.CompletedProcess[str]:
+    """`replay verify` in a process that imports the planted line."""
     module = plant.file.removesuffix(".py").replace("/", ".")
-    recording = REPLAYS / f"{plant.recording}.mcap"
+    return run(REPOSITORY, "-c", VERIFY, module, plant.line, plant.planted, path_of(plant))
+
+
+def run(folder: Path, *words: str, **changes: str) -> subprocess.CompletedProcess[str]:
+    """Python in a folder, with the packages there."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder), **changes}
     return subprocess.run(
-        [sys.executable, "-c", RUN, module, str(planted), str(recording)],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
+        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True
     )
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, subprocess.CompletedProcess[str]]:
-    """All plants verified, two at a time."""
-    folder = tmp_path_factory.mktemp("plants")
-    with ThreadPoolExecutor(2) as pool:
-        folders = [folder / str(index) for index in range(len(PLANTS))]
-        return dict(zip(PLANTS, pool.map(verified_with, PLANTS.values(), folders), strict=True))
+def path_of(plant: Plant) -> str:
+    return str(REPOSITORY / "tests" / "replays" / f"{plant.recording}.mcap")
 
 
-@pytest.mark.parametrize("name", [name for name, plant in PLANTS.items() if plant.stage])
-def test_a_planted_change_is_found_and_its_stage_named(
-    name: str, runs: dict[str, subprocess.CompletedProcess[str]]
-) -> None:
-    done = runs[name]
+def assert_differs(done: subprocess.CompletedProcess[str], stage: str) -> None:
+    """Every step differs, from that stage on."""
     assert done.returncode == 1, done.stderr
     stages = re.findall(r"first difference: (.*) \(", done.stdout)
     steps = re.findall(r"step -?\d+, \w+: differs", done.stdout)
     assert len(steps) == len(stages) > 0
-    assert set(stages) == {PLANTS[name].stage}, done.stdout
+    assert set(stages) == {stage}, done.stdout
 
 
-def test_without_a_change_the_bits_are_those_recorded(
-    runs: dict[str, subprocess.CompletedProcess[str]],
-) -> None:
-    """What the tests above see is their plants alone."""
-    done = runs["nothing"]
-    notices = re.sub(r"compiling the kernels .*\n", "", done.stderr)  # if none are kept yet
-    assert (done.returncode, notices) == (0, "")
-    assert "4 of 4 steps equal" in done.stdout
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_planted_change_is_found_and_its_stage_named(name: str) -> None:
+    assert_differs(verified_with(PLANTS[name]), PLANTS[name].stage)
+
+
+def test_a_change_in_a_kernel_is_compiled_and_found(tmp_path: Path) -> None:
+    """In a copy, which has the same kernels as the original before."""
+    for package in ("chsel", "replay"):
+        unwanted = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(REPOSITORY / package, tmp_path / package, ignore=unwanted)
+    verify = ("-m", "replay", "verify", path_of(KERNEL))
+    same = run(tmp_path, *verify)
+    assert (same.returncode, KERNEL.stage in same.stdout) == (0, False), same.stderr
+    kernel = tmp_path / KERNEL.file
+    assert kernel.read_text().count(KERNEL.line) == 1
+    kernel.write_text(kernel.read_text().replace(KERNEL.line, KERNEL.planted))
+    done = run(tmp_path, *verify, CHSEL_CACHE_DIR=str(tmp_path / "kept"))
+    assert "compiling the kernels" in done.stderr
+    assert_differs(done, KERNEL.stage)
