@@ -63,7 +63,7 @@ def _has_changed() -> bool:
 
 
 def _digest(*parts: bytes) -> str:
-    return hashlib.blake2b(b"\0".join(parts), digest_size=8).hexdigest()
+    return hashlib.blake2b(b"\0".join(parts), digest_size=10).hexdigest()
 
 
 _FILES = sorted(map(str, _PACKAGE.rglob("*.py")))
@@ -179,7 +179,7 @@ def _prune(used: Path) -> None:
     others = [
         folder
         for folder in used.parent.iterdir()
-        if re.fullmatch("[0-9a-f]{16}", folder.name) and folder != used
+        if re.fullmatch("[0-9a-f]{16,20}", folder.name) and folder != used  # 16: of old versions
     ]
     others.sort(key=lambda folder: folder.stat().st_mtime)
     for folder in others[: 1 - KEPT_FOLDERS]:

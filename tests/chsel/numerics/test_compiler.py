@@ -199,7 +199,7 @@ def test_without_a_home_that_can_be_written_kernels_go_to_a_temporary_folder(
 
 
 def test_folders_that_were_not_used_for_longest_are_removed(tmp_path: Path) -> None:
-    folders = [tmp_path / f"{number:016x}" for number in range(12)]
+    folders = [tmp_path / f"{number:020x}" for number in range(11)] + [tmp_path / f"{1:016x}"]
     for age, folder in enumerate(folders):
         folder.mkdir()
         os.utime(folder, (time.time() - 1000.0 * age,) * 2)
