@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -105,8 +104,7 @@ class _CompilerWatch(event.Listener):
     """Reports that kernels are being compiled, and vectorises their straight-line code.
 
     Numba has the latter as a switch of the process, which is off otherwise. It makes interpolation
-    of the SDF twice as fast and changes no bit, as it reorders nothing. Garbage is collected after
-    a kernel rather than all the time within it.
+    of the SDF twice as fast and changes no bit, as it reorders nothing.
     """
 
     def __init__(self) -> None:
@@ -115,7 +113,6 @@ class _CompilerWatch(event.Listener):
         self._noticed = False
         self._depth = 0
         self._usual = _config.SLP_VECTORIZE
-        self._collects = True
 
     def on_start(self, event: Any) -> None:
         """The compilation of a function, or of one that it calls, begins."""
@@ -123,8 +120,6 @@ class _CompilerWatch(event.Listener):
             return
         if self._depth == 0:
             self._usual, _config.SLP_VECTORIZE = _config.SLP_VECTORIZE, 1
-            self._collects = gc.isenabled()
-            gc.disable()
             self._report()
         self._depth += 1
 
@@ -135,8 +130,6 @@ class _CompilerWatch(event.Listener):
         self._depth -= 1
         if self._depth == 0:
             _config.SLP_VECTORIZE = self._usual
-            if self._collects:
-                gc.enable()
             self.count += 1
             if self.show is not None:
                 self.show(self.count)

@@ -49,17 +49,11 @@ _log = logging.getLogger(__name__)
 
 
 def _states() -> list[tuple[int, int]]:
-    """Time of the last change and size of each file of the package."""
-    states = map(os.stat, _FILES)
-    return [(state.st_mtime_ns, state.st_size) for state in states]
-
-
-def _has_changed() -> bool:
-    """Whether this process may have imported, or may yet import, other code than that digested."""
+    """Time of the last change and size of each file of the package; empty if one is gone."""
     try:
-        return _states() != _STATES
-    except OSError:  # a file was removed
-        return True
+        return [(state.st_mtime_ns, state.st_size) for state in map(os.stat, _FILES)]
+    except OSError:
+        return []
 
 
 def _digest(*parts: bytes) -> str:
@@ -126,7 +120,7 @@ class KernelCache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The code for types of arguments, None if it must be compiled."""
-        if _has_changed():
+        if _states() != _STATES:  # this process may have imported other code than was digested
             return None
         try:
             return super().load_overload(sig, target_context)
@@ -136,7 +130,7 @@ class KernelCache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep the code for types of arguments. If that fails, it is compiled again next time."""
-        if _has_changed():
+        if _states() != _STATES:
             return
         try:
             super().save_overload(sig, data)
