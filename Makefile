@@ -36,11 +36,7 @@ $(VENV)/constraints.txt: constraints.txt | $(VENV)/bin/python
 	@if $(BIN)/python -c "import importlib.metadata as m; m.version('torch')" 2>/dev/null; \
 		then sed '/^torch==/d' constraints.txt; else cat constraints.txt; fi > $@
 
-# The kernels of method=chsel need these packages alone, so they are compiled while others come.
-# Whatever becomes of that: a session compiles what it lacks.
 $(VENV)/.installed: pyproject.toml $(VENV)/constraints.txt
-	$(INSTALL) filelock numba numpy pyyaml scipy
-	@$(BIN)/python -m chsel.background_rehearsal >/dev/null 2>&1 &
 	$(INSTALL) --editable .
 	@touch $@
 

@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from chsel.methods.method import ConfiguredMethod, Method
+from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.hand_shape import HandShape
+from chsel.numerics.kernel_cache import cache_directory
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies.policy import Policy, StopSettings
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose
-from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import StreamKey
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 
@@ -33,9 +32,11 @@ def warm_up(method: Method) -> None:
     """Compile every kernel that a session with `method` needs, or load it if it was compiled.
 
     Registers a small ball twice, first from contacts and free points, then from points of every
-    class and with the first result as the previous one. Takes a tenth of a second if all is
-    compiled. It changes no bit of any registration, as these depend on their problems alone.
+    class and with the first result as the previous one. Takes up to a minute if nothing is
+    compiled, else a tenth of a second. It changes no bit of any registration, as these depend on
+    their problems alone. Raises SettingError if the folder of compiled kernels cannot be used.
     """
+    cache_directory()
     try:
         method = type(method)(_brief(method.settings))  # type: ignore[call-arg]
         with warnings.catch_warnings():
@@ -44,15 +45,6 @@ def warm_up(method: Method) -> None:
     except Exception:
         # Settings that fit no such ball, or another package's method that fails on it: its kernels
         # are compiled when they are needed.
-        return
-
-
-def warm_up_longest(method: Method) -> None:
-    """Compile the stage of `method` whose kernels take longest, or load it. See `warm_up`."""
-    try:
-        if isinstance(method, ConfiguredMethod):
-            type(method)(_brief(method.settings)).longest_stage(_problem())
-    except Exception:  # as above
         return
 
 
@@ -85,13 +77,6 @@ def warm_up_policy(policy: Policy) -> None:
         steering.felt(np.zeros((1, 3)))
     except Exception:  # as above
         return
-
-
-def _problem() -> RegistrationProblem:
-    surface = _RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
-    points = KnownPoints(np.full((1, 3), 0.05), np.zeros((1, 3)), surface, np.zeros(6))
-    first = np.eye(4)[None]
-    return RegistrationProblem(_ball(), points, first, _WORKSPACE, 0.02, StreamKey(0, 0))
 
 
 def _register_twice(method: Method) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -118,18 +118,6 @@ class Progress(rich.progress.Progress):
         """The description, the bar, and how much is done."""
         _, *columns = super().get_default_columns()
         return (TextColumn("{task.description}"), *columns)
-
-
-class LiveTextColumn(rich.progress.ProgressColumn):
-    """A column of progress that asks for its text whenever it is drawn."""
-
-    def __init__(self, text: Callable[[], str]) -> None:
-        super().__init__()
-        self._text = text
-
-    def render(self, task: rich.progress.Task) -> Text:
-        """The text as it is now, as it is."""
-        return Text(printable(self._text()))
 
 
 class TextColumn(rich.progress.TextColumn):

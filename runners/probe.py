@@ -11,12 +11,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from chsel.methods import build_method
+from chsel.numerics.compiler import watched
 from chsel.numerics.threads import set_threads
 from chsel.problem.settings import build_settings
+from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
 from replay.startup import importing
 from runners.command.choices import calls_for_anchored
 from runners.command.program import command, plain
-from runners.run.compiling import Compiling
+from runners.run.compiling import compiling_line
 from runners.run.display import Display, reading_bar
 from runners.run.probe_run import Interrupt, run
 from runners.run.recording import make_run_folder, write_in_run_folder
@@ -40,18 +42,20 @@ def main(config: DictConfig) -> None:
     method_name = str(method_config.pop("name", None))
     method = build_method(method_name, method_config)
     with ExitStack() as stack:
-        kernels = stack.enter_context(Compiling())
-        kernels.begin(method)
-        with reading_bar() as bar:
+        with reading_bar() as bar, watched(lambda _: None):  # it compiles next to nothing
             scene = open_scene(checked, bar.show)
         stack.callback(scene.session.close)
-        policy = None if scene.steering is None else scene.steering.policy
-        kernels.rehearse_probing(policy, sensing=checked.session["kind"] == "sensors")
+        with compiling_line():
+            warm_up(method)
+            if scene.steering is not None:
+                warm_up_policy(scene.steering.policy)
+            if checked.session["kind"] == "sensors":
+                warm_up_sensing()
         folder = make_run_folder(Path(checked.logs) / "probe", scene.object_name, method_name)
         write_in_run_folder(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False))
         started = session_started(checked, values, method_name, scene)
         with Interrupt() as interrupt:
-            interrupted = run(folder, checked, method, scene, started, kernels, interrupt, display)
+            interrupted = run(folder, checked, method, scene, started, interrupt, display)
     if interrupted:
         sys.exit(130)
 

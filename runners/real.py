@@ -27,6 +27,7 @@ from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import Purpose, StreamKey, uniforms
+from chsel.rehearsal import warm_up
 from replay.console import Console, Progress
 from replay.events import Probe
 from replay.files import whole_file
@@ -36,7 +37,7 @@ from runners.evaluation.selection import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import Cell, Table, number, print_table
-from runners.run.compiling import Compiling
+from runners.run.compiling import compiling_line
 from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sensors.rig import Rig
@@ -101,9 +102,10 @@ def main(config: DictConfig) -> None:
     methods = {contender.label: contender.method() for contender in contenders}
     rows: list[Mapping[str, Any]] = []
     with threads(checked.threads):
-        with Compiling() as kernels:
-            opened = [RealCase(checked, name) for name in cases]
-            kernels.rehearse(*methods.values())
+        opened = [RealCase(checked, name) for name in cases]
+        with compiling_line():
+            for method in methods.values():
+                warm_up(method)
         waiting = Console(stderr=True)
         with Progress(console=waiting, transient=True, disable=not waiting.is_terminal) as bar:
             for case in bar.track(opened, description="cases"):

@@ -12,7 +12,7 @@ import numpy as np
 from chsel.cost.free_kernels import FreeTerm, Neighbours, free_sums, neighbours_of
 from chsel.cost.pose_lanes import LANES, SIZE, SUMS, add_known, add_occupied
 from chsel.numerics.arrays import FloatArray, scratch
-from chsel.numerics.compiler import compiled, kept, leaf
+from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import finite, pose_at
 from chsel.problem.sdf_lookup import DistanceField
 
@@ -89,7 +89,7 @@ def gradient_of(lanes, lane):
     return a, b, c, d, e, f, g, h, i, x, y, z
 
 
-@kept
+@inner
 def evaluate(model, work, first, count, most_slack):
     """The costs of the poses of the first `count` lanes, and their gradients, in their sums.
 

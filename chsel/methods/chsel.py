@@ -25,7 +25,7 @@ from chsel.problem.registration_problem import (
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import CheckedSettings, Presets, at_most, one_of, positive
 from chsel.problem.streams import Purpose, normals
-from chsel.qd.archive import Evaluated, GridArchive, evaluated
+from chsel.qd.archive import GridArchive, evaluated
 from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
@@ -96,17 +96,6 @@ class Chsel(ConfiguredMethod[ChselSettings]):
             initial_set = algorithm.resampled_around_best(hypotheses, index)
             hypotheses = algorithm.run(initial_set, Poses.of(hypotheses.elites), index)
         return hypotheses
-
-    def longest_stage(self, problem: RegistrationProblem) -> None:
-        """Line 6 from the first pose of E_0."""
-        settings = self.settings
-        space, first = search_space(settings.plane, problem.sdf), Poses.of(problem.initial_set[:1])
-        measure = measure_named(settings.archive.measure, planar=settings.plane is not None)
-        mean, deviation = np.zeros(measure.count), np.ones(measure.count)
-        archive = sized_archive(measure, mean, deviation, settings.archive, space.dimension)
-        vectors = space.encode(first)
-        archive.update_cells(Evaluated(vectors, np.zeros(1), measure.values(space, vectors)))
-        _Algorithm1(problem, settings, NullObserver()).cma_mega(archive, first, 0)
 
 
 class _Algorithm1:

@@ -47,9 +47,3 @@ class ConfiguredMethod(Generic[Settings]):
     def online(self) -> OnlineSettings:
         """How a session makes the next problem for this method."""
         return self.settings.online
-
-    def longest_stage(self, problem: RegistrationProblem) -> None:
-        """Run alone the stage whose kernels take longest to compile, if the method names one.
-
-        So that they can be compiled beside the others. See `chsel.background_rehearsal`.
-        """

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Self
@@ -18,7 +16,6 @@ from replay.content.recording_info import recording_digest
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
 from replay.files import WritingError
 from replay.registration import symmetry_for_errors
-from runners.run.compiling import Compiling
 from runners.run.display import Display
 from runners.run.recording import open_recorder, write_in_run_folder
 from runners.run.scene import ProbeConfig, Scene
@@ -39,16 +36,6 @@ class Interrupt:
     def __exit__(self, *_: object) -> None:
         signal.signal(signal.SIGINT, self._previous)
 
-    @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """Within this context, Ctrl-C takes effect at once."""
-        self.check()
-        previous = signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, previous)
-
     def check(self) -> None:
         """Raise KeyboardInterrupt if Ctrl-C was pressed."""
         if self._asked:
@@ -66,7 +53,6 @@ def run(
     method: Method,
     scene: Scene,
     started: SessionStarted,
-    kernels: Compiling,
     interrupt: Interrupt,
     display: Display,
 ) -> bool:
@@ -80,13 +66,6 @@ def run(
         interrupt.check()
         display.working(stage, iteration, total)
 
-    @cache
-    def prepare() -> None:
-        """Wait for the kernels of registrations, once."""
-        display.close()
-        with interrupt.at_once():
-            kernels.rehearse(method)
-
     scene.watcher.show = show
     recorder = open_recorder(folder, config.recording)
     session_run = SessionRun(
@@ -99,7 +78,6 @@ def run(
         show=show,
         opening=scene.warnings,
         steering=steering,
-        prepare=prepare,
     )
     display.warn(scene.warnings)
     rows: list[Row] = []

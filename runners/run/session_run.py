@@ -65,18 +65,16 @@ class SessionRun:
         show: Callable[[str, int, int], None],
         opening: Iterable[InputWarning] = (),
         steering: Steering | None = None,
-        prepare: Callable[[], None] = lambda: None,
     ) -> None:
         """symmetry: of the object, for errors to the true pose; None where that is not known.
 
         opening: warnings about what was opened, which are recorded with the first probe. steering:
         chooses the probes of a session that can be steered; None for the session's own order.
-        prepare: called before each registration; what it takes is in no time.
         """
         self._session, self._online, self._method = session, online, method
         self._recorder, self._recording = recorder, recording
         self._symmetry, self._show = symmetry, show
-        self._opening, self._prepare = tuple(opening), prepare
+        self._opening = tuple(opening)
         self.steering = steering
         self.step = 0
         self.warnings: list[StepWarning] = []
@@ -134,7 +132,6 @@ class SessionRun:
     def register(self, problem: RegistrationProblem) -> Hypotheses:
         """Check the points, register the problem by the run's method, and record it."""
         self._check_points()
-        self._prepare()
         self.registered = register_recorded(
             ProblemPosed(problem.key.step, problem),
             self._method,

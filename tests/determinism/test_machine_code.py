@@ -15,9 +15,8 @@ import pytest
 import trimesh
 from numba.core.registry import CPUDispatcher
 
-from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled
-from chsel.numerics.kernel_sources import kernel_sources
+from chsel.numerics.elementary import _remainder
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
 from chsel.plausible.random_steps import stepped
@@ -30,6 +29,7 @@ from chsel.qd.archive import GridArchive
 from chsel.qd.measures import MEASURES
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
+from tests.chsel.kernel_files import kernel_files
 from tests.chsel.samples import hypotheses_at
 from tests.determinism.cases import CASES
 from tests.determinism.decisions import decision_stages
@@ -102,7 +102,7 @@ def code() -> dict[str, str]:
 def _from_python() -> dict[str, Any]:
     """The kernels by full name that Python calls; elementary functions are in their callers."""
     found = {}
-    for source in kernel_sources():
+    for source in kernel_files():
         module = ".".join(source.relative_to(REPOSITORY).with_suffix("").parts)
         for name, kernel in vars(importlib.import_module(module)).items():
             own = isinstance(kernel, CPUDispatcher) and kernel.__module__ == module
@@ -174,19 +174,12 @@ def test_a_call_of_the_c_library_would_be_found() -> None:
 
 
 def test_code_from_the_cache_is_seen_as_freshly_compiled_code_is() -> None:
-    values = np.array([1.0, 2.0, 3.0])
-    fresh = numba.njit(nogil=True, error_model="numpy")(_cube_sum)
-    compiled(_cube_sum)(values)
-    cached = compiled(_cube_sum)
-    assert fresh(values) == cached(values) == 36.0
-    assert cached.stats.cache_hits
+    function = _remainder.py_func  # type: ignore[attr-defined]
+    fresh = numba.njit(nogil=True, error_model="numpy")(function)
+    compiled(function)(10.0)
+    cached = compiled(function)
+    assert fresh(10.0) == cached(10.0) == 10.0 - 2.0 * math.pi
+    assert cached.stats.cache_hits  # type: ignore[attr-defined]
     assert not fresh.stats.cache_hits
     products = [assembly(*optimised(made), host()).count("mul") for made in (fresh, cached)]
     assert products[0] == products[1] > 0
-
-
-def _cube_sum(values: FloatArray) -> float:
-    total = 0.0
-    for value in values:
-        total += value * value * value
-    return total

@@ -34,7 +34,6 @@ from replay.mcap.reader import read_recording
 from replay.mcap.recovery import recover, tells_loss
 from runners.command.choices import CONF, store_choices
 from runners.command.program import plain
-from runners.run.compiling import Compiling
 from runners.run.display import Display
 from runners.run.probe_run import Interrupt, run
 from runners.run.recording import make_run_folder
@@ -172,8 +171,7 @@ def quick_session(folder: Path, method_name: str) -> Callable[[Path], None]:
 
     def session(logs: Path) -> None:
         folder = make_run_folder(logs / "probe", scene.object_name, method_name)
-        kernels, display = Compiling(), Display("killed")
-        run(folder, checked, method, scene, started, kernels, Interrupt(), display)
+        run(folder, checked, method, scene, started, Interrupt(), Display("killed"))
 
     return session
 

@@ -90,11 +90,6 @@ class Anchored(ConfiguredMethod[AnchoredSettings]):
         found = Search(problem, self.settings, NullObserver()).minima()
         return found.poses[distinct(problem.sdf, found.poses, _MOST_BASINS)]
 
-    def longest_stage(self, problem: RegistrationProblem) -> None:
-        """A step of fitting, from the first pose of E_0."""
-        search = Search(problem, self.settings, NullObserver())
-        search.refined(search.rated(Poses.of(problem.initial_set[:1])), 1)
-
     def holds(
         self, problem: RegistrationProblem, hypotheses: Hypotheses, object_from_world: FloatArray
     ) -> BoolArray:

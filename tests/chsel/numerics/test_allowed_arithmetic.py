@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from chsel.numerics.kernel_sources import kernel_sources
+from tests.chsel.kernel_files import kernel_files
 
-SOURCES = kernel_sources()
+SOURCES = kernel_files()
 ALLOWED_IN_MATH = {"sqrt", "floor", "ceil", "isfinite", "inf", "pi"}
 ALLOWED_IN_MATH |= {"factorial", "prod"}  # constants, and sizes of arrays
 FORBIDDEN_IN_NUMPY = re.compile(
