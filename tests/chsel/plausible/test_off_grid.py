@@ -76,6 +76,24 @@ def test_a_mode_between_the_poses_of_the_grid_is_found_and_filled() -> None:
     assert found.local[found.world_from_object[:, 2, 3] < -0.08].all()
 
 
+def test_modes_are_far_from_all_members_and_from_each_other() -> None:
+    """Two contacts leave the ball a circle of places, three of which are 8 mm from the grid's."""
+    problem, truth = touched_ball(), np.eye(4)
+    contacts = KnownPoints(known=[[0.06, 0.0, -0.08], [-0.06, 0.0, -0.08]])
+    offsets = replace(NEAR, y=((-0.088, 0.088, 3),), z=((-0.168, -0.08, 2), (0.0, 0.0, 1)))
+    by = replace(SEARCH, grid=replace(SEARCH.grid, offsets=offsets), fill_to=0)
+    found = plausible_set(replace(problem, points=contacts), truth, by)
+    places = found.world_from_object[found.local, :3, 3]
+    assert len(places) >= 3
+    drawn = np.random.default_rng(0).normal(size=(4000, 3))
+    surface = 0.1 * drawn / np.sqrt((drawn**2).sum(axis=1))[:, None]
+    for n, place in enumerate(places):
+        others = np.concatenate([np.delete(places, n, axis=0), truth[None, :3, 3]])
+        moved = surface + place - others[:, None]
+        apart = np.sqrt((moved**2).sum(axis=2)) - 0.1
+        assert np.sqrt((apart**2).mean(axis=1)).min() > 0.9 * 0.01  # the separation
+
+
 def test_a_mode_that_is_ruled_out_is_not_found() -> None:
     """By one free point in it; or as it is farther outside of the grid than the separation."""
     seen_through = touched_ball(free=OTHER[None])
