@@ -270,8 +270,9 @@ def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
     beyond, cell, total = buffer.beyond, buffer.cell, buffer.total
     first, last, most, inverse = box.first, box.last, box.most, box.inverse
     x, y, z = buffer.points[0, m], buffer.points[1, m], buffer.points[2, m]
+    us, vs, ws = shifts[0, start:], shifts[1, start:], shifts[2, start:]
     for i in range(_LANES):
-        a, b, c = x + shifts[0, start + i], y + shifts[1, start + i], z + shifts[2, start + i]
+        a, b, c = x + us[i], y + vs[i], z + ws[i]
         d = min(max(first[0], a), last[0])
         e = min(max(first[1], b), last[1])
         f = min(max(first[2], c), last[2])

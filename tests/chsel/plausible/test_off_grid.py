@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.evaluation_cost import EvaluationCost
+from chsel.plausible.off_grid import stepped
 from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import (
@@ -30,6 +32,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from tests.chsel.plausible.scenes import WORKSPACE, ball
+from tests.chsel.samples import random_poses
 
 OTHER = np.array([0.0, 0.0, -0.16])  # where the ball may be as well
 # The positions nearest to it are 8 mm off, along z.
@@ -92,6 +95,16 @@ def test_modes_are_far_from_all_members_and_from_each_other() -> None:
         moved = surface + place - others[:, None]
         apart = np.sqrt((moved**2).sum(axis=2)) - 0.1
         assert np.sqrt((apart**2).mean(axis=1)).min() > 0.9 * 0.01  # the separation
+
+
+def test_steps_move_poses_and_turn_them_about_their_origins() -> None:
+    stream = np.random.default_rng(1)
+    poses, shifts, turns = random_poses(stream, 20, 2.0), *stream.normal(size=(2, 20, 3))
+    turns[7] = 0.0
+    found = stepped(poses, shifts, turns)
+    expected = Rotation.from_rotvec(turns) * Rotation.from_matrix(poses[:, :3, :3])
+    np.testing.assert_allclose(found[:, :3, :3], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_array_equal(found[:, :3, 3], poses[:, :3, 3] + shifts)
 
 
 def test_a_mode_that_is_ruled_out_is_not_found() -> None:
