@@ -36,7 +36,7 @@ _CAPACITY = 50_000  # poses that a thread finds before it hands them over, at le
 _ROTATIONS_PER_THREAD = 200
 _MOST_INFORMATIVE = 256  # known points that are put in order
 _ROUNDING = 1e-9  # share of a sum that is more than rounding changes
-_LEAST_OUTWARD = 1e-9
+_LEAST_OUTWARD = 1e-9  # of a gradient along the normal of a face, so that rounding is no matter
 _LANES = 32  # positions that are looked at together
 
 
