@@ -90,10 +90,7 @@ class EvaluationCost:
 
     def evaluate(self, object_from_world: FloatArray, *, limit: float = np.inf) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for those not below `limit`."""
-        return self.of_poses(Poses.of(object_from_world), limit=limit)
-
-    def of_poses(self, poses: Poses, *, limit: float = np.inf) -> FloatArray:
-        """Costs (B,) of poses; infinite for those not below `limit`."""
+        poses = Poses.of(object_from_world)
         costs = np.empty(len(poses))
 
         def run(first: int, last: int, scratch: Candidates) -> None:

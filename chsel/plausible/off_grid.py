@@ -19,9 +19,8 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import ModeSearchSettings
 from chsel.plausible.pose_scan import MOST_MEMBERS, PoseGrid, plausible_stream, scan_grid
-from chsel.plausible.random_steps import stepped
 from chsel.plausible.surface_distance import SQUARE_MILLIMETRES, DistanceSettings, SurfaceDistance
-from chsel.problem.poses import Poses, inverse
+from chsel.problem.poses import Poses, compose, inverse, product, rotation_vector
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import SE3Space
 from chsel.problem.streams import normals, uniforms
@@ -77,8 +76,8 @@ def local_members(
         stream = plausible_stream(seed, 2 + n)
         steps = normals(stream, (_DRAWN, 6)) * scale
         starts = pool[np.floor(uniforms(stream, 0.0, float(len(pool)), _DRAWN)).astype(int)]
-        drawn, to_object = stepped(starts, steps, _POSITION, _ANGLE)
-        drawn_costs = cost.of_poses(to_object, limit=limit)
+        drawn = stepped(starts, _POSITION * steps[:, :3], _ANGLE * steps[:, 3:])
+        drawn_costs = cost.evaluate(inverse(drawn), limit=limit)
         good = drawn_costs < limit
         pool = np.concatenate([pool, drawn[good]])
         costs = np.concatenate([costs, drawn_costs[good]])
@@ -89,6 +88,15 @@ def local_members(
     places = _places(pool, cost.problem.sdf)
     chosen = np.sort(farthest_points(places, known + wanted, given=known))[known:]
     return pool[chosen], costs[chosen - known]
+
+
+def stepped(poses: FloatArray, shifts: FloatArray, turns: FloatArray) -> FloatArray:
+    """Poses (..., 4, 4) moved by shifts (..., 3), turned about their origins by vectors (..., 3).
+
+    The latter are rotation vectors about the axes of the world.
+    """
+    rotation = product(rotation_vector(turns), poses[..., :3, :3])
+    return compose(rotation, poses[..., :3, 3] + shifts)
 
 
 def _places(poses: FloatArray, sdf: SdfGrid) -> FloatArray:
@@ -178,10 +186,9 @@ def _climbed(
         stream = plausible_stream(seed, _MODE_STREAM + 2 + n)
         steps = normals(stream, (len(climbing), _CLIMB_DRAWN, 6)) * scale[climbing, None, None]
         steps *= uniforms(stream, 0.05, 1.0, (len(climbing), _CLIMB_DRAWN, 1))
-        starts = np.repeat(poses[climbing], _CLIMB_DRAWN, axis=0)
-        drawn, to_object = stepped(starts, steps.reshape(-1, 6), _CLIMB_POSITION, _CLIMB_ANGLE)
-        drawn = drawn.reshape(-1, _CLIMB_DRAWN, 4, 4)
-        drawn_costs = cost.of_poses(to_object).reshape(-1, _CLIMB_DRAWN)
+        shifts, turns = _CLIMB_POSITION * steps[..., :3], _CLIMB_ANGLE * steps[..., 3:]
+        drawn = stepped(poses[climbing, None], shifts, turns)
+        drawn_costs = cost.evaluate(inverse(drawn).reshape(-1, 4, 4)).reshape(-1, _CLIMB_DRAWN)
         rows, best = np.arange(len(climbing)), np.argmin(drawn_costs, axis=1)
         better = drawn_costs[rows, best] < costs[climbing]
         scale[climbing[~better]] *= _CLIMB_SHRINK

@@ -86,7 +86,7 @@ def plausible_set(
         _check_survivors(survivors, problem, truth, settings, seed)
         costs = cost.evaluate(inverse(grid.poses(survivors.index)), limit=limit)
         index, costs = survivors.index[costs < limit], costs[costs < limit]
-    kept = _subset(len(index), settings.members - 1, seed)
+    kept = random_subset(len(index), settings.members - 1, plausible_stream(seed, 1))
     poses = grid.poses(index[kept])
     others = ~(poses == truth).all(axis=(1, 2))  # a grid may hold the true pose itself
     members = PlausibleSet(
@@ -127,11 +127,6 @@ def _check_survivors(
         )
 
 
-def _subset(count: int, most: int, seed: int) -> IntArray:
-    """Which members are kept for evaluation: the same ones wherever it runs."""
-    return random_subset(count, most, plausible_stream(seed, 1))
-
-
 def _with_modes(
     members: PlausibleSet, cost: EvaluationCost, grid: PoseGrid, limit: float
 ) -> PlausibleSet:
@@ -147,7 +142,7 @@ def _with_modes(
         most=max(most - count, most // 2),
         seed=members.seed,
     )
-    others = _subset(count - 1, most - 1 - len(poses), members.seed) + 1
+    others = random_subset(count - 1, most - 1 - len(poses), plausible_stream(members.seed, 1)) + 1
     kept = np.concatenate([[0], others])
     on_grid = replace(
         members,

@@ -1,25 +1,33 @@
 """A grid of poses around the true one, and all its poses that cost less than a limit.
 
-A block of positions is skipped if a lower bound of what the known points cost anywhere in it is
-too high. Bounds allow for rounding, and every pose that remains gets its exact cost.
+A pose is rejected as soon as what the first known points cost at least is too much. Bounds allow
+for rounding, and every pose that remains gets its exact cost.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from chsel.errors import EvaluationError
 from chsel.numerics.arrays import FloatArray, IntArray
-from chsel.numerics.octree import rounding_margin
+from chsel.numerics.cell_set import node_of
+from chsel.numerics.compiler import compiled, leaf
+from chsel.numerics.octree import Candidates
+from chsel.numerics.pose_tuples import pose_at, turned
 from chsel.numerics.threads import spread
-from chsel.plausible.evaluation_cost import EvaluationCost
+from chsel.plausible.evaluation_cost import (
+    EvaluationCost,
+    EvaluationModel,
+    cost_below,
+    scratch_for,
+)
 from chsel.plausible.plausible_settings import Offsets, PoseGridSettings
-from chsel.plausible.position_blocks import Blocks, blocks_of, bounds_of
-from chsel.plausible.scan_kernels import Scan, ScanBuffer, scan_buffer, scan_rotations
-from chsel.problem.poses import axis_angle, compose, random_rotations
+from chsel.problem.poses import Poses, axis_angle, compose, inverse, random_rotations
+from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from chsel.problem.subset import farthest_points
 
@@ -27,8 +35,9 @@ MOST_MEMBERS = 2_000_000
 _CAPACITY = 50_000  # poses that a thread finds before it hands them over, at least
 _ROTATIONS_PER_THREAD = 200
 _MOST_INFORMATIVE = 256  # known points that are put in order
-_ROUNDING = 1e-6  # more than a few numbers of 32 bits are rounded by, of the greatest
-_SLACK = 1e-3  # cells of the SDF grid that rounding may move a point
+_ROUNDING = 1e-9  # share of a sum that is more than rounding changes
+_LEAST_OUTWARD = 1e-9  # of a gradient along the normal of a face, so that rounding is no matter
+_LANES = 32  # positions that are looked at together
 
 
 def plausible_stream(seed: int, index: int = 0) -> np.random.Generator:
@@ -87,39 +96,19 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
 
     Raises EvaluationError if there are more than MOST_MEMBERS.
     """
-    points, settings = cost.problem.points, cost.settings
-    margin = rounding_margin(
-        np.concatenate([grid.positions.reshape(-1), points.all_points().reshape(-1)])
-    )
-    blocks = _blocks(grid.offsets, margin)
+    points, count = cost.problem.points, len(grid.positions)
     order = _most_informative_first(points.known)
-    known, values = points.known[order] - grid.centre, points.sdf[order]
-    sdf, slack = cost.problem.sdf, _SLACK
-    parts = known, blocks.centres, sdf.bounds
-    farthest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
-    while slack * sdf.resolution < _ROUNDING * farthest:
-        slack *= 2.0
-    known_limit = limit * cost.model.divisors.known + 10.0 * margin * len(order)
-    rounding = len(order) * _ROUNDING
+    margin = _ROUNDING * (limit * cost.model.divisors.known + np.abs(points.sdf).sum())
     scan = Scan(
         model=cost.model,
-        blocks=blocks,
-        bounds=bounds_of(
-            sdf,
-            settings.lookup,
-            settings.outside,
-            blocks.radii,
-            value=float(values[0]) if (values == values[:1]).all() and len(order) else None,
-            slack=slack,
-        ),
-        rotations=np.swapaxes(grid.rotations, 1, 2).reshape(-1, 9),
+        bounds=_bounds(cost.problem.sdf, cost.settings.lookup),
+        beyond=_beyond(cost.problem.sdf, cost.settings.outside),
+        rotations=Poses.of(inverse(compose(grid.rotations, np.zeros(3)))).numbers,
         positions=grid.positions,
-        known=known.T.copy(),
-        known_sdf=values.astype(np.float32),
+        known=points.known[order].T.copy(),
+        known_sdf=points.sdf[order],
         limit=limit,
-        known_limit=np.float32(
-            known_limit * (1.0 + rounding) + rounding * np.abs(values).max(initial=0.0)
-        ),
+        known_limit=limit * cost.model.divisors.known + margin,
     )
     found: dict[int, list[tuple[IntArray, FloatArray]]] = {}
     total = [0]
@@ -127,19 +116,28 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
     def run(first: int, last: int, buffer: ScanBuffer) -> None:
         pieces = found[first] = []
         while first < last and total[0] <= MOST_MEMBERS:
-            first, count = scan_rotations(scan, first, last, buffer)
-            pieces.append((buffer.pose[:count].copy(), buffer.cost[:count].copy()))
-            total[0] += count
+            first, filled = scan_rotations(scan, first, last, buffer)
+            pieces.append((buffer.pose[:filled].copy(), buffer.cost[:filled].copy()))
+            total[0] += filled
 
-    capacity = len(grid.positions) + _CAPACITY
-    make_buffer = partial(scan_buffer, scan, capacity)
+    def make_buffer() -> ScanBuffer:
+        return ScanBuffer(
+            cost_scratch=scratch_for(cost.model),
+            points=np.empty((3, len(order))),
+            shifts=np.zeros((3, count + _LANES)),
+            total=np.empty(_LANES),
+            beyond=np.empty(_LANES),
+            cell=np.empty(_LANES, dtype=np.int32),
+            pose=np.empty(count + _CAPACITY, dtype=np.int64),
+            cost=np.empty(count + _CAPACITY),
+        )
+
     spread(run, len(grid.rotations), make_buffer, least=_ROTATIONS_PER_THREAD)
     pieces = [piece for first in sorted(found) for piece in found[first]]
     index = np.concatenate([piece[0] for piece in pieces])
     if len(index) > MOST_MEMBERS:
         raise EvaluationError(_too_many(cost, limit))
-    ascending = np.argsort(index, kind="stable")
-    return index[ascending], np.concatenate([piece[1] for piece in pieces])[ascending]
+    return index, np.concatenate([piece[1] for piece in pieces])
 
 
 def _too_many(cost: EvaluationCost, limit: float) -> str:
@@ -150,13 +148,144 @@ def _too_many(cost: EvaluationCost, limit: float) -> str:
     return text + "; accepted: more known points, a smaller epsilon or a larger cost.tolerance"
 
 
-@lru_cache(maxsize=8)
-def _blocks(offsets: Offsets, margin: float) -> Blocks:
-    return blocks_of(offsets.points(), margin)
-
-
 def _most_informative_first(known: FloatArray) -> IntArray:
     """Known points, each far from those before it, then at random: to reject poses early."""
     first = farthest_points(known, _MOST_INFORMATIVE)
     rest = np.argsort(uniforms(plausible_stream(0), 0.0, 1.0, len(known)), kind="stable")
     return np.concatenate([first, rest[~np.isin(rest, first)]])
+
+
+def _bounds(sdf: SdfGrid, lookup: str) -> FloatArray:
+    """The least and the greatest distance (2, nodes) that the cell of each node reads, m."""
+    values = sdf.values
+    if lookup == "nearest":
+        return np.stack([values, values]).reshape(2, -1)
+    ends = np.pad(values, [(0, 1)] * 3, mode="edge")
+    nx, ny, nz = sdf.shape
+    corners = [ends[i : i + nx, j : j + ny, k : k + nz] for i, j, k in np.ndindex(2, 2, 2)]
+    rounding = 1e-12 * (1.0 + np.abs(values).max())  # of interpolation
+    least, greatest = np.minimum.reduce(corners), np.maximum.reduce(corners)
+    return np.stack([least - rounding, greatest + rounding]).reshape(2, -1)
+
+
+def _beyond(sdf: SdfGrid, outside: str) -> tuple[float, float]:
+    """Weights (w, u) of d^2 and s^2 in the least squared distance beyond the grid.
+
+    d: to its box; s: what its nearest point reads. With gradients that point out of the box, the
+    way to the surface is at least as long as both together; with others, it may be of any length.
+    """
+    if outside == "bounding_box":
+        return 1.0, 0.0
+    for axis in range(3):
+        for end, sign in ((0, -1.0), (-1, 1.0)):
+            face = np.take(sdf.gradients[..., axis], end, axis=axis)
+            if (sign * face).min() <= _LEAST_OUTWARD:
+                return 0.0, 0.0
+    return 1.0, 1.0
+
+
+class Scan(NamedTuple):
+    """All that a scan reads: every rotation with every position."""
+
+    model: EvaluationModel
+    bounds: FloatArray  # (2, nodes), see _bounds
+    beyond: tuple[float, float]  # see _beyond
+    rotations: FloatArray  # (R, 12), object_from_world, of poses at the origin
+    positions: FloatArray  # (P, 3), world
+    known: FloatArray  # (3, M), world, the most informative first
+    known_sdf: FloatArray  # (M,), m
+    limit: float  # costs are below it
+    known_limit: float  # more than the sum over known points of any such pose, m
+
+
+class ScanBuffer(NamedTuple):
+    """Scratch of one thread, and the poses below the limit that it collects."""
+
+    cost_scratch: Candidates
+    points: FloatArray  # (3, M) turned known points, m
+    shifts: FloatArray  # (3, P + _LANES) translations of poses, m
+    total: FloatArray  # (_LANES,) lower bounds of sums over known points, m
+    beyond: FloatArray  # (_LANES,) squared distances to the box of the grid, m^2
+    cell: Any  # (_LANES,) int32
+    pose: IntArray  # (C,) numbers of poses
+    cost: FloatArray  # (C,)
+
+
+@compiled
+def scan_rotations(scan: Scan, first: int, last: int, buffer: ScanBuffer) -> tuple[int, int]:
+    """Collect the poses below the limit, of rotations from `first` to before `last`.
+
+    Returns the rotation to go on with, which is less than `last` where the buffer may be too small
+    for it, and the number of poses in the buffer.
+    """
+    known, positions = scan.known, scan.positions
+    points, shifts, total, count = buffer.points, buffer.shifts, buffer.total, 0
+    for n in range(first, last):
+        if len(buffer.pose) - count < len(positions):
+            return n, count
+        rotation = pose_at(scan.rotations, n)
+        for m in range(known.shape[1]):
+            x, y, z = turned(rotation, known[0, m], known[1, m], known[2, m])
+            points[0, m], points[1, m], points[2, m] = x, y, z
+        for i in range(len(positions)):
+            x, y, z = turned(rotation, positions[i, 0], positions[i, 1], positions[i, 2])
+            shifts[0, i], shifts[1, i], shifts[2, i] = -x, -y, -z
+        for start in range(0, len(positions), _LANES):
+            if not _may_be_below(scan, buffer, start):
+                continue
+            for i in range(start, min(start + _LANES, len(positions))):
+                if total[i - start] <= scan.known_limit:
+                    pose = (*rotation[:9], shifts[0, i], shifts[1, i], shifts[2, i])
+                    cost = cost_below(scan.model, pose, scan.limit, buffer.cost_scratch)
+                    if cost < scan.limit:
+                        buffer.pose[count] = n * len(positions) + i
+                        buffer.cost[count] = cost
+                        count += 1
+    return last, count
+
+
+@leaf
+def _may_be_below(scan: Scan, buffer: ScanBuffer, start: int) -> bool:
+    """Fill buffer.total for positions from `start` on; False as soon as all are too high."""
+    total = buffer.total
+    for i in range(_LANES):
+        total[i] = 0.0
+    for m in range(buffer.points.shape[1]):
+        _add_bounds(scan, buffer, start, m)
+        left = 0
+        for i in range(_LANES):
+            left += 1 if total[i] <= scan.known_limit else 0
+        if left == 0:
+            return False
+    return True
+
+
+@leaf
+def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
+    """Add what the m-th known point costs at least at positions from `start` on.
+
+    Its place in the grid is that of the exact cost, to the bit.
+    """
+    box, bounds, shifts = scan.model.field.box, scan.bounds, buffer.shifts
+    beyond, cell, total = buffer.beyond, buffer.cell, buffer.total
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    x, y, z = buffer.points[0, m], buffer.points[1, m], buffer.points[2, m]
+    us, vs, ws = shifts[0, start:], shifts[1, start:], shifts[2, start:]
+    for i in range(_LANES):
+        a, b, c = x + us[i], y + vs[i], z + ws[i]
+        d = min(max(first[0], a), last[0])
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
+        beyond[i] = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        d = node_of((d - first[0]) * inverse, box.between, most[0])
+        e = node_of((e - first[1]) * inverse, box.between, most[1])
+        f = node_of((f - first[2]) * inverse, box.between, most[2])
+        cell[i] = np.int32(d * box.across + e * box.along + f)
+    value, weights = scan.known_sdf[m], scan.beyond
+    for i in range(_LANES):
+        at = np.uint64(cell[i])
+        least, greatest = bounds[0, at], bounds[1, at]
+        inside = max(least - value, value - greatest)
+        least = max(least, 0.0)
+        outside = np.sqrt(weights[0] * beyond[i] + weights[1] * (least * least)) - value
+        total[i] += max(outside if beyond[i] > 0.0 else inside, 0.0)

@@ -9,7 +9,7 @@ surface; one-directional, s the distance to the mesh (CHSEL, Sec. V).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -97,18 +97,15 @@ class SurfaceDistance:
     def _by_grid(self, to_object: FloatArray, to_world: FloatArray) -> FloatArray:
         """All distances (B, P) by the grid, of poses (B, 12) and (P, 12)."""
         total = np.zeros((len(to_object), len(to_world)))
-        for back in self._directions:
-            total += self._mean_squares(PosePairs(to_object, to_world, back))
-        return total * (SQUARE_MILLIMETRES / len(self._directions))
-
-    def _mean_squares(self, pairs: PosePairs) -> FloatArray:
-        out = np.empty((len(pairs.to_object), len(pairs.to_world)))
 
         def run(first: int, last: int, places: Places) -> None:
-            mean_squares(self._field, self._points, pairs, out, first, last, places)
+            for back in self._directions:
+                add_mean_squares(
+                    self._field, self._points, to_object, to_world, back, total, first, last, places
+                )
 
-        spread(run, len(out), lambda: places_for(self._points.shape[1]))
-        return out
+        spread(run, len(total), lambda: places_for(self._points.shape[1]))
+        return total * (SQUARE_MILLIMETRES / len(self._directions))
 
     def _exact(
         self, to_object: FloatArray, to_world: FloatArray, rows: IntArray, columns: IntArray
@@ -167,34 +164,32 @@ def _nearest(distances: FloatArray) -> tuple[IntArray, IntArray]:
     return rows, columns
 
 
-class PosePairs(NamedTuple):
-    """Every estimate with every plausible pose: how they move points of the object."""
-
-    to_object: FloatArray  # (B, 12), object_from_world
-    to_world: FloatArray  # (P, 12), world_from_object
-    back: bool  # by the inverse of both instead
-
-
 @compiled
-def mean_squares(
+def add_mean_squares(
     field: DistanceField,
     points: FloatArray,
-    pairs: PosePairs,
+    to_object: FloatArray,
+    to_world: FloatArray,
+    back: bool,
     out: FloatArray,
     first: int,
     last: int,
     places: Places,
 ) -> None:
-    """Fill out (B, P) with the mean of s^2 over moved points (3, Q), m^2, in rows first to last."""
+    """Add the means of s^2 over moved points (3, Q), m^2, to rows first to last of out (B, P).
+
+    Points are moved by every pose of to_world (P, 12), then by every one of to_object (B, 12);
+    back: by the inverse of both instead.
+    """
     xs, ys, zs = points[0], points[1], points[2]
     for b in range(first, last):
-        for p in range(len(pairs.to_world)):
-            move = composed(pose_at(pairs.to_object, b), pose_at(pairs.to_world, p))
-            if pairs.back:
+        for p in range(len(to_world)):
+            move = composed(pose_at(to_object, b), pose_at(to_world, p))
+            if back:
                 move = inverted(move)
             locate(move, field.box, xs, ys, zs, places, len(xs))
             total = 0.0
             for n in range(len(xs)):
                 s = distance_in_place(field, move, xs[n], ys[n], zs[n], places, n)[0]
                 total += s * s
-            out[b, p] = total / len(xs)
+            out[b, p] += total / len(xs)

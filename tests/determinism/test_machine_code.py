@@ -19,7 +19,6 @@ from chsel.numerics.compiler import compiled
 from chsel.numerics.elementary import _remainder
 from chsel.plausible.plausible_set import plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings, PoseGridSettings
-from chsel.plausible.random_steps import stepped
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import Purpose, StreamKey
@@ -85,7 +84,6 @@ def code() -> dict[str, str]:
     poses = PoseGridSettings(rotations=5, upright=2)
     members = plausible_set(problem, first[0], PlausibleSettings(epsilon=10.0, grid=poses))
     trust_in(problem, hypotheses_at(first))
-    stepped(first, np.zeros((1, 6)), 0.01, 0.1)
     surface = surface_points(where.sdf, 4, key.stream(Purpose.METRIC_POINTS))
     for method in ("grid", "exact"):
         settings = DistanceSettings(method=method)

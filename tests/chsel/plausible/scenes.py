@@ -38,13 +38,21 @@ def box(half: FloatArray, resolution: float = RESOLUTION) -> SdfGrid:
 
 
 def noise(stream: np.random.Generator) -> SdfGrid:
-    """Numbers that are no distance to anything, but for a border that is outside."""
+    """Numbers that are no distance to anything, but for a border that is outside.
+
+    On most faces of the border, gradients point out of it.
+    """
     shape = tuple(stream.integers(4, 9, 3))
     values = stream.normal(0.0, 0.05, shape)
     border = np.ones(shape, dtype=bool)
     border[1:-1, 1:-1, 1:-1] = False
     values[border] = np.abs(values[border]) + 1e-3
     gradients = stream.normal(size=(*shape, 3))
+    for axis in range(3):
+        normals = np.moveaxis(gradients[..., axis], axis, 0)
+        for end, sign in ((0, -1.0), (-1, 1.0)):
+            if stream.uniform() < 0.9:
+                normals[end] = sign * np.abs(normals[end])
     return SdfGrid(stream.uniform(-0.1, 0.0, 3), 0.03, values, gradients)
 
 

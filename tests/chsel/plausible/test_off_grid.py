@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.evaluation_cost import EvaluationCost
+from chsel.plausible.off_grid import stepped
 from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import (
@@ -30,6 +32,7 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from tests.chsel.plausible.scenes import WORKSPACE, ball
+from tests.chsel.samples import random_poses
 
 OTHER = np.array([0.0, 0.0, -0.16])  # where the ball may be as well
 # The positions nearest to it are 8 mm off, along z.
@@ -74,6 +77,34 @@ def test_a_mode_between_the_poses_of_the_grid_is_found_and_filled() -> None:
     on_grid = found.world_from_object[~found.local]
     np.testing.assert_array_equal(on_grid, plain.world_from_object[~plain.local])
     assert found.local[found.world_from_object[:, 2, 3] < -0.08].all()
+
+
+def test_modes_are_far_from_all_members_and_from_each_other() -> None:
+    """Two contacts leave the ball a circle of places, three of which are 8 mm from the grid's."""
+    problem, truth = touched_ball(), np.eye(4)
+    contacts = KnownPoints(known=[[0.06, 0.0, -0.08], [-0.06, 0.0, -0.08]])
+    offsets = replace(NEAR, y=((-0.088, 0.088, 3),), z=((-0.168, -0.08, 2), (0.0, 0.0, 1)))
+    by = replace(SEARCH, grid=replace(SEARCH.grid, offsets=offsets), fill_to=0)
+    found = plausible_set(replace(problem, points=contacts), truth, by)
+    places = found.world_from_object[found.local, :3, 3]
+    assert len(places) >= 3
+    drawn = np.random.default_rng(0).normal(size=(4000, 3))
+    surface = 0.1 * drawn / np.sqrt((drawn**2).sum(axis=1))[:, None]
+    for n, place in enumerate(places):
+        others = np.concatenate([np.delete(places, n, axis=0), truth[None, :3, 3]])
+        moved = surface + place - others[:, None]
+        apart = np.sqrt((moved**2).sum(axis=2)) - 0.1
+        assert np.sqrt((apart**2).mean(axis=1)).min() > 0.9 * 0.01  # the separation
+
+
+def test_steps_move_poses_and_turn_them_about_their_origins() -> None:
+    stream = np.random.default_rng(1)
+    poses, shifts, turns = random_poses(stream, 20, 2.0), *stream.normal(size=(2, 20, 3))
+    turns[7] = 0.0
+    found = stepped(poses, shifts, turns)
+    expected = Rotation.from_rotvec(turns) * Rotation.from_matrix(poses[:, :3, :3])
+    np.testing.assert_allclose(found[:, :3, :3], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_array_equal(found[:, :3, 3], poses[:, :3, 3] + shifts)
 
 
 def test_a_mode_that_is_ruled_out_is_not_found() -> None:

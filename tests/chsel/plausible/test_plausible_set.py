@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from chsel.errors import EvaluationError, PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
-from chsel.plausible import pose_scan, position_blocks
+from chsel.plausible import pose_scan
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_set import plausible_set, rotation_seed
 from chsel.plausible.plausible_settings import (
@@ -80,7 +80,6 @@ def brute_force(
     by=costs(),
     far=st.sampled_from([0.0, 0.0, 1e4]),
     share=st.floats(0.0, 0.6),
-    tops=st.sampled_from([1, 8, 48]),
     aligned=st.booleans(),
     value=st.sampled_from([None, 0.0, 0.02]),
 )
@@ -90,7 +89,6 @@ def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
     by: EvaluationCostSettings,
     far: float,
     share: float,
-    tops: int,
     aligned: bool,
     value: float | None,
 ) -> None:
@@ -114,10 +112,7 @@ def test_what_a_scan_finds_is_what_brute_force_finds_to_the_bit(
         close = np.isclose(every[some], brute_force(problem, poses[some], by), rtol=1e-9, atol=1e-9)
         assert close.mean() > 0.99
     limit = float(np.quantile(every, share))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(position_blocks, "_TOPS", tops)
-        pose_scan._blocks.cache_clear()
-        index, found = scan_grid(cost, grid, limit)
+    index, found = scan_grid(cost, grid, limit)
     np.testing.assert_array_equal(index, np.flatnonzero(every < limit))
     np.testing.assert_array_equal(found, every[index])
     below = cost.evaluate(inverse(poses), limit=limit)

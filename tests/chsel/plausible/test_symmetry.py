@@ -11,8 +11,14 @@ import trimesh
 from scipy.optimize import brentq
 
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
-from chsel.plausible.symmetry_search import RotatedSurface, generated
+from chsel.plausible import symmetry
+from chsel.plausible.symmetry import (
+    ObjectSymmetry,
+    RotatedSurface,
+    generated,
+    grid_symmetry,
+    object_symmetry,
+)
 from chsel.problem.mesh import load_mesh
 from chsel.problem.poses import axis_angle, compose, rotation_vector
 from chsel.problem.sdf_grid import SdfGrid
@@ -247,8 +253,6 @@ def test_a_mesh_of_a_million_faces_is_merged_first() -> None:
 
 
 def test_the_same_mesh_gives_the_same_bits() -> None:
-    from chsel.plausible import symmetry
-
     first = object_symmetry(MODELS["spam_can"]())
     symmetry._symmetry.cache_clear()
     second = object_symmetry(MODELS["spam_can"]())
@@ -308,8 +312,8 @@ def test_angles_about_an_axis_are_those_between_axes() -> None:
         rotations=np.array([np.eye(3), half_turn(np.array([0.8, -0.6, 0.0]))]), axis=axis
     )
     about = turns_about(axis, 20_000)
-    for symmetry in (cone, can):
-        all_of_them = (symmetry.rotations[:, None] @ about).reshape(-1, 3, 3)
+    for each in (cone, can):
+        all_of_them = (each.rotations[:, None] @ about).reshape(-1, 3, 3)
         traces = np.einsum("bij,sji->bs", errors, all_of_them)
         expected = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)).min(axis=1)
-        np.testing.assert_allclose(symmetry.rotation_errors(errors), expected, atol=1e-3)
+        np.testing.assert_allclose(each.rotation_errors(errors), expected, atol=1e-3)
