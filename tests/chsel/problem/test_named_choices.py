@@ -10,7 +10,7 @@ import pytest
 from chsel.errors import SettingError
 from chsel.policies.policies import _lacks
 from chsel.policies.policy import ConfiguredPolicy, PolicySettings
-from chsel.problem.named_choices import NamedChoices
+from chsel.problem.settings import NamedChoices
 
 POLICY = """
 from dataclasses import dataclass
