@@ -10,8 +10,7 @@ import numpy as np
 
 from chsel.errors import PoseError, require_instance
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.input_checks import require_parts
-from chsel.problem.points import GrowingPoints, KnownPoints, Workspace
+from chsel.problem.points import GrowingPoints, KnownPoints, Workspace, require_parts
 from chsel.problem.poses import (
     axis_angle,
     compose,

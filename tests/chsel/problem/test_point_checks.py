@@ -8,8 +8,14 @@ import trimesh
 
 from chsel.errors import PointsError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.input_checks import check_contacts, check_points
-from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.problem.points import (
+    FreeVoxels,
+    KnownPoints,
+    Lattice,
+    Workspace,
+    check_contacts,
+    check_points,
+)
 
 BOX = trimesh.creation.box((0.2, 0.1, 0.05))
 DIAMETER = float(np.linalg.norm(BOX.extents))  # 0.229 m
