@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from chsel.errors import PointsError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.sensing.contact_patch import contact_mask, contact_subset, deformation, share, smooth
+from chsel.sensing.contact_sensing import contact_mask, contact_subset, deformation, share, smooth
 from chsel.sensing.depth_camera import PinholeCamera
 
 CAMERA = PinholeCamera(224, 171, 200.0, 200.0, 112.0, 85.0)

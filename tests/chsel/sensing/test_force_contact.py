@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from chsel.problem.poses import roll_pitch_yaw
-from chsel.sensing.force_contact import contact_ahead, contact_on_axis
+from chsel.sensing.contact_sensing import contact_ahead, contact_on_axis
 
 BOX = np.asarray(trimesh.creation.box((0.04, 0.06, 0.1)).triangles)
 SPHERE = trimesh.creation.icosphere(4, 0.05)

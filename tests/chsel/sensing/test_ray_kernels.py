@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chsel.sensing.ray_kernels import MarkedVoxels, mark_segments
+from chsel.sensing.free_space import MarkedVoxels, mark_segments
 
 COUNTS = (5, 4, 3)
 LOWER = np.full(3, 0.5)  # so that voxel k is from k to k + 1
