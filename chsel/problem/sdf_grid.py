@@ -55,7 +55,10 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     distance = np.sqrt((away**2).sum(axis=1))
     near = distance < _NORMAL_RANGE
     gradient = away / np.where(near, 1.0, distance)[:, None]
-    gradient[near] = _face_normals(vertices, faces[face[near]])
+    a, b, c = (vertices[faces[face[near], i]] for i in range(3))
+    normal = np.cross(b - a, c - a)  # from positions: normals in a mesh file may differ
+    length = np.sqrt((normal**2).sum(axis=1, keepdims=True))
+    gradient[near] = normal / np.maximum(length, 1e-300)
     return np.asarray(signed, dtype=np.float64), gradient
 
 
@@ -78,7 +81,8 @@ class SdfGrid(ShapesShown):
         if min(values.shape) < 2:
             raise SdfError(f"SDF values have shape {values.shape}; accepted: at least 2 per axis")
         gradients = frozen("SDF gradients", self.gradients, (*values.shape, 3), error=SdfError)
-        if min(float(face.min()) for face in _border(values)) <= 0.0:
+        faces = [np.take(values, end, axis=axis) for axis in range(3) for end in (0, -1)]
+        if min(float(face.min()) for face in faces) <= 0.0:
             raise SdfError(
                 "the border of the SDF grid touches the object; accepted: a grid padded so that "
                 "every node of its border is outside"
@@ -126,9 +130,11 @@ class SdfGrid(ShapesShown):
             )
         origin = np.asarray(mesh.bounds, dtype=np.float64)[0] - padding
         values, gradients = np.empty(math.prod(shape)), np.empty((math.prod(shape), 3))
-        for part in _parts(len(values), len(mesh.faces)):
+        size = max(_PART_NODES, len(mesh.faces) // _PART_FACES)  # prepares the mesh for each part
+        for first in range(0, len(values), size):
             if progress is not None:
-                progress(part.start, len(values))
+                progress(first, len(values))
+            part = slice(first, min(first + size, len(values)))
             nodes = np.stack(np.unravel_index(np.arange(part.start, part.stop), shape), axis=1)
             signed, gradient = mesh_sdf(mesh, origin + nodes * resolution)
             values[part], gradients[part] = _rounded(signed), _rounded(gradient)
@@ -287,28 +293,10 @@ def _shape(mesh: trimesh.Trimesh, resolution: float, padding: float) -> tuple[in
     return tuple(int(n) + 2 for n in np.floor(span / resolution))
 
 
-def _parts(count: int, face_count: int) -> list[slice]:
-    """Parts of so many nodes, so large that preparing the mesh for each costs little."""
-    size = max(_PART_NODES, face_count // _PART_FACES)
-    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
-
-
 def _check_resolution(resolution: float) -> None:
     if not FINEST <= resolution <= COARSEST:
         raise SdfError(f"SDF resolution is {resolution}; accepted: {FINEST:g} to {COARSEST:g} (m)")
 
 
-def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals (F, 3) computed from positions: those in a mesh file may differ."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a)
-    return normal / np.maximum(np.sqrt((normal**2).sum(axis=1, keepdims=True)), 1e-300)
-
-
 def _rounded(values: FloatArray) -> FloatArray:
     return values.astype(np.float32).astype(np.float64) + 0.0  # without negative zeros
-
-
-def _border(values: FloatArray) -> list[FloatArray]:
-    """The six faces of a grid."""
-    return [np.take(values, end, axis=axis) for axis in range(3) for end in (0, -1)]
