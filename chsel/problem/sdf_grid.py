@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from chsel.errors import MeshError, MeshWarning, SdfError, quoted, require_choice, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
+from chsel.numerics.arrays import BoolArray, FloatArray, ShapesShown, digest, frozen
 
 if TYPE_CHECKING:
     import trimesh
@@ -209,8 +209,18 @@ class SdfGrid(ShapesShown):
         points = np.asarray(points, dtype=np.float64)
         first, last = self.bounds
         clamped = np.fmin(np.fmax(points, first), last)
-        read = self._nearest if lookup == "nearest" else self._trilinear
-        value, gradient = read((clamped - first) * (1.0 / self.resolution))
+        cell = (clamped - first) * (1.0 / self.resolution)
+        if lookup == "nearest":
+            rows = self._rows(np.rint(cell))
+        else:
+            base = np.minimum(np.floor(cell), np.array(self.shape) - 2.0)
+            fraction, rows = cell - base, np.zeros((len(cell), 4))
+            sides = (1.0 - fraction, fraction)
+            for corner in np.ndindex(2, 2, 2):
+                i, j, k = corner
+                weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
+                rows = rows + weight[:, None] * self._rows(base + np.array(corner))
+        value, gradient = rows[:, 0].copy(), rows[:, 1:].copy()
         beyond = (clamped != points).any(axis=1)
         if beyond.any():
             away = points[beyond] - clamped[beyond]
@@ -222,30 +232,9 @@ class SdfGrid(ShapesShown):
             gradient[beyond] = away / distance
         return value, gradient
 
-    def _nearest(self, cell: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and gradient at grid coordinates (P, 3) by the nearest node."""
-        index = self._flat(np.rint(cell))
-        return self.values.reshape(-1)[index], self.gradients.reshape(-1, 3)[index]
-
-    def _trilinear(self, cell: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and gradient at grid coordinates (P, 3) by interpolation between 8 nodes."""
-        base = np.minimum(np.floor(cell), np.array(self.shape) - 2.0)
-        fraction = cell - base
-        sides = (1.0 - fraction, fraction)
-        first, (_, ny, nz) = self._flat(base), self.shape
-        values, gradients = self.values.reshape(-1), self.gradients.reshape(-1, 3)
-        value, gradient = np.zeros(len(cell)), np.zeros(cell.shape)
-        for i, j, k in np.ndindex(2, 2, 2):
-            weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
-            index = first + (i * ny + j) * nz + k
-            value = value + weight * values[index]
-            gradient = gradient + weight[:, None] * gradients[index]
-        return value, gradient
-
-    def _flat(self, index: FloatArray) -> IntArray:
-        _, ny, nz = self.shape
-        flat: IntArray = ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).astype(np.int64)
-        return flat
+    def _rows(self, nodes: FloatArray) -> FloatArray:
+        """Value and gradient (P, 4) of nodes (P, 3)."""
+        return self.table[np.ravel_multi_index(tuple(nodes.astype(np.int64).T), self.shape)]
 
 
 def _lengths(vectors: FloatArray) -> FloatArray:
