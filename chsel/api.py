@@ -15,10 +15,9 @@ from chsel.errors import MeshError, PointsError, PointsWarning, quoted, require_
 from chsel.methods import build_method, default_method, noise_of, preset_settings, trust_by
 from chsel.numerics.arrays import frozen
 from chsel.problem.defaults import FREE_RESOLUTION, object_grid, workspace_around
-from chsel.problem.input_checks import check_contacts, check_points, require_parts
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.online_registration import OnlineRegistration
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints, Workspace, check_contacts, check_points, require_parts
 from chsel.problem.registration_problem import Hypotheses, Observer
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.settings import changed_settings
@@ -68,7 +67,7 @@ def register(
     trust them, see `trust_in`; None if an installed method finds no pose.
     Raises ChselError, with what is accepted, for malformed input; at least one point is needed.
     Warns with PointsWarning about points that are hardly meant, and where no hypothesis explains
-    them, see chsel.problem.input_checks and chsel.problem.trust.
+    them, see chsel.problem.points and chsel.problem.trust.
     """
     points = _known_points(surface, free, occupied, known, known_sdf)
     if workspace is not None:

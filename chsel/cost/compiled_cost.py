@@ -21,8 +21,7 @@ from chsel.numerics.pose_tuples import Triple
 from chsel.numerics.rough_tree import rough_tree
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.numerics.voxels import bounds_of
-from chsel.problem.input_checks import require_parts
-from chsel.problem.points import KnownPoints, VoxelGrid
+from chsel.problem.points import KnownPoints, VoxelGrid, require_parts
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid

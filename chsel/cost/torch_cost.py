@@ -12,8 +12,7 @@ from torch import Tensor
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.interior_points import interior_points
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.input_checks import require_parts
-from chsel.problem.points import KnownPoints, VoxelGrid
+from chsel.problem.points import KnownPoints, VoxelGrid, require_parts
 from chsel.problem.poses import stacked
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid

@@ -19,10 +19,9 @@ from chsel.methods.medial_constraint import (
 )
 from chsel.methods.method import Method
 from chsel.methods.svgd import Svgd, SvgdSettings
-from chsel.problem.named_choices import Entry, NamedChoices
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
-from chsel.problem.settings import PRESETS
+from chsel.problem.settings import PRESETS, Entry, NamedChoices
 from chsel.problem.trust import DETERMINED, MANY_CONTACTS, SENSOR_NOISE, has_pose, trust_in
 
 _OURS: dict[str, Entry[Method]] = {

@@ -73,7 +73,8 @@ def first_contacts(
     count, front = len(poses), hand.front
     travel = np.full((count, len(actions)), np.inf)
     contact = np.zeros((count, len(actions), 3))
-    width = 2.0 * _radius(points)
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    width = 2.0 * float(np.sqrt(((points - middle) ** 2).sum(axis=1).max()))
     cell = max(_CELL, width / _MOST_CELLS)
     size = int(width / cell) + 3
     groups = list(moves_by_orientation(actions))
@@ -108,12 +109,6 @@ def _touched_points(sdf: SdfGrid) -> TouchedPoints:
     order = np.argsort(owner, kind="stable")
     first = np.searchsorted(owner[order], np.arange(len(points) + 1))
     return TouchedPoints(points, np.ascontiguousarray(fine[order]), first)
-
-
-def _radius(points: FloatArray) -> float:
-    """The largest distance of points (N, 3) from the middle of their bounds, metres."""
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    return float(np.sqrt(((points - middle) ** 2).sum(axis=1).max()))
 
 
 def moves_by_orientation(actions: Actions) -> Iterator[Moves]:

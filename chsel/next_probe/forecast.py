@@ -1,25 +1,106 @@
-"""What each action would show if the belief is right, and how much would be known after it."""
+"""What is believed of the pose, what each action would show of it, and how surprising that is."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import DecisionProblem
+from chsel.next_probe.decision_problem import Belief, Decision, DecisionProblem
 from chsel.next_probe.first_contact import FirstContacts, first_contacts
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.threads import spread
-from chsel.problem.outline import in_order, outline_distances, surface_spread
-from chsel.problem.poses import Poses
+from chsel.problem.outline import (
+    in_order,
+    outline_distances,
+    outline_in_world,
+    signed_distances,
+    surface_spread,
+)
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import Poses, compose, inverse, random_rotations, rotated
+from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
+from chsel.problem.streams import Purpose, StreamKey, uniforms
+from chsel.problem.subset import evenly_spaced
+from chsel.problem.surface import object_centre
 
+MOST_POSES = 2000
+_DRAWN = 1000  # poses before any registration, of which those that free space allows are kept
+_SOME_FREE = 2000  # free points that rule most of these out, before all are compared
 _FARTHEST = 60.0  # exponents beyond count as zero
 _UNLIKE = 0.01  # overlap of a hit with a miss: a sensor may err
+_NONE_OF_THESE = 0.05  # weight of all that the belief leaves out
+_ANY_OUTCOME = 0.01  # chance of what happened if none of the poses is right
+_WRONG = 0.001  # likelihood of a hit where a pose forecasts a miss, and the other way round
+
+
+@dataclass(frozen=True)
+class BeliefSettings(CheckedSettings):
+    """Which poses a decision weighs up."""
+
+    poses: Annotated[int, positive, at_most(MOST_POSES)] = 100  # K, at most
+    # Height in the world of the floor that the object lies on, metres; None: it may be anywhere.
+    floor: float | None = 0.0
+
+
+def belief_after(hypotheses: Hypotheses, settings: BeliefSettings) -> Belief:
+    """The candidates of a registration, or its hypotheses if it has none; all weigh the same."""
+    poses = hypotheses.candidates
+    if len(poses) == 0:
+        poses = hypotheses.object_from_world[~hypotheses.duplicate]
+    poses = poses[evenly_spaced(len(poses), settings.poses)]
+    return Belief(poses, np.full(len(poses), 1.0 / len(poses)))
+
+
+def belief_before(
+    sdf: SdfGrid,
+    points: KnownPoints,
+    workspace: Workspace,
+    key: StreamKey,
+    settings: BeliefSettings,
+) -> Belief:
+    """Poses with the object's centre in the workspace, turned any way, that free points allow.
+
+    The first of those drawn that free space does not enter by more than its grid's resolution; if
+    they are too few, those that it enters least.
+    """
+    stream = key.stream(Purpose.PRIOR_BELIEF)
+    rotation = random_rotations(stream, _DRAWN)  # world_from_object
+    centre = uniforms(stream, workspace.lower, workspace.upper, (_DRAWN, 3))
+    position = centre - rotated(rotation, object_centre(sdf))
+    poses = Poses.of(inverse(compose(rotation, position)))
+    if settings.floor is not None:
+        position[:, 2] -= heights(sdf, poses, settings.floor)
+        poses = Poses.of(inverse(compose(rotation, position)))
+    free = points.free
+    depth = _depths(sdf, poses, free[evenly_spaced(len(free), _SOME_FREE)])
+    missing = settings.poses
+    for n in np.flatnonzero(depth <= sdf.resolution):
+        if missing == 0:
+            break
+        depth[n] = _depths(sdf, poses[n : n + 1], free)[0]
+        missing -= depth[n] <= sdf.resolution
+    order = np.argsort(depth, kind="stable")[: settings.poses]
+    return Belief(poses.matrices[order], np.full(len(order), 1.0 / len(order)))
+
+
+def _depths(sdf: SdfGrid, poses: Poses, free: FloatArray) -> FloatArray:
+    """Depth (B,) of the deepest of free points (N, 3), metres, at least the resolution."""
+    deepest: FloatArray = -signed_distances(sdf, poses, free).min(axis=1, initial=np.inf)
+    return np.maximum(deepest, sdf.resolution)
+
+
+def heights(sdf: SdfGrid, poses: Poses, floor: float) -> FloatArray:
+    """How far the object's lowest point is above the floor (B,) in each pose, metres."""
+    lowest: FloatArray = outline_in_world(sdf, poses)[..., 2].min(axis=1) - floor
+    return lowest
 
 
 class _Gains(NamedTuple):
@@ -66,10 +147,7 @@ class Forecast:
 
     @cached_property
     def distances(self) -> FloatArray:
-        """How far the surface in one pose is from that in another (K, K), metres.
-
-        See `outline_distances`.
-        """
+        """How far the surface in one pose is from that in another (K, K), metres."""
         poses = Poses.of(self.problem.belief.object_from_world)
         return outline_distances(self.problem.sdf, poses)
 
@@ -150,3 +228,61 @@ def overlap(
         gains.expected_spread[a] = np.sqrt(left)
         gains.loss[a] = loss
         gains.surviving[a] = surviving
+
+
+@dataclass(frozen=True)
+class SurpriseSettings(CheckedSettings):
+    """What follows from an outcome that no pose of the belief has forecast."""
+
+    # Above so many nats the next registration starts afresh, with so many times the hypotheses.
+    limit: Annotated[float, not_negative] = 6.0
+    larger: Annotated[int, positive, at_most(100)] = 3
+
+
+def surprise(
+    problem: DecisionProblem, decision: Decision, noise: float, contact: FloatArray | None
+) -> float:
+    """-ln of the chance that was forecast for the outcome of the chosen action, nats.
+
+    contact (3,): where the hand has met the object, world frame, metres; None if it has not.
+    noise: of contacts, metres. Places within the scatter of the forecast contacts, and within the
+    noise, are as likely as each other; the chance of a place farther off falls like a Gaussian. 6.5
+    is the most: no pose had forecast anything like it.
+    """
+    met = contact is not None
+    place = np.zeros(3) if contact is None else np.array(contact, dtype=np.float64)
+    weights, contacts = np.array(problem.belief.weights), np.array(decision.contacts)
+    return float(_nats(weights, contacts, met, place, float(noise)))
+
+
+@compiled
+def _nats(weights: Any, contacts: Any, met: Any, place: Any, noise: Any) -> Any:
+    """`surprise` of forecast contacts (K, 3), NaN for a miss, and a place (3,)."""
+    hit, mean_x, mean_y, mean_z = 0.0, 0.0, 0.0, 0.0
+    for k in range(len(weights)):
+        if contacts[k, 0] == contacts[k, 0]:
+            hit += weights[k]
+            mean_x += weights[k] * contacts[k, 0]
+            mean_y += weights[k] * contacts[k, 1]
+            mean_z += weights[k] * contacts[k, 2]
+    scatter = 0.0
+    if hit > 0.0:
+        for k in range(len(weights)):
+            if contacts[k, 0] == contacts[k, 0]:
+                x = contacts[k, 0] - mean_x / hit
+                y = contacts[k, 1] - mean_y / hit
+                z = contacts[k, 2] - mean_z / hit
+                scatter += weights[k] / hit * (x * x + y * y + z * z)
+    scale = 1.0 / (4.0 * noise * noise + scatter)
+    chance = 0.0
+    for k in range(len(weights)):
+        likely = _WRONG
+        if met == (contacts[k, 0] == contacts[k, 0]):
+            likely = 1.0
+            if met:
+                x = contacts[k, 0] - place[0]
+                y = contacts[k, 1] - place[1]
+                z = contacts[k, 2] - place[2]
+                likely = max(_WRONG, exp(-scale * (x * x + y * y + z * z)))
+        chance += weights[k] * likely
+    return -log((1.0 - _NONE_OF_THESE) * chance + _NONE_OF_THESE * _ANY_OUTCOME)

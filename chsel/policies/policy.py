@@ -9,10 +9,8 @@ from typing import Annotated, Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from chsel.next_probe.action_lattice import ActionSettings
-from chsel.next_probe.belief import BeliefSettings
 from chsel.next_probe.decision_problem import Decision, DecisionProblem
-from chsel.next_probe.forecast import Forecast
-from chsel.next_probe.surprise import SurpriseSettings
+from chsel.next_probe.forecast import BeliefSettings, Forecast, SurpriseSettings
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
 

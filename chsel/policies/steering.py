@@ -8,14 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.errors import ChselError, SettingError, quoted, require_instance
-from chsel.next_probe.belief import belief_after, belief_before
 from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
+from chsel.next_probe.forecast import belief_after, belief_before, surprise
 from chsel.next_probe.hand_shape import HandShape
-from chsel.next_probe.surprise import surprise
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.policies.policy import Policy
-from chsel.problem.input_checks import require_parts
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints, Workspace, require_parts
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey

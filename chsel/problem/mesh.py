@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chsel.errors import MeshError, MeshWarning, quoted, require_positive
+from chsel.errors import MeshError, MeshWarning, require_positive
 from chsel.numerics.arrays import digest, frozen
 from chsel.problem.file_checks import refuse_special_file
 
@@ -22,7 +22,6 @@ ENOUGH_FACES = 50_000  # of an object of the size of a hand: sides of 1 mm
 _SECONDS_PER_FACE = 1.5e-5  # on one core: merging vertices, and a grid of 60 000 nodes
 _NEAR = 0.5  # largest gap between the bodies of one object, in diameters of the largest body
 _MOST_BODIES = 1000  # that are compared, the largest ones
-_NOT_MESHES = {"bz2", "dxf", "stl_ascii", "svg", "tar.bz2", "tar.gz", "xyz", "zip"}
 
 
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
@@ -31,14 +30,28 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     scale: metres per unit of the file. Checks and raises as `clean_mesh`, and MeshError if the file
     does not exist or cannot be read.
     """
-    if not isinstance(path, str | Path):
-        raise MeshError(f"mesh file is {quoted(path)}; accepted: the path of a file")
+    import trimesh
+
     path = Path(path).expanduser()
     refuse_special_file(f"mesh file {path}", path, MeshError)
+    accepted = "a mesh in metres as ." + ", .".join(sorted(trimesh.available_formats()))
     if not path.is_file():
-        kind = "is a folder" if path.is_dir() else "does not exist"
-        raise MeshError(f"mesh file {path} {kind}; accepted: {_accepted_files()}")
-    loaded = _read(path)
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise MeshError(f"mesh file {path} {what}; accepted: {accepted}")
+    kind = path.suffix.lower().removeprefix(".")
+    try:
+        loaded = trimesh.load(
+            str(path), file_type=kind, force="mesh", process=False, skip_materials=True
+        )
+    except Exception as error:  # readers raise all kinds of errors on damaged files
+        # An ImportError comes from guessing the encoding of a text that is not one.
+        damaged = isinstance(error, ImportError)
+        reason = "it is damaged" if damaged else " ".join(str(error).split())
+        raise MeshError(
+            f"mesh file {path} cannot be read as .{kind}: {reason}; accepted: {accepted}"
+        ) from error
+    if not isinstance(loaded, trimesh.Trimesh):
+        raise MeshError(f"mesh file {path} has no faces; accepted: triangle meshes")
     return clean_mesh(loaded.vertices, loaded.faces, name=f"mesh file {path}", scale=scale)
 
 
@@ -57,7 +70,15 @@ def clean_mesh(
     require_positive("mesh scale", scale)
     vertices = frozen(f"{name}: vertices", vertices, (None, 3), error=MeshError)
     faces = frozen(f"{name}: faces", faces, (None, 3), dtype=np.int64, error=MeshError)
-    _check_faces(name, len(vertices), faces)
+    if len(faces) == 0:
+        raise MeshError(f"{name} has no faces; accepted: triangle meshes")
+    outside = ((faces < 0) | (faces >= len(vertices))).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise MeshError(
+            f"{name}: faces[{row}] is {faces[row].tolist()}; "
+            f"accepted: indices of its {len(vertices)} vertices"
+        )
     if len(faces) > MANY_FACES:
         seconds = len(faces) * _SECONDS_PER_FACE
         warnings.warn(
@@ -75,7 +96,10 @@ def clean_mesh(
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) == 0:
         raise MeshError(f"{name} has no face with an area; accepted: triangle meshes")
-    _turn_outward(mesh)
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0.0:
+        mesh.invert()
     if not mesh.is_watertight:
         text = (
             f"{name} is open even after merging its vertices; the winding number decides what is "
@@ -97,9 +121,15 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
 
     The distance between two bodies is that of the boxes around them; near bodies count as one.
     """
+    import trimesh
     from scipy.sparse.csgraph import connected_components
 
-    lower, upper = _boxes(mesh)
+    body = trimesh.graph.connected_component_labels(mesh.edges, len(mesh.vertices))
+    lower, upper = np.full((2, body.max() + 1, 3), [[[np.inf]], [[-np.inf]]])
+    np.minimum.at(lower, body, mesh.vertices)
+    np.maximum.at(upper, body, mesh.vertices)
+    largest_first = np.argsort(-((upper - lower) ** 2).sum(axis=1), kind="stable")[:_MOST_BODIES]
+    lower, upper = lower[largest_first], upper[largest_first]
     apart = np.maximum(np.maximum(lower[:, None] - upper, lower - upper[:, None]), 0.0)
     distance = np.sqrt((apart**2).sum(axis=2))  # (bodies, bodies)
     largest = float(np.sqrt(((upper - lower) ** 2).sum(axis=1)).max())
@@ -112,58 +142,6 @@ def check_bodies(mesh: trimesh.Trimesh, name: str) -> list[MeshWarning]:
         "they are registered as one rigid object: remove what is not part of it"
     )
     return [MeshWarning("bodies_apart", text)]
-
-
-def _boxes(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corners (bodies, 3) of the boxes of connected faces, largest first."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    a, b, c = np.asarray(mesh.faces).T
-    edges = np.concatenate([a, b]), np.concatenate([b, c])
-    count = len(mesh.vertices)
-    graph = coo_matrix((np.ones(len(edges[0]), dtype=bool), edges), shape=(count, count))
-    bodies, body = connected_components(graph, directed=False)
-    vertices = np.asarray(mesh.vertices)[np.argsort(body, kind="stable")]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(body, minlength=bodies))[:-1]])
-    lower, upper = np.minimum.reduceat(vertices, starts), np.maximum.reduceat(vertices, starts)
-    largest_first = np.argsort(-((upper - lower) ** 2).sum(axis=1), kind="stable")[:_MOST_BODIES]
-    return lower[largest_first], upper[largest_first]
-
-
-def _read(path: Path) -> trimesh.Trimesh:
-    """The content of a file as one mesh, unchecked."""
-    import trimesh
-
-    kind = path.suffix.lower().removeprefix(".")
-    if kind not in _mesh_formats():
-        raise MeshError(f"mesh file {path} is of no known kind; accepted: {_accepted_files()}")
-    try:
-        loaded = trimesh.load(
-            str(path), file_type=kind, force="mesh", process=False, skip_materials=True
-        )
-    except Exception as error:  # readers raise all kinds of errors on damaged files
-        # An ImportError comes from guessing the encoding of a text that is not one.
-        damaged = isinstance(error, ImportError)
-        reason = "it is damaged" if damaged else " ".join(str(error).split())
-        raise MeshError(
-            f"mesh file {path} cannot be read as .{kind}: {reason}; accepted: {_accepted_files()}"
-        ) from error
-    if not isinstance(loaded, trimesh.Trimesh):
-        raise MeshError(f"mesh file {path} has no faces; accepted: triangle meshes")
-    return loaded
-
-
-def _check_faces(name: str, vertex_count: int, faces: np.ndarray) -> None:
-    if len(faces) == 0:
-        raise MeshError(f"{name} has no faces; accepted: triangle meshes")
-    outside = (faces < 0) | (faces >= vertex_count)
-    if outside.any():
-        row = int(np.argwhere(outside)[0, 0])
-        raise MeshError(
-            f"{name}: faces[{row}] is {faces[row].tolist()}; "
-            f"accepted: indices of its {vertex_count} vertices"
-        )
 
 
 def _check_size(name: str, extents: np.ndarray) -> None:
@@ -180,23 +158,3 @@ def _check_size(name: str, extents: np.ndarray) -> None:
         raise MeshError(f"{name} is {size}: flat; accepted: a solid, with three extents above 0")
     if largest < SMALLEST:
         raise MeshError(f"{name} is {size}: too small; pass a larger scale ({accepted})")
-
-
-def _turn_outward(mesh: trimesh.Trimesh) -> None:
-    """Make the winding of faces consistent, and the volume of a closed mesh positive."""
-    import trimesh
-
-    if not mesh.is_winding_consistent:
-        trimesh.repair.fix_winding(mesh)
-    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0.0:
-        mesh.invert()
-
-
-def _mesh_formats() -> set[str]:
-    import trimesh
-
-    return set(trimesh.available_formats()) - _NOT_MESHES
-
-
-def _accepted_files() -> str:
-    return "a mesh in metres as " + ", ".join(f".{kind}" for kind in sorted(_mesh_formats()))

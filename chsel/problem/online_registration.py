@@ -10,8 +10,7 @@ import numpy as np
 
 from chsel.errors import PoseError, require_instance
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.input_checks import require_parts
-from chsel.problem.points import GrowingPoints, KnownPoints, Workspace
+from chsel.problem.points import GrowingPoints, KnownPoints, Workspace, require_parts
 from chsel.problem.poses import (
     axis_angle,
     compose,
@@ -69,10 +68,14 @@ def pose_problem(
         initial_set = first_initial_set(workspace, points, key, settings)
         low_cost_set = np.zeros((0, 4, 4))
     else:
+        low_cost_set = {
+            "elites": previous.elites,
+            "estimates": previous.object_from_world,
+            "none": np.zeros((0, 4, 4)),
+        }[settings.low_cost_set]
         initial_set = previous.object_from_world[: settings.hypotheses]
         if settings.update == "noise":
             initial_set = updated_initial_set(previous, key, settings)
-        low_cost_set = _low_cost_set(previous, settings)
     return RegistrationProblem(
         sdf, points, initial_set, workspace, free_resolution, key, low_cost_set
     )
@@ -113,30 +116,17 @@ def updated_initial_set(
     stream = key.stream(Purpose.UPDATE_NOISE)
     count = settings.hypotheses
     shift = settings.translation_noise * normals(stream, (count, 3))
-    turn = _rotation_noise(stream, count, settings)
+    direction = normals(stream, (count, 3))
+    if settings.rotation_law == "rotvec_gauss":
+        turn = rotation_vector(settings.rotation_noise * direction)
+    else:
+        axis = direction / np.sqrt((direction**2).sum(axis=1, keepdims=True))
+        turn = axis_angle(axis, settings.rotation_noise * normals(stream, count))
     rotation = product(turn, world_from_best[:3, :3])
     initial_set = inverse(compose(rotation, world_from_best[:3, 3] + shift))
     if settings.keep_best:
         initial_set[0] = best
     return initial_set
-
-
-def _rotation_noise(
-    stream: np.random.Generator, count: int, settings: OnlineSettings
-) -> FloatArray:
-    direction = normals(stream, (count, 3))
-    if settings.rotation_law == "rotvec_gauss":
-        return rotation_vector(settings.rotation_noise * direction)
-    axis = direction / np.sqrt((direction**2).sum(axis=1, keepdims=True))
-    return axis_angle(axis, settings.rotation_noise * normals(stream, count))
-
-
-def _low_cost_set(previous: Hypotheses, settings: OnlineSettings) -> FloatArray:
-    if settings.low_cost_set == "elites":
-        return previous.elites
-    if settings.low_cost_set == "estimates":
-        return previous.object_from_world
-    return np.zeros((0, 4, 4))
 
 
 class Start(NamedTuple):
@@ -219,20 +209,14 @@ class OnlineRegistration:
                     problem = self.pose(step)  # with E_0 and E_l
                     if register is not None:
                         hypotheses = register(problem)  # E <- CHSEL(X, E_0, E_l)
-                        hypotheses = self._judged(problem, hypotheses)
+                    if hypotheses is not None and hypotheses.trust is None and has_pose(hypotheses):
+                        trust = trust_in(problem, hypotheses, self._sensor_noise)
+                        hypotheses = replace(hypotheses, trust=trust)
                 except catch as error:
                     failure = error
             if hypotheses is not None:
                 self.remember(hypotheses)
             yield OnlineStep(step, problem, hypotheses, failure)
-
-    def _judged(
-        self, problem: RegistrationProblem, hypotheses: Hypotheses | None
-    ) -> Hypotheses | None:
-        """The same hypotheses with trust, unless there is no pose."""
-        if hypotheses is None or hypotheses.trust is not None or not has_pose(hypotheses):
-            return hypotheses
-        return replace(hypotheses, trust=trust_in(problem, hypotheses, self._sensor_noise))
 
     def enough(self, step: int) -> bool:
         """Whether a step registers, with the points that are known."""

@@ -11,8 +11,7 @@ import numpy as np
 
 from chsel.errors import PoseError, SettingError, require_between, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
-from chsel.problem.input_checks import require_parts
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints, Workspace, require_parts
 from chsel.problem.poses import check_rigid
 from chsel.problem.sdf_grid import COARSEST, FINEST, SdfGrid
 from chsel.problem.streams import StreamKey

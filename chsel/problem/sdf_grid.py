@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from chsel.errors import MeshError, MeshWarning, SdfError, quoted, require_choice, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, ShapesShown, digest, frozen
+from chsel.numerics.arrays import BoolArray, FloatArray, ShapesShown, digest, frozen
 
 if TYPE_CHECKING:
     import trimesh
@@ -55,7 +55,10 @@ def mesh_sdf(mesh: trimesh.Trimesh, points: FloatArray) -> tuple[FloatArray, Flo
     distance = np.sqrt((away**2).sum(axis=1))
     near = distance < _NORMAL_RANGE
     gradient = away / np.where(near, 1.0, distance)[:, None]
-    gradient[near] = _face_normals(vertices, faces[face[near]])
+    a, b, c = (vertices[faces[face[near], i]] for i in range(3))
+    normal = np.cross(b - a, c - a)  # from positions: normals in a mesh file may differ
+    length = np.sqrt((normal**2).sum(axis=1, keepdims=True))
+    gradient[near] = normal / np.maximum(length, 1e-300)
     return np.asarray(signed, dtype=np.float64), gradient
 
 
@@ -78,7 +81,8 @@ class SdfGrid(ShapesShown):
         if min(values.shape) < 2:
             raise SdfError(f"SDF values have shape {values.shape}; accepted: at least 2 per axis")
         gradients = frozen("SDF gradients", self.gradients, (*values.shape, 3), error=SdfError)
-        if min(float(face.min()) for face in _border(values)) <= 0.0:
+        faces = [np.take(values, end, axis=axis) for axis in range(3) for end in (0, -1)]
+        if min(float(face.min()) for face in faces) <= 0.0:
             raise SdfError(
                 "the border of the SDF grid touches the object; accepted: a grid padded so that "
                 "every node of its border is outside"
@@ -126,9 +130,11 @@ class SdfGrid(ShapesShown):
             )
         origin = np.asarray(mesh.bounds, dtype=np.float64)[0] - padding
         values, gradients = np.empty(math.prod(shape)), np.empty((math.prod(shape), 3))
-        for part in _parts(len(values), len(mesh.faces)):
+        size = max(_PART_NODES, len(mesh.faces) // _PART_FACES)  # prepares the mesh for each part
+        for first in range(0, len(values), size):
             if progress is not None:
-                progress(part.start, len(values))
+                progress(first, len(values))
+            part = slice(first, min(first + size, len(values)))
             nodes = np.stack(np.unravel_index(np.arange(part.start, part.stop), shape), axis=1)
             signed, gradient = mesh_sdf(mesh, origin + nodes * resolution)
             values[part], gradients[part] = _rounded(signed), _rounded(gradient)
@@ -203,8 +209,18 @@ class SdfGrid(ShapesShown):
         points = np.asarray(points, dtype=np.float64)
         first, last = self.bounds
         clamped = np.fmin(np.fmax(points, first), last)
-        read = self._nearest if lookup == "nearest" else self._trilinear
-        value, gradient = read((clamped - first) * (1.0 / self.resolution))
+        cell = (clamped - first) * (1.0 / self.resolution)
+        if lookup == "nearest":
+            rows = self._rows(np.rint(cell))
+        else:
+            base = np.minimum(np.floor(cell), np.array(self.shape) - 2.0)
+            fraction, rows = cell - base, np.zeros((len(cell), 4))
+            sides = (1.0 - fraction, fraction)
+            for corner in np.ndindex(2, 2, 2):
+                i, j, k = corner
+                weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
+                rows = rows + weight[:, None] * self._rows(base + np.array(corner))
+        value, gradient = rows[:, 0].copy(), rows[:, 1:].copy()
         beyond = (clamped != points).any(axis=1)
         if beyond.any():
             away = points[beyond] - clamped[beyond]
@@ -216,30 +232,9 @@ class SdfGrid(ShapesShown):
             gradient[beyond] = away / distance
         return value, gradient
 
-    def _nearest(self, cell: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and gradient at grid coordinates (P, 3) by the nearest node."""
-        index = self._flat(np.rint(cell))
-        return self.values.reshape(-1)[index], self.gradients.reshape(-1, 3)[index]
-
-    def _trilinear(self, cell: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and gradient at grid coordinates (P, 3) by interpolation between 8 nodes."""
-        base = np.minimum(np.floor(cell), np.array(self.shape) - 2.0)
-        fraction = cell - base
-        sides = (1.0 - fraction, fraction)
-        first, (_, ny, nz) = self._flat(base), self.shape
-        values, gradients = self.values.reshape(-1), self.gradients.reshape(-1, 3)
-        value, gradient = np.zeros(len(cell)), np.zeros(cell.shape)
-        for i, j, k in np.ndindex(2, 2, 2):
-            weight = sides[i][:, 0] * sides[j][:, 1] * sides[k][:, 2]
-            index = first + (i * ny + j) * nz + k
-            value = value + weight * values[index]
-            gradient = gradient + weight[:, None] * gradients[index]
-        return value, gradient
-
-    def _flat(self, index: FloatArray) -> IntArray:
-        _, ny, nz = self.shape
-        flat: IntArray = ((index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).astype(np.int64)
-        return flat
+    def _rows(self, nodes: FloatArray) -> FloatArray:
+        """Value and gradient (P, 4) of nodes (P, 3)."""
+        return self.table[np.ravel_multi_index(tuple(nodes.astype(np.int64).T), self.shape)]
 
 
 def _lengths(vectors: FloatArray) -> FloatArray:
@@ -287,28 +282,10 @@ def _shape(mesh: trimesh.Trimesh, resolution: float, padding: float) -> tuple[in
     return tuple(int(n) + 2 for n in np.floor(span / resolution))
 
 
-def _parts(count: int, face_count: int) -> list[slice]:
-    """Parts of so many nodes, so large that preparing the mesh for each costs little."""
-    size = max(_PART_NODES, face_count // _PART_FACES)
-    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
-
-
 def _check_resolution(resolution: float) -> None:
     if not FINEST <= resolution <= COARSEST:
         raise SdfError(f"SDF resolution is {resolution}; accepted: {FINEST:g} to {COARSEST:g} (m)")
 
 
-def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Unit normals (F, 3) computed from positions: those in a mesh file may differ."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a)
-    return normal / np.maximum(np.sqrt((normal**2).sum(axis=1, keepdims=True)), 1e-300)
-
-
 def _rounded(values: FloatArray) -> FloatArray:
     return values.astype(np.float32).astype(np.float64) + 0.0  # without negative zeros
-
-
-def _border(values: FloatArray) -> list[FloatArray]:
-    """The six faces of a grid."""
-    return [np.take(values, end, axis=axis) for axis in range(3) for end in (0, -1)]

@@ -1,8 +1,8 @@
-"""Frozen settings from plain mappings and presets, with errors that name what is accepted.
+"""Frozen settings from plain mappings and presets, and what users choose by name and settings.
 
-The defaults of a settings class are the preset `default`. Its class variable `presets` has what
-differs from them in the others: `paper`, as printed, and `reference`, as the paper's authors ran
-it. docs/presets.md has all differences with their reasons.
+Errors name what is accepted. The defaults of a settings class are the preset `default`. Its class
+variable `presets` has what differs from them in the others: `paper`, as printed, and `reference`,
+as the paper's authors ran it. docs/presets.md has all differences with their reasons.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ import difflib
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
-from typing import Annotated, Any, TypeVar
+from dataclasses import MISSING, dataclass
+from functools import cache, cached_property, partial
+from importlib.metadata import EntryPoint, entry_points
+from typing import Annotated, Any, Generic, TypeVar
 
 from chsel.errors import (
     SettingError,
@@ -21,6 +23,7 @@ from chsel.errors import (
     require_at_most,
     require_between,
     require_choice,
+    require_instance,
     require_positive,
 )
 
@@ -28,31 +31,15 @@ Settings = TypeVar("Settings")
 Presets = Mapping[str, Mapping[str, Any]]
 PRESETS = ("default", "paper", "reference")
 Check = Callable[[str, Any], None]
+Made = TypeVar("Made")
+Entry = tuple[Callable[[Any], Made], Any]
+"""What makes a choice of its settings, and its settings by default."""
 
+_hints: Callable[[Any], dict[str, Any]] = cache(partial(typing.get_type_hints, include_extras=True))
+_KINDS = {int: "an integer", float: "a number", str: "a text", bool: "true or false"}
 
-class CheckedSettings:
-    """Base of settings whose annotations say what their fields accept.
-
-    A field `rate: Annotated[float, positive]` raises SettingError for other values; None passes
-    where the type has it. A class that checks more, such as pairs of fields, extends __post_init__.
-    """
-
-    def __post_init__(self) -> None:
-        for name, (optional, checks) in _checks_of(type(self)).items():  # type: ignore[arg-type]
-            value = getattr(self, name)
-            if not (optional and value is None):
-                for check in checks:
-                    check(name, value)
-
-
-def positive(name: str, value: Any) -> None:
-    """A finite number above 0."""
-    require_positive(name, value)
-
-
-def not_negative(name: str, value: Any) -> None:
-    """A finite number of at least 0."""
-    require_positive(name, value, zero=True)
+positive = require_positive
+not_negative = partial(require_positive, zero=True)
 
 
 def at_most(most: float) -> Check:
@@ -70,30 +57,56 @@ def one_of(*accepted: str) -> Check:
     return partial(require_choice, accepted=accepted)
 
 
-@cache
-def _checks_of(cls: type) -> dict[str, tuple[bool, tuple[Check, ...]]]:
-    """Whether a field may be None, and its checks, by name."""
-    return {
-        name: (type(None) in typing.get_args(hint.__origin__), hint.__metadata__)
-        for name, hint in typing.get_type_hints(cls, include_extras=True).items()
-        if typing.get_origin(hint) is Annotated
-    }
+class CheckedSettings:
+    """Base of settings whose annotations say what their fields accept.
+
+    A field `rate: Annotated[float, positive]` raises SettingError for other values; None passes
+    where the type has it. A class that checks more, such as pairs of fields, extends __post_init__.
+    """
+
+    def __post_init__(self) -> None:
+        for name, hint in _hints(type(self)).items():
+            if typing.get_origin(hint) is Annotated:
+                value = getattr(self, name)
+                if value is not None or type(None) not in typing.get_args(hint.__origin__):
+                    for check in hint.__metadata__:
+                        check(name, value)
 
 
-@cache
-def _hints_of(cls: type) -> dict[str, Any]:
-    """The types of fields, by name."""
-    return typing.get_type_hints(cls)
-
-
-def build_settings(cls: type[Settings], mapping: Mapping[str, Any], where: str) -> Settings:
+def build_settings(
+    cls: type[Settings], mapping: Mapping[str, Any], where: str, base: Settings | None = None
+) -> Settings:
     """Make the dataclass `cls` from a plain mapping; nested mappings make nested dataclasses.
 
-    `where` is the name of the mapping in messages ("method.cost"). What the mapping leaves out has
-    its default. Raises SettingError for names that `cls` does not have, for names that are missing,
-    and for values of another type.
+    `where` is the name of the mapping in messages ("method.cost"). What the mapping leaves out is
+    as in `base`, or has its default. Raises SettingError for names that `cls` does not have, for
+    names that are missing, and for values of another type.
     """
-    return _built(cls, mapping, where, None)
+    if not isinstance(mapping, Mapping):
+        raise SettingError(f"{where} is {quoted(mapping)}; accepted: a group of settings")
+    values = {}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if base is not None:
+            values[field.name] = getattr(base, field.name)
+        else:
+            make = field.default_factory
+            values[field.name] = field.default if make is MISSING else make()
+    for name in mapping:
+        if name not in values:
+            close = difflib.get_close_matches(str(name), values, n=1)
+            meant = f"did you mean {close[0]}? " if close else ""
+            raise SettingError(
+                f"{where}.{name} does not exist; {meant}accepted: {', '.join(sorted(values))}"
+            )
+    for name, value in mapping.items():
+        values[name] = _convert(_hints(cls)[name], value, f"{where}.{name}", values[name])
+    missing = [name for name, value in values.items() if value is MISSING]
+    if missing:
+        raise SettingError(f"{where} lacks {', '.join(missing)}")
+    try:
+        return cls(**values)
+    except SettingError as error:
+        raise SettingError(f"{where}: {error}") from None
 
 
 def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str) -> Settings:
@@ -101,7 +114,46 @@ def changed_settings(settings: Settings, changes: Mapping[str, Any], where: str)
 
     Raises SettingError as `build_settings` does.
     """
-    return _built(type(settings), changes, where, settings)
+    return build_settings(type(settings), changes, where, settings)
+
+
+def settings_mapping(settings: Any) -> dict[str, Any]:
+    """The plain nested mapping that `build_settings` turns back into equal settings."""
+    return dataclasses.asdict(settings)
+
+
+def _convert(hint: Any, value: Any, where: str, before: Any = None) -> Any:
+    """`value` as the annotated type `hint`, or SettingError; a group is laid over `before`."""
+    if typing.get_origin(hint) is Annotated:
+        hint = hint.__origin__
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        inner = [argument for argument in arguments if argument is not type(None)]
+        return _convert(inner[0], value, where, before)
+    if dataclasses.is_dataclass(hint):
+        base = before if isinstance(before, hint) else None  # type: ignore[arg-type]
+        return build_settings(typing.cast(type, hint), value, where, base)
+    if origin is tuple:
+        return _convert_tuple(arguments, value, where)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if hint is Any or (isinstance(value, hint) and not (hint is int and isinstance(value, bool))):
+        return value
+    accepted = _KINDS.get(hint, getattr(hint, "__name__", str(hint)))
+    raise SettingError(f"{where} is {quoted(value)}; accepted: {accepted}")
+
+
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise SettingError(f"{where} is {quoted(value)}; accepted: a list")
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        arguments = (arguments[0],) * len(value)
+    if len(arguments) != len(value):
+        raise SettingError(f"{where} has {len(value)} entries; accepted: {len(arguments)}")
+    pairs = zip(arguments, value, strict=True)
+    return tuple(_convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(pairs))
 
 
 def in_preset(settings: Settings, preset: str) -> Settings:
@@ -120,84 +172,96 @@ def in_preset(settings: Settings, preset: str) -> Settings:
     return changed_settings(settings, presets.get(preset, {}), f"preset {preset}")
 
 
-def settings_mapping(settings: Any) -> dict[str, Any]:
-    """The plain nested mapping that `build_settings` turns back into equal settings."""
-    return dataclasses.asdict(settings)
+@dataclass(eq=False)
+class NamedChoices(Generic[Made]):
+    """The choices of one kind by name."""
 
+    kind: str  # what messages call one
+    group: str  # of entry points, by which packages offer theirs
+    page: str  # of docs/, on writing one
+    ours: Mapping[str, Entry[Made]]  # those of this package
+    lacks: Callable[[Any], str | None]  # what an object lacks to be one and what is accepted
 
-def _built(
-    cls: type[Settings], mapping: Mapping[str, Any], where: str, base: Settings | None
-) -> Settings:
-    """`base` with the values of a mapping; without a base, an instance of `cls` of these."""
-    if not isinstance(mapping, Mapping):
-        raise SettingError(f"{where} is {quoted(mapping)}; accepted: a group of settings")
-    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    for name in mapping:
-        if name not in fields:
-            raise SettingError(_unknown(where, str(name), list(fields)))
-    kind: Any = cls
-    hints = _hints_of(kind)
-    if base is None:
-        before = {name: _default(field) for name, field in fields.items()}
-    else:
-        before = {name: getattr(base, name) for name in fields}
-    values = before | {
-        name: _convert(hints[name], value, f"{where}.{name}", before[name])
-        for name, value in mapping.items()
-    }
-    missing = [name for name, value in values.items() if value is dataclasses.MISSING]
-    if missing:
-        raise SettingError(f"{where} lacks {', '.join(missing)}")
-    try:
-        return cls(**values)
-    except SettingError as error:
-        raise SettingError(f"{where}: {error}") from None
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """All names: ours in their order, then those of installed packages."""
+        return (*self.ours, *(name for name in sorted(self._offers) if name not in self.ours))
 
+    def entry(self, name: str) -> Entry[Made]:
+        """What makes a choice of its settings, and its settings by default.
 
-def _default(field: dataclasses.Field[Any]) -> Any:
-    """The default of a field, MISSING if it has none."""
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return field.default
+        Raises SettingError for a name that does not exist, and for a choice of an installed package
+        that cannot be imported, is not of this kind, or has two packages.
+        """
+        require_choice(self.kind, name, self.names)
+        if name not in self._entries:
+            self._entries[name] = self._load(name)
+        return self._entries[name]
 
+    def settings(self, name: str, preset: str = "default") -> Any:
+        """The settings of a choice by name in a preset, one of PRESETS; SettingError if none is."""
+        make, default = self.entry(name)
+        require_choice("preset", preset, PRESETS)
+        in_own_preset = getattr(make, "preset", None)
+        return in_own_preset(preset) if in_own_preset else in_preset(default, preset)
 
-def _unknown(where: str, name: str, accepted: list[str]) -> str:
-    close = difflib.get_close_matches(name, accepted, n=1)
-    hint = f"did you mean {close[0]}? " if close else ""
-    return f"{where}.{name} does not exist; {hint}accepted: {', '.join(sorted(accepted))}"
+    def build(self, name: str, settings: Any = None) -> Made:
+        """A choice, such as a method or a policy, by name.
 
+        settings: its settings, or a mapping of changes to those of the preset `default`. Raises
+        SettingError for names and values that do not exist, and for a name of ours that an
+        installed package offers, too.
+        """
+        default = self.settings(name)
+        if name in self.ours and name in self._offers:
+            also = f"{self.kind} {name} is of package {self._packages(name)[0]}, too"
+            raise SettingError(f"{also}; accepted: one of them")
+        kind = type(default)
+        if settings is None:
+            settings = default
+        elif isinstance(settings, Mapping):
+            settings = changed_settings(default, settings, self.kind)
+        require_instance("settings", settings, kind, f"a mapping, or a {kind.__name__}")
+        return self.entry(name)[0](settings)
 
-def _convert(hint: Any, value: Any, where: str, before: Any = None) -> Any:
-    """`value` as the annotated type `hint`, or SettingError; a group is laid over `before`."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        inner = [argument for argument in arguments if argument is not type(None)]
-        return _convert(inner[0], value, where, before)
-    if dataclasses.is_dataclass(hint):
-        base = before if isinstance(before, hint) else None  # type: ignore[arg-type]
-        return _built(typing.cast(type, hint), value, where, base)
-    if origin is tuple:
-        return _convert_tuple(arguments, value, where)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if hint is Any or (isinstance(value, hint) and not (hint is int and isinstance(value, bool))):
-        return value
-    raise SettingError(f"{where} is {quoted(value)}; accepted: {_name(hint)}")
+    def _load(self, name: str) -> Entry[Made]:
+        point, *others = self._offers[name]
+        package = self._packages(name)
+        if others:
+            raise SettingError(
+                f"{self.kind} {name} is of {' and '.join(package)}; accepted: one of them"
+            )
+        who = f"{self.kind} {name} of package {package[0]}"
+        try:
+            offered = point.load()
+            default = offered()
+        except Exception as error:  # whatever somebody else's code raises
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise SettingError(
+                f"{who} cannot be loaded: {reason}; accepted: a class as in {self.page}"
+            ) from error
+        settings = getattr(default, "settings", None)
+        if not dataclasses.is_dataclass(settings):
+            lacks: str | None = f"settings {settings!r}; accepted: a frozen dataclass"
+        else:
+            lacks = self.lacks(default)
+        if lacks:
+            raise SettingError(f"{who} has {lacks}; see {self.page}")
+        return offered, settings
 
+    def _packages(self, name: str) -> list[str]:
+        """The installed packages that offer a choice of that name."""
+        return sorted(point.dist.name if point.dist else "unknown" for point in self._offers[name])
 
-def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise SettingError(f"{where} is {quoted(value)}; accepted: a list")
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        arguments = (arguments[0],) * len(value)
-    if len(arguments) != len(value):
-        raise SettingError(f"{where} has {len(value)} entries; accepted: {len(arguments)}")
-    pairs = zip(arguments, value, strict=True)
-    return tuple(_convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(pairs))
+    @cached_property
+    def _entries(self) -> dict[str, Entry[Made]]:
+        """Ours, and those of packages that were asked for."""
+        return dict(self.ours)
 
-
-def _name(hint: Any) -> str:
-    names = {int: "an integer", float: "a number", str: "a text", bool: "true or false"}
-    return names.get(hint, getattr(hint, "__name__", str(hint)))
+    @cached_property
+    def _offers(self) -> dict[str, list[EntryPoint]]:
+        """All entry points of the group, by their names."""
+        offers: dict[str, list[EntryPoint]] = {}
+        for point in entry_points(group=self.group):
+            offers.setdefault(point.name, []).append(point)
+        return offers

@@ -78,13 +78,9 @@ def surface_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatAr
     def run(first: int, last: int, _: Any) -> None:
         distances_from_surface(field, numbers, places, distances, first, last)
 
-    spread(run, len(poses), lambda: None, least=poses_per_thread(len(points)))
+    least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
+    spread(run, len(poses), lambda: None, least=least)
     return distances
-
-
-def poses_per_thread(points: int) -> int:
-    """How many poses are worth another thread where each looks up so many distances."""
-    return 1 + _LOOKUPS_PER_THREAD // max(points, 1)
 
 
 @compiled

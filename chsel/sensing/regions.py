@@ -43,8 +43,7 @@ def depth_regions(
     cells[::2, ::2] = counts
     cells[::2, 1::2] = _linked(depth[:, 1:], depth[:, :-1], jump + _STEEPEST / camera.fx)
     cells[1::2, ::2] = _linked(depth[1:], depth[:-1], jump + _STEEPEST / camera.fy)
-    regions: IntArray = label(cells)[0][::2, ::2]
-    return regions
+    return np.asarray(label(cells)[0][::2, ::2])
 
 
 def point_regions(points: FloatArray, gap: float) -> IntArray:
@@ -55,7 +54,9 @@ def point_regions(points: FloatArray, gap: float) -> IntArray:
     """
     if len(points) < 2:
         return np.ones(len(points), dtype=np.int64)
-    side = max(gap, _SPACINGS * _spacing(points))
+    asked = points[:: -(-len(points) // _MOST_ASKED)]
+    spacing = float(np.median(cKDTree(points).query(asked, k=2)[0][:, 1]))
+    side = max(gap, _SPACINGS * spacing)
     voxels, of_point = np.unique(
         np.floor((points - points.min(axis=0)) / side), axis=0, return_inverse=True
     )
@@ -98,8 +99,7 @@ def small_regions(regions: IntArray, least: int) -> BoolArray:
     """Pixels (H, W) in regions of fewer than `least` pixels."""
     small = np.bincount(regions.reshape(-1)) < least
     small[0] = False
-    found: BoolArray = small[regions]
-    return found
+    return np.asarray(small[regions])
 
 
 def speckle_free(
@@ -119,9 +119,3 @@ def _linked(one: FloatArray, other: FloatArray, share: float) -> BoolArray:
     """Whether pairs of depths are connected; none is with 0."""
     nearer = np.minimum(one, other)
     return (nearer > 0.0) & (np.abs(one - other) <= share * nearer)
-
-
-def _spacing(points: FloatArray) -> float:
-    """The median distance of points (N, 3), N > 1, to their nearest neighbours."""
-    asked = points[:: -(-len(points) // _MOST_ASKED)]
-    return float(np.median(cKDTree(points).query(asked, k=2)[0][:, 1]))

@@ -176,7 +176,7 @@ def check_hand(values: Mapping[str, Any]) -> None:
 
 def check_decision(made: Mapping[str, Any]) -> None:
     """Raise RecordingError unless choice, scores and contacts of a message `Decision` agree."""
-    from chsel.next_probe.belief import MOST_POSES
+    from chsel.next_probe.forecast import MOST_POSES
 
     chosen, score, contacts = made["chosen"], made["score"], made["contacts"]
     if len(made["weights"]) > MOST_POSES:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from chsel.next_probe.belief import belief_after, belief_before
 from chsel.next_probe.decision_problem import Belief, Decision
+from chsel.next_probe.forecast import belief_after, belief_before
 from chsel.numerics.arrays import FloatArray
 from chsel.policies.policy import PolicySettings, StopSettings
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep

@@ -12,9 +12,8 @@ from chsel.methods import noise_of
 from chsel.methods.method import Method
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.policies.steering import Steering
-from chsel.problem.input_checks import check_contacts, check_points
 from chsel.problem.online_registration import OnlineRegistration, OnlineStep
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import KnownPoints, check_contacts, check_points
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
 from chsel.problem.trust import check_trust

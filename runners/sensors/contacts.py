@@ -9,7 +9,7 @@ import numpy as np
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey
-from chsel.sensing.contact_patch import contact_subset, share
+from chsel.sensing.contact_sensing import contact_subset, share
 from runners.sensors.cell import RobotCell
 from runners.sensors.depth_camera import View
 from runners.sensors.pad import Imprint, Pad

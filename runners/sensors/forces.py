@@ -12,7 +12,7 @@ from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse, rotated
-from chsel.sensing.force_contact import contact_ahead, contact_on_axis
+from chsel.sensing.contact_sensing import contact_ahead, contact_on_axis
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import Contacts
 from runners.sensors.hand import HandModel

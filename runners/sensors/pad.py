@@ -11,7 +11,7 @@ import numpy as np
 from chsel.errors import SessionError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.poses import apply, inverse, rotated, rotation_angle
-from chsel.sensing.contact_patch import contact_mask, deformation, smooth
+from chsel.sensing.contact_sensing import contact_mask, deformation, smooth
 from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from chsel.sensing.regions import depth_regions, main_regions, small_regions
 from replay.events import SensorImage

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from chsel.problem.input_checks import check_points
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import KnownPoints, check_points
 from replay.events import Logged, Probe, RigDescribed, SensorImage
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel

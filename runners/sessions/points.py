@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from chsel.errors import PointsError, SettingError, require_positive
 from chsel.problem.defaults import FREE_RESOLUTION, workspace_around
-from chsel.problem.input_checks import check_points
-from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
+from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace, check_points
 from chsel.problem.sdf_grid import OBJECT_PADDING
 from replay.events import Probe
 from runners.objects.loader import ObjectModel

@@ -12,9 +12,8 @@ from chsel.next_probe.action_lattice import ActionSettings
 from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import BoolArray
-from chsel.problem.input_checks import check_points
 from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
-from chsel.problem.points import KnownPoints
+from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.settings import build_settings
 from replay.events import Probe
 from replay.mcap.reader import read_recording

@@ -6,11 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from chsel.next_probe.belief import BeliefSettings, belief_before
 from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem
-from chsel.next_probe.forecast import Forecast
+from chsel.next_probe.forecast import BeliefSettings, Forecast, belief_before, surprise
 from chsel.next_probe.hand_shape import HandShape
-from chsel.next_probe.surprise import surprise
 from chsel.numerics.arrays import FloatArray
 from chsel.policies import OURS, build_policy
 from chsel.problem.poses import axis_angle, compose, inverse, product, random_rotations

@@ -12,7 +12,7 @@ import trimesh
 import yaml
 
 from chsel.next_probe.decision_problem import STOPS, Actions
-from chsel.next_probe.surprise import surprise
+from chsel.next_probe.forecast import surprise
 from chsel.policies import OURS
 from chsel.policies.policy import PolicySettings
 from chsel.problem.points import KnownPoints, Workspace

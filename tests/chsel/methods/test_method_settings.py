@@ -20,9 +20,8 @@ from chsel.methods.icp import Icp, IcpSettings
 from chsel.methods.medial_constraint.medial_constraint import CmaEsSettings
 from chsel.methods.medial_constraint.medial_cost import MedialCostSettings
 from chsel.methods.svgd import SvgdSettings
-from chsel.problem.named_choices import NamedChoices
 from chsel.problem.online_registration import OnlineSettings
-from chsel.problem.settings import PRESETS, settings_mapping
+from chsel.problem.settings import PRESETS, NamedChoices, settings_mapping
 from chsel.qd.selection import OutputSettings
 
 NAN, INF = float("nan"), float("inf")

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from chsel.errors import ChselError, SettingError
-from chsel.next_probe.belief import BeliefSettings, belief_after, belief_before
 from chsel.next_probe.decision_problem import Decision, DecisionProblem
-from chsel.next_probe.surprise import surprise
+from chsel.next_probe.forecast import BeliefSettings, belief_after, belief_before, surprise
 from chsel.policies import build_policy
 from chsel.policies.policy import PolicySettings
 from chsel.policies.steering import Steering

@@ -8,11 +8,11 @@ import trimesh
 
 import chsel
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.freedom import can_be_moved, pose_energies
 from chsel.problem.noise import noise_model
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.streams import StreamKey
+from chsel.problem.trust import can_be_moved, pose_energies
 from tests.chsel.samples import plain_energies
 
 BOX = trimesh.creation.box((0.1, 0.06, 0.16))

@@ -130,8 +130,6 @@ def test_a_missing_file_is_named(tmp_path):
         load_mesh(tmp_path / "nowhere.obj")
     with pytest.raises(MeshError, match="is a folder"):
         load_mesh(tmp_path)
-    with pytest.raises(MeshError, match=r"mesh file is 3; accepted: the path of a file"):
-        load_mesh(3)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "off", "glb"])
@@ -153,7 +151,7 @@ def test_files_without_faces_are_no_mesh(tmp_path):
 @pytest.mark.parametrize("name", ["notes.txt", "mesh", "cloud.xyz", "parts.zip"])
 def test_a_file_of_another_kind_is_refused_with_the_kinds_accepted(tmp_path, name):
     (tmp_path / name).write_text("0 0 0\n")
-    with pytest.raises(MeshError, match=r"no known kind; accepted: .*\.off, \.ply"):
+    with pytest.raises(MeshError, match=rf"{name} cannot be read .*; accepted: .*\.off, \.ply"):
         load_mesh(tmp_path / name)
 
 

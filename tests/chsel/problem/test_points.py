@@ -1,3 +1,5 @@
+"""Known points, and those that cannot be, or hardly are, those of an object."""
+
 from __future__ import annotations
 
 import itertools
@@ -5,10 +7,19 @@ import itertools
 import numpy as np
 import pytest
 import torch
+import trimesh
 
-from chsel import KnownPoints, Workspace
 from chsel.errors import PointsError
-from chsel.problem.points import FreeVoxels, GrowingPoints, Lattice
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.points import (
+    FreeVoxels,
+    GrowingPoints,
+    KnownPoints,
+    Lattice,
+    Workspace,
+    check_contacts,
+    check_points,
+)
 
 
 def test_points_are_copied_and_can_not_be_changed() -> None:
@@ -83,3 +94,138 @@ def test_workspace_must_have_an_inside() -> None:
         Workspace((0, 0, 0), (1, 0, 1))
     around = Workspace.around(np.array([[0.0, 1.0, 2.0], [0.5, 1.0, 2.0]]), 0.1)
     np.testing.assert_allclose(around.bounds, [[-0.1, 0.9, 1.9], [0.6, 1.1, 2.1]])
+
+
+BOX = trimesh.creation.box((0.2, 0.1, 0.05))
+DIAMETER = float(np.linalg.norm(BOX.extents))  # 0.229 m
+SIDE = 0.01
+SURFACE = trimesh.sample.sample_surface(BOX, 200, seed=0)[0]
+ROOM = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
+
+
+def lattice_of(lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """The centres of all voxels between two corners, of a lattice that begins at ROOM."""
+    axes = [np.arange(low, high, SIDE / 2) for low, high in zip(lower, upper, strict=True)]
+    every = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return FreeVoxels(Lattice(ROOM.lower, SIDE)).add(every)
+
+
+AROUND = lattice_of(*ROOM.bounds)  # the whole room, the object's place included
+OUTSIDE_BOX = (np.abs(AROUND) > BOX.extents / 2).any(axis=1)
+GOOD = KnownPoints(free=AROUND[OUTSIDE_BOX], known=SURFACE)
+
+
+def codes(points: KnownPoints, workspace: Workspace | None = ROOM) -> list[str]:
+    return [warning.code for warning in check_points(points, DIAMETER, SIDE, workspace)]
+
+
+def text(points: KnownPoints, workspace: Workspace | None = ROOM) -> str:
+    return "\n".join(map(str, check_points(points, DIAMETER, SIDE, workspace)))
+
+
+def test_all_space_around_an_object_and_points_all_over_it_are_fine() -> None:
+    assert codes(GOOD) == []
+    assert check_contacts(GOOD) == []
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_points_in_millimetres_are_an_error(scale: float) -> None:
+    """Also contacts that are all on a small part of the object."""
+    points = KnownPoints(known=1000.0 * scale * SURFACE)
+    with pytest.raises(
+        PointsError, match=r"span .* m, and the object is 0.229 m: are they in mill"
+    ):
+        check_points(points, DIAMETER, SIDE)
+    points = KnownPoints(free=1000.0 * AROUND[::100])
+    with pytest.raises(PointsError, match=r"known points span 1\d\d\d m"):
+        check_points(points, DIAMETER, SIDE)
+
+
+def test_contacts_ten_diameters_apart_are_a_warning() -> None:
+    near = KnownPoints(known=[[0.0, 0.0, 0.0], [9.9 * DIAMETER, 0.0, 0.0]])
+    assert codes(near, None) == []
+    far = KnownPoints(known=[[0.0, 0.0, 0.0], [10.1 * DIAMETER, 0.0, 0.0]])
+    assert codes(far, None) == ["contacts_apart"]
+    assert "span 2.31 m, and the object is 0.229 m" in text(far, None)
+
+
+def test_a_single_contact_far_away_is_an_outlier_and_no_error() -> None:
+    stray = KnownPoints(known=np.concatenate([SURFACE, [[0.0, 500.0, 0.0]]]))
+    assert codes(stray, None) == ["contacts_apart"]
+
+
+def test_contacts_far_from_all_free_points_are_a_warning() -> None:
+    free = AROUND[:50]
+    reach = float(np.linalg.norm(free, axis=1).min())
+    away = np.array([[reach + 10.5 * DIAMETER, 0.0, 0.0]])
+    assert codes(KnownPoints(free=free, known=away), None) == ["contacts_far_from_free"]
+    assert "1 of 1 contacts are more than 10 object diameters from" in text(
+        KnownPoints(free=free, known=away), None
+    )
+    assert codes(KnownPoints(free=np.concatenate([free, away + 0.1]), known=away), None) == []
+
+
+def test_a_contact_between_two_far_regions_of_free_space_is_a_warning() -> None:
+    free = np.array([[-3.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    points = KnownPoints(free=free, known=[[0.0, 0.0, 0.0]])
+    assert codes(points, None) == ["contacts_far_from_free"]
+
+
+def test_contacts_outside_of_the_workspace_are_counted() -> None:
+    moved = SURFACE + np.array([0.32, 0.0, 0.0])  # its ends are at 0.22 and 0.42, the room's at 0.3
+    count = int((moved[:, 0] > 0.3 + 0.2 * DIAMETER).sum())
+    assert 10 < count < 190
+    points = KnownPoints(known=moved)
+    assert codes(points) == ["contacts_outside"]
+    assert f"{count} of 200 points on the object are outside of the workspace [[-0.3," in text(
+        points
+    )
+    assert codes(points, None) == []
+    by_4_cm = SURFACE + np.array([0.24, 0.0, 0.0])  # workspaces are not that exact
+    assert codes(KnownPoints(known=by_4_cm)) == []
+
+
+def test_contacts_that_are_all_far_outside_of_the_workspace_are_an_error() -> None:
+    away = KnownPoints(known=SURFACE + np.array([0.0, 0.7, 0.0]))
+    with pytest.raises(PointsError, match=r"the nearest 0.35 m from it; accepted: a workspace"):
+        check_points(away, DIAMETER, SIDE, ROOM)
+
+
+def test_contacts_deep_in_free_space_are_a_warning() -> None:
+    points = KnownPoints(free=AROUND, known=SURFACE)
+    assert codes(points) == ["contacts_in_free_space"]
+    assert "200 of 200 contacts are in free space" in text(points)
+    inside = KnownPoints(free=GOOD.free, known=np.concatenate([SURFACE, [[0.2, 0.2, 0.2]]]))
+    assert "1 of 201 contacts are in free space" in text(inside)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_contact_with_any_unknown_voxel_beside_it_is_fine(axis: int) -> None:
+    contact = np.zeros((1, 3)) + 0.001
+    beside = np.zeros(3)
+    beside[axis] = SIDE
+    free = AROUND[np.abs(AROUND - beside).max(axis=1) > SIDE / 2]
+    assert len(AROUND) - len(free) == 1
+    assert codes(KnownPoints(free=free, known=contact)) == []
+    assert codes(KnownPoints(free=AROUND, known=contact)) == ["contacts_in_free_space"]
+
+
+def test_the_same_points_as_contacts_and_as_free_are_a_warning() -> None:
+    points = KnownPoints(free=np.concatenate([GOOD.free, SURFACE[:7]]), known=SURFACE)
+    assert "7 of 200 contacts are in free space" in text(points)
+
+
+def test_free_points_alone_say_nothing_about_where_the_object_is() -> None:
+    (warning,) = check_contacts(KnownPoints(free=AROUND))
+    assert warning.code == "no_contact"
+    for informative in (
+        KnownPoints(free=AROUND, occupied=[[0.0, 0.0, 0.0]]),
+        KnownPoints(free=AROUND, known=[[0.0, 0.0, 0.1]], known_sdf=[0.05]),
+    ):
+        assert check_contacts(informative) == []
+
+
+def test_fine_voxels_over_a_large_space_take_no_memory() -> None:
+    """Too many voxels to number them are not looked at."""
+    points = KnownPoints(free=[[1.0, 0.0, 0.0]], known=[[0.0, 0.0, 0.0], [4.0, 4.0, 4.0]])
+    assert check_points(points, 10.0, 1e-6) == []

@@ -13,7 +13,7 @@ from chsel.errors import MeshError, MeshWarning, SdfError, SettingError
 from chsel.problem import defaults
 from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
-from chsel.problem.sdf_grid import DEFAULT_NODES, _default_spacing, _parts, _shape, mesh_sdf
+from chsel.problem.sdf_grid import DEFAULT_NODES, _default_spacing, _shape, mesh_sdf
 from chsel.problem.surface import surface_points
 from tests.chsel.samples import box_distance
 
@@ -85,9 +85,9 @@ def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
     told: list[tuple[int, int]] = []
     nodes = grid.values.size
 
-    def remade() -> SdfGrid:
+    def remade(mesh: trimesh.Trimesh = box) -> SdfGrid:
         told.clear()
-        return SdfGrid.from_mesh(box, 0.01, progress=lambda *counts: told.append(counts))
+        return SdfGrid.from_mesh(mesh, 0.01, progress=lambda *counts: told.append(counts))
 
     assert remade().digest == grid.digest
     assert told == [(0, nodes)]
@@ -95,8 +95,10 @@ def test_a_grid_made_in_parts_has_the_same_bits_and_says_how_far_it_is(
     assert remade().digest == grid.digest
     assert told == [(done, nodes) for done in range(0, nodes, 1000)]
     monkeypatch.setattr("chsel.problem.sdf_grid._PART_NODES", 1)
-    parts = _parts(10, face_count=20)  # of a large mesh, parts are large
-    assert parts == [slice(0, 4), slice(4, 8), slice(8, 10)]
+    remade(
+        box.subdivide().subdivide().subdivide().subdivide()
+    )  # of a mesh of 3072 faces, parts are larger
+    assert told == [(done, nodes) for done in range(0, nodes, 3072 // 5)]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import trimesh
 import chsel
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.freedom import pose_energies
 from chsel.problem.noise import LIMIT, noise_model
 from chsel.problem.outline import outline_distances
 from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
@@ -31,6 +30,7 @@ from chsel.problem.trust import (
     check_trust,
     correlation,
     has_pose,
+    pose_energies,
     trust_in,
     turned,
 )
