@@ -14,13 +14,10 @@ from chsel.cost.interior_points import InteriorPoints, interior_points
 from chsel.cost.pose_lanes import LANES
 from chsel.errors import require_choice
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import CellSet, Region, box_of, cell_set_of, triple
-from chsel.numerics.clearance import squared_gaps
-from chsel.numerics.octree import Tree, octree, rounding_margin
+from chsel.numerics.cell_set import bounds_of, box_of, cell_set_of, triple
+from chsel.numerics.near_points import PointTree, point_tree
 from chsel.numerics.pose_tuples import Triple
-from chsel.numerics.rough_tree import rough_tree
 from chsel.numerics.threads import require_ieee_arithmetic, spread
-from chsel.numerics.voxels import bounds_of
 from chsel.problem.points import KnownPoints, VoxelGrid, require_parts
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
@@ -29,8 +26,6 @@ from chsel.problem.sdf_lookup import cells_below, distance_field
 
 CULLINGS = ("octree", "none")
 _NO_BOX = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-_NOWHERE = np.zeros(0, dtype=np.float32)
-_NO_DEPTHS = np.zeros(0, dtype=np.uint8)
 _POSES_PER_THREAD = 200  # fewer are evaluated faster than a thread wakes up
 
 
@@ -82,8 +77,7 @@ class CompiledCost:
         lookup = self.settings.lookup
         centre, radius = _sphere_around_cells(sdf, level, lookup)
         free = self.model.free._replace(
-            region=cells_below(sdf, level, lookup),
-            cells=_cell_set_below(sdf, level, lookup),
+            cells=cells_below(sdf, level, lookup),
             centre=centre,
             radius=radius,
         )
@@ -116,17 +110,14 @@ def _free_term(
         weights = np.concatenate([weights, -weights * interior.normals], axis=1).reshape(-1)
         voxels = VoxelGrid.around(free, free_resolution)
         box = box_of(voxels.origin, free_resolution, voxels.flags.shape)
-        region, cells = Region(box, _NOWHERE), cell_set_of(box, voxels.flags)
-        depths: Any = np.empty(voxels.flags.shape, dtype=np.uint8)
-        squared_gaps(voxels.flags, depths)
+        cells = cell_set_of(box, voxels.flags)
         centre, radius = _sphere_around(interior.points, 0.0)
         lower, upper = box.first, box.last
     else:
         alpha, lookup, weights = settings.alpha, settings.lookup, np.zeros(0)
-        tree, region = octree(free, free_resolution), cells_below(sdf, alpha, lookup)
-        cells, depths = _cell_set_below(sdf, alpha, lookup), _NO_DEPTHS
+        tree, cells = point_tree(free, free_resolution), cells_below(sdf, alpha, lookup)
         centre, radius = _sphere_around_cells(sdf, alpha, lookup)
-        if len(free) and not (region.clearance < 0.0).any():
+        if len(free) and cells.steps[:-2].all():
             warnings.warn(
                 f"no node of the SDF is deeper than {-alpha} m: free points cannot be violated; "
                 "use a smaller penetration_tolerance",
@@ -137,62 +128,34 @@ def _free_term(
         interior=is_interior,
         exhaustive=culling == "none",
         tree=tree,
-        rough=rough_tree(tree),
-        region=region,
         cells=cells,
-        depths=depths.reshape(-1),
         weights=weights,
         centre=centre,
         radius=radius,
         lower=lower,
         upper=upper,
-        margin=_margin(tree, region),
     )
 
 
-def _cell_set_below(sdf: SdfGrid, level: float, lookup: str) -> CellSet:
-    """The cells of a grid that read any value below `level`, derived once."""
-
-    def make() -> CellSet:
-        region = cells_below(sdf, level, lookup)
-        return cell_set_of(region.box, (region.clearance < 0.0).reshape(sdf.shape))
-
-    return sdf.derived(("cell set below", level, lookup), make)
-
-
-def _interior_tree(sdf: SdfGrid, settings: CostSettings) -> tuple[Tree, InteriorPoints]:
+def _interior_tree(sdf: SdfGrid, settings: CostSettings) -> tuple[PointTree, InteriorPoints]:
     """The interior points of the object as a tree, and in the order of the tree."""
     interior = interior_points(sdf, settings)
-    tree = octree(interior.points, interior.spacing)
+    tree = point_tree(interior.points, interior.spacing)
     return tree, interior.in_order(tree.order)
-
-
-def _margin(tree: Tree, region: Region) -> float:
-    """More metres than rounding moves a point of either frame."""
-    uppermost = tree.spheres[:, : tree.levels[min(1, len(tree.levels) - 1)]]
-    corners = np.array([region.box.first, region.box.last])
-    return rounding_margin(np.concatenate([2.0 * uppermost.reshape(-1), corners.reshape(-1)]))
 
 
 def _sphere_around_cells(sdf: SdfGrid, level: float, lookup: str) -> tuple[Triple, float]:
     """Centre and radius of a sphere around the cells that read any value below `level`."""
 
     def make() -> tuple[Triple, float]:
-        region = cells_below(sdf, level, lookup)
-        centres = cell_centres(region).T
-        if len(centres) == 0:
+        box = cells_below(sdf, level, lookup).box
+        cells = np.argwhere(sdf.active_cells(level, lookup))
+        if len(cells) == 0:
             return (0.0, 0.0, 0.0), 0.0
-        return _sphere_around(centres, 0.5 / region.box.inverse)
+        centres = np.array(box.first) + (cells + 0.5 * box.between) / box.inverse
+        return _sphere_around(centres, 0.5 / box.inverse)
 
     return sdf.derived(("sphere", level, lookup), make)
-
-
-def cell_centres(region: Region) -> FloatArray:
-    """Centres (3, A) of the cells of a region, in the order of their indices."""
-    box, cells = region.box, np.flatnonzero(region.clearance < 0.0)
-    plane, k = np.divmod(cells, int(box.along))
-    index = np.stack([*np.divmod(plane, int(box.across / box.along)), k])
-    return np.array(box.first)[:, None] + (index + 0.5 * box.between) / box.inverse
 
 
 def _sphere_around(points: FloatArray, margin: float) -> tuple[Triple, float]:

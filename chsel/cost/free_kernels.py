@@ -2,52 +2,45 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from chsel.cost.point_sums import NOTHING, SIZE, sums_over, sums_over_all
+from chsel.cost.point_sums import NOTHING, SIZE, sums_over
 from chsel.numerics.arrays import FloatArray, scratch
-from chsel.numerics.cell_set import CellSet, Region
+from chsel.numerics.cell_set import CellSet
 from chsel.numerics.compiler import leaf, spliced
 from chsel.numerics.near_points import (
     NearPoints,
+    PointTree,
     gather,
     is_kept,
-    is_within,
     near_points_for,
     select,
     to_cells,
 )
-from chsel.numerics.octree import Tree
 from chsel.numerics.pose_tuples import Triple, inverted, rigid, turned_back
-from chsel.numerics.rough_tree import RoughTree
 
 MOST_SLACK = 0.03  # metres, in a descent
 SEARCH_SLACK = 0.02  # metres, among the branches of a search, which scatter
 STEPS_AHEAD = 3.0  # that gathered neighbours should last
-_ALL = -1  # instead of the number of packets that were gathered
 
 
 class FreeTerm(NamedTuple):
     """The points that the free term looks up, and the cells where they cost something.
 
-    "The object" is, for free points, the region; for interior points, all of them.
+    "The object" is, for free points, the cells; for interior points, all of them.
     """
 
     interior: bool  # interior points of the object in free voxels, else free points in the object
     exhaustive: bool  # look up all points
-    tree: Tree  # over free points of the world, or over interior points in the object frame
-    rough: RoughTree  # the same
-    region: Region  # cells of the object that read values below alpha; empty for interior points
-    cells: CellSet  # the same cells, or the free voxels of the world
-    depths: Any  # (nodes,) squared gaps from free voxels to others; empty for free points; uint8
+    tree: PointTree  # of free points of the world, or of interior points in the object frame
+    cells: CellSet  # those of the object that read values below alpha, or free voxels of the world
     weights: FloatArray  # (4 N,) weight of interior points, and it times the inward normal
     centre: Triple  # of a sphere around the object, in its frame
     radius: float
     lower: Triple  # corners of a box of the world: where the object is beyond, nothing costs
     upper: Triple
-    margin: float  # more metres than rounding moves a point
 
 
 class Neighbours(NamedTuple):
@@ -65,7 +58,7 @@ def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
     slack = scratch(poses)
     slack[:] = -1.0
     gathered, last = scratch(poses, 12), scratch(poses, 12)
-    return Neighbours(near_points_for(free.rough, poses), slack, gathered, last, scratch(SIZE))
+    return Neighbours(near_points_for(free.tree, poses), slack, gathered, last, scratch(SIZE))
 
 
 @leaf
@@ -80,7 +73,7 @@ def free_sums(model, pose, near, n, most_slack):
     if total == 0:
         return NOTHING
     move = inverted(pose) if free.interior else pose
-    to_cell, rounding = to_cells(free.rough, free.cells.box, move)
+    to_cell, rounding = to_cells(free.tree, free.cells.box, move)
     count = 0
     if free.exhaustive or rounding < 0.0 or not rigid(pose):
         near.slack[n] = -1.0
@@ -88,14 +81,11 @@ def free_sums(model, pose, near, n, most_slack):
             points.hits[at] = at
         count = total
     else:
-        rounding += free.margin
         slack = _slack_to_gather(free, pose, near, n, most_slack)
         if slack >= 0.0:
             _gather_within(free, pose, near, n, to_cell, slack, rounding)
-        if points.number[n] == _ALL:
-            return sums_over_all(free, pose, near.block)
         if points.number[n] > 0:
-            count = select(free.rough, free.cells, to_cell, rounding, points, n)
+            count = select(free.tree, free.cells, to_cell, rounding, points, n)
     return sums_over(model, pose, move, points.hits, count, near.block)
 
 
@@ -103,12 +93,10 @@ def free_sums(model, pose, near, n, most_slack):
 def _gather_within(free, pose, near, n, to_cell, slack, rounding):
     """Gather the points that can matter until the object has moved by `slack` metres."""
     points, reach = near.points, slack + rounding
-    if is_apart(free, pose, slack + free.margin):
+    if is_apart(free, pose, reach):
         points.number[n] = 0
-    elif free.interior and is_within(free.rough, free.cells, free.depths, to_cell, reach):
-        points.number[n] = _ALL
     else:
-        gather(free.rough, free.cells, to_cell, reach, points, n)
+        gather(free.tree, free.cells, to_cell, reach, points, n)
         near.slack[n] = near.slack[n] if is_kept(points, n) else -1.0
 
 

@@ -39,22 +39,22 @@ NOTHING = CostAndGradient(0.0, (0.0,) * 12)
 def sums_over(model, pose, move, numbers, count, block):
     """The sums over the first `count` points by number, block by block."""
     free = model.free
-    spheres, nodes = free.tree.spheres, len(free.tree.starts) - 1
+    points = free.tree.points
     for i in range(17):
         block[_SUMS + i] = 0.0
     for first in range(0, count, _MOST):
         size = min(_MOST, count - first)
         for n in range(np.uint64(size)):
-            at = np.uint64(nodes + numbers[np.uint64(first) + n])
-            block[np.uint64(_POINT) + n] = spheres[0, at]
-            block[np.uint64(_POINT + _MOST) + n] = spheres[1, at]
-            block[np.uint64(_POINT + 2 * _MOST) + n] = spheres[2, at]
+            at = np.uint64(numbers[np.uint64(first) + n])
+            block[np.uint64(_POINT) + n] = points[0, at]
+            block[np.uint64(_POINT + _MOST) + n] = points[1, at]
+            block[np.uint64(_POINT + 2 * _MOST) + n] = points[2, at]
         whole = (size + 3) // 4 * 4  # vectors read what is left of another block, for nothing
         _locate(move, free.cells.box, model.alpha, block, whole)
         if free.interior:
             _read_weights(free, numbers, first, block, size)
             _subtract_points(pose, block, whole)
-            _add_weights(pose, block, np.uint64(_SUMMAND), block, size)
+            _add_weights(pose, block, size)
         else:
             if model.field.trilinear:
                 _weigh_corners(block, whole)
@@ -62,29 +62,6 @@ def sums_over(model, pose, move, numbers, count, block):
             else:
                 _violate_at_nodes(model, block, size)
             _add_violations(block, size)
-    return _sums_in(free, block)
-
-
-@leaf
-def sums_over_all(free, pose, block):
-    """The sums over all interior points, which are all in free voxels."""
-    weights, spheres, nodes = free.weights, free.tree.spheres, len(free.tree.starts) - 1
-    for i in range(17):
-        block[_SUMS + i] = 0.0
-    for first in range(0, len(weights) // 4, _MOST):
-        size = min(_MOST, len(weights) // 4 - first)
-        for n in range(np.uint64(size)):
-            at = np.uint64(nodes + first) + n
-            block[np.uint64(_POINT) + n] = spheres[0, at]
-            block[np.uint64(_POINT + _MOST) + n] = spheres[1, at]
-            block[np.uint64(_POINT + 2 * _MOST) + n] = spheres[2, at]
-        _subtract_points(pose, block, size)
-        _add_weights(pose, weights, np.uint64(4 * first), block, size)
-    return _sums_in(free, block)
-
-
-@leaf
-def _sums_in(free, block):
     _, a, b, c = _four(block, _SUMS, 0)
     _, d, e, f = _four(block, _SUMS, 1)
     _, g, h, i = _four(block, _SUMS, 2)
@@ -206,7 +183,7 @@ def _subtract_points(pose, block, count):
 
 
 @inner
-def _add_weights(pose, weights, begin, block, count):
+def _add_weights(pose, block, count):
     """Add weights w at y = R^T (m - t), with gradient w R^T n by y: inwards, out of free voxels."""
     _, a, b, c = _four(block, _SUMS, 0)
     _, d, e, f = _four(block, _SUMS, 1)
@@ -216,7 +193,7 @@ def _add_weights(pose, weights, begin, block, count):
     for n in range(np.uint64(count)):
         x, y = block[np.uint64(_POINT) + n], block[np.uint64(_POINT + _MOST) + n]
         z = block[np.uint64(_POINT + 2 * _MOST) + n]
-        w, j, k, m = _four(weights, begin, n)
+        w, j, k, m = _four(block, _SUMMAND, n)
         o, p, q, r = o + w, p + j, q + k, r + m
         v, j, k, m = (
             0.0 * j + 0.0 * k + 0.0 * m,

@@ -17,8 +17,8 @@ from chsel.cost.cost_settings import uncertain_depth
 from chsel.errors import SettingError
 from chsel.methods.anchor_kernels import NO_POSE, UNIT, Box32, CoarseScore, keep_best
 from chsel.numerics.arrays import FloatArray, IntArray
+from chsel.numerics.cell_set import bounds_of, set_voxels
 from chsel.numerics.threads import spread
-from chsel.numerics.voxels import bounds_of, set_voxels
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, product, rotated, rotation_matrices
 from chsel.problem.registration_problem import RegistrationProblem

@@ -74,7 +74,7 @@ class SteinStep(NamedTuple):
 
 def surroundings_of(model: Model, count: int) -> Work:
     """Scratch in which so many particles remember their neighbours, if it is not too large."""
-    size = model.free.tree.spheres.shape[1]
+    size = model.free.tree.points.shape[1]
     return work_of(model, count if count * size <= _MOST_REMEMBERED else LANES)
 
 

@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.numerics.clearance import squared_clearances, squared_gaps
-from chsel.numerics.compiler import inner, leaf
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray, read_only
+from chsel.numerics.compiler import compiled, inner, leaf
+
+_FAR = 2**60
+_MOST_STEPS = 225  # squared sides of a cell: 15, the greatest that a byte holds squared
 
 
 class Box(NamedTuple):
@@ -24,13 +26,6 @@ class Box(NamedTuple):
     along: float  # and on the second
 
 
-class Region(NamedTuple):
-    """A set of grid cells, and how far every other cell is from it."""
-
-    box: Box
-    clearance: Any  # (nodes,) -1 in the set, else at most the squared distance to it, m^2; float32
-
-
 class CellSet(NamedTuple):
     """A set of grid cells in a small table: which cells it has, and how far others are from it.
 
@@ -38,8 +33,8 @@ class CellSet(NamedTuple):
     """
 
     box: Box
-    # (nodes + 2,) 0 in the set, else 1 + the squared distance to it, see squared_gaps; then 0 for
-    # points that may be in the set, and 255 for none; uint8
+    # (nodes + 2,) 0 in the set, else 1 + the squared distance to it, at most 226; then 0 for points
+    # that may be in the set, and 255 for none; uint8
     steps: Any
 
 
@@ -60,27 +55,88 @@ def triple(values: Sequence[float] | FloatArray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def clearance_of(cells: BoolArray, resolution: float) -> Any:
-    """Squared distances of grid cells (nx, ny, nz) to the set ones: Region.clearance."""
-    if not cells.any():
-        return np.full(cells.size, np.inf, dtype=np.float32)
-    halves = np.empty(cells.shape, dtype=np.int64)  # squared distances between cells as boxes
-    squared_clearances(~cells, halves, 2)
-    distance = np.sqrt(halves.astype(np.float64)) / 2.0 * resolution
-    squared = (distance * (1.0 - 1e-6)) ** 2
-    squared[cells] = -1.0
-    return squared.astype(np.float32).reshape(-1)
-
-
 def cell_set_of(box: Box, cells: BoolArray) -> CellSet:
     """The set of the flagged cells (nx, ny, nz) of a box."""
-    gaps = np.empty(cells.shape, dtype=np.uint8)
-    squared_gaps(~cells, gaps)
-    steps = np.empty(cells.size + 2, dtype=np.uint8)
-    steps[:-2] = gaps.reshape(-1) + np.uint8(1)
-    steps[:-2][cells.reshape(-1)] = 0
+    halves, steps = np.empty(cells.shape, np.int64), np.empty(cells.size + 2, dtype=np.uint8)
+    squared_clearances(~cells, halves, 2)
+    steps[:-2] = np.where(cells, 0, 1 + np.minimum(halves // 4, _MOST_STEPS)).reshape(-1)
     steps[-2:] = 0, 255
     return CellSet(box, steps)
+
+
+@compiled
+def squared_clearances(inside: BoolArray, out: IntArray, gap: int) -> None:
+    """Fill out (nx, ny, nz) with squared distances of voxels to the nearest that is not inside.
+
+    In half sides of a voxel: the least over all voxels w that are not inside of the sum over the
+    axes of max(2 |v - w| - gap, 0)^2, computed axis by axis (Felzenszwalb and Huttenlocher, 2012).
+    gap: 1 for the distance from the centre of v to the cube w, 2 for that between cubes. If all are
+    inside, no distance is less than 2^60.
+    """
+    flat, flags = out.reshape(-1), inside.reshape(-1)
+    for n in range(len(flat)):
+        flat[n] = _FAR if flags[n] else 0
+    nx, ny, nz = out.shape
+    line = np.empty(max(nx, ny, nz), dtype=np.int64)
+    _along(flat, nz, 1, line, gap)
+    _along(flat, ny, nz, line, gap)
+    _along(flat, nx, ny * nz, line, gap)
+
+
+@inner
+def _along(flat: IntArray, count: int, stride: int, line: IntArray, gap: int) -> None:
+    """One axis, whose neighbours are `stride` apart in lines of `count` voxels."""
+    for block in range(0, len(flat), count * stride):
+        for start in range(block, block + stride):
+            for k in range(count):
+                line[k] = flat[start + k * stride]
+            for k in range(count):
+                flat[start + k * stride] = _nearest(line, count, k, gap)
+
+
+@inner
+def _nearest(line: IntArray, count: int, k: int, gap: int) -> int:
+    """The least of line[j] + max(2 |k - j| - gap, 0)^2, going outwards while that can be less."""
+    least, reach = line[k], max(k, count - 1 - k)
+    for step in range(1, reach + 1):
+        along = (2 * step - gap) * (2 * step - gap)
+        if along >= least:
+            break
+        if step <= k:
+            least = min(least, line[k - step] + along)
+        if k + step < count:
+            least = min(least, line[k + step] + along)
+    return least
+
+
+def bounds_of(points: FloatArray) -> FloatArray:
+    """The least and the greatest coordinates (2, 3) of points (N, 3), N > 0."""
+    bounds = np.empty((2, 3))
+    _fill_bounds(read_only(points), bounds)
+    return bounds
+
+
+@compiled
+def _fill_bounds(points: FloatArray, bounds: FloatArray) -> None:
+    bounds[0], bounds[1] = np.inf, -np.inf
+    for n in range(len(points)):
+        for axis in range(3):
+            bounds[0, axis] = min(bounds[0, axis], points[n, axis])
+            bounds[1, axis] = max(bounds[1, axis], points[n, axis])
+
+
+@compiled
+def set_voxels(points: FloatArray, first: FloatArray, side: float, flags: BoolArray) -> None:
+    """Set the flags (nx, ny, nz) of the voxels nearest to points (N, 3), ties to even, plus one.
+
+    first (3,): centre of a voxel, which is (1, 1, 1); no point may be further than one beyond.
+    """
+    x, y, z = first[0], first[1], first[2]
+    for n in range(len(points)):
+        i = int(np.rint((points[n, 0] - x) / side)) + 1
+        j = int(np.rint((points[n, 1] - y) / side)) + 1
+        k = int(np.rint((points[n, 2] - z) / side)) + 1
+        flags[i, j, k] = True
 
 
 class Places(NamedTuple):

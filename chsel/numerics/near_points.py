@@ -1,33 +1,179 @@
-"""The points of a tree that may lie in a set of cells, found in 32-bit arithmetic.
+"""The points that may lie in a set of cells: a tree of points, searched in 32-bit arithmetic.
 
-Distances are rounded so that no point is left out: whether a point lies in the set, and what it
-adds to a sum, is then decided in 64 bits for the few that are left. Eight nodes or points, the
-lanes of a vector instruction, are tested at a time.
+A point may be left out of a sum only if it adds nothing to it. Distances are rounded so that no
+such point is: whether a point lies in the set, and what it adds, is then decided in 64 bits for
+the few that are left. Eight nodes or points, the lanes of a vector instruction, are tested at a
+time. Sums always run in the order of the tree, so that culling changes no bit.
 """
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.numerics.arrays import IntArray, scratch
-from chsel.numerics.compiler import inner, leaf
-from chsel.numerics.rough_tree import LANES, RoughTree
+from chsel.errors import PointsError
+from chsel.numerics.arrays import FloatArray, IntArray, read_only, scratch
+from chsel.numerics.cell_set import bounds_of, triple
+from chsel.numerics.compiler import compiled, inner, leaf
+from chsel.numerics.pose_tuples import Triple
 
+LANES = 8
+_SUBDIVISION = 4  # cells of the Morton order per spacing of the points, and a power of two
+_LEAST = 4  # points of a packet on average
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
-_ROW = np.uint64(LANES)
+_ROW, _BLOCK = np.uint64(LANES), np.uint64(4 * LANES)
 _U1, _U2, _U3, _U4, _U5, _U6, _U7 = (np.uint64(n) for n in range(1, 8))
 _UNIT = 2.0**-20  # 16 roundings of 32-bit numbers: more than are on the way to any coordinate
+_UNIT_64 = 1e-12  # more than all roundings of 64-bit numbers in a rigid motion
 _COARSEST = 0.25  # cells: if rounding moves a point further, 32 bits are not enough
 _MOST_LIMIT = 1e6  # of squared distances, in cells
 LONGEST = 16_000  # points, of lists that are kept
 
 
+class PointTree(NamedTuple):
+    """An octree of N points in Morton order: B blocks of at most LANES children, the root's first.
+
+    The children of the last P blocks, the packets, are points; those of others are blocks, given by
+    spheres around their points. Coordinates in blocks are relative to the origin.
+    """
+
+    points: FloatArray  # (3, N) metres
+    order: IntArray  # (N,) indices that the points had before
+    blocks: Any  # (4 LANES B,) x of each child, then y, z, radius; NaN where there is none; float32
+    first: Any  # (B,) the first child of each block; int32
+    places: Any  # (B,) where blocks have the x of each block; int32
+    roots: int  # blocks without a parent, at most LANES
+    depth: int  # levels above the packets
+    packets: int  # P
+    origin: Triple  # metres
+    reach: float  # the greatest coordinate in blocks, metres
+    rounding: float  # more metres than rounding in 64 bits moves a point in a rigid motion
+
+
+def point_tree(points: FloatArray, spacing: float) -> PointTree:
+    """The tree of points (N, 3) about `spacing` metres apart.
+
+    Points in one cell of the Morton order stay in their order. Raises PointsError if the extent
+    of the points is not finite.
+    """
+    points, count = read_only(points), len(points)
+    lower, upper = bounds = bounds_of(points) if count else np.zeros((2, 3))
+    extent = max(high - low for low, high in bounds.T.tolist())
+    if not extent < np.inf:
+        raise PointsError(f"points span {extent} m; accepted: a finite extent")
+    bits = count.bit_length()
+    most = float((1 << (63 - bits) // 3) - 1)
+    quantum = spacing / _SUBDIVISION
+    while extent / quantum >= most:
+        quantum *= 2.0
+    keys = np.empty(count, dtype=np.int64)
+    _fill_keys(points, lower, 1.0 / quantum, extent, bits, keys)
+    keys.sort()
+    levels = _levels(keys, bits)
+    below = [*accumulate(map(len, levels[:-1])), 0]  # the number of the first child
+    first = np.concatenate([level + np.int32(n) for level, n in zip(levels, below, strict=True)])
+    order, origin = keys & ((1 << bits) - 1), 0.5 * lower + 0.5 * upper
+    tree = PointTree(
+        points=np.empty((3, count)),
+        order=order,
+        blocks=np.full(4 * LANES * len(first), np.float32(np.nan)),
+        first=first,
+        places=np.zeros(len(first), dtype=np.int32),
+        roots=len(levels[0]),
+        depth=len(levels) - 1,
+        packets=len(levels[-1]),
+        origin=triple(origin),
+        reach=float((upper - origin).max()) * (1.0 + 1e-6),
+        rounding=1e-9 + 2.0 * _UNIT_64 * float(np.abs(bounds).max()),
+    )
+    _fill_blocks(points, tree)
+    return tree
+
+
+def _levels(keys: IntArray, bits: int) -> list[Any]:
+    """For each level, the uppermost first, the first child of each block, of those below.
+
+    The cells of each level are the finest that make its blocks full enough.
+    """
+    levels: list[Any] = []
+    begins = np.empty(len(keys), dtype=np.int32)
+    while len(levels) < 2 or len(levels[0]) > LANES:
+        count = _begin_blocks(keys, min(bits, 63), begins)
+        if count * _LEAST <= len(keys) or bits > 63:
+            levels.insert(0, begins[:count].copy())
+            keys = keys[levels[0]]
+        bits += 3
+    return levels
+
+
+@compiled
+def _begin_blocks(keys, bits, begins):
+    """Fill the first children of blocks whose keys differ in the lowest bits alone; how many."""
+    count = 0
+    for n in range(len(keys)):
+        if n == 0 or n - begins[count - 1] == LANES or (keys[n] ^ keys[n - 1]) >> bits:
+            begins[count] = n
+            count += 1
+    return count
+
+
+@compiled
+def _fill_keys(points, lower, inverse, extent, index_bits, keys):
+    """Interleaved bits of the points' cells on the finest level, then the points' indices."""
+    spread = np.empty(int(np.rint(extent * inverse)) + 1, dtype=np.int64)
+    for cell in range(len(spread)):
+        spread[cell] = _spread_bits(cell) << index_bits
+    x, y, z = lower[0], lower[1], lower[2]
+    for n in range(len(points)):
+        i = np.uint64(np.int32(np.rint((points[n, 0] - x) * inverse)))
+        j = np.uint64(np.int32(np.rint((points[n, 1] - y) * inverse)))
+        k = np.uint64(np.int32(np.rint((points[n, 2] - z) * inverse)))
+        keys[n] = spread[i] | spread[j] << 1 | spread[k] << 2 | n
+
+
+@leaf
+def _spread_bits(cell):
+    """Two zeros between each of 21 bits."""
+    cell = (cell | cell << 32) & 0x1F00000000FFFF
+    cell = (cell | cell << 16) & 0x1F0000FF0000FF
+    cell = (cell | cell << 8) & 0x100F00F00F00F00F
+    cell = (cell | cell << 4) & 0x10C30C30C30C30C3
+    return (cell | cell << 2) & 0x1249249249249249
+
+
+@compiled
+def _fill_blocks(points, tree):
+    """Fill PointTree.points, blocks and places, axis by axis, from the points up."""
+    blocks, first, order, count = tree.blocks, tree.first, tree.order, len(tree.first)
+    low, high, squares = np.empty(count), np.empty(count), np.zeros(count)  # of boxes
+    for axis in range(3):
+        placed, origin = tree.points[axis], tree.origin[axis]
+        end = len(order)
+        for block in range(count - 1, -1, -1):
+            least, most = np.inf, -np.inf
+            at = np.uint64(4 * LANES * block + LANES * axis)
+            for child in range(first[block], end):
+                if block >= count - tree.packets:
+                    a = b = placed[child] = points[order[child], axis]
+                else:
+                    a, b = low[child], high[child]
+                    tree.places[child] = at - np.uint64(LANES * axis)
+                    radius = np.sqrt(squares[child]) * (1.0 + 1e-6)
+                    blocks[at + np.uint64(LANES * (3 - axis))] = np.float32(radius)
+                blocks[at] = np.float32(0.5 * a + 0.5 * b - origin)
+                least, most, at = min(least, a), max(most, b), at + np.uint64(1)
+            low[block], high[block] = least, most
+            half = 0.5 * most - 0.5 * least
+            squares[block] += half * half
+            end = count if block == count - tree.packets else first[block]
+
+
 class NearPoints(NamedTuple):
     """Scratch for P lists of the packets of points that are near a set of cells."""
 
-    x: Any  # (P C + S,) of spheres around packets, as in RoughTree.blocks; float32
+    x: Any  # (P C + S,) of spheres around packets, as in PointTree.blocks; float32
     y: Any
     z: Any
     radius: Any
@@ -42,18 +188,18 @@ class NearPoints(NamedTuple):
     hits: Any  # (S',) points of a list that may lie in the set, int32
 
 
-def near_points_for(tree: RoughTree, lists: int) -> NearPoints:
+def near_points_for(tree: PointTree, lists: int) -> NearPoints:
     """Scratch for so many lists of the points of a tree.
 
     Each has little room, as it takes longer to get much memory than to use a little of it.
     """
-    packets = len(tree.places)
+    packets = tree.packets
     own = min(packets, LONGEST // LANES)
     room = lists * own + packets + LANES  # vectors reach beyond the last list
     x, y, z, radius = (np.empty(room, dtype=np.float32) for _ in range(4))
     kept = np.empty(room, dtype=np.int32)
     begin, number = (scratch(lists, dtype=np.int64) for _ in range(2))
-    most = LANES * (max(packets, len(tree.first), len(tree.starts)) + 1)
+    most = LANES * (packets + 1)
     rows = np.empty((4, most), dtype=np.float32)
     nodes, cells, limits, hits = (np.empty(most, dtype=np.int32) for _ in range(4))
     return NearPoints(x, y, z, radius, kept, own, begin, number, rows, nodes, cells, limits, hits)
@@ -76,7 +222,9 @@ def to_cells(tree, box, move):
     b = move[3] * x + move[4] * y + move[5] * z + (move[10] - box.first[1])
     c = move[6] * x + move[7] * y + move[8] * z + (move[11] - box.first[2])
     scale, shift = box.inverse, 0.5 - 0.5 * box.between
+    far = abs(box.first[0]) + abs(box.first[1]) + abs(box.first[2])
     rounding = (tree.reach + max(abs(a), max(abs(b), abs(c))) + 1.0 / scale) * _UNIT
+    rounding += tree.rounding + far * _UNIT_64
     if not rounding * scale <= _COARSEST:
         rounding = -1.0
         a = b = c = 0.0
@@ -96,8 +244,9 @@ def gather(tree, cells, to_cell, slack, near, n):
     to_cell: as to_cells makes it; slack includes its rounding. See is_kept.
     """
     x, y, z, radius = near.rows[0], near.rows[1], near.rows[2], near.rows[3]
-    nodes, count, none = near.nodes, 1, np.uint64(0)
-    nodes[0] = 0
+    nodes, count, none = near.nodes, tree.roots, np.uint64(0)
+    for at in range(np.uint64(count)):
+        nodes[at] = at
     for _ in range(tree.depth):
         count = _expand(tree, nodes, count, near)
         _locate_spheres(x, y, z, radius, none, count, to_cell, cells.box, slack, near)
@@ -113,80 +262,19 @@ def gather(tree, cells, to_cell, slack, near, n):
     near.begin[n], near.number[n] = begin, count
 
 
-@inner
-def is_within(tree, cells, depths, to_cell, slack):
-    """Whether all points of a tree stay in cells of a set while they move by `slack` metres.
-
-    depths: squared gaps (nodes,) from cells of the set to others, among which is every cell at a
-    border of the box; see gather.
-    """
-    box, blocks = cells.box, tree.blocks
-    scale, slack = np.float32(box.inverse * (1.0 + 1e-6)), np.float32(slack)
-    across, along = np.int32(box.across), np.int32(box.along)
-    p, q, r = _last_centres(box)
-    for child in range(LANES * tree.starts[1]):
-        at = np.uint64(child // LANES * 4 * LANES + child % LANES)
-        x, y, z = blocks[at], blocks[at + _ROW], blocks[at + np.uint64(2) * _ROW]
-        radius = blocks[at + np.uint64(3) * _ROW]
-        a = to_cell[0] * x + to_cell[1] * y + to_cell[2] * z + to_cell[9]
-        b = to_cell[3] * x + to_cell[4] * y + to_cell[5] * z + to_cell[10]
-        c = to_cell[6] * x + to_cell[7] * y + to_cell[8] * z + to_cell[11]
-        i = np.int32(min(max(_HALF, a), p))
-        j = np.int32(min(max(_HALF, b), q))
-        k = np.int32(min(max(_HALF, c), r))
-        reach = (radius + slack) * scale
-        cell = np.uint64(np.int32(np.int32(i * across) + np.int32(j * along)) + k)
-        if np.float32(depths[cell]) <= reach * reach:  # never where the radius is NaN
-            return False
-    return True
-
-
-@inner
-def gather_points(tree, cells, to_cell, slack, near):
-    """Fill rows and nodes with the points themselves, number[0] with how many; see gather."""
-    gather(tree, cells, to_cell, slack, near, 0)
-    x, y, z, radius = near.rows[0], near.rows[1], near.rows[2], near.rows[3]
-    nodes, begin, packets = near.nodes, np.uint64(near.begin[0]), near.number[0]
-    for at in range(np.uint64(packets)):
-        packet = np.uint64(near.kept[begin + at])
-        _copy_points(tree, packet, at, x, y, z)
-        for lane in range(_ROW):
-            nodes[at * _ROW + lane] = tree.begins[packet] + np.int32(lane)
-    for n in range(np.uint64(packets) * _ROW):
-        radius[n] = x[n] - x[n]  # 0, or NaN where there is no point
-    count, none, total = LANES * packets, np.uint64(0), np.uint64(0)
-    _locate_spheres(x, y, z, radius, none, count, to_cell, cells.box, slack, near)
-    for n in range(np.uint64(count)):
-        x[total], y[total], z[total], nodes[total] = x[n], y[n], z[n], nodes[n]
-        total += np.uint64(np.int32(cells.steps[np.uint64(near.cells[n])]) <= near.limits[n])
-    near.number[0] = np.int64(total)
-
-
-@leaf
-def _copy_points(tree, packet, at, x, y, z):
-    """Copy the points of a packet to the at-th place for packets."""
-    place, to = packet * np.uint64(3) * _ROW, at * _ROW
-    _copy(tree.points, place, x, to)
-    _copy(tree.points, place + _ROW, y, to)
-    _copy(tree.points, place + np.uint64(2) * _ROW, z, to)
-
-
 @leaf
 def _expand(tree, nodes, count, near):
-    """Replace nodes by their children, block by block; returns how many lanes these have."""
-    starts, first, parents, one = tree.starts, tree.first, near.cells, np.uint64(1)
+    """Replace blocks by their children; returns how many lanes these have."""
+    parents, total = near.cells, np.uint64(0)
     for n in range(np.uint64(count)):
         parents[n] = nodes[n]
-    total = np.uint64(0)
     for n in range(np.uint64(count)):
-        node = np.uint64(parents[n])
-        for block in range(np.uint64(starts[node]), np.uint64(starts[node + one])):
-            for row in range(4):
-                step = np.uint64(row)
-                _copy(tree.blocks, (np.uint64(4) * block + step) * _ROW, near.rows[row], total)
-            for lane in range(_ROW):
-                nodes[total + lane] = first[block] + np.int32(lane)
-            total += _ROW
+        block = np.uint64(parents[n])
+        for row in range(4):
+            _copy(tree.blocks, block * _BLOCK + np.uint64(row) * _ROW, near.rows[row], total)
+        for lane in range(_ROW):
+            nodes[total + lane] = tree.first[block] + np.int32(lane)
+        total += _ROW
     return np.int64(total)
 
 
@@ -257,7 +345,7 @@ def select(tree, cells, to_cell, rounding, near, n):
 
     rounding: by how many metres it may move a point.
     """
-    steps, where, nodes, hits, begins = cells.steps, near.cells, near.nodes, near.hits, tree.begins
+    steps, where, nodes, hits = cells.steps, near.cells, near.nodes, near.hits
     begin, count = np.uint64(near.begin[n]), near.number[n]
     _locate_spheres(
         near.x, near.y, near.z, near.radius, begin, count, to_cell, cells.box, rounding, near
@@ -265,11 +353,14 @@ def select(tree, cells, to_cell, rounding, near, n):
     packets = _keep(near.kept, begin, count, steps, near)
     x, y, z = near.rows[0], near.rows[1], near.rows[2]
     for at in range(np.uint64(packets)):
-        _copy_points(tree, np.uint64(nodes[at]), at, x, y, z)
+        place, to = np.uint64(nodes[at]) * _BLOCK, at * _ROW
+        _copy(tree.blocks, place, x, to)
+        _copy(tree.blocks, place + _ROW, y, to)
+        _copy(tree.blocks, place + np.uint64(2) * _ROW, z, to)
     _locate_points(x, y, z, packets, to_cell, cells, rounding, where)
     total = np.uint64(0)
     for at in range(np.uint64(packets)):
-        point = begins[np.uint64(nodes[at])]
+        point = tree.first[np.uint64(nodes[at])]
         for lane in range(_ROW):
             hits[total] = point + np.int32(lane)
             total += np.uint64(steps[np.uint64(where[at * _ROW + lane])] == 0)

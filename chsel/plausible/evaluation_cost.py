@@ -7,9 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Box, Places, Region, box_of, clearance_of, locate
+from chsel.numerics.cell_set import Box, CellSet, Places, box_of, locate, places_for
 from chsel.numerics.compiler import compiled, inner, leaf, spliced
-from chsel.numerics.octree import Candidates, Tree, candidates_for, octree, walk
+from chsel.numerics.near_points import (
+    NearPoints,
+    PointTree,
+    gather,
+    near_points_for,
+    point_tree,
+    select,
+    to_cells,
+)
 from chsel.numerics.pose_tuples import finite, pose_at, rigid, turned_back
 from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.plausible.plausible_settings import EvaluationCostSettings
@@ -19,6 +27,7 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import (
     DistanceField,
+    cells_below,
     distance_field,
     distance_in_box,
     distance_in_place,
@@ -46,8 +55,8 @@ class EvaluationModel(NamedTuple):
     """All that the evaluation cost of a pose depends on."""
 
     field: DistanceField
-    tree: Tree  # of the free points
-    region: Region  # cells of the object in which a free point can violate
+    tree: PointTree  # of the free points
+    cells: CellSet  # of the object in which a free point can violate
     occupied: FloatArray  # (3, K), world
     known: FloatArray  # (3, M), world
     known_sdf: FloatArray  # (M,), m
@@ -70,13 +79,13 @@ class EvaluationCost:
         require_ieee_arithmetic()
         self.problem, self.settings = problem, settings
         points, sdf, level = problem.points, problem.sdf, -settings.tolerance
-        tree = octree(points.free, problem.free_resolution)
+        tree = point_tree(points.free, problem.free_resolution)
         voxels, point_in = _voxels(tree, problem.free_resolution)
         occupied = points.occupied if settings.occupied else np.zeros((0, 3))
         self.model = EvaluationModel(
             field=distance_field(sdf, settings.lookup, settings.outside),
             tree=tree,
-            region=_region(sdf, level, settings.lookup),
+            cells=cells_below(sdf, level + _LEVEL_ROUNDING, settings.lookup),
             occupied=occupied.T.copy(),
             known=points.known.T.copy(),
             known_sdf=points.sdf.copy(),
@@ -93,7 +102,7 @@ class EvaluationCost:
         poses = Poses.of(object_from_world)
         costs = np.empty(len(poses))
 
-        def run(first: int, last: int, scratch: Candidates) -> None:
+        def run(first: int, last: int, scratch: Scratch) -> None:
             costs_below(self.model, poses.numbers, limit, costs, first, last, scratch)
 
         spread(run, len(poses), lambda: scratch_for(self.model), least=_POSES_PER_THREAD)
@@ -111,17 +120,6 @@ def _divisors(points: KnownPoints, settings: EvaluationCostSettings) -> Divisors
     return Divisors(*(float(max(len(part), 1)) for part in classes))
 
 
-def _region(sdf: SdfGrid, level: float, lookup: str) -> Region:
-    """The cells that read any value of `level` or less."""
-
-    def make() -> Region:
-        box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
-        active = sdf.active_cells(level + _LEVEL_ROUNDING, lookup)
-        return Region(box, clearance_of(active, sdf.resolution))
-
-    return sdf.derived(("evaluation region", level, lookup), make)
-
-
 def _inside(sdf: SdfGrid, level: float) -> FloatArray:
     """Points (3, I) inside of the object, far apart from each other."""
     nodes = np.argwhere(sdf.values <= level)
@@ -130,9 +128,9 @@ def _inside(sdf: SdfGrid, level: float) -> FloatArray:
     return points[farthest_points(points, _MOST_INSIDE)].T.copy()
 
 
-def _voxels(tree: Tree, resolution: float) -> tuple[Box, Any]:
+def _voxels(tree: PointTree, resolution: float) -> tuple[Box, Any]:
     """The voxels of free points with an empty layer around them, and a free point of each."""
-    free = tree.spheres[:3, len(tree.starts) - 1 :].T
+    free = tree.points.T
     if len(free) == 0 or voxels_spanned(free, resolution) > _MOST_VOXELS:
         return box_of(np.zeros(3), 1.0, (1, 1, 1)), np.full(1, -1, dtype=np.int32)
     grid = VoxelGrid.around(free, resolution)
@@ -142,10 +140,22 @@ def _voxels(tree: Tree, resolution: float) -> tuple[Box, Any]:
     return box_of(grid.origin, resolution, grid.flags.shape), point_in.reshape(-1)
 
 
-def scratch_for(model: EvaluationModel) -> Candidates:
+class Scratch(NamedTuple):
+    """Of one thread: the free points that are looked up, and where points lie."""
+
+    near: NearPoints
+    x: FloatArray  # (S,) metres, world
+    y: FloatArray
+    z: FloatArray
+    places: Places
+
+
+def scratch_for(model: EvaluationModel) -> Scratch:
     """Scratch for one thread."""
-    points = model.tree.spheres, model.occupied, model.known
-    return candidates_for(max(_MOST_DISTINCT + 1, *(array.shape[1] for array in points)))
+    points = model.tree.points, model.occupied, model.known
+    size = max(_MOST_DISTINCT, *(array.shape[1] for array in points))
+    near, (x, y, z) = near_points_for(model.tree, 1), np.empty((3, size))
+    return Scratch(near, x, y, z, places_for(size))
 
 
 @compiled
@@ -156,7 +166,7 @@ def costs_below(
     out: FloatArray,
     first: int,
     last: int,
-    scratch: Candidates,
+    scratch: Scratch,
 ) -> None:
     """Fill out (B,) with the costs below a limit, else inf, of poses (B, 12) from first to last."""
     for n in range(first, last):
@@ -164,7 +174,7 @@ def costs_below(
 
 
 @inner
-def cost_below(model: EvaluationModel, pose: Pose, limit: float, scratch: Candidates) -> float:
+def cost_below(model: EvaluationModel, pose: Pose, limit: float, scratch: Scratch) -> float:
     """The evaluation cost of a pose; infinite if it is not below the limit."""
     if not finite(pose):
         return np.inf
@@ -188,7 +198,7 @@ def _cost(model: EvaluationModel, free: int, occupied: int, total: float) -> flo
 
 
 @spliced
-def _known_sum(model: EvaluationModel, pose: Pose, scratch: Candidates) -> float:
+def _known_sum(model: EvaluationModel, pose: Pose, scratch: Scratch) -> float:
     """sum |s - v| over the points of known signed distance, in their order."""
     known, total = model.known, 0.0
     locate(pose, model.field.box, known[0], known[1], known[2], scratch.places, known.shape[1])
@@ -200,7 +210,7 @@ def _known_sum(model: EvaluationModel, pose: Pose, scratch: Candidates) -> float
 
 
 @spliced
-def _occupied_count(model: EvaluationModel, pose: Pose, scratch: Candidates) -> int:
+def _occupied_count(model: EvaluationModel, pose: Pose, scratch: Scratch) -> int:
     occupied, count = model.occupied, 0
     places, number = scratch.places, occupied.shape[1]
     locate(pose, model.field.box, occupied[0], occupied[1], occupied[2], places, number)
@@ -218,11 +228,10 @@ def _may_be_below(
     occupied: int,
     total: float,
     limit: float,
-    scratch: Candidates,
+    scratch: Scratch,
 ) -> bool:
     """False if the free points near some points inside of the object violate too often."""
-    spheres, nodes = model.tree.spheres, len(model.tree.starts) - 1
-    voxels, inside, hits = model.voxels, model.inside, 0
+    voxels, inside, points, hits = model.voxels, model.inside, model.tree.points, 0
     for n in range(inside.shape[1]):
         x, y, z = inside[0, n] - pose[9], inside[1, n] - pose[10], inside[2, n] - pose[11]
         x, y, z = turned_back(pose, x, y, z)
@@ -230,14 +239,12 @@ def _may_be_below(
         j = min(max(np.rint((y - voxels.first[1]) * voxels.inverse), 0.0), voxels.most[1])
         k = min(max(np.rint((z - voxels.first[2]) * voxels.inverse), 0.0), voxels.most[2])
         point = model.point_in[int(i * voxels.across + j * voxels.along + k)]
-        if point >= 0 and hits < _MOST_DISTINCT and _is_new(scratch.kept, hits, point):
-            node = nodes + point
-            scratch.x[0] = spheres[0, node]
-            scratch.y[0] = spheres[1, node]
-            scratch.z[0] = spheres[2, node]
-            locate(pose, model.region.box, scratch.x, scratch.y, scratch.z, scratch.places, 1)
+        if point >= 0 and hits < _MOST_DISTINCT and _is_new(scratch.near.hits, hits, point):
+            scratch.x[0], scratch.y[0] = points[0, point], points[1, point]
+            scratch.z[0] = points[2, point]
+            locate(pose, model.cells.box, scratch.x, scratch.y, scratch.z, scratch.places, 1)
             if _violates(model, scratch.places, 0):
-                scratch.kept[hits] = point
+                scratch.near.hits[hits] = point
                 hits += 1
                 if not _cost(model, hits, occupied, total) < limit:
                     return False
@@ -245,26 +252,36 @@ def _may_be_below(
 
 
 @leaf
-def _is_new(kept: Any, count: int, point: int) -> bool:
+def _is_new(hits: Any, count: int, point: int) -> bool:
     new = True
     for n in range(count):
-        new &= kept[n] != point
+        new &= hits[n] != point
     return new
 
 
 @leaf
 def _violates(model: EvaluationModel, places: Places, n: int) -> bool:
     """Whether a free point at the n-th of the places is inside; nothing beyond the grid is."""
-    if model.region.clearance[places.cell[n]] >= 0.0 or places.beyond[n] > 0.0:
+    if model.cells.steps[places.cell[n]] > 0 or places.beyond[n] > 0.0:
         return False
     return distance_in_box(model.field, places, n)[0] <= model.level
 
 
 @spliced
-def _free_count(model: EvaluationModel, pose: Pose, scratch: Candidates) -> int:
-    slack = 0.0 if rigid(pose) else np.inf
-    count = walk(model.tree, model.region, pose, slack, scratch)
-    locate(pose, model.region.box, scratch.x, scratch.y, scratch.z, scratch.places, count)
+def _free_count(model: EvaluationModel, pose: Pose, scratch: Scratch) -> int:
+    tree, cells, near, points = model.tree, model.cells, scratch.near, model.tree.points
+    to_cell, rounding = to_cells(tree, cells.box, pose)
+    if rounding >= 0.0 and rigid(pose):
+        gather(tree, cells, to_cell, rounding, near, 0)
+        count = select(tree, cells, to_cell, rounding, near, 0)
+    else:
+        count = points.shape[1]
+        for n in range(count):
+            near.hits[n] = n
+    for n in range(count):
+        at = near.hits[n]
+        scratch.x[n], scratch.y[n], scratch.z[n] = points[0, at], points[1, at], points[2, at]
+    locate(pose, cells.box, scratch.x, scratch.y, scratch.z, scratch.places, count)
     violations = 0
     for n in range(count):
         violations += 1 if _violates(model, scratch.places, n) else 0

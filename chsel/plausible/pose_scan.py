@@ -16,12 +16,12 @@ from chsel.errors import EvaluationError
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import compiled, leaf
-from chsel.numerics.octree import Candidates
 from chsel.numerics.pose_tuples import pose_at, turned
 from chsel.numerics.threads import spread
 from chsel.plausible.evaluation_cost import (
     EvaluationCost,
     EvaluationModel,
+    Scratch,
     cost_below,
     scratch_for,
 )
@@ -201,7 +201,7 @@ class Scan(NamedTuple):
 class ScanBuffer(NamedTuple):
     """Scratch of one thread, and the poses below the limit that it collects."""
 
-    cost_scratch: Candidates
+    cost_scratch: Scratch
     points: FloatArray  # (3, M) turned known points, m
     shifts: FloatArray  # (3, P + _LANES) translations of poses, m
     total: FloatArray  # (_LANES,) lower bounds of sums over known points, m

@@ -26,7 +26,7 @@ from chsel.numerics.arrays import (
     read_only,
     same_bits,
 )
-from chsel.numerics.voxels import bounds_of, set_voxels
+from chsel.numerics.cell_set import bounds_of, set_voxels
 from chsel.problem.sdf_grid import SdfGrid
 
 # In diameters of the object:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.cell_set import Box, Region, box_of, clearance_of
+from chsel.numerics.cell_set import Box, CellSet, box_of, cell_set_of
 from chsel.numerics.compiler import leaf
 from chsel.numerics.pose_tuples import moved
 from chsel.problem.sdf_grid import SdfGrid
@@ -29,12 +29,12 @@ def distance_field(sdf: SdfGrid, lookup: str, outside: str) -> DistanceField:
     return DistanceField(box, sdf.table.reshape(-1), trilinear, outside == "bounding_box")
 
 
-def cells_below(sdf: SdfGrid, level: float, lookup: str) -> Region:
+def cells_below(sdf: SdfGrid, level: float, lookup: str) -> CellSet:
     """The cells of a grid that read any value below `level`, derived once."""
 
-    def make() -> Region:
+    def make() -> CellSet:
         box = box_of(sdf.origin, sdf.resolution, sdf.shape, between=lookup == "trilinear")
-        return Region(box, clearance_of(sdf.active_cells(level, lookup), sdf.resolution))
+        return cell_set_of(box, sdf.active_cells(level, lookup))
 
     return sdf.derived(("cells below", level, lookup), make)
 

@@ -106,7 +106,7 @@ class Energy:
 
     def scratch(self) -> Scratch:
         """Scratch of one thread."""
-        near = near_points_for(self.model.free.rough, 1)
+        near = near_points_for(self.model.free.tree, 1)
         return Scratch(near, scratch(12), scratch(_LEVELS))
 
     def of(self, poses: Poses) -> FloatArray:
@@ -236,13 +236,15 @@ def gather_free(model, pose, slack, work):
     """Gather the free points that can matter until the object moves by a slack, metres."""
     free, points = model.free, work.near
     remember(free, pose, work.memory)
-    to_cell, rounding = to_cells(free.rough, free.cells.box, pose)
-    if len(free.tree.order) == 0 or is_apart(free, pose, slack + free.margin):
+    to_cell, rounding = to_cells(free.tree, free.cells.box, pose)
+    if len(free.tree.order) == 0:
         points.number[0] = 0
     elif rounding < 0.0 or not rigid(pose):
         points.number[0] = _ALL
+    elif is_apart(free, pose, slack + rounding):
+        points.number[0] = 0
     else:
-        gather(free.rough, free.cells, to_cell, slack + free.margin + rounding, points, 0)
+        gather(free.tree, free.cells, to_cell, slack + rounding, points, 0)
 
 
 @leaf
@@ -257,9 +259,9 @@ def look_around(model, pose, work):
     free, points = model.free, work.near
     if points.number[0] == 0:
         return 0
-    to_cell, rounding = to_cells(free.rough, free.cells.box, pose)
+    to_cell, rounding = to_cells(free.tree, free.cells.box, pose)
     if points.number[0] != _ALL and rounding >= 0.0:
-        return select(free.rough, free.cells, to_cell, rounding + free.margin, points, 0)
+        return select(free.tree, free.cells, to_cell, rounding, points, 0)
     count = len(free.tree.order)
     for at in range(count):
         points.hits[at] = at
@@ -269,9 +271,8 @@ def look_around(model, pose, work):
 @leaf
 def free_point(model, work, n):
     """The n-th of the hits: a point of the world."""
-    free = model.free
-    at, spheres = np.uint64(len(free.tree.starts) - 1 + work.near.hits[n]), free.tree.spheres
-    return spheres[0, at], spheres[1, at], spheres[2, at]
+    at, points = np.uint64(work.near.hits[n]), model.free.tree.points
+    return points[0, at], points[1, at], points[2, at]
 
 
 @leaf
@@ -289,6 +290,6 @@ def place_of(model, pose, point):
     u, v, w = (a - first[0]) * inverse, (b - first[1]) * inverse, (c - first[2]) * inverse
     i, j, k = min(np.floor(u), most[0]), min(np.floor(v), most[1]), min(np.floor(w), most[2])
     cell = int(i * box.across + j * box.along + k)
-    if a != x or b != y or c != z or model.free.region.clearance[np.uint64(cell)] >= 0.0:
+    if a != x or b != y or c != z or model.free.cells.steps[np.uint64(cell)] > 0:
         cell = -1
     return cell, u - i, v - j, w - k

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.clearance import squared_clearances
+from chsel.numerics.cell_set import squared_clearances
 from chsel.numerics.compiler import compiled
 from chsel.problem.points import VoxelGrid, Workspace
 

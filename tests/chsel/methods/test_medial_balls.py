@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from chsel.errors import SettingError
 from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.clearance import squared_clearances
+from chsel.numerics.cell_set import squared_clearances
 from chsel.problem.points import Workspace
 
 SIDE = 0.025
