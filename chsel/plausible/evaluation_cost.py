@@ -102,7 +102,7 @@ class EvaluationCost:
         poses = Poses.of(object_from_world)
         costs = np.empty(len(poses))
 
-        def run(first: int, last: int, scratch: Scratch) -> None:
+        def run(first: int, last: int, scratch: EvaluationScratch) -> None:
             costs_below(self.model, poses.numbers, limit, costs, first, last, scratch)
 
         spread(run, len(poses), lambda: scratch_for(self.model), least=_POSES_PER_THREAD)
@@ -140,7 +140,7 @@ def _voxels(tree: PointTree, resolution: float) -> tuple[Box, Any]:
     return box_of(grid.origin, resolution, grid.flags.shape), point_in.reshape(-1)
 
 
-class Scratch(NamedTuple):
+class EvaluationScratch(NamedTuple):
     """Of one thread: the free points that are looked up, and where points lie."""
 
     near: NearPoints
@@ -150,12 +150,12 @@ class Scratch(NamedTuple):
     places: Places
 
 
-def scratch_for(model: EvaluationModel) -> Scratch:
-    """Scratch for one thread."""
+def scratch_for(model: EvaluationModel) -> EvaluationScratch:
+    """EvaluationScratch for one thread."""
     points = model.tree.points, model.occupied, model.known
     size = max(_MOST_DISTINCT, *(array.shape[1] for array in points))
     near, (x, y, z) = near_points_for(model.tree, 1), np.empty((3, size))
-    return Scratch(near, x, y, z, places_for(size))
+    return EvaluationScratch(near, x, y, z, places_for(size))
 
 
 @compiled
@@ -166,7 +166,7 @@ def costs_below(
     out: FloatArray,
     first: int,
     last: int,
-    scratch: Scratch,
+    scratch: EvaluationScratch,
 ) -> None:
     """Fill out (B,) with the costs below a limit, else inf, of poses (B, 12) from first to last."""
     for n in range(first, last):
@@ -174,7 +174,9 @@ def costs_below(
 
 
 @inner
-def cost_below(model: EvaluationModel, pose: Pose, limit: float, scratch: Scratch) -> float:
+def cost_below(
+    model: EvaluationModel, pose: Pose, limit: float, scratch: EvaluationScratch
+) -> float:
     """The evaluation cost of a pose; infinite if it is not below the limit."""
     if not finite(pose):
         return np.inf
@@ -198,7 +200,7 @@ def _cost(model: EvaluationModel, free: int, occupied: int, total: float) -> flo
 
 
 @spliced
-def _known_sum(model: EvaluationModel, pose: Pose, scratch: Scratch) -> float:
+def _known_sum(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> float:
     """sum |s - v| over the points of known signed distance, in their order."""
     known, total = model.known, 0.0
     locate(pose, model.field.box, known[0], known[1], known[2], scratch.places, known.shape[1])
@@ -210,7 +212,7 @@ def _known_sum(model: EvaluationModel, pose: Pose, scratch: Scratch) -> float:
 
 
 @spliced
-def _occupied_count(model: EvaluationModel, pose: Pose, scratch: Scratch) -> int:
+def _occupied_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> int:
     occupied, count = model.occupied, 0
     places, number = scratch.places, occupied.shape[1]
     locate(pose, model.field.box, occupied[0], occupied[1], occupied[2], places, number)
@@ -228,7 +230,7 @@ def _may_be_below(
     occupied: int,
     total: float,
     limit: float,
-    scratch: Scratch,
+    scratch: EvaluationScratch,
 ) -> bool:
     """False if the free points near some points inside of the object violate too often."""
     voxels, inside, points, hits = model.voxels, model.inside, model.tree.points, 0
@@ -268,7 +270,7 @@ def _violates(model: EvaluationModel, places: Places, n: int) -> bool:
 
 
 @spliced
-def _free_count(model: EvaluationModel, pose: Pose, scratch: Scratch) -> int:
+def _free_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScratch) -> int:
     tree, cells, near, points = model.tree, model.cells, scratch.near, model.tree.points
     to_cell, rounding = to_cells(tree, cells.box, pose)
     if rounding >= 0.0 and rigid(pose):

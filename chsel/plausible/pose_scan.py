@@ -21,7 +21,7 @@ from chsel.numerics.threads import spread
 from chsel.plausible.evaluation_cost import (
     EvaluationCost,
     EvaluationModel,
-    Scratch,
+    EvaluationScratch,
     cost_below,
     scratch_for,
 )
@@ -199,9 +199,9 @@ class Scan(NamedTuple):
 
 
 class ScanBuffer(NamedTuple):
-    """Scratch of one thread, and the poses below the limit that it collects."""
+    """EvaluationScratch of one thread, and the poses below the limit that it collects."""
 
-    cost_scratch: Scratch
+    cost_scratch: EvaluationScratch
     points: FloatArray  # (3, M) turned known points, m
     shifts: FloatArray  # (3, P + _LANES) translations of poses, m
     total: FloatArray  # (_LANES,) lower bounds of sums over known points, m
