@@ -180,28 +180,25 @@ def evaluate(
 def _print_by_faults(folder: Path) -> None:
     """By level of faults: whether sets hold the truth, and how far hypotheses are from it."""
     # Pandas and matplotlib take a second to import, which an evaluation starts without.
-    from runners.reporting.by_faults import tables_by_faults
     from runners.reporting.evaluation_folder import open_evaluation
-    from runners.reporting.method_style import method_styles
+    from runners.reporting.figures import method_styles
+    from runners.reporting.method_sections import tables_by_faults
     from runners.reporting.tables import print_table
 
     evaluation = open_evaluation(folder)
-    styles = method_styles(evaluation.methods)
-    for table in tables_by_faults(evaluation.rows, styles):
+    for table in tables_by_faults(evaluation.rows, method_styles(evaluation.methods)):
         print_table(Console(), table)
 
 
 def _print_policies(folder: Path) -> None:
     """How far each policy has come after how many probes."""
-    from runners.reporting.error_over_probes import error_table
     from runners.reporting.evaluation_folder import open_evaluation
-    from runners.reporting.method_style import policy_styles
-    from runners.reporting.probes_needed import needed_table
+    from runners.reporting.figures import policy_styles
+    from runners.reporting.policy_sections import error_table, needed_table
     from runners.reporting.steered_sessions import steered_sessions
     from runners.reporting.tables import print_table
 
-    evaluation = open_evaluation(folder)
-    sessions = steered_sessions(evaluation)
+    sessions = steered_sessions(open_evaluation(folder))
     if sessions.count:
         styles = policy_styles(sessions.policies)
         for table in (error_table(sessions, styles), needed_table(sessions, styles)):

@@ -36,7 +36,7 @@ from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.selection import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.reporting.statistics import spreads
-from runners.reporting.tables import Cell, Table, number, print_table
+from runners.reporting.tables import Table, number, print_table
 from runners.run.compiling import compiling_line
 from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
@@ -211,7 +211,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         for column, points, _, scale in _MEDIANS:
             found = medians[column].reindex([(points, case, method)]).iloc[0]
             texts.append(number(scale * found["median"]))
-        lines.append(tuple(map(Cell, texts)))
+        lines.append(tuple(texts))
     header = ("case", "method", "tou-\nches", "right", *(text for _, _, text, _ in _MEDIANS))
     note = (
         "Of the best hypothesis. Residual: mean |SDF| of all touches; held out: that of a random "

@@ -1,167 +1,127 @@
-"""A report as one HTML page with its pictures in it, and as Markdown beside them."""
+"""A report as Markdown with its pictures beside it, and as one HTML page with them in it."""
 
 from __future__ import annotations
 
 import base64
+import html
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jinja2
+from markdown_it import MarkdownIt
 
 from runners.reporting.evaluation_folder import Evaluation, trials_of
-from runners.reporting.figures import Picture, file_content
-from runners.reporting.section import Section
-from runners.reporting.tables import Cell, Table
+from runners.reporting.figures import Picture
+from runners.reporting.tables import Table, table_of
 
-_LONG = 20  # rows, of tables that can be folded
 _NOT_SHOWN = ("environment", "other_environments", "commands", "methods", "policies", "format")
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 0 auto; padding: 1rem; }
+p { max-width: 48rem; }
+img { max-width: 100%; }
+table { border-collapse: collapse; font-size: 0.85rem; display: block; overflow-x: auto; }
+th, td { padding: 0.25rem 0.6rem; border-bottom: 1px solid #d5d5d5; vertical-align: top; }
+"""
 
 
 @dataclass(frozen=True)
-class Page:
-    """A report in full."""
+class Section:
+    """A section of the page."""
 
     title: str
-    lead: tuple[str, ...]  # what it is about
-    sections: tuple[Section, ...]
-    commands: tuple[str, ...]  # that made the evaluation and the report
-    made: tuple[Table, ...]  # settings and versions
-    kind: str  # of the files of its pictures, one of FORMATS
+    text: str  # what is shown and how it comes about
+    tables: Sequence[Table] = ()
+    picture: Picture | None = None
 
 
-def page_of(evaluation: Evaluation, sections: Sequence[Section], command: str, kind: str) -> Page:
-    """A page of sections. command: that makes the report itself. kind: of the pictures' files."""
-    experiment, rows = evaluation.experiment, evaluation.rows
-    lead = [
-        f"{len(evaluation.methods)} methods on {len(trials_of(rows))} trials of "
-        f"{len(evaluation.objects)} objects: {len(rows)} registrations. PD is plausible diversity "
-        "in mm², lower is better; the best median of a row is bold, in brackets are its quartiles, "
-        "and n is how many numbers are behind it.",
-        f"Plausible sets are by the definition {evaluation.definition_text}.",
-    ]
-    if evaluation.is_steered:
-        lead = [_lead_of_policies(evaluation)]
-    if evaluation.gathered:
-        lead.append("There is no table of the whole evaluation yet: this is what is finished.")
-    if rows.empty and evaluation.probes.empty:
-        lead = ["Nothing is finished yet: there is no registration to report on."]
-    commands = experiment.get("commands")
-    made = [str(line) for line in commands] if isinstance(commands, list) else []
-    return Page(
-        f"Evaluation {evaluation.name}",
-        tuple(lead),
-        tuple(sections),
-        (*made, command),
-        tuple(table for table in _made(experiment) if table.rows),
-        kind,
-    )
-
-
-def _lead_of_policies(evaluation: Evaluation) -> str:
-    probes = evaluation.probes
-    methods = ", ".join(sorted(probes["method"].dropna().unique()))
-    return (
-        f"{probes['policy'].nunique()} policies on {len(trials_of(probes))} trials of "
-        f"{probes['object'].nunique()} objects: {len(probes)} probes, after which {methods} "
-        "registered, from the first contact on."
-    )
-
-
-def as_html(page: Page, contents: Mapping[str, bytes]) -> str:
-    """The page with its pictures in it, to be read without anything else.
-
-    contents: of the pictures' files by name. Pictures of PDF files, which pages cannot show, are
-    drawn as PNG.
-    """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("runners.reporting", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        undefined=jinja2.StrictUndefined,
-    )
-
-    def address(picture: Picture) -> str:
-        pdf = page.kind == "pdf"
-        content = file_content(picture.figure) if pdf else contents[picture.name]
-        media_type = "svg+xml" if page.kind == "svg" else "png"
-        return f"data:image/{media_type};base64,{base64.b64encode(content).decode()}"
-
-    environment.filters["address"] = address
-    return environment.get_template("page.html").render(vars(page))
-
-
-def as_markdown(page: Page) -> str:
-    """The page, with links to the files of its pictures and of their data."""
-    parts = [f"# {_text(page.title)}", *map(_text, page.lead)]
-    for section in page.sections:
-        parts += [f"## {_text(section.title)}"]
-        parts += [_text(section.text)] if section.text else []
-        if section.picture is not None:
-            name, alt = section.picture.name, _text(section.picture.alt)
-            parts.append(f"{'' if page.kind == 'pdf' else '!'}[{alt}]({name}.{page.kind})")
-            parts.append(f"[The numbers drawn]({name}.csv)")
-        elif section.missing:
-            parts.append(f"No picture: {_text(section.missing)}.")
-        parts += [part for table in section.tables for part in _markdown_table(table)]
-    parts += ["## How it was made", "```\n" + "\n".join(page.commands) + "\n```"]
-    parts += [part for table in page.made for part in _markdown_table(table)]
+def as_markdown(
+    evaluation: Evaluation, sections: Sequence[Section], command: str, kind: str
+) -> str:
+    """The report. command: that makes it again. kind: of its pictures' files, one of FORMATS."""
+    parts = [f"# Evaluation {_escaped(evaluation.name)}", *map(_escaped, _lead(evaluation))]
+    for section in sections:
+        parts += [f"## {section.title}", _escaped(section.text)]
+        if (picture := section.picture) is not None:
+            link = f"[{_escaped(picture.alt)}]({picture.name}.{kind})"
+            parts.append(link if kind == "pdf" else f"!{link}")
+            parts.append(f"[The numbers drawn]({picture.name}.csv)")
+        parts += [part for table in section.tables if table.rows for part in _table(table)]
+    commands = [*evaluation.experiment.get("commands", ()), command]
+    parts += ["## How it was made", "```\n" + "\n".join(commands) + "\n```"]
+    parts += [part for table in _made(evaluation.experiment) for part in _table(table)]
     return "\n\n".join(parts) + "\n"
 
 
-def _markdown_table(table: Table) -> list[str]:
-    lines = [
-        "| " + " | ".join(_text(name) for name in table.header) + " |",
-        "|" + "|".join(" :-- " if i < table.labels else " --: " for i in range(len(table.header)))
-        + "|",
-        *("| " + " | ".join(_markdown_cell(cell) for cell in row) + " |" for row in table.rows),
-    ]  # fmt: skip
-    text = "\n".join(lines)
-    note = [_text(table.note)] if table.note else []
-    if len(table.rows) <= _LONG:
-        return [f"**{_text(table.title)}**", text, *note]
-    return [f"<details><summary>{_text(table.title)}</summary>", text, *note, "</details>"]
+def as_html(markdown: str, pictures: Mapping[str, bytes]) -> str:
+    """The same to be read without anything else. pictures: contents of files by their names."""
+    body = MarkdownIt("commonmark", {"html": False}).enable("table").render(markdown)
+    for name, content in pictures.items():
+        kind = "image/svg+xml" if name.endswith("svg") else "image/png"
+        data = f"data:{kind};base64,{base64.b64encode(content).decode()}"
+        body = body.replace(f'<img src="{name}"', f'<img src="{data}"')
+    title = html.escape(markdown.partition("\n")[0].lstrip("# "))
+    head = f'<meta charset="utf-8">\n<title>{title}</title>\n<style>{_STYLE}</style>'
+    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n</head>\n{body}</html>\n'
 
 
-def _markdown_cell(cell: Cell) -> str:
-    text = f"**{_text(cell.text)}**" if cell.best else _text(cell.text)
-    text += f" {_text(cell.between)}" if cell.between else ""
-    return f"{text} ({_text(cell.note)})" if cell.note else text
+def _lead(evaluation: Evaluation) -> Iterator[str]:
+    """What the report is about."""
+    rows, probes = evaluation.rows, evaluation.probes
+    if evaluation.gathered:
+        yield "There is no table of the whole evaluation yet: this is what is finished."
+    if len(probes):
+        yield (
+            f"{probes['policy'].nunique()} policies on {len(trials_of(probes))} trials of "
+            f"{probes['object'].nunique()} objects: {len(probes)} probes, after which "
+            f"{', '.join(sorted(probes['method'].dropna().unique()))} registered, from the first "
+            "contact on."
+        )
+    elif len(rows):
+        yield (
+            f"{rows['method'].nunique()} methods on {len(trials_of(rows))} trials of "
+            f"{rows['object'].nunique()} objects: {len(rows)} registrations. PD is plausible "
+            "diversity in mm², lower is better; the best median of a row is bold, in brackets are "
+            "its quartiles, and n is how many numbers are behind it."
+        )
+        yield f"Plausible sets are by the definition {evaluation.definition_text}."
+    else:
+        yield "Nothing is finished yet: there is no registration to report on."
 
 
-def _text(text: str) -> str:
+def _table(table: Table) -> list[str]:
+    ends = [" :-- " if n < table.labels else " --: " for n in range(len(table.header))]
+    lines = ["|" + "|".join(ends) + "|"]
+    lines += ["| " + " | ".join(map(_cell, row)) + " |" for row in table.rows]
+    lines.insert(0, "| " + " | ".join(map(_cell, table.header)) + " |")
+    note = [_escaped(table.note)] if table.note else []
+    return [f"**{_escaped(table.title)}**", "\n".join(lines), *note]
+
+
+def _cell(text: str) -> str:
+    bold = re.fullmatch(r"\*\*(.*)\*\*", text)
+    return f"**{_escaped(bold[1])}**" if bold else _escaped(text)
+
+
+def _escaped(text: str) -> str:
     """Text that Markdown takes for nothing else."""
     return re.sub(r"([\\`*_<>|#]|(?<=\])\()", r"\\\1", " ".join(text.split()))
 
 
-def _made(experiment: Mapping[str, Any]) -> list[Table]:
+def _made(experiment: Mapping[str, Any]) -> Iterator[Table]:
     """Settings and versions."""
     settings = {name: value for name, value in experiment.items() if name not in _NOT_SHOWN}
-    environments = [experiment.get("environment"), *(experiment.get("other_environments") or ())]
-    tables = [_pairs("Settings, all of which experiment.json holds", _flat(settings))]
-    for index, values in enumerate(environments):
-        title = "Versions" if index == 0 else f"Versions on another machine, {index}"
-        tables.append(_pairs(title, _flat(values) if isinstance(values, Mapping) else {}))
-    return tables
+    others = {f"other {n}": v for n, v in enumerate(experiment.get("other_environments") or ())}
+    versions = {**experiment.get("environment", {}), **others}
+    for title, values in (("Settings", settings), ("Versions", versions)):
+        lines = ({"name": name, "value": str(value)} for name, value in _flat(values))
+        yield table_of(title, lines, labels=2)
 
 
-def _pairs(title: str, values: Mapping[str, str]) -> Table:
-    rows = tuple((Cell(name), Cell(value)) for name, value in values.items())
-    return Table(title, ("name", "value"), rows, labels=2)
-
-
-def _flat(values: Mapping[str, Any], path: str = "") -> dict[str, str]:
+def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Nested settings by their paths."""
-    flat: dict[str, str] = {}
     for name, value in values.items():
-        key = f"{path}.{name}" if path else str(name)
         if isinstance(value, Mapping):
-            flat |= _flat(value, key)
-        elif isinstance(value, list):
-            flat[key] = ", ".join(map(str, value))
+            yield from _flat(value, f"{path}{name}.")
         else:
-            flat[key] = "-" if value is None else str(value)
-    return flat
+            yield f"{path}{name}", value

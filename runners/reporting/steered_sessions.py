@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import binomtest
 
 from runners.reporting.evaluation_folder import TRIAL, Evaluation, ReportError
+from runners.reporting.statistics import bootstrap_interval
 
 REFERENCE = "information"
 """The policy that all others are compared with, unless another one is asked for."""
 LEAST_ERROR = 1e-4  # metres: an error below counts as this in geometric means
 GOOD = 0.010  # metres: what counts as found
 LIMITS = (0.020, GOOD, 0.005)  # metres
-_RESAMPLES = 2000
-_SEED = 0
+PROBES = 10
+"""After so many probes errors are compared, or at the end of shorter sessions."""
 SESSION = ["policy", *TRIAL]
 """The columns that tell sessions apart."""
 
 
 @dataclass(frozen=True, eq=False)
 class SteeredSessions:
-    """The rows of all sessions that every policy has finished, so that all have the same ones."""
+    """The rows of all trials that every policy has finished, so that all have the same ones."""
 
     policies: list[str]  # with a finished session
     budget: int  # probes of a session, at most
@@ -50,9 +51,10 @@ class SteeredSessions:
         """
         return self.rows.pivot(index=SESSION, columns="probes", values=column).ffill(axis=1)
 
-    def after(self, probes: int) -> int:
-        """This number of probes, or the greatest below it that any session has."""
-        return max(number for number in self.errors.columns if number <= probes)
+    @property
+    def compared(self) -> int:
+        """The number of probes after which errors are compared."""
+        return max(number for number in self.errors.columns if number <= PROBES)
 
     @cached_property
     def solvable(self) -> pd.MultiIndex:
@@ -60,17 +62,22 @@ class SteeredSessions:
         best = self.errors.min(axis=1).groupby(TRIAL).min()
         return best[best < GOOD].index
 
+    @cached_property
+    def forecasts(self) -> pd.DataFrame:
+        """The rows with a forecast and an outcome; `touched`: a contact came before the probe."""
+        rows = self.rows.sort_values([*SESSION, "probes"])
+        before = rows.groupby(SESSION)["contacts"].shift(1).fillna(0.0)
+        rows = rows.assign(touched=before.astype(float) > 0.0)
+        return rows[rows["hit_forecast"].notna() & rows["hit"].notna()].astype({"hit": float})
+
 
 def steered_sessions(evaluation: Evaluation, reference: str | None = None) -> SteeredSessions:
     """The sessions of an evaluation. Raises ReportError for a reference without any."""
-    rows, asked = evaluation.probes, evaluation.experiment.get("policies")
-    asked = asked if isinstance(asked, Mapping) else {}
-    rows = rows[rows["probes"].notna() & (rows["probes"] >= 1)].astype({"probes": int})
-    rows = rows.drop_duplicates([*SESSION, "probes"], keep="last")
-    known = rows[rows["error"].notna()]
-    first = known.groupby(SESSION)["probes"].min()
+    rows = evaluation.probes
+    rows = rows[rows["probes"].notna()].astype({"probes": int})
+    first = rows[rows["error"].notna()].groupby(SESSION)["probes"].min()
     begun = first[first == 1].reset_index()
-    policies = [name for name in evaluation.planned_policies if (begun["policy"] == name).any()]
+    policies = [name for name in evaluation.policies if (begun["policy"] == name).any()]
     if reference is not None and reference not in policies:
         raise ReportError(f"baseline {reference} has no session; accepted: {', '.join(policies)}")
     if reference is None and policies:
@@ -78,17 +85,10 @@ def steered_sessions(evaluation: Evaluation, reference: str | None = None) -> St
     having = begun.groupby(TRIAL)["policy"].nunique()
     common = having[having == len(policies)].index
     kept = pd.MultiIndex.from_frame(rows[TRIAL]).isin(common) & rows["policy"].isin(policies)
-    budget = min((_probes(one) for one in asked.values()), default=0)
-    budget = budget or int(rows["probes"].max() if len(rows) else 1)
+    asked = evaluation.experiment.get("policies", {}).values()
+    budget = min((one["settings"]["probes"] for one in asked), default=1)
     rows = rows[kept & (rows["probes"] <= budget)].reset_index(drop=True)
     return SteeredSessions(policies, budget, rows, len(having) - len(common), reference or "")
-
-
-def _probes(policy: Any) -> int:
-    """The budget of a policy by experiment.json; 0 if that does not say."""
-    settings = policy.get("settings") if isinstance(policy, Mapping) else None
-    probes = settings.get("probes") if isinstance(settings, Mapping) else None
-    return probes if isinstance(probes, int) and probes > 0 else 0
 
 
 def geometric_means(values: pd.DataFrame) -> pd.DataFrame:
@@ -97,35 +97,49 @@ def geometric_means(values: pd.DataFrame) -> pd.DataFrame:
     return np.exp(logs.groupby("policy", sort=False).mean())
 
 
-def bootstrap_interval(values: pd.Series) -> tuple[float, float]:
-    """95 % interval of the mean of values by (configuration, seed), configurations resampled.
-
-    The same every time.
-    """
-    groups = values.groupby("configuration")
-    sums, counts = groups.sum().to_numpy(), groups.count().to_numpy()
-    drawn = np.random.default_rng(_SEED).integers(len(sums), size=(_RESAMPLES, len(sums)))
-    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1).clip(min=1)
-    lower, upper = np.quantile(means, [0.025, 0.975])
-    return float(lower), float(upper)
-
-
-def first_below(values: pd.DataFrame, limit: float) -> pd.Series:
-    """The number of probes after which sessions of `over_probes` first are below a limit.
-
-    Infinite for those that never are.
-    """
-    below = values.to_numpy() < limit
-    number = np.array(values.columns, dtype=float)[np.argmax(below, axis=1)]
-    return pd.Series(np.where(below.any(axis=1), number, np.inf), values.index)
+def means_with_intervals(sessions: SteeredSessions, column: str) -> pd.DataFrame:
+    """By policy and number of probes: `mean`, geometric, and its 95 % interval, metres."""
+    values = sessions.over_probes(column)
+    logs, lines = np.log(values.clip(lower=LEAST_ERROR)), []
+    for policy in sessions.policies:
+        for probes, own in logs.loc[policy].items():
+            lower, upper = np.exp(bootstrap_interval(own))
+            mean = float(np.exp(own.mean()))
+            lines.append((policy, probes, lower, mean, upper))
+    return pd.DataFrame(lines, columns=["policy", "probes", "lower", "mean", "upper"])
 
 
-def censored_quantile(numbers: pd.Series, share: float) -> float:
-    """The least number by which this share of the sessions has come there; infinite if none.
+def ratios_to_best(sessions: SteeredSessions) -> pd.Series:
+    """Error of the reference by that of the best other policy, by number of probes."""
+    means = geometric_means(sessions.errors)
+    return means.loc[sessions.reference] / means.drop(index=sessions.reference).min()
 
-    Sessions that end before count as infinite, so this is the Kaplan-Meier estimate: nothing is
-    censored before the budget is spent.
-    """
-    if numbers.empty:
-        return float("nan")
-    return float(np.quantile(numbers, share, method="inverted_cdf"))
+
+@dataclass(frozen=True)
+class Paired:
+    """A policy beside the reference, over the same sessions."""
+
+    sessions: int
+    wins: int  # sessions in which the reference has the smaller error
+    losses: int
+    sign_test: float  # chance of wins and losses as uneven as these if both were as good
+    median: float  # of the policy's error by the reference's
+    mean: float  # geometric, of the same
+    lower: float  # 95 % interval of that mean
+    upper: float
+
+
+def paired(sessions: SteeredSessions, policy: str) -> Paired:
+    """A policy beside the reference."""
+    errors = sessions.errors[sessions.compared].clip(lower=LEAST_ERROR)
+    logs = np.log(errors.loc[policy] / errors.loc[sessions.reference])
+    wins, losses = int((logs > 0.0).sum()), int((logs < 0.0).sum())
+    test = float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
+    ratios = [math.exp(log) for log in (logs.median(), logs.mean(), *bootstrap_interval(logs))]
+    return Paired(len(logs), wins, losses, test, *ratios)
+
+
+def first_stops(rows: pd.DataFrame, spread: float) -> pd.DataFrame:
+    """Of each session the first row with at most this spread of the belief, metres."""
+    narrow = rows[rows["spread"] <= spread].sort_values([*SESSION, "probes"])
+    return narrow.drop_duplicates(SESSION)

@@ -1,11 +1,11 @@
-"""Tables of a report: their cells, those of medians by method, and how the terminal shows them."""
+"""Tables of a report: texts by row and column, and how the terminal shows them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import pandas as pd
 from rich.box import SIMPLE_HEAD
@@ -13,55 +13,34 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 
 from replay.console import Console
-from runners.reporting.method_style import MethodStyle
+from runners.reporting.figures import Style
 from runners.reporting.statistics import DIVERSITY, spreads
 
 Best = Literal["min", "max"] | None
 """Which median of a row is best."""
-Subject = TypeVar("Subject")
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A cell of a table."""
-
-    text: str
-    best: bool = False  # the best of its row, shown bold
-    between: str = ""  # quartiles, or another range
-    note: str = ""  # such as a count
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its title."""
+    """A table with its title. Cells may have Markdown's **bold**."""
 
     title: str
     header: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[tuple[str, ...], ...]
     labels: int = 1  # so many columns at the left are texts
     note: str = ""  # what the table shows
 
 
 def table_of(
-    title: str,
-    columns: Mapping[str, Callable[[Subject], Any]],
-    subjects: Iterable[Subject],
-    *,
-    labels: int = 1,
-    note: str = "",
+    title: str, lines: Iterable[Mapping[str, Any]], *, labels: int = 1, note: str = ""
 ) -> Table:
-    """A row for every subject. columns: by heading, what the cell of a subject shows.
-
-    That is a Cell, a text, a count (int), or a number (float).
-    """
-    rows = [tuple(_cell(show(subject)) for show in columns.values()) for subject in subjects]
-    return Table(title, tuple(columns), tuple(rows), labels, note)
-
-
-def _cell(value: Any) -> Cell:
-    if isinstance(value, Cell):
-        return value
-    return Cell(number(value) if isinstance(value, float) else str(value))
+    """A row for each line, of cells by heading: texts, counts (int) or numbers (float)."""
+    lines = list(lines)
+    rows = [
+        tuple(number(cell) if isinstance(cell, float) else str(cell) for cell in line.values())
+        for line in lines
+    ]
+    return Table(title, tuple(lines[0]) if lines else (), tuple(rows), labels, note)
 
 
 def number(value: float) -> str:
@@ -70,35 +49,51 @@ def number(value: float) -> str:
         return "-"
     if value != 0.0 and abs(value) < 1e-3:
         return f"{value:.2e}"
-    if abs(value) >= 1000.0:
-        return f"{value:.0f}"
     text = f"{value:.3g}"
-    return "1000" if "e" in text else text
+    return f"{value:.0f}" if abs(value) >= 1000.0 or "e" in text else text
 
 
-def range_text(lower: float, upper: float) -> str:
-    """Such as quartiles, "[17.5, 37.5]"; empty for NaN."""
-    return f"[{number(lower)}, {number(upper)}]" if math.isfinite(lower) else ""
+def with_range(value: float, lower: float, upper: float) -> str:
+    """A number and a range, such as quartiles: "26.1 [17.5, 37.5]"."""
+    return f"{number(value)} [{number(lower)}, {number(upper)}]" if math.isfinite(lower) else "-"
 
 
-def median_cells(found: pd.DataFrame, best: Best) -> list[Cell]:
+def percent(share: float) -> str:
+    """A share, "12.5 %"."""
+    return f"{100.0 * share:.1f} %" if math.isfinite(share) else "-"
+
+
+def percent_range(found: Any) -> str:
+    """A share with its interval, of a row of `shares`."""
+    share, lower, upper = (100.0 * found[name] for name in ("share", "lower", "upper"))
+    return f"{share:.0f} % [{lower:.0f}, {upper:.0f}]"
+
+
+def bold_best(values: Sequence[float], texts: Sequence[str], best: Best = "min") -> list[str]:
+    """The texts of some values, the best in bold, if there are several values."""
+    known = [value for value in values if math.isfinite(value)]
+    bold = {"min": min, "max": max}[best](known) if best and len(known) > 1 else None
+    return [
+        f"**{text}**" if value == bold else text for value, text in zip(values, texts, strict=True)
+    ]
+
+
+def median_cells(found: pd.DataFrame, best: Best) -> list[str]:
     """Median [quartiles] of each of the `spreads`; notes where numbers are fewer than elsewhere."""
-    most, medians = found["count"].max(), found["median"].dropna()
-    bold = medians.agg(best) if best is not None and len(medians) > 1 else None
-    cells = []
-    for each in found.itertuples():
-        notes = [f"n {each.count}"] if 0 < each.count < most else []
+    most, cells = found["count"].max(), []
+    for each in found.rename(columns={"count": "numbers"}).itertuples():
+        notes = [f"n {each.numbers}"] if 0 < each.numbers < most else []
         notes += [f"{each.left_out} left out"] if each.left_out else []
-        quartiles = range_text(each.lower, each.upper)
-        cells.append(Cell(number(each.median), each.median == bold, quartiles, ", ".join(notes)))
-    return cells
+        note = f" ({', '.join(notes)})" if notes else ""
+        cells.append(with_range(each.median, each.lower, each.upper) + note)
+    return bold_best(found["median"].tolist(), cells, best)
 
 
 def method_table(
     title: str,
     rows: pd.DataFrame,
     by: str,
-    styles: Mapping[str, MethodStyle],
+    styles: Mapping[str, Style],
     *,
     column: str = DIVERSITY,
     best: Best = "min",
@@ -110,14 +105,15 @@ def method_table(
     bold.
     """
     lines = []
-    for value, found in spreads(rows, [by, "method"], column).groupby(level=0):
+    for value, found in spreads(rows, [by, "method"], column).groupby(level=0, observed=True):
         of_methods = found.droplevel(0).reindex(list(styles))
         of_methods = of_methods.fillna({"count": 0, "left_out": 0})
         of_methods = of_methods.astype({"count": int, "left_out": int})
-        count = Cell(str(of_methods["count"].max()))
-        lines.append((Cell(str(value)), count, *median_cells(of_methods, best)))
-    header = (by, "n", *(style.title for style in styles.values()))
-    return Table(title, header, tuple(lines), note=note)
+        cells = median_cells(of_methods, best)
+        titles = [style.title for style in styles.values()]
+        line = {by: str(value), "n": int(of_methods["count"].max())}
+        lines.append(line | dict(zip(titles, cells, strict=True)))
+    return table_of(title, lines, note=note)
 
 
 def print_table(console: Console, table: Table) -> None:
@@ -128,7 +124,7 @@ def print_table(console: Console, table: Table) -> None:
         justify: Literal["left", "right"] = "left" if text else "right"
         shown.add_column(name, justify=justify, no_wrap=text, vertical="bottom")
     for row in table.rows:
-        shown.add_row(*(_plain_text(cell) for cell in row))
+        shown.add_row(*(cell.replace("**", "") for cell in row))
     console.print(table.title, soft_wrap=True)
     if not console.is_terminal:
         width = Measurement.get(console, console.options.update(width=10_000), shown).maximum
@@ -137,8 +133,3 @@ def print_table(console: Console, table: Table) -> None:
         console.print(shown)
     if table.note:
         console.print(table.note, soft_wrap=not console.is_terminal)
-
-
-def _plain_text(cell: Cell) -> str:
-    parts = [cell.text, cell.between, f"({cell.note})" if cell.note else ""]
-    return " ".join(part for part in parts if part)

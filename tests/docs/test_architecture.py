@@ -169,17 +169,13 @@ def test_recordings_of_before_the_event_stay_readable(copy: Path) -> None:
 
 def test_a_figure_is_in_the_report_with_its_numbers_and_its_title(reported: Path) -> None:
     report = reported / "logs" / "evaluation" / "smoke" / "report"
-    rows = open_evaluation(report.parent).last_half
-    drawn = pd.read_csv(report / "diversity_and_time.csv", index_col="method")
-    assert list(drawn.index) == ["chsel", "icp"]
-    for method, numbers in drawn.iterrows():
-        own = rows[rows["method"] == method]
-        assert numbers["diversity"] == pytest.approx(own["diversity"].median())
-        assert numbers["seconds"] == pytest.approx(own["seconds"].median())
-    picture = (report / "diversity_and_time.svg").read_text()
-    assert "<!-- Medians of PD and time, made_up -->" in picture
-    assert "\\mathdefault" not in picture  # of an axis whose scale is not ours
-    assert "(diversity_and_time.svg)" in (report / "report.md").read_text()
+    rows = open_evaluation(report.parent).rows
+    drawn = pd.read_csv(report / "time_over_probes.csv", index_col=["method", "step"])
+    for place, numbers in drawn.iterrows():
+        own = rows[(rows["method"] == place[0]) & (rows["step"] == place[1])]
+        assert numbers["median"] == pytest.approx(own["seconds"].median())
+    assert set(drawn.index) == set(rows[["method", "step"]].itertuples(index=False, name=None))
+    assert "(time_over_probes.svg)" in (report / "report.md").read_text()
 
 
 def test_a_column_is_in_its_table(reported: Path) -> None:

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 
 from chsel.errors import SettingError
-from runners import evaluate, report
+from runners import evaluate
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.selection import chosen_names
 from runners.evaluation.table import RESULTS, read_part, write_part
 from runners.evaluation.trial_configurations import configurations_of, with_faults
-from runners.reporting.by_faults import picture_of_shares, shares_held, tables_by_faults
 from runners.reporting.evaluation_folder import open_evaluation
-from runners.reporting.method_style import method_styles
+from runners.reporting.figures import method_styles
+from runners.reporting.method_sections import tables_by_faults
 from runners.reporting.statistics import shares
 from runners.sessions.faults import LEVELS
 from tests.runners.in_process import do_task, run
-from tests.runners.made_up_evaluations import row, write_evaluation
+from tests.runners.made_up_evaluations import row, tables_of, write_evaluation
 from tests.runners.test_evaluation import TRIAL, plan_in
-from tests.runners.test_report import page_of
 
 FAULTY = Trial(0, "mustard+noise_3mm")
 HELD = "Steps with the true pose in the set"
@@ -134,36 +132,21 @@ def made_up(tmp_path: Path) -> Path:
 
 
 def test_tables_have_a_line_a_level_and_one_of_all(made_up: Path) -> None:
-    done = run(report.main, str(made_up))
-    assert done.returncode == 0
-    tables = page_of(made_up / "report").tables
+    tables = tables_of(made_up)
     assert tables[HELD] == [
         ["faults", "own"],
-        ["clean", "100 % [51, 100] n 4"],
-        ["mixed", "25 % [5, 70] n 4"],
-        ["all levels", "62 % [31, 86] n 8"],
+        ["clean", "100 % [51, 100] (n 4)"],
+        ["mixed", "25 % [5, 70] (n 4)"],
+        ["all levels", "62 % [31, 86] (n 8)"],
     ]
     nearest = tables["From the true pose to the nearest hypothesis, mm"]
     assert nearest[1][:2] == ["clean", "4"]
     assert nearest[1][2].startswith("-")
     assert nearest[1][3] == "1.5 [0.75, 2.25]"
     assert tables["PD in mm²"][3][:2] == ["all levels", "8"]
-    assert (made_up / "report" / "truth_held.png").stat().st_size > 5000
-
-
-def test_lines_are_the_intervals_of_the_shares_by_level_and_method(made_up: Path) -> None:
-    held = shares_held(open_evaluation(made_up).rows)
-    picture = picture_of_shares(held, method_styles(["own"]))
-    (axes,) = picture.figure.axes
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["clean", "mixed", "all levels"]
-    points, _, (lines,) = axes.containers[0]
-    np.testing.assert_allclose(points.get_xydata()[:, 0], [100.0, 25.0, 62.5])
-    ends = [line[:, 0] for line in lines.get_segments()]
-    np.testing.assert_allclose(ends, [[51.0, 100.0], [4.6, 69.9], [30.6, 86.3]], atol=0.05)
-    assert picture.data["count"].tolist() == [4, 1, 5]
 
 
 def test_evaluations_without_faults_have_no_such_section(tmp_path: Path) -> None:
     folder = write_evaluation(tmp_path, [row("can", 0, "icp", 4, diversity=1.0)])
     evaluation = open_evaluation(folder)
-    assert tables_by_faults(evaluation.rows, method_styles(evaluation.methods)) == ()
+    assert tables_by_faults(evaluation.rows, method_styles(evaluation.methods)) == []

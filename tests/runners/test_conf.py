@@ -13,7 +13,6 @@ from runners.benchmarks.registrations import Steps
 from runners.command.choices import CONF
 from runners.evaluation.metrics import MetricsConfig
 from runners.published_package.environment import PackageConfig
-from runners.reporting.section import SequenceConfig
 from runners.run.recording import RecordingConfig
 from runners.sessions.points import PointsSettings
 from runners.sessions.recorded import RecordedSettings
@@ -26,7 +25,6 @@ SHOWN = [
     ("published", "package", PackageConfig),
     ("plausible", "metrics", MetricsConfig),
     ("evaluate", "metrics", MetricsConfig),
-    ("report", "sequence", SequenceConfig),
     ("simulate_rig", "", RobotSettings),
     ("recording/both", "", RecordingConfig),
     ("session/points", "", PointsSettings),

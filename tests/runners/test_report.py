@@ -1,141 +1,321 @@
-"""The report on an evaluation, as a user makes it."""
+"""The report on methods: tables computed by hand, what the figures draw, and the files."""
 
 from __future__ import annotations
 
 import json
-import re
-from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
-from PIL import Image
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
 
 from runners import report
-from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.evaluation_folder import last_half, open_evaluation
+from runners.reporting.figures import method_styles
+from runners.reporting.method_sections import pd_over_probes, sections_on_methods
+from runners.reporting.statistics import spreads
+from runners.reporting.tables import median_cells, number
 from tests.runners.in_process import run
-from tests.runners.made_up_evaluations import (
-    METHODS,
-    add_recording,
-    made_up_iterations,
-    made_up_rows,
-    row,
-    write_evaluation,
-    write_table,
+from tests.runners.made_up_evaluations import row, tables_of, write_evaluation, write_table
+
+SUMMARY = "PD and its ratios over all registrations, by default"
+Bands = dict[float, tuple[float, float, float]]
+
+
+def bands_of(figure: Figure, panel: int, color: str) -> Bands:
+    """Lower end of the band, line and upper end by the place on the x axis."""
+    axes = figure.axes[panel]
+    (line,) = (line for line in axes.lines if line.get_color() == color)
+    place = [line.get_color() for line in axes.lines].index(color)
+    band = [one for one in axes.collections if isinstance(one, PolyCollection)][place]
+    corners = np.concatenate([path.vertices for path in band.get_paths()])
+    shown: Bands = {}
+    for x, middle in np.column_stack(line.get_data()).tolist():
+        if np.isfinite(middle):
+            heights = corners[corners[:, 0] == x, 1]
+            shown[x] = (float(heights.min()), middle, float(heights.max()))
+    return shown
+
+
+def test_the_last_half_is_that_of_all_methods_of_a_trial() -> None:
+    rows = [row("can", 0, "chsel", step) for step in (3, 4, 5, 6)]
+    rows += [row("can", 0, "icp", step) for step in (7, 8)] + [row("can", 1, "icp", 3)]
+    kept = last_half(pd.DataFrame(rows))[["seed", "method", "step"]]
+    assert list(kept.itertuples(index=False, name=None)) == [
+        (0, "chsel", 6),
+        (0, "icp", 7),
+        (0, "icp", 8),
+        (1, "icp", 3),
+    ]
+
+
+def test_quartiles_are_of_the_numbers_that_there_are() -> None:
+    numbers = {"a": [4.0, None, 1.0, None, 3.0, 2.0], "b": [2.5, 2.5], "c": [None, None, None]}
+    rows = [{"of": of, "number": value} for of, values in numbers.items() for value in values]
+    found = spreads(pd.DataFrame(rows), "of", "number")
+    by_hand = {"count": 4, "left_out": 2, "lower": 1.75, "median": 2.5, "upper": 3.25}
+    by_hand |= {"mean": 2.5, "deviation": 1.25**0.5}
+    assert found.loc["a"].to_dict() == pytest.approx(by_hand)
+    assert median_cells(found, "min") == [
+        "**2.5 [1.75, 3.25] (2 left out)**",
+        "**2.5 [2.5, 2.5] (n 2)**",
+        "- (3 left out)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (12.345, "12.3"), (999.7, "1000"), (12345.6, "12346"), (0.000123, "1.23e-04")],
 )
-
-PICTURES = [
-    "cvo.png",
-    "gradients.png",
-    "medial.png",
-    "over_iterations.png",
-    "pd_boxes.png",
-    "pd_over_probes.png",
-    "sequence.png",
-    "times.png",
-]
-DATA = [name.replace(".png", ".csv") for name in PICTURES]
-_VOID = ("meta", "img", "link", "br")
+def test_numbers_have_three_digits_that_count(value: float, text: str) -> None:
+    assert number(value) == text
 
 
-class Page(HTMLParser):
-    """A page in short: its tags as they were opened, and its tables. Fails for tags left open."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.tables: dict[str, list[list[str]]] = {}
-        self._open: list[str] = []
-        self._name = ""
-        self.feed(text)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in _VOID:
-            self._open.append(tag)
-        if tag == "tr":
-            self._cells: list[str] = []
-        if tag in ("td", "th"):
-            self._cells.append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-        if tag == "tr":
-            self.tables.setdefault(self._name, []).append(self._cells)
-
-    def handle_data(self, data: str) -> None:
-        if "caption" in self._open or "summary" in self._open:
-            self._name = data.strip()
-        elif {"td", "th"} & set(self._open):
-            self._cells[-1] += (" " if self._open[-1] == "small" else "") + data.strip()
+def test_tables_hold_medians_over_trials_and_the_last_half_of_their_steps(tmp_path: Path) -> None:
+    values = {0: (1000.0, 10.0, 20.0), 1: (1000.0, 30.0, 60.0)}  # PD of seeds at steps 4, 5, 6
+    rows = [
+        row("can", seed, method, step, diversity=factor * value, seconds=0.01 * factor)
+        for seed, found in values.items()
+        for method, factor in (("chsel", 1.0), ("icp", 2.0))
+        for step, value in zip((4, 5, 6), found, strict=True)
+    ]
+    rows[0]["seconds"] = 0.07
+    tables = tables_of(write_evaluation(tmp_path, rows))
+    # 10, 20, 30, 60: the middle step of three is of the last half
+    expected = ["can", "4", "25 [17.5, 37.5]", "50 [35, 75]"]
+    assert tables["PD in mm² by object"] == [["object", "n", "CHSEL", "ICP"], expected]
+    assert tables["PD in mm² by configuration"][1] == expected
+    assert tables["PD in mm² of can by step"][2] == ["5", "2", "20 [15, 25]", "40 [30, 50]"]
+    assert tables["Time per registration in ms"][1:] == [
+        ["CHSEL", "20", "22.4", "10 [10, 10]", "6", "0"],  # of 70 and five times 10
+        ["ICP", "20", "0", "20 [20, 20]", "6", "0"],
+    ]
 
 
-def page_of(folder: Path) -> Page:
-    return Page((folder / "report.html").read_text(encoding="utf-8"))
+def test_what_has_no_number_is_left_out_and_counted(tmp_path: Path) -> None:
+    rows = [
+        row("can", 0, "chsel", 4, diversity=8.0, seconds=0.1),
+        row("can", 1, "chsel", 4, seconds=0.3) | {"status": "no plausible set: too few points"},
+        row("can", 0, "icp", 4, diversity=float("nan"), seconds=None),
+        row("can", 1, "icp", None) | {"status": "failed: the worker was killed"},
+    ]
+    methods = {"chsel": {}, "icp": {}, "svgd": {}}
+    write_evaluation(tmp_path, rows, configurations=["can"], seeds=[0, 1, 2], methods=methods)
+    tables = tables_of(tmp_path)
+    left_out = ["can", "1", "8 [8, 8] (1 left out)", "-", "- (1 left out)"]
+    assert tables["PD in mm² by object"][1] == left_out
+    assert tables["Time per registration in ms"][1:] == [
+        ["CHSEL", "200", "100", "200 [150, 250]", "2", "0"]
+    ]
+    assert tables["What is there"][1:] == [
+        ["CHSEL", "2 of 3", "0", "1", "2", "0", "1"],
+        ["SVGD", "0 of 3", "0", "3", "0", "0", "0"],
+        ["ICP", "1 of 3", "1", "1", "1", "1", "1"],
+    ]
+    assert tables["What failed"][1:] == [
+        ["can", "chsel", "1", "no plausible set: too few points"],
+        ["can", "icp", "1", "failed: the worker was killed"],
+    ]
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An evaluation with everything in it."""
-    folder = tmp_path_factory.mktemp("evaluation")
-    rows = made_up_rows(["clamp", "mustard", "mustard_fallen"], [0, 1], 3, METHODS)
-    moments = made_up_iterations("clamp", [0, 1], [9], ["chsel", "chsel_cma_me"])
-    planned = {"configurations": ["clamp", "mustard", "mustard_fallen"], "seeds": [0, 1]}
-    methods = {method: {"name": method} for method in METHODS}
-    write_evaluation(folder, rows, moments, **planned, methods=methods)
-    for method in ("chsel", "icp", "medial_constraint"):
-        add_recording(folder, "clamp", 1, method, f"clamp_{method}")
-    done = run(report.main, str(folder))
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "no picture" not in done.stdout
-    written = {line for line in done.stdout.splitlines() if line.startswith("written: ")}
-    assert written == {f"written: {path}" for path in (folder / "report").iterdir()}
-    return folder
+def test_ranks_and_shares_of_members_are_those_of_the_last_half(tmp_path: Path) -> None:
+    rows = [
+        row("can", seed, method, step, rank=rank if step == 5 else 1.0, exact_members=exact)
+        for seed in (0, 1)
+        for method, rank, exact in (("chsel", 0.2, 0.75), ("icp", 0.6, 0.25))
+        for step in (4, 5)
+    ]
+    tables = tables_of(write_evaluation(tmp_path, rows))
+    ranks = tables["Rank of the true pose among the hypotheses"]
+    assert ranks[1] == ["can", "2", "0.2 [0.2, 0.2]", "0.6 [0.6, 0.6]"]
+    members = tables["Share of hypotheses in the plausible set"]
+    assert members[1] == ["can", "2", "0.75 [0.75, 0.75]", "0.25 [0.25, 0.25]"]
 
 
-def test_a_report_has_all_pictures_and_stands_alone(whole: Path) -> None:
-    found = whole / "report"
-    assert sorted(path.name for path in found.iterdir()) == sorted(
-        [*PICTURES, *DATA, "report.html", "report.md"]
-    )
-    for name in PICTURES:
-        with Image.open(found / name) as image:
-            assert image.width == 1440
-            assert image.info.keys() <= {"dpi"}  # no clock, no program
-            assert len(image.convert("RGB").getcolors(2**24) or []) > 50
-    page = page_of(found)
-    images = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(images) == len(PICTURES)
-    assert all((image["src"] or "").startswith("data:image/png;base64,") for image in images)
-    assert all(len(image["alt"] or "") > 40 for image in images)
-    assert not {"script", "link", "iframe"} & {tag for tag, _ in page.tags}
-    names = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
-    assert len(set(names)) == len(names)
-    targets = [(a["href"] or "")[1:] for tag, a in page.tags if tag == "a"]
-    assert targets
-    assert set(targets) <= set(names)
-    html = (found / "report.html").read_text(encoding="utf-8")
-    assert html.startswith("<!DOCTYPE html>")
-    assert "url(" not in html
-    assert "python -m runners.evaluate experiment=made_up\npython -m runners.report" in html
+def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -> None:
+    names = ["cabinet_drill", "cabinet_mustard"]
+    write_evaluation(tmp_path, [], configurations=names, seeds=[0, 1, 2])
+    for index, (name, seed) in enumerate([(names[0], 0), (names[0], 1), (names[1], 0)]):
+        truth: dict[str, Any] = {"cost": 0.001, "guess_cost": 0.1, "mean_distance": 0.001}
+        truth["violations"] = index
+        truth["from_guess"] = {"position": 0.002 * index, "rotation": 0.034906585 * index}
+        if name == names[0]:
+            truth["from_simulated"] = {"position": 0.003 + 0.002 * index, "rotation": 0.01745329}
+        folder = tmp_path / "trials" / name / f"seed_{seed}"
+        folder.mkdir(parents=True)
+        (folder / "session.json").write_text(json.dumps({"truth": truth}))
+    table = tables_of(tmp_path)["True poses found"]
+    assert table[1] == [names[0], "2", "1 [1]", "0.5 [1]", "1 [2]", "1 [2]", "4 [5]", "1 [1]"]
+    assert table[2][3:] == ["2 [2]", "4 [4]", "4 [4]", "- [-]", "- [-]"]
+    assert table[3][:2] == ["all", "3"]
 
 
-def test_the_markdown_links_its_pictures_and_has_the_same_numbers(whole: Path) -> None:
-    text = (whole / "report" / "report.md").read_text(encoding="utf-8")
-    assert sorted(re.findall(r"\]\(([\w.]+)\)", text)) == sorted([*PICTURES, *DATA])
-    table = text.split("**PD in mm² by object**\n\n")[1].split("\n\n")[0]
-    lines = [line.strip("| ").split(" | ") for line in table.splitlines()]
-    assert [line[:2] for line in lines[2:]] == [["clamp", "4"], ["mustard", "8"]]
-    cells = [[cell.replace("**", "") for cell in line] for line in lines[2:]]
-    assert cells == page_of(whole / "report").tables["PD in mm² by object"][1:]
-    assert [line[2:].count(next(c for c in line if "**" in c)) for line in lines[2:]] == [1, 1]
+@pytest.fixture
+def compared(tmp_path: Path) -> Path:
+    """Two draws of the package and of an anchored method, at two steps of a trial."""
+    numbers = {"exact_members": 0.5, "distinct": 30, "seconds": 0.1}
+    found = [
+        ("package", 4, {"diversity": 100.0, "distinct": 12, "seconds": 2.0}),
+        ("package+1", 4, {"diversity": 400.0, "distinct": 10, "seconds": 4.0}),
+        ("package", 5, {"diversity": 100.0, "distinct": 8, "seconds": 3.0}),
+        ("package+1", 5, {"diversity": 100.0, "distinct": 30, "seconds": 3.0}),
+        ("own", 4, {"diversity": 20.0, **numbers}),
+        ("own+1", 4, {"diversity": 400.0, **numbers, "exact_members": 0.8}),
+        ("own", 5, {"diversity": 0.0, **numbers}),
+    ]
+    rows = [row("can", 0, method, step, **values) for method, step, values in found]
+    rows.append(row("can", 0, "own+1", 5) | {"status": "failed: of a lack of memory"})
+    planned = {"configurations": ["can"], "seeds": [0], "methods": {"own": {}, "own+1": {}}}
+    planned["outside"] = {"package": "sets", "package+1": "sets/draw_1"}
+    return write_evaluation(tmp_path / "evaluation", rows, **planned)
 
 
-def test_the_same_evaluation_gives_the_same_bytes(whole: Path, tmp_path: Path) -> None:
-    assert run(report.main, str(whole), f"out={tmp_path / 'again'}").returncode == 0
-    for path in (whole / "report").iterdir():
-        assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes(), path.name
+def test_ratios_are_of_the_same_trial_and_step_by_the_mean_of_the_baselines_draws(
+    compared: Path,
+) -> None:
+    tables = tables_of(compared, "package")
+    header, own, package = tables[SUMMARY]
+    assert dict(zip(header, own, strict=True)) == {
+        "method": "own",
+        "n": "3 (1 left out)",
+        "PD in mm², median [quartiles]": "20 [10, 210]",
+        "geometric mean": "20",  # of 20, 400 and 1, as which 0 counts
+        "ratio to package": "0.126",  # of 20 / 200, 400 / 200 and 1 / 100
+        "worse": "33.3 %",
+        "members": "60.0 %",
+        "distinct [least]": "30 [30]",
+        "s, median": "0.1",
+        "s, mean": "0.1",
+    }
+    by_hand = ["package", "4", "100 [100, 175]", "141", "1", "-", "-", "15 [8]", "3", "3"]
+    assert package == by_hand
+    steps = tables["Ratios of PD by step, geometric means"]
+    assert steps == [["step", "own", "package"], ["4", "0.447", "1"], ["5", "0.01", "1"]]
+    assert tables["Ratios of PD by object, geometric means"][1] == ["can", "0.126", "1"]
+
+
+def test_a_pd_equal_to_the_baselines_is_not_worse(tmp_path: Path) -> None:
+    values = {"package": 8.0, "icp": 8.0, "svgd": 8.1, "cvo": 7.9}
+    rows = [row("can", 0, method, 4, diversity=value) for method, value in values.items()]
+    header, *lines = tables_of(write_evaluation(tmp_path, rows), "package")[SUMMARY]
+    shares = {line[0]: line[header.index("worse")] for line in lines}
+    assert shares == {"SVGD": "100.0 %", "ICP": "0.0 %", "CVO": "0.0 %", "package": "-"}
+
+
+def test_draws_are_told_apart_by_their_column_alone(compared: Path) -> None:
+    evaluation = open_evaluation(compared)
+    assert evaluation.methods == ["own", "package"]
+    places = sorted(evaluation.rows[["method", "step", "draw"]].to_numpy().tolist())
+    assert places == [[m, s, d] for m in ("own", "package") for s in (4, 5) for d in (0, 1)]
+    alone = write_evaluation(compared / "other", [row("can", 0, "own+1", 4, diversity=1.0)])
+    assert open_evaluation(alone).methods == ["own+1"]  # a label of its own
+
+
+def test_pd_over_probes_is_the_median_and_quartiles_of_each_object_and_step(
+    tmp_path: Path,
+) -> None:
+    numbers = {"can": {4: (16.0, 1.0, 4.0), 5: (25.0, 9.0)}, "box": {5: (100.0, 400.0)}}
+    rows = [
+        row(name, seed, method, step, diversity=factor * value)
+        for name, steps in numbers.items()
+        for step, values in steps.items()
+        for seed, value in enumerate(values)
+        for method, factor in (("chsel", 1.0), ("icp", 3.0))
+        if (method, step) != ("icp", 4)  # a gap
+    ]
+    styles = method_styles(["chsel", "icp"])
+    evaluation = open_evaluation(write_evaluation(tmp_path, rows))
+    picture = pd_over_probes("pd", evaluation.rows, styles)
+    box, can = range(2)
+    assert [axes.get_title() for axes in picture.figure.axes] == ["box", "can"]
+    chsel, icp = styles["chsel"].color, styles["icp"].color
+    of_can = bands_of(picture.figure, can, chsel)
+    assert of_can == {4.0: (2.5, 4.0, 10.0), 5.0: (13.0, 17.0, 21.0)}
+    assert bands_of(picture.figure, can, icp) == {5.0: (39.0, 51.0, 63.0)}
+    assert bands_of(picture.figure, box, chsel) == {5.0: (175.0, 250.0, 325.0)}
+    drawn = picture.data[picture.data["object"] == "can"].drop(columns="object")
+    assert drawn.to_numpy().tolist() == [
+        ["chsel", 4, 3, 2.5, 4.0, 10.0],
+        ["chsel", 5, 2, 13.0, 17.0, 21.0],
+        ["icp", 5, 2, 39.0, 51.0, 63.0],
+    ]
+
+
+def test_boxes_are_quartiles_by_method(tmp_path: Path) -> None:
+    values = {"icp": (1.0, 2.0, 3.0, 4.0, 5.0, 100.0), "chsel": (10.0, 10.0, 11.0, 12.0)}
+    rows = [
+        row("can", seed, method, 4, diversity=value)
+        for method, some in values.items()
+        for seed, value in enumerate(some)
+    ]
+    sections = sections_on_methods(open_evaluation(write_evaluation(tmp_path, rows)))
+    (picture,) = (s.picture for s in sections if s.picture and s.picture.name == "pd_boxes")
+    (axes,) = picture.figure.axes
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["CHSEL", "ICP"]
+    boxes = [patch for patch in axes.patches if isinstance(patch, PathPatch)]
+    heights = [patch.get_path().vertices[:, 1] for patch in boxes]
+    assert [(part.min(), part.max()) for part in heights] == [(10.0, 11.25), (2.25, 4.75)]
+
+
+def test_each_panel_over_iterations_draws_its_own_number_and_costs_of_one_kind(
+    tmp_path: Path,
+) -> None:
+    methods = {"chsel": 1.0, "chsel_cma_me": 2.0, "medial_constraint_cma_me": 1000.0}
+    about = {"configuration": "drill", "step": 4}
+    moments = [
+        {**about, "seed": seed, "method": method, "iteration": iteration}
+        | {"diversity": 10.0 * value, "mean_cost": cost * value}
+        for method, cost in methods.items()
+        for seed, start in enumerate((1.0, 3.0, 8.0))
+        for iteration, value in ((0, 2.0 * start), (25, start))
+    ]
+    folder = write_evaluation(tmp_path, [], moments, methods=methods)
+    section = sections_on_methods(open_evaluation(folder))[1]
+    assert section.picture is not None
+    figure, styles = section.picture.figure, method_styles(list(methods))
+    diversity, cost = range(2)
+    for method in methods:
+        of_method = bands_of(figure, diversity, styles[method].color)
+        assert of_method == {0.0: (40.0, 60.0, 110.0), 25.0: (20.0, 30.0, 55.0)}
+    costs = bands_of(figure, cost, styles["chsel_cma_me"].color)
+    assert costs == {0.0: (8.0, 12.0, 22.0), 25.0: (4.0, 6.0, 11.0)}
+    # Costs of the Medial Constraint are in m², those of the others are relaxed costs.
+    assert len(figure.axes[cost].lines) == 2
+    assert section.tables[1].header == ("iteration", "n", "CHSEL", "CHSEL (CMA-ME)")
+
+
+def test_a_method_looks_the_same_in_every_figure_and_like_no_other() -> None:
+    names = ["icp", "svgd", "chsel", "chsel@paper", "mine", "icp#small"]
+    styles = method_styles(names)
+    assert len({style.color for style in styles.values()}) == len(names)
+    assert method_styles(["icp", "svgd"])["icp"] == styles["icp"]
+    assert list(method_styles(names[::-1])) == list(styles)
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_a_report_has_its_pictures_its_data_and_the_same_bytes_each_time(
+    compared: Path, kind: str
+) -> None:
+    contents = []
+    for out in ("first", "again"):
+        arguments = (f"out={compared / out}", f"format={kind}", "baseline=package")
+        done = run(report.main, str(compared), *arguments)
+        assert (done.returncode, done.stderr) == (0, "")
+        contents.append({path.name: path.read_bytes() for path in (compared / out).iterdir()})
+    assert contents[0] == contents[1]
+    names = {f"{name}.{end}" for name in ("pd_over_probes", "pd_boxes") for end in (kind, "csv")}
+    assert contents[0].keys() == names | {"report.md", "report.html"}
+    page = contents[0]["report.html"].decode()
+    assert page.count('<img src="data:image/') == (0 if kind == "pdf" else 2)
+    text = contents[0]["report.md"].decode()
+    assert f"](pd_boxes.{kind})" in text
+    assert f"runners.report {compared} baseline=package" in text
+    assert SUMMARY in text
+    assert SUMMARY in done.stdout
 
 
 def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Path) -> None:
@@ -148,109 +328,26 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(tmp_path: Pat
     write_table(trial / "icp.failed.parquet", [failed])  # before it went well
     evaluation = open_evaluation(tmp_path)
     assert evaluation.gathered
-    assert evaluation.rows[["method", "diversity"]].to_numpy().tolist() == [
-        ["icp", 3.0],
-        ["svgd", 4.0],
-    ]
-    assert run(report.main, str(tmp_path)).returncode == 0
-    assert "no table of the whole" in (tmp_path / "report" / "report.md").read_text("utf-8")
+    found = evaluation.rows[["method", "diversity"]].to_numpy().tolist()
+    assert found == [["icp", 3.0], ["svgd", 4.0]]
 
 
-@pytest.mark.parametrize(
-    ("kind", "begins", "on_page"),
-    [("svg", b"<?xml", "image/svg+xml"), ("pdf", b"%PDF-", "image/png")],
-)
-def test_figures_are_files_of_a_format_the_same_each_time_with_the_evaluations_name(
-    tmp_path: Path, kind: str, begins: bytes, on_page: str
-) -> None:
-    folder = write_evaluation(tmp_path, made_up_rows(["can"], [0, 1], 2, ["icp"]), name="$own$ 1")
-    contents = []
-    for name in ("first", "again"):
-        assert (
-            run(report.main, str(folder), f"out={tmp_path / name}", f"format={kind}").stderr == ""
-        )
-        files = sorted((tmp_path / name).iterdir())
-        contents.append([path.read_bytes() for path in files if path.suffix == f".{kind}"])
-    assert contents[0] == contents[1]
-    assert len(contents[0]) == 3
-    assert {path.suffix for path in files} == {f".{kind}", ".csv", ".html", ".md"}
-    assert all(content.startswith(begins) for content in contents[0])
-    if kind == "svg":
-        assert b"<!-- Plausible diversity by object and method, $own$ 1 -->" in contents[0][0]
-    sources = [
-        attributes["src"] or ""
-        for tag, attributes in page_of(tmp_path / "first").tags
-        if tag == "img"
-    ]
-    assert [source.split(";")[0] for source in sources] == [f"data:{on_page}"] * 3
-    text = (tmp_path / "again" / "report.md").read_text("utf-8")
-    assert f"](pd_boxes.{kind})" in text
-    assert f"format={kind}" in text.split("How it was made")[1]
-
-
-@pytest.mark.parametrize(
-    ("rows", "sections"),
-    [
-        ([], []),
-        ([row("can", 0, "chsel", 4) | {"status": "failed: no reason"}], []),
-        (
-            [row("can", 0, "chsel", 4, diversity=0.0, seconds=0.0)],
-            ["over-probes", "boxes", "times"],
-        ),
-        (
-            [row("can", 0, name, 4, diversity=0.0) for name in ("cvo", "icp")],
-            ["over-probes", "boxes", "cvo"],
-        ),
-        ([row("can", 0, "our own @#$1", 4, seconds=2.0)], ["times"]),
-    ],
-    ids=["nothing", "all failed", "one zero", "no time", "no PD"],
-)
-def test_there_are_only_sections_of_what_the_rows_have(
-    tmp_path: Path, rows: list, sections: list
-) -> None:
-    write_evaluation(tmp_path, rows)
-    done = run(report.main, str(tmp_path))
+@pytest.mark.parametrize("rows", [[], [row("a@#$|<b>", 0, "own *$_", 4, seconds=0.0)]])
+def test_there_is_a_report_on_little(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+    done = run(report.main, str(write_evaluation(tmp_path, rows, name="<$own_$>")))
     assert (done.returncode, done.stderr) == (0, "")
-    assert "no picture" not in done.stdout
-    page = page_of(tmp_path / "report")
-    names = [attributes["id"] for tag, attributes in page.tags if tag == "section"]
-    assert names == ["what-was-run", *sections, "made"]
-    done = run(report.main, str(tmp_path), "sequence.view=xy")
-    assert done.stdout.count("there are no recordings") == 2  # as they were asked for
-
-
-def test_settings_of_the_sequence_choose_trial_methods_and_steps(
-    whole: Path, tmp_path: Path
-) -> None:
-    out = f"out={tmp_path}"
-    some = ["sequence.methods=[icp]", "sequence.steps=[11]", "sequence.view=xy"]
-    assert run(report.main, str(whole), out, "sequence.trial=clamp/1", *some).returncode == 0
-    text = (tmp_path / "report.md").read_text("utf-8")
-    assert "seen from above" in text
-    assert "sequence.trial=clamp/1 'sequence.methods=[icp]' 'sequence.steps=[11]'" in text
-    assert "that ICP hold" in text
-    done = run(report.main, str(whole), out, "sequence.steps=[3]")
-    assert "step 3 has no result of every method shown; accepted: 10, 11" in done.stdout
-    done = run(report.main, str(whole), out, "sequence.trial=mustard/seed_0")
-    assert "there is no recording of mustard, seed 0" in done.stdout
+    assert "<h1>Evaluation &lt;$own_$&gt;</h1>" in (tmp_path / "report/report.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "dir is missing"),
-        (["{}/nowhere"], "nowhere does not exist; accepted: a folder that runners.evaluate has"),
-        (["{}/empty"], "has no experiment.json"),
+        (["{}/nowhere"], "accepted: a folder that runners.evaluate has written"),
         (["{}/text"], "experiment.json cannot be read"),
-        (["{}/damaged"], "results.parquet cannot be read as a table"),
-        (["{}/other"], "results.parquet lacks the column"),
-        (["{}/letters"], "results.parquet cannot be read as a table (Failed to parse string"),
-        (["{}/good", "sequence.trial=clamp"], "accepted: CONFIGURATION/SEED"),
-        (["{}/good", "sequence.view=zz"], "view is 'zz'; accepted: xz, xy, yz"),
-        (["{}/good", "sequence.steps=[]"], "steps is empty"),
+        (["{}/damaged"], "results.parquet cannot be read"),
+        (["{}/good", "baseline=icp"], "baseline icp has no PD; accepted: chsel"),
         (["{}/good", "format=gif"], "format is 'gif'; accepted: png, svg, pdf"),
-        (["{}/good", "colour=red"], "has no key 'colour'"),
-        (["{}/good", "{}/empty"], "one argument too many; accepted: DIR KEY=VALUE"),
         (["{}/good", "out={}/good/experiment.json/x"], "accepted: an out=DIR that can be written"),
     ],
 )
@@ -258,11 +355,6 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: st
     write_evaluation(tmp_path / "good", [row("can", 0, "chsel", 4, diversity=1.0)])
     write_evaluation(tmp_path / "damaged", [])
     (tmp_path / "damaged" / "results.parquet").write_bytes(b"PAR1 and no more")
-    write_evaluation(tmp_path / "other", None)
-    write_table(tmp_path / "other" / "results.parquet", [{"a": 1}], None)
-    letters = [row("can", 0, "chsel", 4, diversity="much")]
-    write_table(write_evaluation(tmp_path / "letters", None) / "results.parquet", letters, None)
-    (tmp_path / "empty").mkdir()
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "experiment.json").write_text("{")
     done = run(report.main, *(argument.format(tmp_path) for argument in arguments))
@@ -270,4 +362,3 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: list[str], message: st
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
-    assert json.loads((tmp_path / "good" / "experiment.json").read_text())["name"] == "made_up"

@@ -17,15 +17,15 @@ from chsel.problem.outline import outline_in_world
 from chsel.problem.poses import Poses, apply, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.mcap.reader import read_recording
-from runners import evaluate, probe, report
+from runners import evaluate, probe
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.policy_contenders import chosen_policies
 from runners.evaluation.probe_rows import spread_of
 from tests.runners.in_process import do_task, run
+from tests.runners.made_up_evaluations import tables_of
 from tests.runners.test_evaluate import stamps
 from tests.runners.test_evaluation import plan_in
-from tests.runners.test_report import page_of
 
 POLICY = ("policy.probes=3", "policy.belief.poses=20")
 SMALL = (
@@ -200,12 +200,10 @@ def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], mes
     assert stamps(folder) == before
 
 
-def test_a_report_is_about_these_sessions(folder: Path, tmp_path: Path) -> None:
-    done = run(report.main, str(folder), f"out={tmp_path}")
-    assert (done.returncode, done.stderr) == (0, "")
-    page = page_of(tmp_path)
-    assert page.tables["What is there"][1][:2] == ["grid", "2 of 2"]
-    errors = page.tables["Error of the set after so many probes, mm"]
+def test_a_report_is_about_these_sessions(folder: Path) -> None:
+    tables = tables_of(folder)
+    assert tables["What is there"][1][:2] == ["grid", "2 of 2"]
+    errors = tables["Error of the set after so many probes, mm"]
     assert errors[0] == ["policy", "1", "2", "3"]
     last = [
         row["error"] for row in rows_of(folder) if (row["policy"], row["probes"]) == ("grid", 3)

@@ -11,25 +11,28 @@ import pytest
 
 from runners import report
 from runners.evaluation.table import PROBES
-from runners.reporting.error_over_probes import ratios_to_best
 from runners.reporting.evaluation_folder import open_evaluation
-from runners.reporting.forecast_calibration import first_stops, forecast_rows, hit_bins
-from runners.reporting.policies_compared import paired
-from runners.reporting.section import Subject
-from runners.reporting.sections import sections_of
-from runners.reporting.steered_sessions import (
-    SESSION,
-    SteeredSessions,
+from runners.reporting.figures import policy_styles
+from runners.reporting.policy_sections import picture_over_probes, sections_on_policies
+from runners.reporting.statistics import (
     bootstrap_interval,
     censored_quantile,
     first_below,
+    hit_bins,
+)
+from runners.reporting.steered_sessions import (
+    SESSION,
+    SteeredSessions,
+    first_stops,
     geometric_means,
+    paired,
+    ratios_to_best,
     steered_sessions,
 )
 from tests.runners.in_process import run
-from tests.runners.made_up_evaluations import write_table
+from tests.runners.made_up_evaluations import tables_of, write_table
 from tests.runners.made_up_sessions import Row, session, write_sessions
-from tests.runners.test_report import page_of
+from tests.runners.test_report import bands_of
 
 BUDGETS = {"information": 4, "grid": 4}
 
@@ -114,7 +117,7 @@ def test_the_interval_of_a_mean_is_that_of_independent_configurations() -> None:
 
 
 def test_forecasts_are_compared_with_outcomes(tmp_path: Path, rows: list[Row]) -> None:
-    found = forecast_rows(sessions_of(tmp_path, rows))
+    found = sessions_of(tmp_path, rows).forecasts
     assert found["touched"].tolist() == [False, False, True, True]  # contacts: 0, 1, 2, 3 after
     bins = hit_bins(found)
     assert bins["total"].to_dict() == {1: 1, 8: 2, 9: 1}
@@ -134,31 +137,80 @@ def test_a_stop_is_the_first_probe_with_a_small_spread(tmp_path: Path, rows: lis
     }
 
 
-def test_the_page_has_all_sections_and_numbers(tmp_path: Path, rows: list[Row]) -> None:
+def test_tables_have_the_numbers_of_the_sessions(tmp_path: Path, rows: list[Row]) -> None:
     for row in rows:
         row |= {"seconds": 0.05, "decision_seconds": None if row["policy"] == "grid" else 0.02}
-    write_sessions(tmp_path, rows, BUDGETS)
-    done = run(report.main, str(tmp_path))
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "no picture" not in done.stdout
-    assert "Error beside information after 4 probes" in done.stdout
-    page = page_of(tmp_path / "report")
-    needed = page.tables["Probes until the error of the set is below a limit"]
-    assert needed[0][:3] == ["policy", "to 20 mm", "to 10 mm"]
-    assert needed[1][:4] == ["information", "3 [2, >4]", "3 [2, >4]", ">4 [3, >4]"]
-    assert needed[1][4:] == ["67 [21, 94]", "100 [34, 100]", "2 [2, 3]"]
-    assert needed[2][:4] == ["grid", "4 [4, >4]", ">4 [4, >4]", ">4 [4, >4]"]
-    hits = page.tables["Chance of a hit, forecast and happened, %"]
-    assert hits[1] == ["information", "4", "70.0", "50.0", "+20.0"]
-    stops = page.tables["Stopping by the spread of the belief"]
-    assert stops[4][:6] == ["information", "10 mm", "3", "2", "2.5", "15 mm"]
-    times = page.tables["Milliseconds a probe, medians and 95th percentiles"]
+    tables = tables_of(write_sessions(tmp_path, rows, BUDGETS))
+    needed = tables["Probes until the error of the set is below a limit"]
+    assert [line[:4] for line in needed[1:]] == [
+        ["information", "3 [2, >4]", "3 [2, >4]", ">4 [3, >4]"],
+        ["grid", "4 [4, >4]", ">4 [4, >4]", ">4 [4, >4]"],
+    ]
+    assert [line[4:] for line in needed[1:]] == [
+        ["67 % [21, 94]", "100 % [34, 100]", "2 [2, 3]"],
+        ["33 % [6, 79]", "50 % [9, 91]", "4 [4, >4]"],
+    ]
+    errors = tables["Error of the set after so many probes, mm"]
+    assert errors[1:] == [
+        ["information", "62.1", "22.9", "10.3"],  # cube roots of 80 50 60, 8 25 60 and 2 9 60
+        ["grid", "62.1", "55.2", "9.65"],  # the same of 40 60 70 and 10 3 30
+    ]
+    hits = tables["Chance of a hit, forecast and happened, %"]
+    assert hits[1:] == [
+        ["information", "4", "70.0", "50.0", "+20.0"],
+        ["all, before the first contact", "2", "90.0", "100.0", "-10.0"],
+        ["all, after it", "2", "50.0", "0.0", "+50.0"],
+        ["all", "4", "70.0", "50.0", "+20.0"],
+    ]
+    bins = tables["Hits by their forecast, all policies"]
+    assert bins[1:] == [
+        ["10 to 20 %", "1", "15 %", "0 % [0, 79]"],
+        ["80 to 90 %", "2", "85 %", "50 % [9, 91]"],
+        ["90 to 100 %", "1", "95 %", "100 % [21, 100]"],
+    ]
+    stops = tables["Stopping by the spread of the belief"]
+    assert stops[4] == [
+        *("information", "10 mm", "3", "2", "2.5", "15 mm", "100 % [34, 100]", "9.0 mm")
+    ]
+    times = tables["Milliseconds a probe, medians and 95th percentiles"]
     assert times[1:] == [
         ["information", "20", "20", "50", "50", "70", "70"],
         ["grid", "-", "-", "50", "50", "50", "50"],
     ]
+
+
+def test_each_panel_draws_its_own_number_with_the_interval_of_its_mean(
+    tmp_path: Path, rows: list[Row]
+) -> None:
+    for row in rows:
+        row["spread"] = 2.0 * row["error"]
+    sessions = sessions_of(tmp_path, rows)
+    styles = policy_styles(BUDGETS)
+    figure = picture_over_probes(sessions, styles).figure
+    errors = bands_of(figure, 0, styles["information"].color)
+    spreads = bands_of(figure, 1, styles["information"].color)
+    mean = (2.0 * 9.0 * 60.0) ** (1 / 3)
+    # Of two configurations, either can be drawn twice: the can with 2 and 9 mm, the drill with 60.
+    assert errors[4.0] == pytest.approx((18.0**0.5, mean, 60.0))
+    assert spreads[4.0] == pytest.approx((2.0 * 18.0**0.5, 2.0 * mean, 120.0))
+
+
+def test_sessions_are_compared_within_the_smallest_budget(tmp_path: Path, rows: list[Row]) -> None:
+    budgets = {"information": 2, "grid": 4}
+    found = steered_sessions(open_evaluation(write_sessions(tmp_path, rows, budgets)))
+    assert found.budget == 2
+    assert found.errors.columns.tolist() == [1, 2]
+
+
+def test_a_report_is_written_and_a_baseline_without_sessions_is_an_error(
+    tmp_path: Path, rows: list[Row]
+) -> None:
+    write_sessions(tmp_path, rows, BUDGETS)
+    done = run(report.main, str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "Error beside information after 4 probes" in done.stdout
     names = {path.name for path in (tmp_path / "report").iterdir()}
-    assert {"error_over_probes.csv", "probes_needed.csv", "hit_forecasts.png"} <= names
+    assert {"error_over_probes.csv", "error_over_probes.png", "report.html"} <= names
     done = run(report.main, str(tmp_path), "baseline=icp")
     assert (done.returncode, done.stderr.strip()) == (
         2,
@@ -167,17 +219,18 @@ def test_the_page_has_all_sections_and_numbers(tmp_path: Path, rows: list[Row]) 
 
 
 @pytest.mark.parametrize("kept", [0, 1, 4])
-def test_what_is_not_there_yet_is_said(tmp_path: Path, rows: list[Row], kept: int) -> None:
+def test_there_is_a_report_on_sessions_that_have_hardly_begun(
+    tmp_path: Path, rows: list[Row], kept: int
+) -> None:
     write_sessions(tmp_path, rows[:kept], BUDGETS)
-    first, *others = sections_of(Subject(open_evaluation(tmp_path)))
-    counts = next(table for table in first.tables if table.title == "What is there")
-    there = [(line[0].text, line[1].text, line[3].text) for line in counts.rows]
+    first, *others = sections_on_policies(open_evaluation(tmp_path))
+    there = [(line[0], line[1], line[3]) for line in first.tables[0].rows]
     if kept == 0:
-        assert there == [("information", "0 of 0", "0"), ("grid", "0 of 0", "0")]
-        assert {one.missing for one in others} == {"no session is finished by all policies"}
+        assert there == [("grid", "0 of 0", "0"), ("information", "0 of 0", "0")]
+        assert others == []
     else:  # of the one that has begun
-        assert there == [("information", "1 of 1", str(kept)), ("grid", "0 of 1", "0")]
-        assert "policies-compared" not in {one.name for one in others}
+        assert there == [("grid", "0 of 1", "0"), ("information", "1 of 1", str(kept))]
+        assert "Policies compared, session by session" not in {one.title for one in others}
 
 
 def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(
@@ -194,17 +247,3 @@ def test_finished_parts_stand_in_for_a_table_that_is_not_there_yet(
     evaluation = open_evaluation(tmp_path)
     assert evaluation.gathered
     pd.testing.assert_frame_equal(steered_sessions(evaluation).errors, whole.errors)
-
-
-def test_numbers_that_cannot_be_are_neither_drawn_nor_counted(
-    tmp_path: Path, rows: list[Row]
-) -> None:
-    odd = [{**rows[0], "probes": probes, "step": probes} for probes in (-1, 0, 2**62)]
-    odd += [{**rows[4], "error": math.nan, "spread": math.inf}, {**rows[8], "status": "failed: x"}]
-    write_sessions(tmp_path, [*odd, *rows], dict.fromkeys(BUDGETS))
-    evaluation = open_evaluation(tmp_path)
-    assert steered_sessions(evaluation).errors.shape == (6, 5)
-    assert len(sections_of(Subject(evaluation))) == 6
-    write_sessions(tmp_path, [*odd, *rows], BUDGETS)
-    found = steered_sessions(open_evaluation(tmp_path))
-    assert found.errors.shape == (6, 4)
