@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -11,19 +12,17 @@ import numpy as np
 from chsel.methods.method import Method
 from chsel.next_probe.decision_problem import Actions
 from chsel.next_probe.hand_shape import HandShape
-from chsel.numerics.kernel_cache import cache_directory
+from chsel.numerics.compiler import cache_directory
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies.policy import Policy, StopSettings
 from chsel.policies.steering import Steering
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints, Workspace
-from chsel.problem.poses import compose
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges
 from chsel.sensing.free_space import FreeGrid
 
 _RADIUS = 0.025
-_SPACING = 0.01
 _MOST = 30  # iterations, hypotheses and so on: one compiles as much as a thousand do
 _WORKSPACE = Workspace((-0.06, -0.06, -0.06), (0.06, 0.06, 0.06))
 
@@ -37,22 +36,26 @@ def warm_up(method: Method) -> None:
     their problems alone. Raises SettingError if the folder of compiled kernels cannot be used.
     """
     cache_directory()
-    try:
+    surface = _RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
+    free = 0.02 * np.argwhere(np.ones((6, 6, 6))) - 0.05
+    touched = KnownPoints(free[(free**2).sum(axis=1) > 0.035**2], known=surface[:3])
+    known = np.concatenate([surface[3:], 1.2 * surface])
+    known_sdf = np.concatenate([np.zeros(3), np.full(6, 0.2 * _RADIUS)])
+    others = KnownPoints(occupied=np.zeros((1, 3)), known=known, known_sdf=known_sdf)
+    # Settings may fit no such ball, or another package's method fail on it: its kernels are
+    # compiled when they are needed.
+    with suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about a ball that nobody has asked for
         method = type(method)(_brief(method.settings))  # type: ignore[call-arg]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about a ball that nobody has asked for
-            _register_twice(method)
-    except Exception:
-        # Settings that fit no such ball, or another package's method that fails on it: its kernels
-        # are compiled when they are needed.
-        return
+        online = OnlineRegistration(_ball(), _WORKSPACE, 0.02, method.online)
+        for step in online.steps(enumerate((touched, others)), method.register):
+            assert step.hypotheses is not None
+            assert step.problem is not None
+            result_numbers(step.hypotheses, step.problem, np.eye(4), None)
 
 
 def warm_up_sensing() -> None:
-    """Compile the kernels that turn depth images and swept solids into known points, or load them.
-
-    See `warm_up`.
-    """
+    """Compile the kernels of depth images and swept solids, or load them. See `warm_up`."""
     grid, camera = FreeGrid(_WORKSPACE, 0.02), PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5)
     depth, mask = np.full((3, 4), 0.05), np.ones((3, 4), dtype=bool)
     occlusion_edges(depth, mask, 0.1)
@@ -66,48 +69,30 @@ def warm_up_policy(policy: Policy) -> None:
     """Compile the kernels that decisions by `policy` need, or load them. See `warm_up`."""
     corners = np.array([[0.0, 0.0, 0.01], [0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [-0.01, -0.01, 0.0]])
     hand = HandShape(corners, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-    starts = np.array([[0.0, 0.0, -0.05], [0.01, 0.0, -0.05]])
-    actions = Actions(compose(np.eye(3)[None].repeat(2, axis=0), starts), np.full(2, 0.1))
-    try:
+    world_from_hand = np.eye(4)[None].repeat(2, axis=0)
+    world_from_hand[:, :3, 3] = [[0.0, 0.0, -0.05], [0.01, 0.0, -0.05]]
+    with suppress(Exception):  # as above
         settings = dataclasses.replace(_brief(policy.settings), stop=StopSettings(0.0, 0.0))
         policy = type(policy)(settings)  # type: ignore[call-arg]
+        actions = Actions(world_from_hand, np.full(2, 0.1))
         steering = Steering(policy, _ball(), _WORKSPACE, 0.02, actions, hand)
-        points = KnownPoints(free=np.full((1, 3), 0.05))
-        steering.decide(0, points, None, np.ones(2, dtype=bool))
+        steering.decide(0, KnownPoints(free=np.full((1, 3), 0.05)), None, np.ones(2, dtype=bool))
         steering.felt(np.zeros((1, 3)))
-    except Exception:  # as above
-        return
-
-
-def _register_twice(method: Method) -> None:
-    surface = _RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
-    free = 0.02 * np.argwhere(np.ones((6, 6, 6))) - 0.05
-    free = free[(free**2).sum(axis=1) > 0.035**2]
-    touched = KnownPoints(free, known=surface[:3])
-    known = np.concatenate([surface[3:], 1.2 * surface])
-    known_sdf = np.concatenate([np.zeros(3), np.full(6, 0.2 * _RADIUS)])
-    others = KnownPoints(occupied=np.zeros((1, 3)), known=known, known_sdf=known_sdf)
-    online = OnlineRegistration(_ball(), _WORKSPACE, 0.02, method.online)
-    for step in online.steps(enumerate((touched, others)), method.register):
-        assert step.hypotheses is not None
-        assert step.problem is not None
-        result_numbers(step.hypotheses, step.problem, np.eye(4), None)
 
 
 def _ball() -> SdfGrid:
-    nodes = np.indices((9, 9, 9)) * _SPACING - 0.04
+    nodes = np.indices((9, 9, 9)) * 0.01 - 0.04
     radius = np.sqrt((nodes**2).sum(axis=0))
     gradients = np.moveaxis(nodes / np.maximum(radius, 1e-9), 0, -1)
-    return SdfGrid(np.full(3, -0.04), _SPACING, radius - _RADIUS, gradients)
+    return SdfGrid(np.full(3, -0.04), 0.01, radius - _RADIUS, gradients)
 
 
 def _brief(settings: Any) -> Any:
     """The settings with every count at most _MOST."""
-    changes: dict[str, Any] = {}
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
-            changes[field.name] = _brief(value)
-        elif isinstance(value, int) and not isinstance(value, bool):
-            changes[field.name] = min(value, _MOST)
+    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    changes: dict[str, Any] = {
+        name: _brief(value) if dataclasses.is_dataclass(value) else min(value, _MOST)
+        for name, value in values.items()
+        if dataclasses.is_dataclass(value) or type(value) is int
+    }
     return dataclasses.replace(settings, **changes)

@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chsel.cost.point_sums import NOTHING, SIZE, sums_over
 from chsel.numerics.arrays import FloatArray, scratch
-from chsel.numerics.cell_set import CellSet
-from chsel.numerics.compiler import leaf, spliced
+from chsel.numerics.cell_set import CellSet, node_of
+from chsel.numerics.compiler import inner, leaf, spliced
 from chsel.numerics.near_points import (
     NearPoints,
     PointTree,
@@ -19,11 +18,32 @@ from chsel.numerics.near_points import (
     select,
     to_cells,
 )
-from chsel.numerics.pose_tuples import Triple, inverted, rigid, turned_back
+from chsel.numerics.pose_tuples import Pose, Triple, inverted, rigid, turned_back
+from chsel.problem.sdf_lookup import at_node
 
 MOST_SLACK = 0.03  # metres, in a descent
 SEARCH_SLACK = 0.02  # metres, among the branches of a search, which scatter
 STEPS_AHEAD = 3.0  # that gathered neighbours should last
+
+
+# A block holds the numbers of 64 points, a row for each quantity or four numbers for each point.
+_MOST = 64
+_LEVEL = 0  # row: below which signed distance a point costs something; beyond the box none does
+_PLACE = 1 * _MOST  # the first of 3 rows: from the node of the cell, in cells
+_CELL = 4 * _MOST  # row
+_POINT = 5 * _MOST  # the first of 3 rows
+_WEIGHT = 8 * _MOST  # the first of 8 rows: how much each corner of the cell counts
+_SUMMAND = 16 * _MOST  # four: a number, and the gradient by the translation
+_VALUE = 20 * _MOST  # row
+_SUMS = 21 * _MOST  # 3 times a number and 3 of the gradient by the rotation; summands; values
+_SIZE = 21 * _MOST + 17
+
+
+class CostAndGradient(NamedTuple):
+    """The relaxed cost of a pose, and its gradient by the pose's 12 numbers."""
+
+    cost: float
+    by_pose: Pose
 
 
 class FreeTerm(NamedTuple):
@@ -50,7 +70,7 @@ class Neighbours(NamedTuple):
     slack: FloatArray  # (P,) metres that the object may move until they are gathered anew, or -1
     gathered: FloatArray  # (P, 12) where the object was when they were gathered
     last: FloatArray  # (P, 12) where it was at the last evaluation
-    block: FloatArray  # (SIZE,) numbers of the points that are looked up, see point_sums
+    block: FloatArray  # (_SIZE,) numbers of the points that are looked up
 
 
 def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
@@ -58,7 +78,7 @@ def neighbours_of(free: FreeTerm, poses: int) -> Neighbours:
     slack = scratch(poses)
     slack[:] = -1.0
     gathered, last = scratch(poses, 12), scratch(poses, 12)
-    return Neighbours(near_points_for(free.tree, poses), slack, gathered, last, scratch(SIZE))
+    return Neighbours(near_points_for(free.tree, poses), slack, gathered, last, scratch(_SIZE))
 
 
 @leaf
@@ -71,7 +91,7 @@ def free_sums(model, pose, near, n, most_slack):
     free, points = model.free, near.points
     total = len(free.tree.order)
     if total == 0:
-        return NOTHING
+        return CostAndGradient(0.0, (0.0,) * 12)
     move = inverted(pose) if free.interior else pose
     to_cell, rounding = to_cells(free.tree, free.cells.box, move)
     count = 0
@@ -86,7 +106,7 @@ def free_sums(model, pose, near, n, most_slack):
             _gather_within(free, pose, near, n, to_cell, slack, rounding)
         if points.number[n] > 0:
             count = select(free.tree, free.cells, to_cell, rounding, points, n)
-    return sums_over(model, pose, move, points.hits, count, near.block)
+    return _sums_over(model, pose, move, points.hits, count, near.block)
 
 
 @leaf
@@ -156,3 +176,222 @@ def _centre_in_world(free, pose):
     """R^T (c - t)."""
     x, y, z = free.centre
     return turned_back(pose, x - pose[9], y - pose[10], z - pose[11])
+
+
+@leaf
+def slope(exact, violation):
+    """The violation itself, as the paper defines the gradient, or that of its value."""
+    if exact:
+        return 1.0 if violation > 0.0 else 0.0
+    return violation
+
+
+@leaf
+def _sums_over(model, pose, move, numbers, count, block):
+    """The sums over the first `count` points by number, block by block."""
+    free = model.free
+    points = free.tree.points
+    for i in range(17):
+        block[_SUMS + i] = 0.0
+    for first in range(0, count, _MOST):
+        size = min(_MOST, count - first)
+        for n in range(np.uint64(size)):
+            at = np.uint64(numbers[np.uint64(first) + n])
+            block[np.uint64(_POINT) + n] = points[0, at]
+            block[np.uint64(_POINT + _MOST) + n] = points[1, at]
+            block[np.uint64(_POINT + 2 * _MOST) + n] = points[2, at]
+        whole = (size + 3) // 4 * 4  # vectors read what is left of another block, for nothing
+        _locate(move, free.cells.box, model.alpha, block, whole)
+        if free.interior:
+            _read_weights(free, numbers, first, block, size)
+            _subtract_points(pose, block, whole)
+            _add_weights(pose, block, size)
+        else:
+            if model.field.trilinear:
+                _weigh_corners(block, whole)
+                _violate_between_nodes(model, block, size)
+            else:
+                _violate_at_nodes(model, block, size)
+            _add_violations(block, size)
+    _, a, b, c = _four(block, _SUMS, 0)
+    _, d, e, f = _four(block, _SUMS, 1)
+    _, g, h, i = _four(block, _SUMS, 2)
+    value, x, y, z = _four(block, _SUMS, 3)
+    if free.interior:
+        return CostAndGradient(value, (a, b, c, d, e, f, g, h, i, x, y, z))
+    return CostAndGradient(block[_SUMS + 16], (a, d, g, b, e, h, c, f, i, x, y, z))
+
+
+@leaf
+def _put(block, first, n, four):
+    """Set the four numbers of the n-th point."""
+    at = np.uint64(first) + np.uint64(4) * np.uint64(n)
+    block[at], block[at + np.uint64(1)] = four[0], four[1]
+    block[at + np.uint64(2)], block[at + np.uint64(3)] = four[2], four[3]
+
+
+@inner
+def _locate(move, box, level, block, count):
+    """Where the points lie, once moved."""
+    first, last, most, inverse = box.first, box.last, box.most, box.inverse
+    for n in range(count):
+        x, y, z = block[_POINT + n], block[_POINT + _MOST + n], block[_POINT + 2 * _MOST + n]
+        a = move[0] * x + move[1] * y + move[2] * z + move[9]
+        b = move[3] * x + move[4] * y + move[5] * z + move[10]
+        c = move[6] * x + move[7] * y + move[8] * z + move[11]
+        d = min(max(first[0], a), last[0])  # in this order, NaN ends up in the box
+        e = min(max(first[1], b), last[1])
+        f = min(max(first[2], c), last[2])
+        beyond = (a - d) * (a - d) + (b - e) * (b - e) + (c - f) * (c - f)
+        block[_LEVEL + n] = level if beyond == 0.0 else -np.inf
+        a, b, c = (d - first[0]) * inverse, (e - first[1]) * inverse, (f - first[2]) * inverse
+        d = node_of(a, box.between, most[0])
+        e = node_of(b, box.between, most[1])
+        f = node_of(c, box.between, most[2])
+        block[_PLACE + n], block[_PLACE + _MOST + n] = a - d, b - e
+        block[_PLACE + 2 * _MOST + n] = c - f
+        block[_CELL + n] = d * box.across + e * box.along + f
+
+
+@inner
+def _weigh_corners(block, count):
+    """How much each corner of its cell counts at each point, as distance_between_nodes has it."""
+    for n in range(count):
+        u, v, w = block[_PLACE + n], block[_PLACE + _MOST + n], block[_PLACE + 2 * _MOST + n]
+        a, b, c = 1.0 - u, 1.0 - v, 1.0 - w
+        ab, av, ub, uv = a * b, a * v, u * b, u * v
+        block[_WEIGHT + n], block[_WEIGHT + _MOST + n] = ab * c, ab * w
+        block[_WEIGHT + 2 * _MOST + n], block[_WEIGHT + 3 * _MOST + n] = av * c, av * w
+        block[_WEIGHT + 4 * _MOST + n], block[_WEIGHT + 5 * _MOST + n] = ub * c, ub * w
+        block[_WEIGHT + 6 * _MOST + n], block[_WEIGHT + 7 * _MOST + n] = uv * c, uv * w
+
+
+@inner
+def _violate_between_nodes(model, block, count):
+    """What each point costs where distances are interpolated, see _put_violation."""
+    table, box = model.field.table, model.field.box
+    across, along = np.uint64(np.int64(box.across)), np.uint64(np.int64(box.along))
+    for n in range(np.uint64(count)):
+        cell = np.uint64(np.int64(block[np.uint64(_CELL) + n]))
+        next_cell = cell + across
+        read = _with_edge(table, cell, block, 0, n, (0.0, 0.0, 0.0, 0.0))
+        read = _with_edge(table, cell + along, block, 2, n, read)
+        read = _with_edge(table, next_cell, block, 4, n, read)
+        read = _with_edge(table, next_cell + along, block, 6, n, read)
+        _put_violation(model, block, n, cell, read)
+
+
+@leaf
+def _with_edge(table, node, block, corner, n, read):
+    """What was read so far, plus a node and the next on the third axis, with their weights."""
+    s, nx, ny, nz = read
+    weight = block[np.uint64(_WEIGHT + corner * _MOST) + n]
+    a, b, c, d = at_node(table, node)
+    s, nx, ny, nz = s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
+    weight = block[np.uint64(_WEIGHT + (corner + 1) * _MOST) + n]
+    a, b, c, d = at_node(table, node + np.uint64(1))
+    return s + weight * a, nx + weight * b, ny + weight * c, nz + weight * d
+
+
+@inner
+def _violate_at_nodes(model, block, count):
+    """What each point costs where the nearest node is read, see _put_violation."""
+    for n in range(np.uint64(count)):
+        cell = np.uint64(np.int64(block[np.uint64(_CELL) + n]))
+        _put_violation(model, block, n, cell, at_node(model.field.table, cell))
+
+
+@leaf
+def _put_violation(model, block, n, cell, read):
+    """lambda max(0, alpha - s), with gradient -lambda max(0, alpha - s) n (Eq. 8); 0 elsewhere."""
+    scale, exact = model.free_scale, model.exact_gradient
+    s, nx, ny, nz = read
+    violation = max(block[np.uint64(_LEVEL) + n] - s, 0.0)
+    violation = violation if model.free.cells.steps[cell] == 0 else 0.0
+    size = -scale * slope(exact, violation)
+    _put(block, _SUMMAND, n, (size * s, size * nx, size * ny, size * nz))
+    block[np.uint64(_VALUE) + n] = scale * violation
+
+
+@inner
+def _read_weights(free, numbers, first, block, count):
+    """Weight, and it times the inward normal, of each point in a free voxel; else 0."""
+    steps = free.cells.steps
+    for n in range(count):
+        read = (0.0, 0.0, 0.0, 0.0)
+        if steps[np.uint64(np.int64(block[_CELL + n]))] == 0 and block[_LEVEL + n] > -np.inf:
+            read = _four(free.weights, 0, numbers[first + n])
+        _put(block, _SUMMAND, n, read)
+
+
+@inner
+def _subtract_points(pose, block, count):
+    """Replace points m by t - m."""
+    for n in range(count):
+        block[_POINT + n] = pose[9] - block[_POINT + n]
+        block[_POINT + _MOST + n] = pose[10] - block[_POINT + _MOST + n]
+        block[_POINT + 2 * _MOST + n] = pose[11] - block[_POINT + 2 * _MOST + n]
+
+
+@inner
+def _add_weights(pose, block, count):
+    """Add weights w at y = R^T (m - t), with gradient w R^T n by y: inwards, out of free voxels."""
+    _, a, b, c = _four(block, _SUMS, 0)
+    _, d, e, f = _four(block, _SUMS, 1)
+    _, g, h, i = _four(block, _SUMS, 2)
+    o, p, q, r = _four(block, _SUMS, 3)
+    s = t = u = 0.0  # of a fourth column, so that vectors have four lanes
+    for n in range(np.uint64(count)):
+        x, y = block[np.uint64(_POINT) + n], block[np.uint64(_POINT + _MOST) + n]
+        z = block[np.uint64(_POINT + 2 * _MOST) + n]
+        w, j, k, m = _four(block, _SUMMAND, n)
+        o, p, q, r = o + w, p + j, q + k, r + m
+        v, j, k, m = (
+            0.0 * j + 0.0 * k + 0.0 * m,
+            pose[0] * j + pose[3] * k + pose[6] * m,
+            pose[1] * j + pose[4] * k + pose[7] * m,
+            pose[2] * j + pose[5] * k + pose[8] * m,
+        )
+        s, a, b, c = s + x * v, a + x * j, b + x * k, c + x * m
+        t, d, e, f = t + y * v, d + y * j, e + y * k, f + y * m
+        u, g, h, i = u + z * v, g + z * j, h + z * k, i + z * m
+    _put(block, _SUMS, 0, (s, a, b, c))
+    _put(block, _SUMS, 1, (t, d, e, f))
+    _put(block, _SUMS, 2, (u, g, h, i))
+    _put(block, _SUMS, 3, (o, p, q, r))
+
+
+@inner
+def _add_violations(block, count):
+    """Add the violation of each point, one after the other, to the sums."""
+    a, b, c, d = _four(block, _SUMS, 0)
+    e, f, g, h = _four(block, _SUMS, 1)
+    i, j, k, m = _four(block, _SUMS, 2)
+    o, p, q, r = _four(block, _SUMS, 3)
+    cost = block[np.uint64(_SUMS + 16)]
+    for n in range(np.uint64(count)):
+        x, y = block[np.uint64(_POINT) + n], block[np.uint64(_POINT + _MOST) + n]
+        z = block[np.uint64(_POINT + 2 * _MOST) + n]
+        s, t, u, v = _four(block, _SUMMAND, n)
+        a, b, c, d = a + s * x, b + t * x, c + u * x, d + v * x
+        e, f, g, h = e + s * y, f + t * y, g + u * y, h + v * y
+        i, j, k, m = i + s * z, j + t * z, k + u * z, m + v * z
+        o, p, q, r = o + s, p + t, q + u, r + v
+        cost += block[np.uint64(_VALUE) + n]
+    _put(block, _SUMS, 0, (a, b, c, d))
+    _put(block, _SUMS, 1, (e, f, g, h))
+    _put(block, _SUMS, 2, (i, j, k, m))
+    _put(block, _SUMS, 3, (o, p, q, r))
+    block[np.uint64(_SUMS + 16)] = cost
+
+
+@leaf
+def _four(block, first, n):
+    """The four numbers of the n-th point."""
+    at = np.uint64(first) + np.uint64(4) * np.uint64(n)
+    return (
+        block[at],
+        block[at + np.uint64(1)],
+        block[at + np.uint64(2)],
+        block[at + np.uint64(3)],
+    )

@@ -1,4 +1,4 @@
-"""The relaxed cost as a function of search vectors, and its gradient."""
+"""The relaxed cost as a function of search vectors, its gradient, and descents by Adam."""
 
 from __future__ import annotations
 
@@ -7,15 +7,26 @@ from typing import Any
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_kernels import Model, Work, evaluate, gradient_of, put_pose, work_of
-from chsel.cost.descent import descend
-from chsel.cost.free_kernels import SEARCH_SLACK
-from chsel.cost.pose_lanes import LANES, SUMS
+from chsel.cost.cost_kernels import (
+    LANES,
+    SUMS,
+    Model,
+    Work,
+    evaluate,
+    forget,
+    gradient_of,
+    put_pose,
+    work_of,
+)
+from chsel.cost.free_kernels import MOST_SLACK, SEARCH_SLACK
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.compiler import compiled, implements, spliced
+from chsel.numerics.compiler import compiled, implements, leaf, spliced
 from chsel.numerics.pose_tuples import all_finite, decode, pull_back
 from chsel.numerics.threads import spread
 from chsel.problem.search_space import SearchSpace
+
+BETA1, BETA2 = 0.9, 0.999  # of Adam (Kingma and Ba, 2015)
+EPSILON = 1e-8
 
 
 def costs_of(model, space, vectors, costs, work):
@@ -62,6 +73,55 @@ def costs_and_gradients(model, space, vectors, costs, gradients, first, last, wo
             costs[start + lane] = work.lanes[SUMS + lane]
             by_pose = gradient_of(work.lanes, lane)
             pull_back(space, vectors[start + lane], by_pose, gradients[start + lane])
+
+
+@leaf
+def adam_step(slope, moments, j, powers, rate, epsilon):
+    """The step down a slope along coordinate j; updates moments (2, d).
+
+    powers: beta_1 and beta_2 to the power of the number of steps, this one included.
+    """
+    moments[0, j] = BETA1 * moments[0, j] + (1.0 - BETA1) * slope
+    moments[1, j] = BETA2 * moments[1, j] + (1.0 - BETA2) * slope * slope
+    step = rate * (moments[0, j] / (1.0 - powers[0]))
+    return step / (np.sqrt(moments[1, j] / (1.0 - powers[1])) + epsilon)
+
+
+@compiled
+def descend(
+    model, space, vectors, costs, iterations, rate, divisor, ends_on_poses, first, last, work
+):
+    """Move search vectors (S, d) from `first` to before `last` by some iterations of Adam.
+
+    divisor: of gradients. ends_on_poses: makes rotations orthonormal again, and fills costs (S,).
+    """
+    dimension = vectors.shape[1]
+    moments, gradient = np.empty((LANES, 2, dimension)), np.empty(dimension)
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
+        moments[:] = 0.0
+        powers = 1.0, 1.0
+        forget(work)
+        for _ in range(iterations):
+            for lane in range(count):
+                put_pose(work.lanes, lane, decode(space, vectors[start + lane]))
+            evaluate(model, work, 0, count, MOST_SLACK)
+            powers = powers[0] * BETA1, powers[1] * BETA2
+            for lane in range(count):
+                vector = vectors[start + lane]
+                pull_back(space, vector, gradient_of(work.lanes, lane), gradient)
+                for j in range(dimension):
+                    slope = gradient[j] / divisor
+                    vector[j] -= adam_step(slope, moments[lane], j, powers, rate, EPSILON)
+        if ends_on_poses:
+            for lane in range(count):
+                pose = decode(space, vectors[start + lane])
+                for j in range(6):
+                    vectors[start + lane, j] = pose[j]
+                put_pose(work.lanes, lane, decode(space, vectors[start + lane]))
+            evaluate(model, work, 0, count, 0.0)
+            for lane in range(count):
+                costs[start + lane] = work.lanes[SUMS + lane]
 
 
 class Objective:

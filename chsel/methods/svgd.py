@@ -8,12 +8,10 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_kernels import Model, Work, evaluate, gradient_of, put_pose, work_of
+from chsel.cost.cost_kernels import LANES, Model, Work, evaluate, gradient_of, put_pose, work_of
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.descent import BETA1, BETA2, EPSILON, adam_step
 from chsel.cost.free_kernels import MOST_SLACK
-from chsel.cost.objective import Objective
-from chsel.cost.pose_lanes import LANES
+from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective, adam_step
 from chsel.errors import require_at_most
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import FloatArray

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.cost.descent import BETA1, BETA2, adam_step
-from chsel.cost.objective import cost_and_gradient_of, costs_of
+from chsel.cost.objective import BETA1, BETA2, adam_step, cost_and_gradient_of, costs_of
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, spliced
 from chsel.numerics.pose_tuples import all_finite

@@ -8,8 +8,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from chsel.cost.descent import EPSILON
-from chsel.cost.objective import Objective
+from chsel.cost.objective import EPSILON, Objective
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import NullObserver, Observer
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive

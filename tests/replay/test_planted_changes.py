@@ -11,7 +11,7 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECORDING = REPOSITORY / "tests" / "replays" / "spam_can_gradient_descent.mcap"
-KERNEL = "chsel/cost/pose_lanes.py"
+KERNEL = "chsel/cost/cost_kernels.py"
 LINE = "value = scale * excess"
 PLANTED = "value = 1.0000000000001 * scale * excess"
 

@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.descent import BETA1, BETA2, EPSILON
-from chsel.cost.objective import Objective
-from chsel.cost.pose_lanes import LANES
+from chsel.cost.cost_kernels import LANES
+from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective
 from chsel.errors import EngineError, PointsError, PoseError, SettingError
 from chsel.numerics import near_points
 from chsel.numerics.arrays import FloatArray
@@ -222,6 +221,34 @@ def test_an_object_that_turns_misses_none_of_the_points_that_it_sweeps(
     plain = descended_plainly(case.objective("none"), vectors, 1.0, turn, 50)
     assert (np.abs(plain[:, 0] - vectors[:, 0]) > 5.0 * turn).any()
     assert_same_bits(case.objective().descended(vectors, 1.0, turn, 50), plain)
+
+
+def test_an_object_that_comes_into_free_space_from_outside_misses_none_of_its_points() -> None:
+    """A corner of a box comes first, where a sphere around the box fits it best."""
+    corner = np.array(BOX_SIDES) / 2.0
+    x = corner / np.linalg.norm(corner)
+    y = np.cross(x, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(x, [0.0, 0.0, 1.0]))
+    rotation = np.stack([x, y, np.cross(x, y)], axis=1)  # its columns are the world's axes
+    away = np.linalg.norm(corner) + np.arange(0.0, 0.05, 0.003)
+    transforms = compose(np.tile(rotation, (len(away), 1, 1)), away[:, None] * x)
+    free = np.random.default_rng(17).uniform([0.0, -0.05, -0.05], [0.2, 0.05, 0.05], (20_000, 3))
+    points = KnownPoints(free, known=[[1.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
+    changes = CostSettings(penetration_tolerance=0.0)
+    vectors = SE3Space().encode(Poses.of(transforms))
+    case = Case("box", points, changes, 0.005, vectors, SE3Space())
+    plain = vectors
+    for rate in (0.002, 0.005):
+        plain = descended_plainly(case.objective("none"), vectors, 1.0, rate, 20)
+        assert_same_bits(case.objective().descended(vectors, 1.0, rate, 20), plain)
+    free_alone = replace(case, points=KnownPoints(free)).objective("none")
+    assert not free_alone.costs(vectors)[1:].any()
+    assert (free_alone.costs(plain) > 0.0).sum() > 5
+
+
+def test_by_default_alpha_is_a_quarter_of_a_free_voxel_or_half_of_the_greatest_depth() -> None:
+    sdf = grid_of("sphere")  # 5 cm deep
+    for resolution, alpha in ((0.02, -0.005), (0.4, -0.025)):
+        assert CostSettings().of_object(sdf, resolution).alpha == pytest.approx(alpha)
 
 
 @settings(max_examples=25, deadline=None)
