@@ -49,7 +49,11 @@ class RelaxedCost:
             self._voxels = VoxelGrid.around(points.free, free_resolution)
             self._inside, self._normals = _tensor(interior.points), _tensor(interior.normals)
             self._weights = _tensor(interior.weights(settings, free_resolution))
-        elif len(points.free) and not (sdf.values < settings.alpha).any():
+        deep = np.argwhere(sdf.values < settings.alpha)
+        corners = (deep.min(axis=0) - 1, deep.max(axis=0) + 1) if len(deep) else (1, 0)
+        # Free points outside of this box cost nothing.
+        self._deep = [_tensor(sdf.origin + sdf.resolution * np.asarray(c)) for c in corners]
+        if len(points.free) and not len(deep):
             warnings.warn(
                 f"no node of the SDF is deeper than {-settings.alpha} m: free points cannot be "
                 "violated; use a smaller penetration_tolerance",
@@ -88,7 +92,15 @@ class RelaxedCost:
         occupied = settings.occupied_scale * self._violation(*pose, self._occupied, 1.0)
         if self._is_interior:
             return known + occupied + self._interior(*pose)
-        return known + occupied + settings.free_scale * self._violation(*pose, self._free, -1.0)
+        return (
+            known + occupied + settings.free_scale * self._violation(*pose, self._near(*pose), -1.0)
+        )
+
+    def _near(self, rotation: Tensor, translation: Tensor) -> Tensor:
+        """The free points (N', 3) that may cost something at one of the poses."""
+        with torch.no_grad():
+            x = _moved(rotation[:, None], translation[:, None], self._free)
+        return self._free[((x >= self._deep[0]) & (x <= self._deep[1])).all(dim=2).any(dim=0)]
 
     def _violation(
         self, rotation: Tensor, translation: Tensor, points: Tensor, sign: float

@@ -131,7 +131,7 @@ def test_gradient_by_the_search_vector_is_the_defined_point_gradient_chain_ruled
 
 def point_gradients_by_hand(cost, sphere, points, vector, free_term):  # type: ignore[no-untyped-def]
     """How the points that the cost looks at move, and dC/d(moved point) as the paper defines it."""
-    interior = cost._interior.points.numpy() if free_term == "interior" else np.zeros((0, 3))
+    interior = cost._inside.numpy() if free_term == "interior" else np.zeros((0, 3))
     free = points.free if free_term == "direct" else np.zeros((0, 3))
     world = np.concatenate([free, points.occupied, points.known])
 
