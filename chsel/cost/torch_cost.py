@@ -16,8 +16,6 @@ from chsel.problem.poses import stacked
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 
-_PAIRS_AT_ONCE = 60_000  # of poses and points; more leave the processor's cache
-
 
 class RelaxedCost:
     """C^(X) = lambda sum_free c_f + lambda sum_occupied c_o + sum_known c_k (CHSEL, Eq. 7).
@@ -59,9 +57,6 @@ class RelaxedCost:
                 "violated; use a smaller penetration_tolerance",
                 stacklevel=2,
             )
-        free = len(self._inside) if self._is_interior else len(points.free)
-        pairs = max(1, free + len(points.occupied) + len(points.known))
-        self._poses_at_once = max(1, _PAIRS_AT_ONCE // pairs)
 
     @classmethod
     def of(cls, problem: RegistrationProblem, settings: CostSettings | None = None) -> RelaxedCost:
@@ -70,9 +65,8 @@ class RelaxedCost:
 
     def __call__(self, rotation: Tensor, translation: Tensor) -> Tensor:
         """Costs (B,) of object_from_world rotations (B, 3, 3) and translations (B, 3)."""
-        size = self._poses_at_once
-        batches = zip(rotation.split(size), translation.split(size), strict=True)
-        return torch.cat([self._cost(*batch) for batch in batches])
+        poses = zip(rotation.split(1), translation.split(1), strict=True)
+        return torch.cat([translation[:0, 0], *(self._cost(*pose) for pose in poses)])
 
     def evaluate(self, object_from_world: FloatArray) -> FloatArray:
         """Costs (B,) of transforms (B, 4, 4); infinite for one that is not finite."""
@@ -83,7 +77,7 @@ class RelaxedCost:
         return np.asarray(costs)
 
     def _cost(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """The same, of a few poses."""
+        """The same, of one pose."""
         settings, pose = self.settings, (rotation, translation)
         x, s, n = self._read(*pose, self._known)
         difference = s - self._known_sdf  # sum |s - v|, with gradient (s - v) n (Eq. 10)
@@ -97,7 +91,7 @@ class RelaxedCost:
         )
 
     def _near(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        """The free points (N', 3) that may cost something at one of the poses."""
+        """The free points (N', 3) that may cost something at a pose."""
         with torch.no_grad():
             x = _moved(rotation[:, None], translation[:, None], self._free)
         return self._free[((x >= self._deep[0]) & (x <= self._deep[1])).all(dim=2).any(dim=0)]
