@@ -20,7 +20,7 @@ from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_kernels import LANES
 from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective
-from chsel.errors import EngineError, PointsError, PoseError, SettingError
+from chsel.errors import PoseError, SettingError
 from chsel.numerics import near_points
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
@@ -251,29 +251,6 @@ def test_by_default_alpha_is_a_quarter_of_a_free_voxel_or_half_of_the_greatest_d
         assert CostSettings().of_object(sdf, resolution).alpha == pytest.approx(alpha)
 
 
-@settings(max_examples=25, deadline=None)
-@given(case=cases(), seed=st.integers(0, 2**32 - 1))
-def test_free_points_in_any_order_cost_the_same_bits_if_no_two_share_a_finest_cell(
-    case: Case, seed: int
-) -> None:
-    """Points in one cell of the finest level, a sixteenth of their spacing, keep their order."""
-    stream, spacing = np.random.default_rng(seed), case.free_resolution
-    free = np.unique(np.rint(case.points.free / spacing), axis=0) * spacing
-    free += stream.uniform(-0.3, 0.3, free.shape) * spacing
-    shuffled = free[stream.permutation(len(free))]
-    points = case.points
-    found = [
-        replace(
-            case, points=KnownPoints(some, points.occupied, points.known, points.sdf)
-        ).objective()
-        for some in (free, shuffled)
-    ]
-    for one, other in zip(
-        *(objective.costs_and_gradients(case.vectors) for objective in found), strict=True
-    ):
-        assert_same_bits(one, other)
-
-
 def summed_over_all(cost: CompiledCost, sdf: SdfGrid, free: FloatArray, pose: FloatArray) -> float:
     """Eq. 8 over every free point, one after the other in the order of the tree."""
     x, y, z = free[cost.model.free.tree.order].T
@@ -370,31 +347,6 @@ def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them() ->
     case = Case("dyadic", KnownPoints(free), changes, step, vectors, SE3Space())
     assert case.objective().costs(vectors)[0] > 0.0
     assert_equals_torch(case)
-
-
-def test_an_object_that_leaves_free_space_step_by_step_costs_the_same_bits() -> None:
-    """Where all of it is in free voxels, none of its interior points is looked up."""
-    side = 0.01
-    free = np.stack(np.meshgrid(*[np.arange(-15.0, 16.0) * side] * 3), axis=-1).reshape(-1, 3)
-    free = free[np.abs(free - [0.0, 0.08, 0.0]).max(axis=1) > 1.5 * side]  # with a hole
-    stream = np.random.default_rng(15)
-    way = np.linspace(0.0, 0.25, 1500)[:, None] * [[0.0, 1.0, 0.1]]
-    poses = Poses.of(compose(np.repeat(random_rotations(stream, 3), 500, axis=0), way))
-    changes = CostSettings(free_term="interior")
-    vectors = SE3Space().encode(poses)
-    case = Case("box", KnownPoints(free), changes, side, vectors, SE3Space())
-    plain, fast = case.objective("none"), case.objective()
-    for one, other in zip(
-        plain.costs_and_gradients(vectors), fast.costs_and_gradients(vectors), strict=True
-    ):
-        assert_same_bits(one, other)
-    whole = float(fast.model.free.weights[::4].sum())
-    assert (plain.costs(vectors) < 0.999 * whole).any()
-    known = KnownPoints(free, known=[[0.0, 0.3, 0.0], [0.05, 0.3, 0.0]])
-    case = replace(case, points=known, vectors=vectors[::100])
-    for rate in (1e-4, 1e-3):
-        moved = descended_plainly(case.objective("none"), case.vectors, 1.0, rate, 100)
-        assert_same_bits(case.objective().descended(case.vectors, 1.0, rate, 100), moved)
 
 
 def edge_points(name: str) -> KnownPoints:
@@ -567,22 +519,6 @@ def test_matrices_that_are_no_rotations_cost_the_same_bits_with_every_culling(
     assert_same_bits(tree.evaluate(transforms), costs)
 
 
-def test_rows_that_span_no_plane_descend_to_the_same_bits() -> None:
-    stream = np.random.default_rng(10)
-    near = stream.uniform(-0.1, 0.1, (300, 3))
-    vectors = np.zeros((4, 9))
-    vectors[1:, 0] = 1.0
-    vectors[2, 3] = 1.0
-    vectors[3, 3:5] = 1.0, 1e-11
-    case = Case(
-        "box", KnownPoints(near, near[:3], near[:9]), CostSettings(), 0.01, vectors,
-        SE3Space(),
-    )  # fmt: skip
-    plain = descended_plainly(case.objective("none"), vectors, 4.0, 0.01, 30)
-    assert np.isfinite(plain).all()
-    assert_same_bits(case.objective().descended(vectors, 4.0, 0.01, 30), plain)
-
-
 def test_an_sdf_that_32_bits_cannot_hold_is_read_in_64_bits() -> None:
     sdf = grid_of("sphere")
     node = np.array([[0.03, 0.01, 0.02]])
@@ -630,37 +566,6 @@ def test_free_voxels_that_span_too_much_are_an_error(far: float) -> None:
     changes = CostSettings(free_term="interior")
     with pytest.raises(SettingError, match="coarser free_resolution"):
         CompiledCost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0], [far, far, far]]), changes)
-
-
-def test_free_points_whose_distance_is_no_number_are_an_error() -> None:
-    with pytest.raises(PointsError, match="accepted: a finite extent"):
-        CompiledCost(grid_of("box"), KnownPoints([[-1.7e308, 0.0, 0.0], [1.7e308, 0.0, 0.0]]))
-
-
-def test_points_and_poses_are_left_as_they_were() -> None:
-    stream = np.random.default_rng(13)
-    near = stream.uniform(-0.05, 0.05, (40, 3))
-    points = KnownPoints(near, near[:3], near[:9])
-    objective = Objective(CompiledCost(grid_of("box"), points), SE3Space())
-    vectors = SE3Space().encode(Poses.of(np.tile(np.eye(4), (3, 1, 1))))
-    before, digest = vectors.copy(), points.digest
-    assert (objective.descended(vectors, 3.0, 0.01, 5) != vectors).any()
-    objective.costs_and_gradients(vectors)
-    assert_same_bits(vectors, before)
-    fresh = KnownPoints(points.free, points.occupied, points.known, points.sdf)
-    assert fresh.digest == digest
-
-
-def test_a_thread_that_flushes_subnormals_is_refused() -> None:
-    points = KnownPoints(known=[[0.0, 0.0, 0.0]])
-    if not torch.set_flush_denormal(True):
-        pytest.skip("this processor cannot flush subnormal numbers")
-    try:
-        with pytest.raises(EngineError, match="flushes subnormal numbers to zero"):
-            CompiledCost(grid_of("box"), points)
-    finally:
-        torch.set_flush_denormal(False)
-    assert CompiledCost(grid_of("box"), points).evaluate(np.eye(4)[None])[0] > 0.0
 
 
 @pytest.mark.parametrize("cost", [CompiledCost, RelaxedCost])
