@@ -81,27 +81,18 @@ def put_pose(lanes, lane, pose):
 
 
 @leaf
-def _row(lanes, row, lane):
-    return lanes[LANES * row + lane]
-
-
-@leaf
-def _pose_of(lanes, lane):
-    """The pose of a lane."""
-    a, b, c = _row(lanes, 0, lane), _row(lanes, 1, lane), _row(lanes, 2, lane)
-    d, e, f = _row(lanes, 3, lane), _row(lanes, 4, lane), _row(lanes, 5, lane)
-    g, h, i = _row(lanes, 6, lane), _row(lanes, 7, lane), _row(lanes, 8, lane)
-    x, y, z = _row(lanes, 9, lane), _row(lanes, 10, lane), _row(lanes, 11, lane)
-    return a, b, c, d, e, f, g, h, i, x, y, z
-
-
-@leaf
 def gradient_of(lanes, lane):
     """The gradient of the cost of a lane by its pose."""
-    a, b, c = _row(lanes, 13, lane), _row(lanes, 14, lane), _row(lanes, 15, lane)
-    d, e, f = _row(lanes, 16, lane), _row(lanes, 17, lane), _row(lanes, 18, lane)
-    g, h, i = _row(lanes, 19, lane), _row(lanes, 20, lane), _row(lanes, 21, lane)
-    x, y, z = _row(lanes, 22, lane), _row(lanes, 23, lane), _row(lanes, 24, lane)
+    return _twelve(lanes, SUMS + LANES + lane)
+
+
+@leaf
+def _twelve(lanes, at):
+    """The numbers of a lane in twelve rows, from `at` on."""
+    a, b, c = lanes[at], lanes[at + LANES], lanes[at + 2 * LANES]
+    d, e, f = lanes[at + 3 * LANES], lanes[at + 4 * LANES], lanes[at + 5 * LANES]
+    g, h, i = lanes[at + 6 * LANES], lanes[at + 7 * LANES], lanes[at + 8 * LANES]
+    x, y, z = lanes[at + 9 * LANES], lanes[at + 10 * LANES], lanes[at + 11 * LANES]
     return a, b, c, d, e, f, g, h, i, x, y, z
 
 
@@ -117,7 +108,7 @@ def evaluate(model, work, first, count, most_slack):
         for lane in range(count, LANES):
             lanes[LANES * row + lane] = lanes[LANES * row]
     for lane in range(count):
-        pose = _pose_of(lanes, lane)
+        pose = _twelve(lanes, lane)
         if finite(pose):
             sums = free_sums(model, pose, near, first + lane, most_slack)
             lanes[SUMS + lane] = sums.cost
@@ -126,7 +117,7 @@ def evaluate(model, work, first, count, most_slack):
     _add_occupied(model, lanes)
     _add_known(model, lanes)
     for lane in range(count):
-        if not finite(_pose_of(lanes, lane)):
+        if not finite(_twelve(lanes, lane)):
             lanes[SUMS + lane] = np.inf
             for i in range(12):
                 lanes[SUMS + LANES * (i + 1) + lane] = 0.0
