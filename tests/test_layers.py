@@ -36,12 +36,11 @@ MAY_IMPORT = {
     },
     "replay": {
         "mcap": set(),
-        "raw": {"mcap"},
-        "content": {"mcap", "raw"},
+        "content": {"mcap"},
         "registration": {"mcap"},
         "comparing": {"mcap", "registration"},
         "rerun": {"mcap", "comparing"},
-        "verbs": {"mcap", "raw", "content", "registration", "comparing", "rerun"},
+        "verbs": {"mcap", "content", "registration", "comparing", "rerun"},
     },
     "runners": {
         "objects": set(),
@@ -67,7 +66,7 @@ MAY_IMPORT = {
 LOWEST = {
     "chsel": {"errors"},
     "replay": {
-        *("events", "recorder", "lost_attachment", "settings_migration", "environment"),
+        *("events", "recorder", "environment"),
         *("arguments", "colors", "console", "files", "startup"),
     },
     "runners": set(),

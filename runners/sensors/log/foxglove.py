@@ -9,9 +9,7 @@ from typing import Any
 
 from google.protobuf.message import DecodeError
 
-from chsel.errors import RecordingError
 from chsel.problem.poses import apply
-from replay.mcap.wire import check_wire
 from runners.sensors.log import message_fields as fields
 from runners.sensors.log.images import pixel_rows, png_pixels
 from runners.sensors.log.messages import (
@@ -42,9 +40,8 @@ def foxglove_decoder(name: str) -> Decode | None:
 
     def decode(data: bytes) -> Iterator[Decoded]:
         try:
-            check_wire(kind.DESCRIPTOR, data)
             message = kind.FromString(data)
-        except (DecodeError, RecordingError):
+        except DecodeError:
             raise UnusableMessage(f"a message is no valid {name}") from None
         return contents(message)
 

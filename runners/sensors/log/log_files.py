@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import heapq
 import re
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from chsel.errors import SessionError
+from replay.mcap.log_file import ACCEPTED, RawMessage
 from replay.mcap.texts import one_line
-from replay.raw.raw_file import ACCEPTED
-from replay.raw.raw_reading import RawMessage
 from runners.sensors.yaml_file import read_yaml
 
 _METADATA = "metadata.yaml"
@@ -120,9 +118,3 @@ def merged(
         following = next(messages, None)
         if following is not None:
             heapq.heappush(heads, (following.log_time, number, following, messages))
-
-
-def most_at_once(spans: Sequence[Span]) -> int:
-    """How many of the files are open at a time, at most."""
-    firsts, lasts = (sorted(span[end] for span in spans) for end in (0, 1))
-    return max(bisect_right(firsts, first) - bisect_left(lasts, first) for first in firsts)

@@ -9,12 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from chsel.errors import SessionError
+from replay.mcap.log_file import Channel, Fault, RawFile, RawMessage
 from replay.mcap.texts import one_line
-from replay.raw.channels import Channel
-from replay.raw.raw_file import RawFile
-from replay.raw.raw_reading import Fault, RawMessage, Wanted
 from runners.sensors.log.foxglove import foxglove_decoder
-from runners.sensors.log.log_files import Span, log_files, merged, most_at_once
+from runners.sensors.log.log_files import Span, log_files, merged
 from runners.sensors.log.messages import (
     Decode,
     Decoded,
@@ -87,7 +85,7 @@ class RawLog:
         if not known:
             named = ", ".join(sorted(topics)) or "none"
             raise SessionError(f"log {self.path} has no topic {named}; it has {self.listing()}")
-        return self._received(Wanted(known), progress)
+        return self._received(known, progress)
 
     def listing(self) -> str:
         """All topics with their schemas, for messages to the user."""
@@ -115,10 +113,10 @@ class RawLog:
         whole = "".join(f"{digest}\n" for digest in digests).encode()
         return hashlib.blake2b(whole, digest_size=_DIGEST_SIZE).hexdigest()
 
-    def _received(self, wanted: Wanted, progress: Progress | None) -> Iterator[Received]:
+    def _received(self, topics: frozenset[str], progress: Progress | None) -> Iterator[Received]:
         fault, report = self._new_faults(), _seldom(progress, self.size)
         decoders: dict[Channel, Decode | UnusableMessage] = {}
-        for message in self._raw_messages(wanted, fault, report):
+        for message in self._raw_messages(topics, fault, report):
             channel = message.channel
             if channel not in decoders:
                 decoders[channel] = _decoder(channel)
@@ -135,17 +133,16 @@ class RawLog:
                 fault(f"{channel.topic}: {error}")
 
     def _raw_messages(
-        self, wanted: Wanted, fault: Fault, report: Callable[[int], None]
+        self, topics: frozenset[str], fault: Fault, report: Callable[[int], None]
     ) -> Iterator[RawMessage]:
         done = [0] * len(self._parts)
-        at_once = most_at_once(self._spans)
 
         def read(number: int) -> Iterator[RawMessage]:
             def report_file(of_file: int) -> None:
                 done[number] = of_file
                 report(sum(done))
 
-            return self._parts[number].messages(wanted, fault, report_file, at_once=at_once)
+            return self._parts[number].messages(topics, fault, report_file)
 
         yield from merged(self._spans, read)
         report(self.size)
@@ -157,15 +154,12 @@ class RawLog:
         for part in self._parts:
             counts: dict[Channel, int] = {}
             times = list(part.times or ())
-            if part.counts is not None:
-                for number, channel in part.channels.by_id.items():
-                    counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
-            else:
-                for message in part.messages(Wanted(), fault, _after(done, report)):
+            if not part.is_indexed:
+                for message in part.messages(None, fault, _after(done, report)):
                     counts[message.channel] = counts.get(message.channel, 0) + 1
                     times = [min([message.log_time, *times]), max([message.log_time, *times])]
-                for channel in part.channels.by_id.values():
-                    counts.setdefault(channel, 0)
+            for number, channel in part.channels.items():
+                counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
             for channel, count in counts.items():
                 self._add_topic(channel, count)
             done += part.size
