@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chsel.errors import SettingError
-from chsel.numerics.arrays import frozen
+import numpy as np
+
 from chsel.problem.poses import compose, roll_pitch_yaw
 from runners.sensors.rig import BoxRig, HandRig
 from runners.sensors.urdf import Linkage
@@ -24,7 +24,7 @@ class HandModel:
     """
 
     def __init__(self, rig: HandRig) -> None:
-        self._boxes = [_solid(box, f"hand.boxes[{i}]") for i, box in enumerate(rig.boxes)]
+        self._boxes = [_solid(box) for box in rig.boxes]
         self._linkage = None if rig.urdf is None else Linkage(Path(rig.urdf), rig.root)
         self.joint_names = () if self._linkage is None else self._linkage.joint_names
         self.warnings = () if self._linkage is None else self._linkage.warnings
@@ -33,7 +33,7 @@ class HandModel:
         """Closed solids in the hand's frame, metres; they may overlap.
 
         joints: values by name, radians or metres. Those of other joints do not matter, missing
-        ones are 0. Raises SettingError for a value that is not finite.
+        ones are 0.
         """
         links = [] if self._linkage is None else self._linkage.solids(joints or {})
         return self._boxes + links
@@ -47,12 +47,8 @@ class HandModel:
         return joined
 
 
-def _solid(box: BoxRig, where: str) -> trimesh.Trimesh:
+def _solid(box: BoxRig) -> trimesh.Trimesh:
     import trimesh
 
-    values = {
-        name: frozen(f"{where}.{name}", getattr(box, name), (3,), error=SettingError)
-        for name in ("size", "position", "rotation")
-    }
-    hand_from_box = compose(roll_pitch_yaw(values["rotation"]), values["position"])
-    return trimesh.creation.box(values["size"], hand_from_box)
+    hand_from_box = compose(roll_pitch_yaw(np.array(box.rotation)), np.array(box.position))
+    return trimesh.creation.box(box.size, hand_from_box)

@@ -14,7 +14,7 @@ from chsel.sensing.swept import interior_lattice, poses_between
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import PushEnd
 from runners.sensors.hand import HandModel
-from runners.sensors.log.motion import JointHistory
+from runners.sensors.log.joints import JointHistory
 from runners.sensors.log.probe_windows import ProbeWindow
 from runners.sensors.rig import HandRig
 from runners.sensors.session_report import Counts

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from chsel.errors import SessionError
+from replay.files import file_digest
 from replay.mcap.texts import one_line
 from replay.raw.channels import Channel
 from replay.raw.raw_file import RawFile
@@ -27,9 +28,7 @@ from runners.sensors.log.ros2 import ros2_decoder
 Progress = Callable[[int, int], None]  # bytes so far, and of all
 
 _PROGRESS_STEP = 2**22  # bytes
-_BLOCK = 2**22  # bytes
 _DIGEST_SIZE = 16  # bytes
-_MOST_FAULTS = 200  # different texts
 _MOST_LISTED = 60
 _STATIC = "tf_static"
 
@@ -96,20 +95,9 @@ class RawLog:
         damage = "".join(f" ({fault})" for fault, _ in self.faults.most_common(1))
         return ", ".join(shown[:_MOST_LISTED] + more) or f"no topics{damage}"
 
-    def digest(self, progress: Progress | None = None) -> str:
+    def digest(self) -> str:
         """BLAKE2b (128 bit, hexadecimal) of the file, or of the digests of a folder's files."""
-        report, done, digests = _seldom(progress, self.size), 0, []
-        for path in self.files:
-            state = hashlib.blake2b(digest_size=_DIGEST_SIZE)
-            try:
-                with path.open("rb") as file:
-                    while block := file.read(_BLOCK):
-                        state.update(block)
-                        done += len(block)
-                        report(done)
-            except OSError as error:
-                raise SessionError(f"log {path} cannot be read: {error.strerror}") from None
-            digests.append(state.hexdigest())
+        digests = [file_digest(path) for path in self.files]
         if self.path.is_file():
             return digests[0]
         whole = "".join(f"{digest}\n" for digest in digests).encode()
@@ -192,10 +180,6 @@ class RawLog:
 
         def fault(text: str) -> None:
             text = one_line(text)
-            if text not in self.faults and len(self.faults) >= _MOST_FAULTS:
-                text = f"{text.partition(':')[0]}: further reasons"
-                if text not in self.faults and len(self.faults) >= 2 * _MOST_FAULTS:
-                    text = "further faults"
             found[text] += 1
             self.faults[text] = max(self.faults[text], found[text])
 

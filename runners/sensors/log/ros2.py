@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -24,68 +23,29 @@ from runners.sensors.log.messages import (
     UnusableMessage,
     WrenchMessage,
 )
-from runners.sensors.log.ros2_definitions import (
-    DEFINITIONS,
-    Fields,
-    defined_fields,
-    full_definition,
-    short_name,
-)
+from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition, short_name
 
-_ERRORS = (ValueError, struct.error, IndexError, OverflowError, MemoryError)  # of the decoder
-_SMALL = 2**20  # bytes; what has no pixels or points is smaller
-_BULKY = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud2")
-_HEAD = 2**12  # bytes of a cloud that must hold all before its points
 _LARGEST_FORCE = 1e6  # N, Nm
-_TEXT_AT = 8  # bytes before the text of std_msgs/String
-
-
-_Decoder = tuple[Callable[[bytes], Any], int | None]
-"""Decodes so many bytes at the start of a message, or all."""
 
 
 def ros2_decoder(name: str, definition: str | None = None) -> Decode | None:
     """Decodes messages of this name; None for one that is not read.
 
-    definition: of the schema in the file, where there is one. Raises UnusableMessage if it lacks a
-    field of ROS 2's, or has others than numbers and texts besides.
+    definition: of the schema in the file, by which messages are decoded; by default that of ROS 2.
+    Raises UnusableMessage for one that is not understood.
     """
     short = short_name(name)
     contents = _CONTENTS.get(short)
     if contents is None:
         return None
-    fields = defined_fields(short, definition or "")
-    if fields is None:
-        raise UnusableMessage(f"messages {name} have other fields than those of ROS 2")
-    decoders: list[_Decoder] = [(_decoder(short, fields), None)]
-    if short == "sensor_msgs/PointCloud2":
-        # A hostile one could otherwise claim more fields than fit into memory.
-        before_points = [field for _, field in fields].index("is_bigendian")
-        decoders.insert(0, (_decoder(short, fields[:before_points]), _HEAD))
-    return lambda data: contents(_message(short, decoders, data))
-
-
-def _message(name: str, decoders: Sequence[_Decoder], data: bytes) -> Any:
-    if len(data) > _SMALL and name not in _BULKY:
-        raise UnusableMessage(f"a {name} of {len(data)} bytes; accepted: up to {_SMALL}")
-    message: Any = None
+    text = definition if definition and definition.strip() else full_definition(short)
+    schema = Schema(id=1, data=text.encode(), encoding="ros2msg", name=short)
     try:
-        for decode, size in decoders:
-            message = decode(data[:size])
-    except _ERRORS:
-        raise UnusableMessage(f"a message is no whole {name}") from None
-    if name == "std_msgs/String" and _TEXT_AT + len(message.data.encode()) + 1 > len(data):
-        raise UnusableMessage("a text ends early")
-    return message
-
-
-def _decoder(name: str, fields: Fields) -> Callable[[bytes], Any]:
-    """The decoder of a message of these fields."""
-    text = full_definition(name, fields)
-    schema = Schema(id=1, data=text.encode(), encoding="ros2msg", name=name)
-    decoder = DecoderFactory().decoder_for("cdr", schema)
-    assert decoder is not None
-    return decoder
+        parse = DecoderFactory().decoder_for("cdr", schema)
+    except Exception as error:  # the parser raises whatever it stumbles over
+        raise UnusableMessage(f"the definition of {name} is not read: {error}") from None
+    assert parse is not None
+    return message_fields.decoder(name, parse, contents)
 
 
 def _stamp(header: Any) -> int | None:
@@ -135,9 +95,7 @@ def _point(message: Any, frame: str) -> CloudMessage:
 def _cloud(message: Any, frame: str) -> CloudMessage:
     points = message_fields.packed_points(
         message.data,
-        message_fields.named_fields(
-            (part.name, part.offset, part.datatype) for part in message.fields
-        ),
+        {part.name: (part.offset, part.datatype) for part in message.fields},
         message.point_step,
         size=(message.width, message.height),
         row=message.row_step,
@@ -154,7 +112,6 @@ def _wrench(message: Any, frame: str) -> WrenchMessage:
 
 
 def _joints(message: Any, _: str) -> JointsMessage:
-    message_fields.require_length("positions", len(message.position), "names", len(message.name))
     return message_fields.joints(zip(message.name, message.position, strict=True))
 
 

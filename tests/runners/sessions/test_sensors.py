@@ -28,7 +28,6 @@ from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from runners.command.choices import CONF
 from runners.objects.loader import ObjectConfig, load_object
-from runners.run.display import Display
 from runners.run.recording import RecordingConfig
 from runners.run.session_run import SessionRun
 from runners.sensors.pose_file import beside, write_pose
@@ -535,20 +534,6 @@ def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) 
         build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")
 
 
-def test_progress_is_told_in_megabytes(log: Path) -> None:
-    told: list[tuple[str, int, int]] = []
-    session = SensorsSession(
-        SensorsSettings(RIG, str(log)), 0, lambda *progress: told.append(progress)
-    )
-    list(session.probes())
-    assert {stage for stage, _, _ in told} >= {
-        "first pass over the log, MB",
-        "digest of the log, MB",
-        "reading images, MB",
-    }
-    assert all(0 <= done <= total == 1 for _, done, total in told)
-
-
 @settings(max_examples=24, derandomize=True, deadline=None)
 @given(
     part=st.floats(0.0, 1.0),
@@ -653,16 +638,3 @@ def test_recordings_of_such_sessions_can_be_read_and_registered_again(
     assert [probe.new_points.digest for probe in recording.probes] == [
         probe.new_points.digest for probe in probes(session.probes())
     ]
-
-
-def test_the_report_is_a_table_of_what_was_used(
-    log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session = open_log(log)
-    list(session.probes())
-    display = Display("title")
-    display.sensed(session.report)
-    shown = capsys.readouterr().out
-    rows = {tuple(line.split()[:3]) for line in shown.splitlines()}
-    assert {("0", "camera", "7/7"), ("pad", "22/31", "0.0"), ("all", "camera", "11/11")} <= rows
-    assert "no pose" not in shown
