@@ -173,11 +173,11 @@ class FirstPass:
                 f"no camera info of {sensor.name} on topic {sensor.info}{self._reason(sensor.info)}"
             )
         sizes = self._sensed[sensor.depth].sizes
-        if (info.height, info.width) not in sizes:
+        if (info.camera.height, info.camera.width) not in sizes:
             (height, width), _ = sizes.most_common(1)[0]
             raise self._error(
                 f"images of {sensor.name} have {width} x {height} pixels, and its camera info says "
-                f"{info.width} x {info.height}; accepted: the same"
+                f"{info.camera.width} x {info.camera.height}; accepted: the same"
             )
         if info.distorted:
             self._warnings.warn(
@@ -186,7 +186,7 @@ class FirstPass:
         self._warnings.warn(
             f"{sensor.name}: another camera info than the first", self._changed_infos[sensor.info]
         )
-        return PinholeCamera(info.width, info.height, info.fx, info.fy, info.cx, info.cy)
+        return info.camera
 
     def _windows(self) -> list[ProbeWindow]:
         """The probes of the log; all of it is one without markers."""

@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from chsel.problem.poses import apply
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log import message_fields as fields
 from runners.sensors.log.images import pixel_rows, png_pixels
 from runners.sensors.log.messages import (
@@ -18,11 +19,8 @@ from runners.sensors.log.messages import (
     ImageMessage,
     JointsMessage,
     MarkerMessage,
-    PoseMessage,
     UnusableMessage,
 )
-
-_MATRIX = 9  # entries of intrinsics
 
 
 def foxglove_decoder(name: str) -> Decode | None:
@@ -54,23 +52,9 @@ def _compressed_image(message: Any, frame: str) -> ImageMessage:
 
 
 def _calibration(message: Any, frame: str) -> CameraInfoMessage:
-    if len(message.K) != _MATRIX:
-        raise UnusableMessage(f"its intrinsics have {len(message.K)} entries; accepted: {_MATRIX}")
     fx, _, cx, _, fy, cy, *_ = message.K
-    size = (message.width, message.height)
-    return fields.intrinsics(frame, size, (fx, fy), (cx, cy), message.D)
-
-
-def _pose(message: Any, frame: str) -> PoseMessage:
-    return PoseMessage(frame, fields.rigid(message.pose.position, message.pose.orientation))
-
-
-def _poses(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, fields.positions(pose.position for pose in message.poses))
-
-
-def _point(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, fields.positions([message.point]))
+    camera = PinholeCamera(message.width, message.height, fx, fy, cx, cy)
+    return CameraInfoMessage(frame, camera, distorted=any(message.D))
 
 
 def _cloud(message: Any, frame: str) -> CloudMessage:
@@ -125,9 +109,9 @@ _CONTENTS: dict[str, Callable[[Any], Iterator[Decoded]]] = {
     "foxglove.CameraCalibration": _stamped(_calibration),
     "foxglove.FrameTransform": _transform,
     "foxglove.FrameTransforms": _transforms,
-    "foxglove.PoseInFrame": _stamped(_pose),
-    "foxglove.PosesInFrame": _stamped(_poses),
-    "foxglove.Point3InFrame": _stamped(_point),
+    "foxglove.PoseInFrame": _stamped(fields.pose),
+    "foxglove.PosesInFrame": _stamped(fields.poses),
+    "foxglove.Point3InFrame": _stamped(fields.point),
     "foxglove.PointCloud": _stamped(_cloud),
     "foxglove.JointStates": _stamped(_joints),
     "foxglove.Log": _stamped(_log),

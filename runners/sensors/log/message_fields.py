@@ -11,11 +11,12 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray
 from replay.mcap.texts import one_line
 from runners.sensors.log.messages import (
-    CameraInfoMessage,
+    CloudMessage,
     Decode,
     Decoded,
     JointsMessage,
     MarkerMessage,
+    PoseMessage,
     TransformMessage,
     UnusableMessage,
 )
@@ -94,22 +95,19 @@ def transform(
         return error
 
 
-def intrinsics(
-    frame: str,
-    size: tuple[int, int],
-    focal: tuple[float, float],
-    centre: tuple[float, float],
-    distortion: Sequence[float],
-) -> CameraInfoMessage:
-    """Intrinsics; UnusableMessage for those that are none, as of a camera without calibration."""
-    numbers = (*focal, *centre, *distortion)
-    if not all(map(math.isfinite, numbers)) or min(focal) <= 0.0 or min(size) < 1:
-        raise UnusableMessage(
-            f"a camera has {size[0]} x {size[1]} pixels, focal lengths {focal[0]:.3g} and "
-            f"{focal[1]:.3g}, centre {centre[0]:.3g}, {centre[1]:.3g}; accepted: finite, lengths "
-            "above 0"
-        )
-    return CameraInfoMessage(frame, *size, *focal, *centre, distorted=any(distortion))
+def pose(message: Any, frame: str) -> PoseMessage:
+    """A pose of both encodings."""
+    return PoseMessage(frame, rigid(message.pose.position, message.pose.orientation))
+
+
+def poses(message: Any, frame: str) -> CloudMessage:
+    """Places of poses of both encodings."""
+    return CloudMessage(frame, positions(one.position for one in message.poses))
+
+
+def point(message: Any, frame: str) -> CloudMessage:
+    """A single point of both encodings."""
+    return CloudMessage(frame, positions([message.point]))
 
 
 def joints(positions: Iterable[tuple[str, float]]) -> JointsMessage:

@@ -9,7 +9,8 @@ import numpy as np
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from runners.sensors.log import message_fields
+from chsel.sensing.depth_camera import PinholeCamera
+from runners.sensors.log import message_fields as fields
 from runners.sensors.log.images import compressed_pixels, pixel_rows
 from runners.sensors.log.messages import (
     CameraInfoMessage,
@@ -19,7 +20,6 @@ from runners.sensors.log.messages import (
     Decoded,
     ImageMessage,
     JointsMessage,
-    PoseMessage,
     UnusableMessage,
     WrenchMessage,
 )
@@ -45,11 +45,11 @@ def ros2_decoder(name: str, definition: str | None = None) -> Decode | None:
     except Exception as error:  # the parser raises whatever it stumbles over
         raise UnusableMessage(f"the definition of {name} is not read: {error}") from None
     assert parse is not None
-    return message_fields.decoder(name, parse, contents)
+    return fields.decoder(name, parse, contents)
 
 
 def _stamp(header: Any) -> int | None:
-    return message_fields.stamp_of(header.stamp.sec, header.stamp.nanosec)
+    return fields.stamp_of(header.stamp.sec, header.stamp.nanosec)
 
 
 def _image(message: Any, frame: str) -> ImageMessage:
@@ -71,29 +71,19 @@ def _camera_info(message: Any, frame: str) -> CameraInfoMessage:
     """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
     region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
     fx, _, cx, _, fy, cy, *_ = message.k
-    return message_fields.intrinsics(
-        frame,
-        ((region.width or message.width) // across, (region.height or message.height) // down),
-        (fx / across, fy / down),
-        ((cx - region.x_offset) / across, (cy - region.y_offset) / down),
-        message.d,
+    camera = PinholeCamera(
+        (region.width or message.width) // across,
+        (region.height or message.height) // down,
+        fx / across,
+        fy / down,
+        (cx - region.x_offset) / across,
+        (cy - region.y_offset) / down,
     )
-
-
-def _pose(message: Any, frame: str) -> PoseMessage:
-    return PoseMessage(frame, message_fields.rigid(message.pose.position, message.pose.orientation))
-
-
-def _poses(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, message_fields.positions(pose.position for pose in message.poses))
-
-
-def _point(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, message_fields.positions([message.point]))
+    return CameraInfoMessage(frame, camera, distorted=any(message.d))
 
 
 def _cloud(message: Any, frame: str) -> CloudMessage:
-    points = message_fields.packed_points(
+    points = fields.packed_points(
         message.data,
         {part.name: (part.offset, part.datatype) for part in message.fields},
         message.point_step,
@@ -105,19 +95,19 @@ def _cloud(message: Any, frame: str) -> CloudMessage:
 
 
 def _wrench(message: Any, frame: str) -> WrenchMessage:
-    force, torque = message_fields.positions([message.wrench.force, message.wrench.torque])
+    force, torque = fields.positions([message.wrench.force, message.wrench.torque])
     if not (np.abs([force, torque]) <= _LARGEST_FORCE).all():  # NaN is not
         raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
     return WrenchMessage(frame, force, torque)
 
 
 def _joints(message: Any, _: str) -> JointsMessage:
-    return message_fields.joints(zip(message.name, message.position, strict=True))
+    return fields.joints(zip(message.name, message.position, strict=True))
 
 
 def _transform(message: Any) -> Iterator[Decoded]:
     parent, child, moved = message.header.frame_id, message.child_frame_id, message.transform
-    content = message_fields.transform(parent, child, moved.translation, moved.rotation)
+    content = fields.transform(parent, child, moved.translation, moved.rotation)
     yield _stamp(message.header), content
 
 
@@ -128,14 +118,14 @@ def _transforms(message: Any) -> Iterator[Decoded]:
 
 def _marker(message: Any) -> Iterator[Decoded]:
     value = message.data
-    yield None, message_fields.marker(str(value).lower() if isinstance(value, bool) else str(value))
+    yield None, fields.marker(str(value).lower() if isinstance(value, bool) else str(value))
 
 
 def _stamped(content: Callable[[Any, str], Content]) -> Callable[[Any], Iterator[Decoded]]:
     """One content of a message with a header."""
 
     def contents(message: Any) -> Iterator[Decoded]:
-        frame = message_fields.frame_name(message.header.frame_id)
+        frame = fields.frame_name(message.header.frame_id)
         yield _stamp(message.header), content(message, frame)
 
     return contents
@@ -149,9 +139,9 @@ _CONTENTS: dict[str, Callable[[Any], Iterator[Decoded]]] = {
     "sensor_msgs/JointState": _stamped(_joints),
     "tf2_msgs/TFMessage": _transforms,
     "geometry_msgs/TransformStamped": _transform,
-    "geometry_msgs/PoseStamped": _stamped(_pose),
-    "geometry_msgs/PoseArray": _stamped(_poses),
-    "geometry_msgs/PointStamped": _stamped(_point),
+    "geometry_msgs/PoseStamped": _stamped(fields.pose),
+    "geometry_msgs/PoseArray": _stamped(fields.poses),
+    "geometry_msgs/PointStamped": _stamped(fields.point),
     "geometry_msgs/WrenchStamped": _stamped(_wrench),
     **{
         name: _marker

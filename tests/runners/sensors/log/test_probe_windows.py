@@ -51,6 +51,19 @@ def test_begins_without_number_are_counted() -> None:
     assert said == ["a probe has a begin and no end; the next begin ends it"]
 
 
+def test_marks_that_do_not_fit_are_reported() -> None:
+    found, said = spans("end 9", "begin 2", "hello", "begin 2", "begin 1")
+    assert found == [(0, 0, 20, 50, 50), (1, 50, 50, 100, 101)]
+    assert said == [
+        "probe 9 has an end and no begin; ignored",
+        "a marker is 'hello'; accepted: begin N, end",
+        "probe 2 begins twice without an end; taken as one",
+        "probe 2 has a begin and no end; the next begin ends it",
+        "probe 1 has a begin and no end; the log's end ends it",
+        "probes are marked 2, 1; as these do not rise, they are counted from 0 to 1",
+    ]
+
+
 def test_no_marker_that_is_understood_is_no_window() -> None:
     found, said = spans("begin 99999999999", "stop", "")
     assert found == []
