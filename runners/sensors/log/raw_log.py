@@ -18,7 +18,6 @@ from runners.sensors.log.foxglove import foxglove_decoder
 from runners.sensors.log.log_files import Span, log_files, merged, most_at_once
 from runners.sensors.log.messages import (
     Decode,
-    Decoded,
     Received,
     TransformMessage,
     UnusableMessage,
@@ -30,7 +29,7 @@ Progress = Callable[[int, int], None]  # bytes so far, and of all
 _PROGRESS_STEP = 2**22  # bytes
 _DIGEST_SIZE = 16  # bytes
 _MOST_LISTED = 60
-_STATIC = "tf_static"
+_STATIC = "tf_static"  # what a topic of transforms that hold for all times ends with
 
 
 @dataclass(frozen=True)
@@ -117,8 +116,10 @@ class RawLog:
                 for stamp, content in decode(message.data):
                     if isinstance(content, UnusableMessage):
                         fault(f"{channel.topic}: {content}")
-                    else:
-                        yield Received(channel.topic, message.log_time, stamp, content)
+                        continue
+                    if isinstance(content, TransformMessage) and channel.topic.endswith(_STATIC):
+                        content = replace(content, static=True)
+                    yield Received(channel.topic, message.log_time, stamp, content)
             except UnusableMessage as error:
                 fault(f"{channel.topic}: {error}")
 
@@ -198,19 +199,7 @@ def _decoder(channel: Channel) -> Decode | UnusableMessage:
     if decode is None:
         encoding = channel.encoding or "unknown bytes"
         return UnusableMessage(f"messages {channel.schema} as {encoding} are not read")
-    return _held(decode) if channel.topic.endswith(_STATIC) else decode
-
-
-def _held(decode: Decode) -> Decode:
-    """Transforms that hold for all times."""
-
-    def static(data: bytes) -> Iterator[Decoded]:
-        for stamp, content in decode(data):
-            if isinstance(content, TransformMessage):
-                content = replace(content, static=True)
-            yield stamp, content
-
-    return static
+    return decode
 
 
 def _after(before: int, report: Callable[[int], None]) -> Callable[[int], None]:

@@ -72,6 +72,19 @@ def test_order_and_repetition_do_not_matter() -> None:
     np.testing.assert_array_equal(found, expected)
 
 
+def test_stamps_of_a_clock_that_is_ahead_are_put_right() -> None:
+    made, ahead = TransformTree(), 90 * SECOND
+    for time in (SECOND, 2 * SECOND):
+        for topic, child, stamp in (("/tf", "b", time + ahead), ("/arm", "c", time)):
+            message = TransformMessage("a", child, pose(time / SECOND))
+            made.add(Received(topic, time + 5, stamp, message), message)
+    shifts, medians = {"/tf": -ahead}, {"/tf": ahead - 5, "/arm": -5}
+    made.settle(ClockCorrection(shifts=shifts, medians=medians, jump=SECOND))
+    assert made.times.tolist() == [SECOND, 2 * SECOND]
+    found = made.lookup("b", "c", 3 * SECOND // 2, gap_s=1.0)
+    np.testing.assert_allclose(found, pose(0.0), atol=1e-12)
+
+
 def test_gaps_and_ends_are_bridged_as_far_as_told() -> None:
     made = tree(*((time, "a", "b", pose(time)) for time in (1.0, 1.4, 3.0)))
     times = np.array([0.4, 0.6, 1.2, 1.4, 1.5, 2.9, 3.0, 3.5, 3.6])
