@@ -19,7 +19,7 @@ from chsel.problem.settings import CheckedSettings, build_settings, not_negative
 from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from chsel.sensing.free_space import FreeGrid
 from chsel.sensing.regions import depth_regions, main_regions
-from runners.sensors.depth_camera import edge_pixels, mark_rays, metres, ray_ends
+from runners.sensors.depth_camera import View, edge_pixels, mark_rays, metres
 from runners.sensors.log.images import read_image
 from runners.sensors.pose_file import pose_of_rows
 from runners.sensors.rig import Rig
@@ -186,12 +186,12 @@ def depth_frame_points(
         surface, labelled = _surface_pixels(frame, rig, valid, edges, measured, diameter)
         rays &= surface | ~frame.label
         counts.outline, counts.far = labelled.outline, labelled.far
-    ends, small = ray_ends(frame.depth, valid, rays, frame.camera, rig.gate)
-    counts.small = small + (0 if labelled is None else labelled.small)
     on_object = apply(frame.world_from_camera, measured[surface])
     workspace = _workspace(rig, on_object, diameter)
     grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
-    mark_rays(grid, camera, ends, frame.camera, frame.world_from_camera, rays)
+    view = View(frame.depth, valid, frame.world_from_camera)
+    counts.small = mark_rays(grid, camera, rig.gate, frame.camera, view, rays)
+    counts.small += 0 if labelled is None else labelled.small
     points = KnownPoints(
         free=_outside_of(on_object, grid.new(), free_resolution),
         known=one_per_voxel(on_object, rig.surface_resolution),
