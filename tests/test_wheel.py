@@ -51,7 +51,7 @@ def test_four_packages_with_their_data_and_no_tests_are_installed(site: Path) ->
     packages = {path.name for path in site.iterdir() if not path.name.endswith(beside)}
     assert packages == {"chsel", "conf", "replay", "runners"}
     assert {file.parent.name for file in site.rglob("py.typed")} == packages - {"conf"}
-    for pattern in ("conf/**/*.yaml", "runners/**/*.html", "replay/*.json"):
+    for pattern in ("conf/**/*.yaml", "runners/**/*.ply", "replay/*.json"):
         names = {str(file.relative_to(REPOSITORY)) for file in REPOSITORY.glob(pattern)}
         assert names
         assert names == {str(file.relative_to(site)) for file in site.glob(pattern)}

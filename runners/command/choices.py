@@ -17,6 +17,7 @@ from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
 from runners.command.arguments import hydra_arguments
+from runners.objects.loader import OBJECTS
 from runners.sensors.rig import Rig
 from runners.sessions.faults import CLEAN, LEVELS
 from runners.sessions.probing_settings import ProbingSettings
@@ -69,6 +70,11 @@ def store_choices() -> None:
         node = {"kind": kind, "configuration": "${configuration}"}
         settings = partial(in_preset, ProbingSettings())
         _store_with_presets("session", kind, settings, node, {"faults": CLEAN})
+    for choice, config in OBJECTS.items():
+        group, _, name = f"object/{choice}".rpartition("/")
+        ConfigStore.instance().store(name, settings_mapping(config), group, package="object")
+    mesh = {"name": "mesh", "kind": "file", "scale": 1.0, "epsilon": 0.001, "scan": None}
+    _store("object", "mesh", {**mesh, "configuration": "drill", "path": None})
     for level, faults in LEVELS.items():
         _store("session/faults", level, settings_mapping(faults))
     for name in DEFINITIONS:
@@ -120,6 +126,10 @@ def choices(group: str) -> list[str]:
     for part in group.split("/"):
         stored = stored.get(part, {})
     names += [Path(name).stem for name in stored if name.endswith(".yaml")]
+    nested_names = [name.rpartition("/")[2] for name in NESTED_GROUPS]
+    for name, options in stored.items():
+        if isinstance(options, dict) and name not in ("presets", *nested_names):
+            names += [f"{name}/{Path(option).stem}" for option in options]
     return sorted(names, key=lambda name: (name.count("/"), name))
 
 

@@ -13,7 +13,7 @@ from chsel.problem.settings import build_settings, settings_mapping
 from runners import simulate_rig
 from runners.command.choices import CONF
 from runners.command.program import plain
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sensors.rig import Rig
 from runners.simulate_rig import SimulateRigConfig
 from runners.simulated_robot import wrist
@@ -44,7 +44,7 @@ def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert sorted(file.name for file in log.parent.iterdir()) == ["log.mcap", "log.truth.yaml"]
     truth = yaml.safe_load(log.with_suffix(".truth.yaml").read_text())
-    pose = stood_on_shelf(MODELS["mustard"](), CABINET_CONFIGURATIONS["cabinet_mustard"])
+    pose = stood_on_shelf(load_model("mustard"), CABINET_CONFIGURATIONS["cabinet_mustard"])
     assert np.allclose(truth.pop("world_from_object"), pose, atol=1e-12)
     assert truth == {
         "configuration": "cabinet_mustard",

@@ -10,7 +10,7 @@ from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.free_space import box_shell
 from runners.sessions.gripper import START, X_REST
@@ -29,7 +29,7 @@ def _run(
 ) -> tuple[trimesh.Trimesh, ProbingSession, list[Probe]]:
     scales = {"cracker_box": 1.5, "clamp": 5.0}
     of = CONFIGURATIONS[name].object
-    mesh = MODELS[of]().apply_scale(scales.get(of, 2.5))
+    mesh = load_model(of).apply_scale(scales.get(of, 2.5))
     session = open_kinematic(mesh, name, settings, seed)
     return mesh, session, list(session.probes())
 
@@ -165,7 +165,7 @@ def test_sweeping_mini_steps_frees_all_that_control_steps_do_and_more() -> None:
 def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace() -> None:
     free = {}
     for boundary in ("floor_slab", "box_shell", "both"):
-        mesh = MODELS["spam_can"]().apply_scale(2.5)
+        mesh = load_model("spam_can").apply_scale(2.5)
         session = open_kinematic(mesh, "can", replace(DEFAULT, boundary=boundary), 0)
         free[boundary] = session.initial_points.free
     np.testing.assert_allclose(np.unique(free["floor_slab"][:, 2]), [-0.075, -0.05], atol=1e-12)
@@ -176,7 +176,7 @@ def test_boundaries_are_a_slab_below_the_floor_and_a_shell_of_the_workspace() ->
 
 
 def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_workspace() -> None:
-    mesh = MODELS["hammer"]().apply_scale(2.5)
+    mesh = load_model("hammer").apply_scale(2.5)
     shell = replace(DEFAULT, boundary="box_shell")
     session = open_kinematic(mesh, "hammer_straight", shell, 0)
     assert session.world_from_object is not None

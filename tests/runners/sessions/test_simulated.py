@@ -13,7 +13,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.kinematic import open_kinematic
 from runners.sessions.panda_hand import panda_hand
@@ -28,10 +28,10 @@ AGREEMENT = 0.003  # m
 PRESSED = 0.0005  # m: how far 30 N press the hand into the object before the engine resists
 
 DIGESTS = """
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.simulated import open_simulated
-session = open_simulated(MODELS["spam_can"]().apply_scale(2.5), "can", ProbingSettings(), 5)
+session = open_simulated(load_model("spam_can").apply_scale(2.5), "can", ProbingSettings(), 5)
 print(session.world_from_object.tobytes().hex(), session.initial_points.digest)
 for probe, _ in zip(session.probes(), range(4)):
     print(probe.new_points.digest, probe.gripper_path.tobytes().hex()[-200:], probe.outcome)
@@ -50,7 +50,7 @@ class _Pair:
 
 def _mesh(configuration_name: str) -> trimesh.Trimesh:
     name = CONFIGURATIONS[configuration_name].object
-    return MODELS[name]().apply_scale(SCALES.get(name, 2.5))
+    return load_model(name).apply_scale(SCALES.get(name, 2.5))
 
 
 @pytest.fixture(scope="module", params=list(CONFIGURATIONS))

@@ -16,7 +16,7 @@ from chsel.next_probe.first_contact import first_contacts
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from replay.events import Probe
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.gripper import START, X_REST, Touch
 from runners.sessions.kinematic import open_kinematic
 from runners.sessions.probing import ProbingSession
@@ -40,7 +40,7 @@ def session(request: pytest.FixtureRequest) -> Iterator[ProbingSession]:
 
 
 def _mustard() -> trimesh.Trimesh:
-    return MODELS["mustard"]().apply_scale(2.5)
+    return load_model("mustard").apply_scale(2.5)
 
 
 def _taken(session: ProbingSession, actions: Actions, count: int) -> list[tuple[int, Probe]]:
