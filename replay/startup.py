@@ -8,9 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -42,20 +40,6 @@ def ready() -> None:
     """Imports are done: Ctrl-C raises KeyboardInterrupt again, unless it is ignored."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@contextmanager
-def importing() -> Iterator[None]:
-    """Imports within a command, during which Ctrl-C ends it at once, too."""
-    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not raises or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    try:
-        yield
-    finally:
-        ready()
 
 
 def is_ours(places: list[Path]) -> bool:

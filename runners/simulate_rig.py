@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from rich.filesize import decimal
 from rich.progress import BarColumn, TimeElapsedColumn
 
 from chsel.errors import SettingError
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.console import Console, Progress, TextColumn
 from replay.files import WritingError, whole_file
@@ -27,6 +28,7 @@ from runners.simulated_robot.robot_configurations import (
 from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
 
+ConfigStore.instance().store("robot", settings_mapping(RobotSettings()), package="_global_")
 EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here
 
 

@@ -19,9 +19,7 @@ from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
 SENSORS = "sensors"
 MOST_PROBES = 1_000
 OBJECT_FILE = "object.yaml"
-_ACCEPTED = (
-    "accepted: a name of the choices of object=, with any other of its keys, such as name: drill"
-)
+_ACCEPTED = "accepted: a choice of object=, with any other of its keys, such as name: drill"
 
 
 @dataclass(frozen=True)

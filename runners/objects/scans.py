@@ -28,6 +28,7 @@ SCANS = {
     "050_medium_clamp": ("clamp", (0.0435, 0.0625, 0.0835)),
 }
 EXTENT_TOLERANCE = 0.01  # of the expected extent
+URL = "http://ycb-benchmarks.s3-website-us-east-1.amazonaws.com/data/google"
 TIMEOUT = 30.0  # seconds without a byte of a download
 RESOLUTION = "google_16k"
 MESH_FILE = "nontextured.ply"

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from chsel.errors import MeshError, SettingError
 from chsel.problem.settings import build_settings
 from runners import fetch
-from runners.command.choices import CONF, store_choices
+from runners.command.choices import CONF
 from runners.command.program import plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import SCANS, check_scan, scan_file
@@ -28,7 +28,6 @@ TRIALS = {
 
 def chosen(*overrides: str) -> ObjectConfig:
     """The object that a command line with these overrides chooses."""
-    store_choices()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = plain(compose("fetch", overrides=list(overrides)))
     return build_settings(ObjectConfig, config["object"], "object")  # type: ignore[arg-type]

@@ -28,7 +28,7 @@ from replay.__main__ import main as replay
 from replay.events import Logged, Measured
 from replay.mcap.reader import read_recording
 from runners import probe
-from runners.command.choices import CONF, store_choices
+from runners.command.choices import CONF
 from runners.run.display import MEANINGS
 from tests.runners.in_process import Done
 from tests.runners.in_process import run as in_process
@@ -179,7 +179,6 @@ def test_points_of_ones_own_are_registered_by_anchored_unless_a_method_is_named(
 def test_the_default_method_follows_from_session_policy_and_preset(
     overrides: tuple[str, ...], method: str
 ) -> None:
-    store_choices()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         assert compose("probe", [*overrides]).method.name == method
 

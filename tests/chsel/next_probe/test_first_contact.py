@@ -13,7 +13,7 @@ from chsel.problem.poses import apply, compose, inverse, random_rotations
 from chsel.problem.sdf_grid import SdfGrid
 from runners.objects.loader import load_model
 from runners.sessions.kinematic import KinematicEngine
-from runners.sessions.panda_hand import panda_hand
+from runners.sessions.probing_hand import panda_hand
 from runners.sessions.probing_settings import ProbingSettings
 from tests.chsel.next_probe.decisions import RADIUS, along_x, at, ball, box_hand, facing
 
