@@ -79,12 +79,12 @@ def _store_sessions() -> None:
         node = {"kind": kind, "configuration": "${configuration}"}
         settings = partial(in_preset, ProbingSettings())
         _store_with_presets("session", kind, settings, node, {"faults": CLEAN})
-    for kind in ("points", "recorded"):
-        _store("session", kind, {"kind": kind, **_defaults(SESSIONS[kind])})
-    defaults = [{"presets/rig@rig": "default"}, {"rig": "cabinet"}, "_self_"]
-    sensors = {"kind": "sensors", **_defaults(SESSIONS["sensors"])}
-    sensors.pop("rig", None)
-    _store("session", "sensors", {"defaults": defaults, **sensors})
+    for kind, settings_class in SESSIONS.items():
+        if settings_class is not ProbingSettings:
+            node = {"kind": kind, **_defaults(settings_class)}
+            if kind == "sensors":
+                node["defaults"] = [{"presets/rig@rig": "default"}, {"rig": "cabinet"}, "_self_"]
+            _store("session", kind, node)
     for level, faults in LEVELS.items():
         _store("session/faults", level, settings_mapping(faults))
     rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out

@@ -20,9 +20,11 @@ def error_message(error: BaseException, config_name: str) -> str:
     if isinstance(cause, ConfigKeyError | ConfigAttributeError):
         return _unknown_key(cause, config_name)
     lines = str(error).splitlines() or [type(error).__name__]
-    if isinstance(error, OmegaConfBaseException | MissingConfigException):
-        lines = lines[:1]  # the others name types of OmegaConf, or folders
+    if isinstance(error, OmegaConfBaseException | HydraException):
+        lines = lines[:1]  # the others name types of OmegaConf, folders, and what may not help
     text = " ".join(" ".join(lines).split())
+    if "No match in the defaults list" in text:
+        return f"{text} --help shows what is accepted"
     if isinstance(cause, OmegaConfBaseException):
         text = f"{text}: {error_message(cause, config_name)}"
     return text
