@@ -17,8 +17,7 @@ from chsel.problem.settings import build_settings
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
 from runners.command.choices import calls_for_anchored
 from runners.command.program import command, plain
-from runners.run.compiling import compiling_line
-from runners.run.display import Display, reading_bar
+from runners.run.display import Display, compiling_line, reading_bar
 from runners.run.probe_run import Interrupt, run
 from runners.run.recording import make_run_folder, write_in_run_folder
 from runners.run.scene import ProbeConfig, open_scene, session_started

@@ -81,10 +81,10 @@ def _store_sessions() -> None:
         _store_with_presets("session", kind, settings, node, {"faults": CLEAN})
     for kind, settings_class in SESSIONS.items():
         if settings_class is not ProbingSettings:
-            node = {"kind": kind, **_defaults(settings_class)}
+            values: dict[str, Any] = {"kind": kind, **_defaults(settings_class)}
             if kind == "sensors":
-                node["defaults"] = [{"presets/rig@rig": "default"}, {"rig": "cabinet"}, "_self_"]
-            _store("session", kind, node)
+                values["defaults"] = [{"presets/rig@rig": "default"}, {"rig": "cabinet"}, "_self_"]
+            _store("session", kind, values)
     for level, faults in LEVELS.items():
         _store("session/faults", level, settings_mapping(faults))
     rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out

@@ -19,7 +19,7 @@ from chsel.numerics.compiler import watched
 from chsel.problem.poses import apply, axis_angle, compose
 from chsel.rehearsal import warm_up, warm_up_sensing
 from runners import probe
-from runners.run.compiling import compiling_line
+from runners.run.display import compiling_line
 from tests.runners.in_process import run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
