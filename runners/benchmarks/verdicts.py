@@ -16,11 +16,10 @@ import chsel
 from chsel.methods import METHODS
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.defaults import object_grid
-from chsel.problem.mesh import clean_mesh
 from chsel.problem.poses import apply, axis_angle, compose, inverse
 from chsel.problem.registration_problem import VERDICTS
 from replay.console import Console
-from runners.objects.models import MODELS
+from runners.objects.loader import MODELS, load_model
 
 TRUTH = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.9)), np.array([0.3, 0.1, 0.2]))
 AFTERWARDS = compose(
@@ -56,7 +55,7 @@ class Probed:
     """A model at its real size, and points as sensors would know them."""
 
     def __init__(self, name: str, seed: int) -> None:
-        self._name, self._mesh = name, _model(name)
+        self._name, self._mesh = name, load_model(name)
         self._rng = np.random.default_rng(seed)
         self._far = chsel.SdfGrid.from_mesh(self._mesh, 0.008, padding=2.0 * _AROUND)
         self.target = object_grid(self._mesh)
@@ -90,16 +89,11 @@ class Probed:
         elif fault == "mesh 1.2 times too small":
             grid = object_grid(mesh.copy().apply_scale(1.0 / 1.2))
         elif fault == "mesh of another object":
-            grid = object_grid(_model(OTHERS[self._name]))
+            grid = object_grid(load_model(OTHERS[self._name]))
         elif fault == "object moved halfway":
             surface[_CONTACTS // 2 :] = self.contacts(AFTERWARDS, 0.0005)[_CONTACTS // 2 :]
             free = np.concatenate([free, self.free(AFTERWARDS)])
         return Case(surface, free, grid)
-
-
-def _model(name: str) -> trimesh.Trimesh:
-    built = MODELS[name]()
-    return clean_mesh(built.vertices, built.faces)
 
 
 def counted(

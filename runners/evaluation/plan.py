@@ -38,7 +38,7 @@ from runners.sessions.faults import CLEAN, LEVELS, level_name
 SESSIONS = ("simulated", "kinematic", SENSORS)
 OWN = "own"
 OBJECTS = {"models": "", "scans": "ycb/"}
-"""Folders of conf/object by the name of what is in them."""
+"""Of the names of objects, by what `objects` says they are."""
 
 
 @dataclass(frozen=True, eq=False)

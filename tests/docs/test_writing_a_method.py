@@ -13,6 +13,7 @@ from replay.mcap.reader import read_recording
 from tests.docs.page import commands, shell, write_files
 from tests.runners.in_process import run
 
+pytestmark = pytest.mark.slow
 PAGE = "writing_a_method.md"
 
 

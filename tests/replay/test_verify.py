@@ -62,7 +62,9 @@ def test_a_recording_written_again_holds_the_same(write: Write) -> None:
 def test_equal_bits_are_status_0(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", str(path)]) == 0
     shown = capsys.readouterr()
-    assert re.fullmatch(rf"{path}: 4 of 4 steps equal \(\w+\), \d+\.\d s, digest \w{{32}}\n", shown.out)
+    assert re.fullmatch(
+        rf"{path}: 4 of 4 steps equal \(\w+\), \d+\.\d s, digest \w{{32}}\n", shown.out
+    )
     assert shown.err == ""
 
 

@@ -14,7 +14,6 @@ from replay.mcap.texts import one_line
 from runners.sensors.yaml_file import read_yaml
 
 _METADATA = "metadata.yaml"
-_LONGEST_METADATA = 2**20  # bytes
 
 
 def log_files(path: Path, warnings: list[str]) -> list[Path]:
@@ -49,7 +48,7 @@ def _named_files(folder: Path, warnings: list[str]) -> list[Path]:
         warnings.append(f"{_METADATA} is missing: its .mcap files are read in the order of names")
         return []
     try:
-        about = read_yaml(folder / _METADATA, _LONGEST_METADATA)["rosbag2_bagfile_information"]
+        about = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
         storage, names = about.get("storage_identifier", "mcap"), about["relative_file_paths"]
         compression = about.get("compression_mode") or ""
     except (SessionError, LookupError, TypeError, AttributeError) as error:

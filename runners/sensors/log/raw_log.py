@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from chsel.errors import SessionError
+from replay.files import file_digest
 from replay.mcap.log_file import Channel, Fault, RawFile, RawMessage
 from replay.mcap.texts import one_line
 from runners.sensors.log.foxglove import foxglove_decoder
 from runners.sensors.log.log_files import Span, log_files, merged
 from runners.sensors.log.messages import (
     Decode,
-    Decoded,
     Received,
     TransformMessage,
     UnusableMessage,
@@ -25,11 +25,9 @@ from runners.sensors.log.ros2 import ros2_decoder
 Progress = Callable[[int, int], None]  # bytes so far, and of all
 
 _PROGRESS_STEP = 2**22  # bytes
-_BLOCK = 2**22  # bytes
 _DIGEST_SIZE = 16  # bytes
-_MOST_FAULTS = 200  # different texts
 _MOST_LISTED = 60
-_STATIC = "tf_static"
+_STATIC = "tf_static"  # what a topic of transforms that hold for all times ends with
 
 
 @dataclass(frozen=True)
@@ -94,20 +92,9 @@ class RawLog:
         damage = "".join(f" ({fault})" for fault, _ in self.faults.most_common(1))
         return ", ".join(shown[:_MOST_LISTED] + more) or f"no topics{damage}"
 
-    def digest(self, progress: Progress | None = None) -> str:
+    def digest(self) -> str:
         """BLAKE2b (128 bit, hexadecimal) of the file, or of the digests of a folder's files."""
-        report, done, digests = _seldom(progress, self.size), 0, []
-        for path in self.files:
-            state = hashlib.blake2b(digest_size=_DIGEST_SIZE)
-            try:
-                with path.open("rb") as file:
-                    while block := file.read(_BLOCK):
-                        state.update(block)
-                        done += len(block)
-                        report(done)
-            except OSError as error:
-                raise SessionError(f"log {path} cannot be read: {error.strerror}") from None
-            digests.append(state.hexdigest())
+        digests = [file_digest(path) for path in self.files]
         if self.path.is_file():
             return digests[0]
         whole = "".join(f"{digest}\n" for digest in digests).encode()
@@ -127,8 +114,10 @@ class RawLog:
                 for stamp, content in decode(message.data):
                     if isinstance(content, UnusableMessage):
                         fault(f"{channel.topic}: {content}")
-                    else:
-                        yield Received(channel.topic, message.log_time, stamp, content)
+                        continue
+                    if isinstance(content, TransformMessage) and channel.topic.endswith(_STATIC):
+                        content = replace(content, static=True)
+                    yield Received(channel.topic, message.log_time, stamp, content)
             except UnusableMessage as error:
                 fault(f"{channel.topic}: {error}")
 
@@ -186,10 +175,6 @@ class RawLog:
 
         def fault(text: str) -> None:
             text = one_line(text)
-            if text not in self.faults and len(self.faults) >= _MOST_FAULTS:
-                text = f"{text.partition(':')[0]}: further reasons"
-                if text not in self.faults and len(self.faults) >= 2 * _MOST_FAULTS:
-                    text = "further faults"
             found[text] += 1
             self.faults[text] = max(self.faults[text], found[text])
 
@@ -208,19 +193,7 @@ def _decoder(channel: Channel) -> Decode | UnusableMessage:
     if decode is None:
         encoding = channel.encoding or "unknown bytes"
         return UnusableMessage(f"messages {channel.schema} as {encoding} are not read")
-    return _held(decode) if channel.topic.endswith(_STATIC) else decode
-
-
-def _held(decode: Decode) -> Decode:
-    """Transforms that hold for all times."""
-
-    def static(data: bytes) -> Iterator[Decoded]:
-        for stamp, content in decode(data):
-            if isinstance(content, TransformMessage):
-                content = replace(content, static=True)
-            yield stamp, content
-
-    return static
+    return decode
 
 
 def _after(before: int, report: Callable[[int], None]) -> Callable[[int], None]:
