@@ -53,11 +53,11 @@ _OBJECTS = {  # with the preset of CHSEL, CHSEL with CMA-ME, gradient descent
     "spam_can": ("paper", "default", "reference"),
     "clamp": ("default", "reference", "paper"),
 }
-# Not stored, as the meshes and grids of these objects are large; three are.
+# Not stored, as the meshes and grids of these objects are large; two are.
 _LARGE = {f"{name}_{method}" for name in ("drill", "hammer") for method in _BASELINES}
 _OF_DEFAULTS = "spam_can"  # of which points_default_METHOD are, and few others
 _LARGE |= {f"{_OF_DEFAULTS}_{method}" for method in _BASELINES}
-_LARGE -= {"drill_svgd", "hammer_icp", "spam_can_icp"}
+_LARGE -= {"hammer_icp", "spam_can_icp"}
 _FULL = ("chsel", "chsel_cma_me", "gradient_descent", "svgd", "cvo", "cvo_no_free_space")
 _FULL += (*_MEDIAL, "anchored", "icp")  # not brief in any other
 
