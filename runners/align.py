@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 import trimesh
 from omegaconf import DictConfig
@@ -26,11 +25,9 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.console import Console
-from replay.rerun.blueprint import at_last_probe, scene_view
-from replay.rerun.clock import PROBE
-from replay.rerun.meshes import display_mesh
 from replay.rerun.scene import Scene
-from replay.rerun.stream import new_file_stream
+from replay.rerun.stream import PROBE, new_file_stream
+from replay.rerun.views import at_last_probe, scene_view
 from runners.command.program import command, plain
 from runners.objects.scans import AssetsConfig
 from runners.sensors.alignment_fit import Fit, fit_of
@@ -245,9 +242,8 @@ def save_view(
         stream.send_blueprint(at_last_probe(rrb.Vertical(view)))
         scene = Scene(stream)
         scene.set_up(mesh, problem.workspace, found)
-        pose = rr.Transform3D(translation=guess[:3, 3], mat3x3=guess[:3, :3])
-        stream.log("scene/guess", display_mesh(mesh, _GUESS_COLOR), pose, static=True)
-        scene.add_points(problem.points, new=False)
+        scene.add_mesh("guess", mesh, guess, _GUESS_COLOR)
+        scene.add_points(problem.points)
 
 
 if __name__ == "__main__":
