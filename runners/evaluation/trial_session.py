@@ -183,9 +183,14 @@ def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSett
     return plan.plausible_settings(float(config["epsilon"]))
 
 
-def problems(plan: Plan, trial: Trial, session: RecordedSession) -> Iterator[RegistrationProblem]:
-    """What is known at every step with a registration; E_0 is one pose that stands for any."""
-    online = session.online(_ONE, trial.seed, only=plan.steps_of(trial.configuration))
+def problems(
+    plan: Plan, trial: Trial, session: RecordedSession, settings: OnlineSettings = _ONE
+) -> Iterator[RegistrationProblem]:
+    """What is known at every step with a registration, none of which follows from a result.
+
+    settings: of E_0, which is one pose by default, that stands for any.
+    """
+    online = session.online(settings, trial.seed, only=plan.steps_of(trial.configuration))
     steps = online.steps(session.perceived())
     return (step.problem for step in steps if step.problem is not None)
 
