@@ -96,7 +96,6 @@ def pd_over_time() -> Iterator[Row]:
     with TemporaryDirectory() as folder:
         plan = _plan(Path(folder))
         for trial in _TRIALS:
-            trial.folder(plan).mkdir(parents=True)
             make_session(plan, trial)
             session = open_recorded(plan, trial)
             assert session.world_from_object is not None
