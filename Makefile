@@ -1,4 +1,5 @@
-# make probe: set up and run a session. make test: set up and run all checks.
+# make probe: set up and run a session. make test: set up and run the checks of every commit.
+# make test-all: those that take long and rarely fail, too.
 # make PYTHON=python3.12 probe: with another Python, 3.11 or newer.
 # make PIP_ARGS="--extra-index-url URL" probe: with options for pip install.
 # make VENV_ARGS=--system-site-packages probe: with the packages that PYTHON has already.
@@ -10,7 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint $(VENV)/constraints.txt
 
-.PHONY: probe test clean
+.PHONY: probe test test-all clean
 
 probe: $(VENV)/.installed
 	@if $(BIN)/python -c "import pybullet" 2>/dev/null; then session=simulated; else \
@@ -24,6 +25,9 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+
+test-all: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "slow or not slow"
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-if sys.argv[:1] == ["-m"] or Path(sys.argv[0] if sys.argv else "").stem == "chsel-replay":
+if sys.argv[:1] == ["-m"] or Path(sys.argv[0] if sys.argv else "").stem.startswith("chsel-"):
     from replay.startup import begin
 
     begin()

@@ -18,7 +18,6 @@ PACKAGES = (
     "torch",
     "libigl",
     "trimesh",
-    "manifold3d",
     "pybullet",
     "mcap",
 )

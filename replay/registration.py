@@ -16,7 +16,7 @@ from chsel.methods import build_method, preset_settings, trust_by
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray, digest
 from chsel.plausible.pose_metrics import result_numbers
-from chsel.plausible.symmetry import ObjectSymmetry, grid_symmetry, object_symmetry
+from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
 from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from chsel.problem.settings import PRESETS, changed_settings, settings_mapping
@@ -29,9 +29,7 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
-from replay.lost_attachment import is_lost
 from replay.mcap.reader import Recording
-from replay.settings_migration import completed
 
 
 class StepObserver:
@@ -103,7 +101,7 @@ def recorded_method(recording: Recording) -> NamedMethod:
         raise RecordingError(f"recording {recording.path} does not have the settings of {name}")
     try:
         settings = {key: value for key, value in config.items() if key != "name"}
-        return _named(name, completed(settings, preset_settings(name)))
+        return _named(name, settings)
     except SettingError as error:
         raise RecordingError(f"recording {recording.path}: {error}") from error
 
@@ -161,8 +159,8 @@ def symmetry_for_errors(start: SessionStarted) -> ObjectSymmetry | None:
 
 
 def recorded_symmetry(start: SessionStarted) -> ObjectSymmetry:
-    """The symmetries of a session's object; only the centre of its grid if the mesh is lost."""
-    return grid_symmetry(start.sdf) if is_lost(start.mesh) else object_symmetry(start.mesh)
+    """The symmetries of a session's object."""
+    return object_symmetry(start.mesh)
 
 
 def snapshot_interval(snapshots: Sequence[ArchiveSnapshot]) -> int:

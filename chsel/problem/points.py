@@ -258,8 +258,7 @@ def require_parts(**parts: object) -> None:
     """Raise SettingError unless what is named sdf, points or workspace is of its class."""
     for name, part in parts.items():
         kind, accepted = _PARTS[name]
-        if not getattr(type(part), "stands_in", False):  # for a grid that a recording has lost
-            require_instance(name, part, kind, accepted)
+        require_instance(name, part, kind, accepted)
 
 
 def check_points(

@@ -103,8 +103,8 @@ def result_changes(recorded: Recording, new: Recording) -> list[ResultChange]:
         found = ResultDifferences()
         found.add_sets(problem, after.posed.problem)
         found.add_stages(before.events, after.events)
-        if has_measured(recorded, before):
-            found.add_measured(recorded, before.events, after.events)
+        if has_measured(before):
+            found.add_measured(before.events, after.events)
         verdict = Verdict.of(step, method, found, environment=differing)
         results = recorded.hypotheses(step), new.hypotheses(step)
         old, now = (numbers(problem, result) for result in results)

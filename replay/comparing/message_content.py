@@ -12,10 +12,10 @@ from google.protobuf.message import DecodeError, Message
 from chsel.errors import RecordingError
 from replay.mcap.attachments import MESH, SDF_GRID, mesh_from_ply
 from replay.mcap.encoding import decode
+from replay.mcap.event_messages import image_from
 from replay.mcap.file import StoredMessage
 from replay.mcap.foxglove_messages import CLOUDS, FOXGLOVE, cloud_points
 from replay.mcap.schemas import RECORDS, STEP_TIME
-from replay.mcap.sensor_messages import image_from
 
 Content = dict[str, Any]
 """Arrays, numbers, texts and None by path, such as "config.method.cost.free_scale"."""

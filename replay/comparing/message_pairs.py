@@ -15,7 +15,6 @@ from replay.mcap.encoding import decode
 from replay.mcap.file import McapFile, StoredMessage
 from replay.mcap.foxglove_messages import FOXGLOVE, SCENE, TOPIC_SCHEMAS
 from replay.mcap.schemas import MESSAGES, RECORDS
-from replay.mcap.seal import SEAL
 
 BEFORE_ALL_STEPS = -1
 MALFORMED = (ChselError, ValueError, RecursionError)
@@ -83,13 +82,12 @@ class ComparedRecording:
     def messages(self) -> Iterator[tuple[Key, StoredMessage]]:
         """All messages that are not left out, in their order, as the file has them.
 
-        Seals follow from the messages that they close, and what viewers draw from the rest.
+        What viewers draw follows from the rest.
         """
-        file = McapFile(self.path, TOPIC_SCHEMAS, check_seals=False)  # to see what was changed
+        file = McapFile(self.path, TOPIC_SCHEMAS)
         numbers: Counter[tuple[str, int, str]] = Counter()
         for message in file.messages():
-            derived = message.topic == SEAL or message.topic in SCENE
-            if not derived and not self._ignored.topic(message.topic):
+            if message.topic not in SCENE and not self._ignored.topic(message.topic):
                 kind = (message.topic, step_of(message), _about(message))
                 yield Key(*kind, numbers[kind]), message
                 numbers[kind] += 1

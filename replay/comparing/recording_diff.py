@@ -23,7 +23,6 @@ from replay.comparing.message_pairs import (
 )
 from replay.mcap.file import StoredMessage
 from replay.mcap.schemas import RECORDS
-from replay.mcap.seal import CONTENTS
 
 BOTH, FIRST, SECOND = "both", "first", "second"
 Stored = TypeVar("Stored", bytes, StoredMessage)
@@ -125,15 +124,7 @@ def _compared_messages(pair: MessagePair, ignored: Ignored) -> list[MessageDiffe
     same = first is not None and second is not None and first.data == second.data
     if same and key.topic in RECORDS:  # else its time stamp may differ from its log time
         return found
-    return found + _compared(key, first, second, _comparable_content, ignored)
-
-
-def _comparable_content(message: StoredMessage) -> Content:
-    """What a message says, without what follows from the seals."""
-    content = message_content(message)
-    if message.topic == CONTENTS:
-        content = {n: value for n, value in content.items() if n not in ("session", "digest")}
-    return content
+    return found + _compared(key, first, second, message_content, ignored)
 
 
 def _compared(

@@ -25,10 +25,8 @@ from replay.events import (
     SnapshotTaken,
     Traced,
 )
-from replay.lost_attachment import is_lost
 from replay.mcap.reader import Recording
 from replay.mcap.recovery import tells_loss
-from replay.mcap.schemas import SEALED_SINCE
 
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
 """How far a measured number may be from the recorded one: libraries may round otherwise."""
@@ -172,13 +170,10 @@ class ResultDifferences:
             one, other = ({} if a is None else _archive("last archive", a) for a in archives)
             self.add("the last archive", one, other)
 
-    def add_measured(
-        self, recording: Recording, recorded: Sequence[Event], again: Sequence[Event]
-    ) -> None:
+    def add_measured(self, recorded: Sequence[Event], again: Sequence[Event]) -> None:
         """The numbers about the result, within tolerances.
 
-        Errors that were not recorded, or that need a lost shape, and trust in recordings of before
-        are not compared.
+        Errors that were not recorded are not compared.
         """
         values = [event.values for event in recorded if isinstance(event, Measured)]
         computed = next((event.values for event in again if isinstance(event, Measured)), None)
@@ -190,7 +185,7 @@ class ResultDifferences:
             if not names.intersection(_TRUST, values[0]):
                 names -= _TRUST
             errors = {name for name in names if name.endswith("_error")}
-            if is_lost(recording.start.mesh) or not errors.intersection(values[0]):
+            if not errors.intersection(values[0]):
                 names -= errors  # which are modulo the shape's symmetries
             far = [
                 name
@@ -201,10 +196,8 @@ class ResultDifferences:
             self.add("the measured values", *pair)
 
 
-def has_measured(recording: Recording, registration: RecordedRegistration) -> bool:
+def has_measured(registration: RecordedRegistration) -> bool:
     """Whether a recording should have the numbers that today's code computes."""
-    if recording.version < SEALED_SINCE:  # they may be others
-        return False
     numbers = any(isinstance(event, Measured) for event in registration.events)
     return numbers or not any(map(tells_loss, registration.following))
 

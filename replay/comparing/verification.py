@@ -26,7 +26,6 @@ from replay.comparing.results import (
 )
 from replay.environment import environment_differences
 from replay.events import Decided, Event, Probe, SnapshotTaken, Traced
-from replay.lost_attachment import LostAttachment
 from replay.mcap.reader import Recording, read_recording
 from replay.recorder import ListRecorder
 from replay.registration import (
@@ -107,13 +106,10 @@ def verify(recording: Recording, steps: Sequence[int] | None = None) -> Iterator
 
     steps: None for all that pose a problem or are followed by a decision. The belief of a decision
     is compared where the registration before it is run again. Raises RecordingError if the
-    recording does not have the settings of its method or policy, lacks a step, or has lost its SDF
-    grid.
+    recording does not have the settings of its method or policy, or lacks a step.
     """
     method = recorded_method(recording)
     wanted = set(steps_to_verify(recording, steps))
-    if isinstance(recording.start.sdf, LostAttachment):
-        raise RecordingError(f"recording {recording.path}: {recording.start.sdf.error()}")
     differing = environment_differences(recording.start)
     registrations, again = tee(recorded_registrations(recording))
     perceived = ((one.posed.step, one.new_points) for one in again)
@@ -232,8 +228,8 @@ def _verified(
     if failure:
         reason = f"today's registration does not end: {failure}"
         found.fail("the end of the registration", reason)
-    if has_measured(recording, registration):
-        found.add_measured(recording, recorded, recorder.events)
+    if has_measured(registration):
+        found.add_measured(recorded, recorder.events)
     verdict = Verdict.of(posed.step, method.name, found, environment=environment, seconds=seconds)
     return verdict, result
 
@@ -275,7 +271,7 @@ class FileVerdict:
     path: Path
     verdicts: list[Verdict] = field(default_factory=list)
     unusable: str = ""  # why the file could not be verified
-    digest: str = ""  # of the recording; empty before format version 3
+    digest: str = ""  # of the file
     seconds: float = 0.0  # from reading the file to its last verdict, summed over processes
 
     @property

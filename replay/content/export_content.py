@@ -14,8 +14,8 @@ from chsel.problem.registration_problem import ArchiveSnapshot
 from replay.arguments import chosen_steps
 from replay.content.export_decisions import exported_decisions
 from replay.content.export_files import Exported, require_any
+from replay.content.step_rows import StepRows
 from replay.events import SensorImage
-from replay.mcap.contents import Contents
 from replay.mcap.event_messages import step_numbers
 from replay.mcap.foxglove_messages import POINT_CLASSES
 from replay.mcap.reader import Recording
@@ -233,14 +233,14 @@ def _archive_parts(archive: ArchiveSnapshot) -> dict[str, Any]:
 
 def _metric_rows(recording: Recording) -> Iterator[tuple[int, str, str, float]]:
     """Step, source, name and value: what is known after all probes, then step by step."""
-    contents = Contents()
+    known = StepRows()
     numbers: list[tuple[int, str, str, float]] = []
     for event in recording.events(images=False):
-        contents.take(event)
+        known.take(event)
         if event.topic in NUMBERS:
             source = event.topic.strip("/")
             numbers += [(event.step, source, *item) for item in step_numbers(event).items()]
-    for row in contents.rows:
+    for row in known.rows:
         for name in ("free", "occupied", "known", "contacts"):
             yield row.step, "contents", name, float(getattr(row, name))
         if row.hypotheses >= 0:

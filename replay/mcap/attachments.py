@@ -69,25 +69,27 @@ def mesh_from_ply(data: bytes) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices.astype(np.float64), indices, process=False)
 
 
-def attached(attachments: Mapping[str, bytes], name: str, digest: str) -> trimesh.Trimesh | SdfGrid:
-    """The mesh or the grid among attachments; RecordingError unless it has the digest."""
+def mesh_attached(attachments: Mapping[str, bytes], digest: str) -> trimesh.Trimesh:
+    """The mesh among attachments; RecordingError unless it is there and has the digest."""
+    mesh = mesh_from_ply(_data(attachments, MESH))
+    check_digest(f"attachment {MESH}", mesh_digest(mesh), digest)
+    return mesh
+
+
+def sdf_attached(attachments: Mapping[str, bytes], digest: str) -> SdfGrid:
+    """The SDF grid among attachments, likewise."""
+    sdf = SdfGrid(**decode("SdfGrid", _data(attachments, SDF_GRID)))
+    check_digest(f"attachment {SDF_GRID}", sdf.digest, digest)
+    return sdf
+
+
+def _data(attachments: Mapping[str, bytes], name: str) -> bytes:
     if name not in attachments:
         raise RecordingError(f"it lacks the attachment {name}")
-    if name == MESH:
-        mesh = mesh_from_ply(attachments[name])
-        check_digest(f"attachment {name}", mesh_digest(mesh), digest)
-        return mesh
-    sdf = sdf_from_bytes(attachments[name])
-    check_digest(f"attachment {name}", sdf.digest, digest)
-    return sdf
+    return attachments[name]
 
 
 def sdf_to_bytes(sdf: SdfGrid) -> bytes:
     """A grid as a protobuf message; exact."""
     fields = ("origin", "resolution", "values", "gradients")
     return encode("SdfGrid", {name: getattr(sdf, name) for name in fields})
-
-
-def sdf_from_bytes(data: bytes) -> SdfGrid:
-    """The grid that `sdf_to_bytes` wrote."""
-    return SdfGrid(**decode("SdfGrid", data))

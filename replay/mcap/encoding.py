@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 
 from chsel.errors import RecordingError
 from replay.mcap.schemas import MESSAGES, PACKAGE, TOGETHER
 from replay.mcap.validation import Check
-from replay.mcap.wire import parsed
 
 _ARRAY = re.compile(r"([fib]\d)(~?)\[(.*)\]")
 _NARROW = np.dtype("<f4")
@@ -111,6 +110,14 @@ def decode(name: str, data: bytes) -> dict[str, Any]:
     return _values(parsed(message_class(name), data), name)
 
 
+def parsed(kind: Any, data: bytes) -> Any:
+    """The message of a protobuf class in bytes; RecordingError if they are no such message."""
+    try:
+        return kind.FromString(data)
+    except DecodeError:
+        raise RecordingError(f"a message is not a valid {kind.DESCRIPTOR.full_name}") from None
+
+
 @cache
 def message_class(name: str) -> type[Message]:
     """The protobuf class of a message of the table."""
@@ -196,10 +203,7 @@ def _values(message: Any, name: str) -> dict[str, Any]:
 def _get(message: Any, where: str, field: str, kind: Kind, lengths: dict[str, int]) -> Any:
     value = getattr(message, field)
     if kind.is_mapping:
-        mapping = {item.name: item.value for item in value}
-        if len(mapping) != len(value):
-            raise RecordingError(f"{where} has a name twice; accepted: each name once")
-        return mapping
+        return {item.name: item.value for item in value}
     if kind.repeated:
         return tuple(value)
     if not kind.is_message:
@@ -215,7 +219,7 @@ def _array(where: str, kind: Kind, message: Any, lengths: dict[str, int]) -> np.
     """The array in an Array message, in the machine's byte order; read-only."""
     wide, data = kind.dtype, message.data
     assert wide is not None
-    shape = tuple(message.shape[: len(kind.shape) + 1])  # not all of a list of millions
+    shape = tuple(message.shape)
     dtype = _NARROW if kind.narrow and message.dtype == _NARROW.str else wide
     if message.dtype != dtype.str:
         raise RecordingError(f"{where} is of type {message.dtype!r}; accepted: {dtype.str!r}")

@@ -1,14 +1,23 @@
 """Events as the values of their messages, and back.
 
 A field that an event and its message share is taken over as it is; here is what is stored in
-another form, and in `sensor_messages`.
+another form.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, get_args
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
+import numpy as np
+import zstandard
+
+from chsel.errors import RecordingError
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
+from chsel.next_probe.hand_shape import HandShape
+from chsel.numerics.arrays import digest
 from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
@@ -24,12 +33,8 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
-from replay.lost_attachment import LostAttachment
-from replay.mcap.decision_messages import decision_values, offered_from, offered_values
-from replay.mcap.encoding import shared_arguments, shared_values
-from replay.mcap.plain_config import config_from_json, config_to_json
-from replay.mcap.schemas import FORMAT_VERSION, RECORDS, UNSTEERED_VERSION
-from replay.mcap.sensor_messages import image_values, rig_from, rig_values
+from replay.mcap.encoding import check_message, shared_arguments, shared_values
+from replay.mcap.schemas import FORMAT_VERSION, RECORDS
 from replay.mcap.validation import check_digest
 
 if TYPE_CHECKING:
@@ -37,6 +42,9 @@ if TYPE_CHECKING:
 
 EVENTS: Mapping[str, type[Event]] = {kind.topic: kind for kind in get_args(Event)}
 """The classes of events by their topics."""
+
+_LEVEL = 3  # of an image's compression: a higher one takes longer for hardly less
+_VALUE = np.dtype("<u2")
 
 
 def event_values(event: Event) -> dict[str, Any]:
@@ -49,13 +57,13 @@ def event_values(event: Event) -> dict[str, Any]:
         case SnapshotTaken():
             return archive_values(event.step, event.archive)
         case RigDescribed():
-            return rig_values(event)
+            return _rig_values(event)
         case ActionsOffered():
-            return offered_values(event)
+            return _offered_values(event)
         case SensorImage():
             return image_values(event)
         case Decided():
-            return decision_values(event)
+            return _decision_values(event)
         case _:
             return shared_values(RECORDS[event.topic], event)
 
@@ -64,20 +72,10 @@ def event_from(topic: str, values: Mapping[str, Any]) -> Event:
     """The event of a message that is all of it."""
     kind = EVENTS[topic]
     if kind is RigDescribed:
-        return rig_from(values)
+        return _rig_from(values)
     if kind is ActionsOffered:
-        return offered_from(values)
+        return _offered_from(values)
     return kind(**shared_arguments(kind, values))
-
-
-def is_steered(start: SessionStarted) -> bool:
-    """Whether a policy decides on the probes of a session, and its decisions are recorded."""
-    return "policy" in start.config
-
-
-def version_of(start: SessionStarted) -> int:
-    """The version of the format in which a session is written: the first that has its topics."""
-    return FORMAT_VERSION if is_steered(start) else UNSTEERED_VERSION
 
 
 def step_numbers(event: Event) -> dict[str, float]:
@@ -93,15 +91,16 @@ def step_numbers(event: Event) -> dict[str, float]:
 
 def _session_values(event: SessionStarted) -> dict[str, Any]:
     """The message `Session`."""
-    mesh: Any = event.mesh
-    lost = [part.name for part in (event.mesh, event.sdf) if isinstance(part, LostAttachment)]
+    try:
+        config = json.dumps(dict(event.config), ensure_ascii=False, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"the configuration cannot be recorded: {error}") from None
     return shared_values("Session", event) | {
-        "format_version": version_of(event),
-        "config": config_to_json(event.config),
+        "format_version": FORMAT_VERSION,
+        "config": config,
         "workspace": event.workspace.bounds,
-        "mesh_digest": mesh.digest if isinstance(mesh, LostAttachment) else mesh_digest(mesh),
+        "mesh_digest": mesh_digest(event.mesh),
         "sdf_digest": event.sdf.digest,
-        "lost": lost,
     }
 
 
@@ -111,12 +110,23 @@ def session_from(
     """The start of a session, with its points and attachments."""
     parts = {
         "config": config_from_json(values["config"]),
-        "workspace": workspace_from(values),
+        "workspace": _workspace_from(values),
         "initial_points": points,
         "mesh": mesh,
         "sdf": sdf,
     }
     return SessionStarted(**shared_arguments(SessionStarted, values) | parts)
+
+
+def config_from_json(text: str) -> dict[str, Any]:
+    """The configuration of a session; RecordingError if it is no mapping in JSON."""
+    try:
+        config = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"its configuration is not valid JSON: {error}") from None
+    if not isinstance(config, dict):
+        raise RecordingError("its configuration is not a mapping")
+    return config
 
 
 def _problem_values(event: ProblemPosed) -> dict[str, Any]:
@@ -132,17 +142,37 @@ def _problem_values(event: ProblemPosed) -> dict[str, Any]:
     }
 
 
-def problem_from(
-    values: Mapping[str, Any], sdf: SdfGrid, points: KnownPoints
-) -> RegistrationProblem:
-    """The problem in a message that has its low-cost set, with its grid and points."""
-    parts = {
-        "workspace": workspace_from(values),
-        "key": StreamKey(values["key_seed"], values["key_step"]),
-        "sdf": sdf,
-        "points": points,
-    }
-    return RegistrationProblem(**shared_arguments(RegistrationProblem, values) | parts)
+@dataclass(frozen=True, eq=False)
+class RecordedProblem:
+    """A problem without its points and grid, which the events before it give."""
+
+    topic: ClassVar[str] = ProblemPosed.topic
+
+    values: Mapping[str, Any]  # of the message `Problem`, the low-cost set included
+
+    @property
+    def step(self) -> int:
+        """Of the registration."""
+        return int(self.values["step"])
+
+    @property
+    def seed(self) -> int:
+        """Of the random streams."""
+        return int(self.values["key_seed"])
+
+    def completed(self, sdf: SdfGrid, points: KnownPoints) -> RegistrationProblem:
+        """The whole problem; RecordingError unless it is the one that was recorded."""
+        values = self.values
+        parts = {
+            "workspace": _workspace_from(values),
+            "key": StreamKey(values["key_seed"], values["key_step"]),
+            "sdf": sdf,
+            "points": points,
+        }
+        problem = RegistrationProblem(**shared_arguments(RegistrationProblem, values) | parts)
+        check_digest(f"the problem of step {self.step}", problem.digest, values["digest"])
+        check_digest(f"all points of step {self.step}", points.digest, values["points_digest"])
+        return problem
 
 
 def archive_values(step: int, archive: ArchiveSnapshot) -> dict[str, Any]:
@@ -157,6 +187,164 @@ def archive_from(values: Mapping[str, Any]) -> ArchiveSnapshot:
     return archive
 
 
-def workspace_from(values: Mapping[str, Any]) -> Workspace:
+def _rig_values(event: RigDescribed) -> dict[str, Any]:
+    """The message `Rig`."""
+    hand = event.hand
+    return shared_values("Rig", event) | {
+        "hand_vertices": None if hand is None else np.asarray(hand.vertices, np.float64),
+        "hand_faces": None if hand is None else np.asarray(hand.faces, np.int32),
+    }
+
+
+def _rig_from(values: Mapping[str, Any]) -> RigDescribed:
+    """The rig of a message `Rig`."""
+    import trimesh
+
+    hand = None
+    if values["hand_vertices"] is not None:
+        vertices, faces = values["hand_vertices"].copy(), values["hand_faces"].astype(np.int64)
+        hand = trimesh.Trimesh(vertices, faces, process=False)
+    return RigDescribed(**shared_arguments(RigDescribed, values), hand=hand)
+
+
+@dataclass(frozen=True)
+class ImagePlace:
+    """Where an image of a sensor stands among the events: its pixels are read when they matter."""
+
+    topic = SensorImage.topic
+
+    step: int
+
+
+def image_values(event: SensorImage) -> dict[str, Any]:
+    """The message `SensorImage`; RecordingError if its pixels are of another type or shape."""
+    values, mask = event.values, event.mask
+    if values.dtype != np.uint16 or values.ndim != 2:
+        raise RecordingError(
+            f"an image has values of {values.dtype} {values.shape}; accepted: uint16 (H, W)"
+        )
+    if mask.dtype != np.bool_ or mask.shape != values.shape:
+        raise RecordingError(
+            f"the mask of an image is {mask.dtype} {mask.shape}; accepted: bool {values.shape}"
+        )
+    return shared_values("SensorImage", event) | {
+        "height": values.shape[0],
+        "width": values.shape[1],
+        "values": zstandard.compress(np.ascontiguousarray(values, _VALUE).tobytes(), _LEVEL),
+        "mask": zstandard.compress(np.packbits(mask).tobytes(), _LEVEL),
+    }
+
+
+def image_from(values: Mapping[str, Any]) -> SensorImage:
+    """The image of a message `SensorImage`; its arrays are read-only.
+
+    Raises RecordingError if it is not as the table accepts it, or has not as many pixels as it
+    says.
+    """
+    check_message("SensorImage", values)
+    shape = (values["height"], values["width"])
+    count = values["height"] * values["width"]
+    pixels = {}
+    for name, size in (("values", count * _VALUE.itemsize), ("mask", -(-count // 8))):
+        try:
+            claimed = zstandard.frame_content_size(values[name])
+            pixels[name] = zstandard.decompress(values[name]) if claimed == size else b""
+        except zstandard.ZstdError as error:
+            raise RecordingError(f"{name} of an image cannot be read: {error}") from None
+        if len(pixels[name]) != size:
+            raise RecordingError(
+                f"{name} of an image of {values['sensor']} have {claimed} bytes; "
+                f"accepted: {size} for {shape}"
+            )
+    depths = np.frombuffer(pixels["values"], _VALUE).astype(np.uint16, copy=False)
+    bits = np.frombuffer(pixels["mask"], np.uint8)
+    mask = np.unpackbits(bits, count=count).view(np.bool_).reshape(shape)
+    mask.setflags(write=False)
+    parts = {"values": depths.reshape(shape), "mask": mask}
+    return SensorImage(**shared_arguments(SensorImage, values) | parts)
+
+
+def _offered_values(event: ActionsOffered) -> dict[str, Any]:
+    """The message `Actions`."""
+    return shared_values("Actions", event.actions) | {
+        "step": event.step,
+        "hand_vertices": event.hand.vertices,
+        "hand_faces": event.hand.faces.astype(np.int32),
+        "digest": _digest_of(event),
+    }
+
+
+def _offered_from(values: Mapping[str, Any]) -> ActionsOffered:
+    """The actions in a message; RecordingError unless they have their digest."""
+    actions = Actions(**shared_arguments(Actions, values))
+    hand = HandShape(values["hand_vertices"], values["hand_faces"])
+    event = ActionsOffered(values["step"], actions, hand)
+    check_digest("the actions offered", _digest_of(event), values["digest"])
+    return event
+
+
+def _digest_of(event: ActionsOffered) -> str:
+    texts = event.actions.digest + event.hand.digest
+    return digest(np.frombuffer(texts.encode(), dtype=np.uint8))
+
+
+def _decision_values(event: Decided) -> dict[str, Any]:
+    """The message `Decision`."""
+    problem = event.problem
+    return shared_values("Decision", event.decision) | {
+        "step": event.step,
+        "poses": problem.belief.object_from_world,
+        "weights": problem.belief.weights,
+        "available": problem.available,
+        "key_seed": problem.key.seed,
+        "key_step": problem.key.step,
+        "problem_digest": problem.digest,
+        "surprise": float(event.surprise),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedDecision:
+    """A decision without what its problem has of the events before it."""
+
+    topic: ClassVar[str] = Decided.topic
+
+    values: Mapping[str, Any]  # of the message `Decision`
+    decision: Decision
+
+    @property
+    def step(self) -> int:
+        """Which it follows."""
+        return int(self.values["step"])
+
+    def completed(
+        self, start: SessionStarted, offered: ActionsOffered, points: KnownPoints
+    ) -> Decided:
+        """With its problem, from all points so far; RecordingError unless that was recorded."""
+        values = self.values
+        problem = DecisionProblem(
+            sdf=start.sdf,
+            points=points,
+            workspace=start.workspace,
+            free_resolution=start.free_resolution,
+            belief=Belief(values["poses"], values["weights"]),
+            actions=offered.actions,
+            available=values["available"],
+            hand=offered.hand,
+            key=StreamKey(values["key_seed"], values["key_step"]),
+        )
+        what = f"the problem of the decision of step {self.step}"
+        check_digest(what, problem.digest, values["problem_digest"])
+        return Decided(self.step, problem, self.decision, values["surprise"])
+
+
+def decision_from(values: Mapping[str, Any]) -> RecordedDecision:
+    """The decision in a message; RecordingError unless it has its digest."""
+    decision = Decision(**shared_arguments(Decision, values))
+    check_digest(f"the decision of step {values['step']}", decision.digest, values["digest"])
+    return RecordedDecision(values, decision)
+
+
+def _workspace_from(values: Mapping[str, Any]) -> Workspace:
     """The workspace of a message."""
     return Workspace(*values["workspace"].tolist())

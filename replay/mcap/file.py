@@ -1,33 +1,106 @@
-"""The messages and attachments of an MCAP file of this project, or a clear error."""
+"""MCAP files, read by the `mcap` package: records of any writer, and messages of recordings."""
 
 from __future__ import annotations
 
+import shlex
+import struct
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Message, Schema
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from chsel.errors import RecordingError
 from chsel.problem.file_checks import refuse_special_file
-from replay.mcap.damaged import DamagedRecordingError
-from replay.mcap.record_bytes import MALFORMED, message, parsed, parts, reason_of
-from replay.mcap.records import Damage, Limits, Record, Records
-from replay.mcap.schemas import MESH, PROFILE, SDF_GRID
-from replay.mcap.seal import Chain
-from replay.mcap.summary import summary
+from replay.mcap.schemas import PROFILE
 from replay.mcap.texts import one_line
 
-# Arrays of equal numbers compress to next to nothing, whole recordings do not.
-LIMITS = Limits(2**24, ratio=100, largest=2**62, checked=True, attachments=(MESH, SDF_GRID))
-UNFINISHED = "unfinished"
+MALFORMED = (
+    McapError,
+    ValueError,
+    struct.error,
+    zstandard.ZstdError,
+    RuntimeError,  # how lz4 says that a frame is broken
+    OverflowError,
+    MemoryError,
+)
+"""What reading records may raise."""
+
 ACCEPTED = "accepted: a recording.mcap that this project wrote"
-_PLAUSIBLE_MESSAGES = 10_000  # and one more for every so many bytes of the file:
-_LEAST_BYTES = 4
+_FOOTER = struct.Struct("<QQI")  # where summary and its offsets start, checksum
+_MOST_UNPACKED = 2**29  # bytes of a chunk; writers make chunks of megabytes, or of one large image
+
+
+class DamagedRecordingError(RecordingError):
+    """A recording is unfinished or damaged. damage: how, without what can be done about it."""
+
+    def __init__(self, path: Path, damage: str) -> None:
+        super().__init__(f"recording {path} {damage}; {recover_hint(path)}")
+        self.damage = damage
+
+
+def recover_hint(path: Path) -> str:
+    """The command that saves what is whole of a file."""
+    return f"`python -m replay recover {shlex.quote(str(path))} -o OUT` saves what is whole"
+
+
+def file_records(file: IO[bytes], size: int) -> Iterator[McapRecord]:
+    """The records of a file, chunks as they are, up to its footer.
+
+    Raises any of MALFORMED at the first damage, also if the checksum of all data is wrong.
+    """
+    file.seek(0)
+    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+    yield from reader.records
+
+
+def chunk_at(file: IO[bytes], size: int, place: int) -> Chunk:
+    """The chunk at a place; any of MALFORMED if there is none."""
+    file.seek(place)
+    reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=size)
+    record = next(reader.records, None)
+    if not isinstance(record, Chunk):
+        raise ValueError("a chunk is not where the index says")
+    return record
+
+
+def unpacked(chunk: Chunk) -> list[McapRecord]:
+    """The records in a chunk; any of MALFORMED if it is not whole, or larger than is plausible."""
+    size = chunk.uncompressed_size
+    if chunk.compression == "zstd":
+        size = max(size, zstandard.frame_content_size(chunk.data))
+    if size > _MOST_UNPACKED:
+        raise ValueError(f"a chunk claims {size} bytes, unpacked; accepted: {_MOST_UNPACKED}")
+    return breakup_chunk(chunk, validate_crc=True)
+
+
+def file_summary(file: IO[bytes], size: int) -> Summary | None:
+    """The summary at the end of a finished file; None if there is none that is whole."""
+    try:
+        file.seek(size - len(MCAP0_MAGIC) - _FOOTER.size)
+        start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
+        file.seek(start)
+        if checksum not in (0, zlib.crc32(file.read(size - start - len(MCAP0_MAGIC) - 4))):
+            return None
+        file.seek(0)
+        return SeekingReader(file, record_size_limit=size).get_summary()
+    except (*MALFORMED, OSError, StopIteration):
+        return None
+
+
+def reason_of(error: BaseException) -> str:
+    """What an error says of a file, on one line; struct's speaks of our program instead."""
+    text = "" if isinstance(error, struct.error) else one_line(str(error))
+    return text or "a record is cut short"
 
 
 @dataclass(frozen=True)
@@ -39,163 +112,104 @@ class StoredMessage:
     data: bytes
 
 
-class Topics:
-    """Which topic the channels of a file stand for, and whether it matters.
+class McapFile:
+    """Reads one recording from start to end.
 
-    names: the full name of the message on every topic that matters.
+    attachments: by name, those met so far. damage: what ended a partial reading. place: bytes that
+    were whole by then. count: messages so far.
     """
 
-    def __init__(self, names: Mapping[str, str]) -> None:
-        self._names = names
-        self._schemas: dict[int, Schema] = {}  # by id
-        self._channels: dict[int, Channel] = {}  # by id
-
-    def describe(self, part: Schema | Channel) -> None:
-        """Take note of a schema or channel; ValueError if it is not as this project writes it."""
-        if isinstance(part, Schema):
-            if self._schemas.setdefault(part.id, part) != part:
-                raise ValueError(f"schema {part.id} is described twice, and not the same")
-            return
-        schema = self._schemas.get(part.schema_id)
-        name = None if schema is None else schema.name
-        if self._names.get(part.topic, name) != name:
-            raise ValueError(f"topic {part.topic} carries {name}")
-        if self._channels.setdefault(part.id, part) != part:
-            raise ValueError(f"channel {part.id} is described twice, and not the same")
-
-    def messages(
-        self, chunk: bytes, chain: Chain | None = None
-    ) -> Iterator[tuple[Message, StoredMessage]]:
-        """Messages in a chunk; any of MALFORMED if one is not as this project writes it.
-
-        chain: gets the schemas and channels.
-        """
-        for opcode, start, end in parts(chunk):
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                part: Schema | Channel = parsed(opcode, chunk[start:end])
-                self.describe(part)
-                if chain is not None:
-                    chain.describe(part)
-            elif opcode == Opcode.MESSAGE:
-                found = message(chunk[start:end])
-                channel = self._channels.get(found.channel_id)
-                if channel is None:
-                    raise ValueError(f"channel {found.channel_id} does not exist")
-                yield found, StoredMessage(channel.topic, found.log_time, found.data)
-
-    def matters(self, message: StoredMessage) -> bool:
-        """Whether the topic of a message is one of those named."""
-        return message.topic in self._names
-
-
-class McapFile:
-    """Reads one file from start to end, checking every checksum on the way."""
-
-    def __init__(
-        self,
-        path: Path,
-        names: Mapping[str, str],
-        *,
-        partial: bool = False,
-        check_seals: bool = True,
-    ) -> None:
-        """names: the full name of the message on every topic that matters; others are skipped.
+    def __init__(self, path: Path, names: Mapping[str, str], *, partial: bool = False) -> None:
+        """names: topics that matter, with the full names of their messages; others are skipped.
 
         partial: take what is whole from an unfinished or damaged file, up to the first damage.
-        check_seals: whether what was changed since it was written counts as damage.
         """
         self.path = path
-        self.attachments: dict[str, bytes] = {}  # by name, those met so far
-        self.chain = Chain()  # of the seals of the file
-        self.damage: str | None = None  # what ended a partial reading
-        self._topics = Topics(names)
+        self.attachments: dict[str, bytes] = {}
+        self.damage: str | None = None
+        self.place = self.count = 0
+        self._names = names
+        self._schemas: dict[int, str] = {}  # names by id
+        self._topics: dict[int, str] = {}  # by id of their channel
         self._partial = partial
-        self._check_seals = check_seals
-        self._count = 0  # messages met so far
-        self._most_messages = _PLAUSIBLE_MESSAGES
-        self._data_ended = False
 
     def messages(self) -> Iterator[StoredMessage]:
         """All messages in the order of writing. Raises RecordingError if the file is not valid."""
         with opened(self.path) as file:
-            self._check_kind(file)
-            records = Records(file, LIMITS)
-            self._most_messages = _PLAUSIBLE_MESSAGES + records.size // _LEAST_BYTES
-            for record in records.up_to_damage():
-                if isinstance(record, Damage):
-                    return self._stop_at(f"damaged before byte {record.end}: {record.reason}")
-                try:
-                    found = self._take(record)
-                except MALFORMED as error:
-                    where = f"damaged before byte {record.end}"
-                    return self._stop_at(f"{where}: {reason_of(error)}")
-                yield from found
+            size = file.seek(0, 2)
+            unfinished = not self._has_end(file, size)
+            if unfinished:
+                self._stop_at("unfinished")
             try:
-                self._check_summary(file)
+                for record in file_records(file, size):
+                    if self.place == 0:
+                        self._check_header(record)
+                    if isinstance(record, DataEnd):
+                        return
+                    if isinstance(record, Message):
+                        raise ValueError("a message stands outside of a chunk")
+                    if isinstance(record, Attachment):
+                        self.attachments.setdefault(record.name, record.data)
+                    elif isinstance(record, Chunk):
+                        yield from self.chunk_messages(record)
+                    self.place = file.tell()
             except MALFORMED as error:
-                return self._stop_at(f"damaged: in its summary, {reason_of(error)}")
-        if self.chain.session and self.chain.is_open:
-            self._stop_at("damaged: records follow its last seal")
+                if not unfinished or file.tell() < size:
+                    self._stop_at(f"damaged after byte {self.place}: {reason_of(error)}")
+            else:
+                self._stop_at(f"damaged after byte {self.place}: the end of its data is missing")
 
-    def _check_kind(self, file: IO[bytes]) -> None:
+    def chunk_messages(self, chunk: Chunk) -> list[StoredMessage]:
+        """The messages of a chunk that matter; any of MALFORMED unless they are the next ones."""
+        found, count = [], self.count
+        for record in unpacked(chunk):
+            if isinstance(record, Schema):
+                self._schemas[record.id] = record.name
+            elif isinstance(record, Channel):
+                name, wanted = self._schemas.get(record.schema_id), self._names.get(record.topic)
+                if wanted not in (None, name):
+                    raise ValueError(f"topic {record.topic} carries {name}")
+                self._topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                if record.sequence != count:
+                    raise ValueError(f"message {count} is missing, {record.sequence} follows")
+                count += 1
+                topic = self._topics.get(record.channel_id, "")
+                if topic in self._names:
+                    found.append(StoredMessage(topic, record.log_time, record.data))
+        self.count = count
+        return found
+
+    def later_messages(self, chunk: Chunk) -> tuple[list[StoredMessage], int]:
+        """Those of a chunk behind damage, and how many are missing before it."""
+        first = next((r.sequence for r in unpacked(chunk) if isinstance(r, Message)), self.count)
+        missing = first - self.count
+        if missing < 0:
+            raise ValueError("its messages were there before")
+        count, self.count = self.count, first
+        try:
+            return self.chunk_messages(chunk), missing
+        except MALFORMED:
+            self.count = count
+            raise
+
+    def _has_end(self, file: IO[bytes], size: int) -> bool:
+        """Whether a file ends as a finished one; RecordingError unless it begins as one of MCAP."""
+        file.seek(0)
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise RecordingError(f"recording {self.path} is no MCAP file; {ACCEPTED}")
-        size = file.seek(0, 2)
-        file.seek(max(0, size - len(MCAP0_MAGIC)))
-        if size < 2 * len(MCAP0_MAGIC) or file.read() != MCAP0_MAGIC:
-            self._stop_at(UNFINISHED)
+        file.seek(max(size - len(MCAP0_MAGIC), len(MCAP0_MAGIC)))
+        return file.read() == MCAP0_MAGIC
 
-    def _take(self, record: Record) -> list[StoredMessage]:
-        """The messages in a record that matter; any of MALFORMED if it is not as was written."""
-        opcode, content = record.opcode, record.content
-        if opcode == Opcode.MESSAGE:
-            raise ValueError("a message stands outside of a chunk")
-        if self._data_ended and opcode in (Opcode.ATTACHMENT, Opcode.CHUNK):
-            raise ValueError("data follow the end of its data")
-        match opcode:
-            case Opcode.HEADER if parsed(opcode, content).profile != PROFILE:
-                raise RecordingError(f"recording {self.path} is another program's; {ACCEPTED}")
-            case Opcode.ATTACHMENT:
-                self._attach(parsed(opcode, content))
-            case Opcode.CHUNK:
-                return [stored for stored in self._chunk(content) if self._topics.matters(stored)]
-            case Opcode.DATA_END:
-                self._data_ended = True
-            case Opcode.FOOTER if not self._data_ended:
-                raise ValueError("the end of its data is missing")
-        return []
-
-    def _attach(self, attachment: Attachment) -> None:
-        if attachment.name in self.attachments:
-            raise ValueError(f"the attachment {attachment.name!r} stands in it twice")
-        self.attachments[attachment.name] = attachment.data
-        if self._check_seals:
-            self.chain.attach(attachment)
-
-    def _chunk(self, content: bytes) -> Iterator[StoredMessage]:
-        """All messages of a chunk, their numbers and seals compared."""
-        chain = self.chain if self._check_seals else None
-        for found, stored in self._topics.messages(content, chain):
-            if found.sequence != self._count:
-                raise ValueError(f"message {self._count} is missing, {found.sequence} follows")
-            self._count += 1
-            if self._count > self._most_messages:
-                raise ValueError(f"it holds more than {self._most_messages} messages")
-            if chain is not None:
-                chain.read(stored.topic, found)
-            yield stored
-
-    def _check_summary(self, file: IO[bytes]) -> None:
-        """Raise ValueError unless the summary is whole and describes the same topics."""
-        for part in summary(file, checked=True):
-            if isinstance(part, Schema | Channel):
-                self._topics.describe(part)
+    def _check_header(self, record: McapRecord) -> None:
+        if not isinstance(record, Header) or record.profile != PROFILE:
+            raise RecordingError(f"recording {self.path} is another program's; {ACCEPTED}")
 
     def _stop_at(self, damage: str) -> None:
         """Keep the damage in mind, or raise it if all is wanted."""
         if not self._partial:
-            raise DamagedRecordingError(self.path, f"is {one_line(damage)}")
-        self.damage = self.damage or damage
+            raise DamagedRecordingError(self.path, f"is {damage}")
+        self.damage = damage
 
 
 @contextmanager

@@ -18,9 +18,9 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from chsel.errors import RecordingError
 from chsel.numerics.arrays import FloatArray
+from replay.mcap.encoding import parsed
 from replay.mcap.schemas import PACKAGE, RECORDS
 from replay.mcap.texts import check_text
-from replay.mcap.wire import parsed
 
 POINT_CLASSES = ("free", "occupied", "known")
 LEVELS = 4
@@ -34,7 +34,7 @@ SCENE: Mapping[str, type[Message]] = {
     "/next_probe": SceneUpdate,
     **{f"/all_points/{kind}/{n}": PointCloud for kind in POINT_CLASSES for n in range(LEVELS)},
 }
-"""Topics of `viewer_messages`, which recordings of older programs do not have."""
+"""Topics of `viewer_messages` that show the object and all points so far."""
 
 VIEWS: Mapping[str, type[Message]] = {
     "/object_pose": FrameTransform,

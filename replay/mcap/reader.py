@@ -25,14 +25,13 @@ from replay.events import (
     SnapshotTaken,
     Timed,
 )
-from replay.mcap.damaged import DamagedRecordingError
-from replay.mcap.decision_messages import RecordedDecision
+from replay.files import file_digest
 from replay.mcap.encoding import decode
-from replay.mcap.event_reader import Entry, EventReader, RecordedProblem
-from replay.mcap.file import McapFile, StoredMessage
+from replay.mcap.event_messages import ImagePlace, RecordedDecision, RecordedProblem, image_from
+from replay.mcap.event_reader import Entry, EventReader
+from replay.mcap.file import DamagedRecordingError, McapFile, StoredMessage
 from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
-from replay.mcap.schemas import RECORDS, SEALED_SINCE, STEP_TIME
-from replay.mcap.sensor_messages import ImagePlace, image_from
+from replay.mcap.schemas import RECORDS, STEP_TIME
 from replay.mcap.texts import one_line
 
 Placed = TypeVar("Placed", RecordedProblem, RecordedDecision)
@@ -45,27 +44,18 @@ class Recording:
     session began. ended: how it ended, None if it did not. probes: in their order. steps: those
     with a registration problem. rig: of a recorded robot session, else None. image_steps: those
     with images of sensors. offered: the actions of a steered session, else None. decision_steps:
-    those that a decision follows, -1 for that before the first probe. version: of its format.
-    digest: of its last seal, "" before version 3. attachments: bytes of each, by name.
+    those that a decision follows, -1 for that before the first probe. attachments: bytes of each,
+    by name.
     """
 
     def __init__(
-        self,
-        path: Path,
-        entries: list[Entry],
-        damage: str | None,
-        *,
-        version: int,
-        digest: str,
-        attachments: Mapping[str, int],
+        self, path: Path, entries: list[Entry], damage: str | None, attachments: Mapping[str, int]
     ) -> None:
         if not entries or not isinstance(entries[0], SessionStarted):
             why = "" if damage is None else f": it is {damage}"
             raise RecordingError(f"recording {path} has no session in it{why}")
         self.path = path
         self.damage = damage
-        self.version = version
-        self.digest = digest
         self.attachments = attachments
         self.start = entries[0]
         self.ended = next((entry for entry in entries if isinstance(entry, SessionEnded)), None)
@@ -142,6 +132,11 @@ class Recording:
         return next(seeds, self.start.seed)
 
     @cached_property
+    def digest(self) -> str:
+        """The digest of its file, which names the recording."""
+        return file_digest(self.path)
+
+    @cached_property
     def has_timings(self) -> bool:
         """Whether wall-clock times were recorded."""
         return any(isinstance(entry, Timed) for entry in self._entries)
@@ -168,8 +163,7 @@ class Recording:
         """The images in the file; others are passed by."""
         topic = "/sensor_image"
         schemas = {topic: TOPIC_SCHEMAS[topic]}
-        partial = self.damage is not None
-        file = McapFile(self.path, schemas, partial=partial, check_seals=False)  # they were
+        file = McapFile(self.path, schemas, partial=self.damage is not None)
         for message in file.messages():
             if steps is None or message.log_time // STEP_TIME - 1 in steps:
                 with _blaming(self.path):
@@ -221,33 +215,23 @@ def read_recording(
 
     With `partial`, an unfinished or damaged file gives all events before the first damage, which
     `Recording.damage` names. `watch` is given every message, as it is met. Raises RecordingError
-    if the file does not exist, is no recording of this project, is of another format version, or
-    is unfinished or damaged.
+    if the file does not exist, is no recording of this project, is of another format, or is
+    unfinished or damaged.
     """
     path = Path(path).expanduser()
     file = McapFile(path, TOPIC_SCHEMAS, partial=partial)
-    events = EventReader(file.attachments, path.stat().st_size if path.is_file() else 0)
+    reader, entries = EventReader(file.attachments), list[Entry]()
     for message in file.messages():
         if watch is not None:
             watch(message)
         with _blaming(path):
-            events.take(message)
-    if events.within is not None and file.damage is None:
-        raise DamagedRecordingError(path, f"ends within an event on {events.within}")
-    if not events.closed and events.entries and file.damage is None:
-        raise DamagedRecordingError(path, "ends without its contents")
-    sealed = bool(file.chain.session) or events.version < SEALED_SINCE
-    if not sealed and events.entries and file.damage is None:
-        raise DamagedRecordingError(path, "has no seals, which its format should have")
+            entry = reader.take(message)
+        if entry is not None:
+            entries.append(entry)
+    if reader.within is not None and file.damage is None:
+        raise DamagedRecordingError(path, f"ends within an event on {reader.within}")
     sizes = {name: len(data) for name, data in file.attachments.items()}
-    return Recording(
-        path,
-        events.entries,
-        file.damage,
-        version=events.version,
-        digest=file.chain.last,
-        attachments=sizes,
-    )
+    return Recording(path, entries, file.damage, sizes)
 
 
 @contextmanager

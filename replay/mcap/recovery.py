@@ -1,14 +1,18 @@
-"""Everything whole in a damaged or unfinished recording, as a finished one."""
+"""What is whole in a damaged or unfinished recording, as a finished one."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from chsel.errors import RecordingError
+from chsel.errors import ChselError, RecordingError
+from chsel.problem.defaults import object_grid
+from chsel.problem.points import GrowingPoints, KnownPoints
 from replay.events import (
+    ActionsOffered,
     Event,
     HypothesesFound,
     Logged,
@@ -17,27 +21,38 @@ from replay.events import (
     SensorImage,
     SessionEnded,
     SessionStarted,
-    SnapshotTaken,
-    Traced,
 )
 from replay.files import new_file
-from replay.lost_attachment import LostAttachment
-from replay.mcap.decision_messages import RecordedDecision
-from replay.mcap.event_reader import Entry, RecordedProblem
-from replay.mcap.file import StoredMessage
-from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
-from replay.mcap.gap_reader import WRONG, GapReader
-from replay.mcap.reader import read_recording
-from replay.mcap.records import Damage
-from replay.mcap.salvage import Gap, Salvage
-from replay.mcap.schemas import STEP_TIME
-from replay.mcap.sensor_messages import ImagePlace
+from replay.mcap.attachments import mesh_attached, sdf_attached, sdf_to_bytes
+from replay.mcap.encoding import decode
+from replay.mcap.event_messages import (
+    ImagePlace,
+    RecordedDecision,
+    RecordedProblem,
+    config_from_json,
+    image_from,
+)
+from replay.mcap.event_reader import Entry, EventReader
+from replay.mcap.file import (
+    MALFORMED,
+    McapFile,
+    StoredMessage,
+    chunk_at,
+    file_summary,
+    opened,
+    reason_of,
+)
+from replay.mcap.foxglove_messages import CLOUDS, TOPIC_SCHEMAS
+from replay.mcap.schemas import BEFORE_ALL_STEPS, RECORDS, SDF_GRID, STEP_TIME
 from replay.mcap.texts import one_line
 from replay.mcap.validation import RECOVERED, EventOrder
 from replay.mcap.writer import McapRecorder
 
-_OF_REGISTRATION = (Traced, SnapshotTaken, HypothesesFound)
-_OF_POINTS = ("/points/free", "/points/occupied", "/points/known", "/known_points")
+_PARTS = {
+    "the registration": ("/problem", "/trace", "/archive", "/hypotheses"),
+    "the probe": ("/probe", "/known_points", *CLOUDS),
+}
+_WRONG = (ChselError, ValueError, RecursionError)  # what reading a message may raise
 
 
 @dataclass
@@ -45,40 +60,27 @@ class Recovered:
     """What a recovery kept and what is lost."""
 
     damage: str | None = None  # why the file cannot be read as it is; None if it can
-    damages: list[Damage] = field(default_factory=list)  # bytes that cannot be believed
     probes: list[int] = field(default_factory=list)  # steps of those kept
     problems: list[int] = field(default_factory=list)  # likewise
     results: list[int] = field(default_factory=list)  # likewise
     images: int = 0  # how many are kept
-    ended: str | None = None  # outcome, if the end of the session is kept
-    messages: int = 0  # how many are known to be missing
-    events: list[str] = field(default_factory=list)  # lost for other reasons than missing bytes
-    complete: bool = False  # whether the list of contents was there, so that all losses are known
-    lost_probes: list[tuple[int, int]] = field(default_factory=list)
-    """First and last of steps in a row; without the list of contents, those that may be lost."""
-    lost_problems: list[int] = field(default_factory=list)  # steps; without the list, those known
-    lost_results: list[int] = field(default_factory=list)  # likewise
-    attachments: list[str] = field(default_factory=list)  # names of those lost
-    remade: list[str] = field(default_factory=list)  # of those that were made again, to the bit
-
-    @property
-    def nothing_lost(self) -> bool:
-        """Whether all that the recording ever held is kept."""
-        lost = self.messages or self.events or self.lost_probes or self.attachments
-        return self.complete and not lost
+    ended: bool = False  # whether the end of the session is kept
+    remade: bool = False  # whether the SDF grid was damaged and is there again, to the bit
+    lost: dict[str, str] = field(default_factory=dict)  # what is known to be lost, and why
 
 
 def recover(path: Path, out: Path) -> Recovered:
     """Write a finished recording of all that is whole in another one.
 
-    A lost SDF grid is made again from the mesh if that gives its digest. Without the mesh, or the
-    grid, all else is kept. Raises RecordingError if the session's start is not whole, without which
-    nothing makes sense; if `path` is no recording; or if `out` exists or cannot be written.
+    That is everything up to the first damage, and in a finished file also each later chunk that its
+    index names and whose checksum is right. Of what follows lost messages, only what does not need
+    them is kept. A damaged SDF grid is made again from the mesh if that gives its digest. Raises
+    RecordingError if the session's start is not whole, without which nothing makes sense; if `path`
+    is not a recording; or if `out` exists or cannot be written.
     """
+    recovery = _Recovery(path)
     with new_file(out) as beside:
-        recovery = _Recovery(path)
-        recorder = McapRecorder(beside)
-        flushed = -1
+        recorder, flushed = McapRecorder(beside), BEFORE_ALL_STEPS
         try:
             for event in recovery.events():
                 if isinstance(event, Probe | SensorImage) and event.step > flushed:
@@ -103,192 +105,132 @@ class _Recovery:
     def __init__(self, path: Path) -> None:
         self.found = Recovered()
         self._path = path
+        self._file = McapFile(path, TOPIC_SCHEMAS, partial=True)
+        self._reader = EventReader(self._file.attachments)
         self._order = EventOrder()
-        self._lost_steps: set[int] = set()  # of registrations
-        self._blind = False  # whether images are lost with their rig
-        self._undecided = False  # whether decisions are lost with the actions offered
+        self._points = GrowingPoints(KnownPoints())  # those that are kept
+        self._start: SessionStarted | None = None
+        self._offered: ActionsOffered | None = None
 
     def events(self) -> Iterator[Event]:
         """Each event as it was; where some are lost, a warning; an end where there is none."""
-        try:
-            for _ in (recording := read_recording(self._path)).events():
-                """Every digest of a problem is compared."""
-        except RecordingError as error:
-            if not self._path.is_file():
-                raise
-            named = f"recording {self._path}: "
-            content = f"cannot be read: {str(error).removeprefix(named)}"
-            self.found.damage = getattr(error, "damage", content)
-            yield from self._counted(self._salvaged())
-        else:
-            self.found.complete = True
-            yield from self._counted(recording.events())
-
-    def _counted(self, events: Iterator[Event]) -> Iterator[Event]:
-        """The events, noted down."""
-        found = self.found
-        for event in events:
-            match event:
-                case Probe():
-                    found.probes.append(event.step)
-                case ProblemPosed():
-                    found.problems.append(event.step)
-                case HypothesesFound():
-                    found.results.append(event.step)
-                case SensorImage():
-                    found.images += 1
-                case SessionEnded() if found.ended is None:
-                    found.ended = event.outcome
-            yield event
-
-    def _salvaged(self) -> Iterator[Event]:
-        self._file = file = Salvage(self._path, TOPIC_SCHEMAS)
-        reader = GapReader(file.attachments, self._path.stat().st_size)
-        unsure: list[tuple[int, int]] = []  # first and last step of those with missing messages
-        gap = False
-        for message in file.messages():
-            if isinstance(message, Gap):
-                self._check_started(reader)
-                self.found.messages += message.messages
-                reader.gap()
-                gap = True
-                yield from self._warning(f"{message.messages} messages are lost here")
-                continue
-            if gap:
-                unsure.append((max(self._order.step, 0), message.log_time // STEP_TIME - 1))
-                gap = False
-            yield from self._taken(reader, message)
-        self._check_started(reader)
-        yield from self._end(reader, file)
-        self._account(reader, unsure)
-
-    def _taken(self, reader: GapReader, message: StoredMessage) -> Iterator[Event]:
-        """The events that a message completes, or a warning if one is lost with it."""
-        try:
-            reader.take(message)
-            entries = reader.drained()
-        except WRONG as error:
-            if reader.start is None:
-                raise RecordingError(f"{self._nothing()}: {one_line(str(error))}") from error
-            reader.gap()
-            entries = []
-            if message.topic not in _OF_POINTS or not self.found.messages:
-                step = message.log_time // STEP_TIME - 1
-                yield from self._lost(f"{message.topic} of step {step}: {one_line(str(error))}")
-            # else its probe was lost with the messages before it
-        for entry in entries:
-            if isinstance(entry, SessionStarted):
-                self._note_attachments(entry, reader)
-            yield from self._kept(reader, entry)
-
-    def _kept(self, reader: GapReader, entry: Entry) -> Iterator[Event]:
-        """The event, if it still makes sense where it is; else a warning, once a registration."""
-        step = entry.step
-        if isinstance(entry, ImagePlace):
-            return  # there is none of them here
-        if isinstance(entry, SensorImage) and not self._order.has_rig:
-            if not self._blind:
-                self._blind = True
-                yield from self._lost("all images of sensors: their rig was lost before")
-            return
-        if isinstance(entry, RecordedDecision) and not self._order.has_actions:
-            if not self._undecided:
-                self._undecided = True
-                yield from self._lost("all decisions: the actions offered were lost before")
-            return
-        if isinstance(entry, _OF_REGISTRATION) and step in self._lost_steps:
-            return  # with its problem
-        try:
-            event = reader.completed(entry)
-            self._order.take(event.topic, event.step)
-        except WRONG as error:
-            what, reason = f"{type(entry).__name__} of step {step}", one_line(str(error))
-            if isinstance(entry, (RecordedProblem, *_OF_REGISTRATION)):
-                self._lost_steps.add(step)
-                what = f"the registration of step {step}"
-            elif isinstance(entry, RecordedDecision):
-                what = f"the decision after step {step}"
-            if isinstance(entry, (RecordedProblem, RecordedDecision, *_OF_REGISTRATION)):
-                reason = "something it needs was lost before" if reader.wanting else reason
-            yield from self._lost(f"{what}: {reason}")
-        else:
-            yield event
-
-    def _end(self, reader: GapReader, file: Salvage) -> Iterator[Event]:
-        """What a recording without its end needs."""
-        self.found.damages = file.damages
-        self.found.complete = reader.closed
-        if reader.within is not None:
-            yield from self._lost(f"the last event on {reader.within}: its points are missing")
-        if not reader.closed and file.rest is not None:
-            yield from self._warning(f"what followed is lost, {file.rest.reason}")
-        if self.found.ended is None:
+        for part in self._parts():
+            if isinstance(part, StoredMessage):
+                yield from self._taken(part)
+            else:
+                self._reader.skip()
+                yield from self._lost(*part)
+        if self._start is None:
+            raise RecordingError(self._nothing("the start of its session is not there"))
+        if self._reader.within is not None:
+            yield from self._lost(f"the last {self._reader.within}", "it is cut")
+        if not self.found.ended:
             yield SessionEnded(self._order.step, f"{RECOVERED}how the session ended is not known")
-            self.found.ended = None  # that was no outcome
 
-    def _account(self, reader: GapReader, unsure: Sequence[tuple[int, int]]) -> None:
-        """Which steps are lost: as the contents say, or else as far as can be known."""
-        found = self.found
-        kept = sorted(set(found.probes))
-        if not reader.closed:
-            found.lost_problems = sorted(self._lost_steps)
-            found.lost_probes = [s for first, last in unsure for s in _without(first, last, kept)]
+    def _parts(self) -> Iterator[StoredMessage | tuple[str, str]]:
+        """All whole messages in the order of writing, and what is lost between them, and why."""
+        file = self._file
+        yield from file.messages()
+        self.found.damage = file.damage
+        if file.damage is None:
             return
-        listed = reader.rows
-        lost = Counter(row.step for row in listed) - Counter(found.probes)
-        found.lost_probes = _in_a_row(sorted(lost))
-        found.lost_problems = _missing((r.step for r in listed if r.posed), found.problems)
-        found.lost_results = _missing((r.step for r in listed if r.hypotheses >= 0), found.results)
+        with opened(self._path) as stream:
+            size = stream.seek(0, 2)
+            summary = file_summary(stream, size)
+            if summary is None:
+                if file.place < size:
+                    yield f"bytes {file.place} to {size}", "they are not whole, and have no index"
+                return
+            for chunk in sorted(summary.chunk_indexes, key=lambda one: one.chunk_start_offset):
+                begin = chunk.chunk_start_offset
+                if begin < file.place:
+                    continue
+                try:
+                    messages, missing = file.later_messages(chunk_at(stream, size, begin))
+                except MALFORMED as error:
+                    yield f"bytes {begin} to {begin + chunk.chunk_length}", reason_of(error)
+                    continue
+                if missing:
+                    yield f"{missing} messages before byte {begin}", "they were in damaged bytes"
+                yield from messages
 
-    def _lost(self, what: str) -> Iterator[Event]:
-        self.found.events.append(what)
-        return self._warning(f"lost: {what}")
-
-    def _warning(self, text: str) -> Iterator[Event]:
-        """A line in the recording; behind the session's end there can be none."""
-        if self.found.ended is None:
-            warning = Logged(self._order.step, "warning", f"{RECOVERED}{text}")
-            self._order.take(warning.topic, warning.step)
-            yield warning
-
-    def _note_attachments(self, start: SessionStarted, reader: GapReader) -> None:
-        for part in (start.mesh, start.sdf):
-            if isinstance(part, LostAttachment):
-                self.found.attachments.append(part.name)
-        self.found.remade = reader.remade
-
-    def _check_started(self, reader: GapReader) -> None:
-        """Raise RecordingError if the session's start is not there by now."""
-        if reader.start is None:
-            raise RecordingError(f"{self._nothing()}: the start of its session is not there")
-
-    def _nothing(self) -> str:
-        """What is wrong if there is no session, with the first damage, which is why."""
-        damages = self._file.damages[:1]
-        where = [f" (bytes {d.start} to {d.end}: {d.reason})" for d in damages]
-        return f"nothing can be recovered from {self._path}{''.join(where)}"
-
-
-def _missing(steps: Iterable[int], kept: Iterable[int]) -> list[int]:
-    return sorted(set(steps) - set(kept))
-
-
-def _in_a_row(steps: Sequence[int]) -> list[tuple[int, int]]:
-    """Steps in ascending order, as first and last of those in a row."""
-    pairs: list[tuple[int, int]] = []
-    for step in steps:
-        if pairs and step == pairs[-1][1] + 1:
-            pairs[-1] = (pairs[-1][0], step)
+    def _taken(self, message: StoredMessage) -> Iterator[Event]:
+        """The event that a message completes, if it still makes sense where it is."""
+        topic, step = message.topic, message.log_time // STEP_TIME - 1
+        if topic == "/session":
+            self._remake_grid(message)
+        try:
+            entry = self._reader.take(message)
+            if entry is None:
+                return
+            event = self._completed(entry, message)
+            self._order.take(event.topic, event.step)
+        except _WRONG as error:
+            if self._start is None:
+                raise RecordingError(self._nothing(one_line(str(error)))) from error
+            self._reader.skip()
+            kind = next((name for name, topics in _PARTS.items() if topic in topics), topic)
+            yield from self._lost(f"{kind} of step {step}", one_line(str(error)))
         else:
-            pairs.append((step, step))
-    return pairs
+            self._note(event)
+            yield event
 
+    def _completed(self, entry: Entry, message: StoredMessage) -> Event:
+        """With its whole problem; RecordingError if something of lost messages is missing."""
+        if isinstance(entry, ImagePlace):
+            return image_from(decode(RECORDS[entry.topic], message.data))
+        if not isinstance(entry, RecordedProblem | RecordedDecision):
+            return entry
+        assert self._start is not None
+        points = self._points.all()
+        if isinstance(entry, RecordedProblem):
+            return ProblemPosed(entry.step, entry.completed(self._start.sdf, points))
+        if self._offered is None:
+            raise RecordingError("the actions offered were lost before")
+        return entry.completed(self._start, self._offered, points)
 
-def _without(first: int, last: int, kept: Sequence[int]) -> list[tuple[int, int]]:
-    """Steps from first to last that are not among those kept, which are in ascending order."""
-    pairs = []
-    for step in kept:
-        if first <= step <= last:
-            pairs.append((first, step - 1))
-            first = step + 1
-    return [pair for pair in [*pairs, (first, last)] if pair[0] <= pair[1]]
+    def _note(self, event: Event) -> None:
+        match event:
+            case SessionStarted():
+                self._start, self._points = event, GrowingPoints(event.initial_points)
+            case ActionsOffered():
+                self._offered = event
+            case Probe():
+                self._points.add(event.new_points)
+                self.found.probes.append(event.step)
+            case ProblemPosed():
+                self.found.problems.append(event.step)
+            case HypothesesFound():
+                self.found.results.append(event.step)
+            case SensorImage():
+                self.found.images += 1
+            case SessionEnded():
+                self.found.ended = True
+
+    def _lost(self, what: str, reason: str) -> Iterator[Event]:
+        """A line in the recording where something is lost; behind the end there can be none."""
+        if what not in self.found.lost:
+            self.found.lost[what] = reason
+            if self._start is not None and not self.found.ended:
+                yield Logged(self._order.step, "warning", f"{RECOVERED}lost: {what}: {reason}")
+
+    def _remake_grid(self, message: StoredMessage) -> None:
+        """Make a damaged SDF grid again as the session's configuration says, if that can be."""
+        attachments = self._file.attachments
+        values: dict[str, Any] = decode("Session", message.data)
+        with suppress(*_WRONG):
+            sdf_attached(attachments, values["sdf_digest"])
+            return
+        with suppress(*_WRONG, LookupError, TypeError):
+            mesh = mesh_attached(attachments, values["mesh_digest"])
+            session = config_from_json(values["config"])["session"]
+            padding = session["object_padding"]
+            grid = object_grid(mesh, session["object_resolution"], padding=padding)
+            self.found.remade = grid.digest == values["sdf_digest"]
+            attachments[SDF_GRID] = sdf_to_bytes(grid)
+
+    def _nothing(self, reason: str) -> str:
+        damage = self._file.damage
+        return f"nothing can be recovered from {self._path}: {reason}" + (
+            f"; it is {damage}" if damage else ""
+        )

@@ -35,17 +35,8 @@ from replay.mcap.validation import (
     voxel_side,
 )
 
-FORMAT_VERSION = 4
-"""The newest. A reader refuses newer ones, so any change of meaning needs a new number.
-
-Version 2 added a rig and images of its sensors, version 3 seals, version 4 decisions.
-"""
-
-UNSTEERED_VERSION = 3
-"""That of new recordings without decisions, which have nothing of a later version."""
-
-SEALED_SINCE = 3
-"""From this version on, seals cover every record, and measured values are those of the results."""
+FORMAT_VERSION = 1
+"""A reader refuses every other one, so any change of meaning needs a new number."""
 
 PROFILE = "chsel"
 """How the file's header names this use of MCAP."""
@@ -89,7 +80,6 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "mesh_digest": "string",
         "sdf_digest": "string",
         "source": ("string", short_name),
-        "lost": "string*",  # attachments that a damaged file no longer held when it was recovered
     },
     "Probe": {
         "step": "sint32",
@@ -108,7 +98,6 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "free": "uint64",
         "occupied": "uint64",
         "known": "uint64",
-        "digest": "string",  # of all points so far; empty since version 3
     },
     "Problem": {
         "step": "sint32",
@@ -166,8 +155,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "hand_vertices": "f8[V,3]?",
         "hand_faces": "i4[F,3]?",
     },
-    # Pixels are compressed by Zstandard, row by row: a blank image is as good as nothing, and no
-    # other message may grow as much as one can.
+    # Pixels are compressed by Zstandard, row by row.
     "SensorImage": {
         "step": "sint32",
         "sensor": ("string", sensor_name),
@@ -209,28 +197,6 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "digest": "string",  # of chosen to contacts
         "surprise": ("double", finite),
     },
-    # The last message: a row for each probe, so that a large file tells at once what is in it.
-    "Contents": {
-        "step": "i8[S]",
-        "free": "i8[S]",
-        "occupied": "i8[S]",
-        "known": "i8[S]",
-        "contacts": "i8[S]",
-        "posed": "b1[S]",
-        "hypotheses": "i8[S]",  # -1 where there is no result
-        "distinct": "i8[S]",
-        "best_cost": "f8[S]",  # NaN where there is no result
-        "session": "string",  # as in the seals; empty before version 3
-        "digest": "string",  # of the last seal
-    },
-    # Ends the session's start, every step and every chunk; see seal.py.
-    "Seal": {
-        "step": "sint32",
-        "session": "string",  # digest of all before the first seal
-        "previous": "string",  # digest of the seal before, empty for the first
-        "parts": "Text*",  # of each topic with messages since then, and the digest of these
-        "digest": "string",  # of the above, and of number and time of this message
-    },
     # No topic: this is the attachment "sdf_grid".
     "SdfGrid": {
         "origin": "f8[3]",
@@ -251,10 +217,8 @@ RECORDS: Mapping[str, str] = {
     "/measured": "Measured",
     "/timed": "Timed",
     "/session_ended": "SessionEnded",
-    "/contents": "Contents",
     "/rig": "Rig",
     "/sensor_image": "SensorImage",
-    "/seal": "Seal",
     "/actions": "Actions",
     "/decision": "Decision",
 }
@@ -272,13 +236,3 @@ TOGETHER: Mapping[str, Callable[[Mapping[str, Any]], None]] = {
     "Trace": check_trace,
 }
 """What the values of a message must be together; raises RecordingError."""
-
-SINCE_VERSION: Mapping[str, int] = {
-    "/rig": 2,
-    "/sensor_image": 2,
-    "/seal": SEALED_SINCE,
-    "/actions": 4,
-    "/decision": 4,
-    "/next_probe": 4,  # for viewers
-}
-"""Topics that a recording of a lower version does not have."""

@@ -6,7 +6,7 @@ messages say, rounded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,6 @@ from chsel.problem.registration_problem import Hypotheses
 from replay.colors import CONTACT, FREE, OCCUPIED, ColorArray, cost_colors
 from replay.colors import OBJECT as OBJECT_COLOR
 from replay.events import Decided, Event, HypothesesFound, Probe, SessionStarted
-from replay.lost_attachment import is_lost
 from replay.mcap.foxglove_messages import (
     LEVELS,
     POINT_CLASSES,
@@ -41,7 +40,6 @@ from replay.mcap.foxglove_messages import (
     serialized,
     stamp,
 )
-from replay.mcap.wire import length_prefix
 
 if TYPE_CHECKING:
     import trimesh
@@ -84,13 +82,12 @@ class Views:
         """Messages in their order; each is made when it is written."""
         match event:
             case SessionStarted():
-                self._scene = None if is_lost(event.mesh) else SceneMessages(event.mesh)
+                self._scene = SceneMessages(event.mesh)
                 yield from self._all_points(event.initial_points)
                 if event.world_from_object is not None:
                     yield "/object_pose", partial(object_in_world, event.world_from_object)
-                    if self._scene is not None:
-                        yield "/object_mesh", self._scene.object_mesh
-                        yield "/object_surface", self._scene.object_surface
+                    yield "/object_mesh", self._scene.object_mesh
+                    yield "/object_surface", self._scene.object_surface
             case Probe():
                 yield from self._all_points(event.new_points)
                 if len(event.gripper_path) > 0:
@@ -98,10 +95,10 @@ class Views:
             case HypothesesFound() if len(event.hypotheses.object_from_world) > 0:
                 found = event.hypotheses
                 yield "/hypothesis_poses", partial(poses_in_world, inverse(found.object_from_world))
-                if self._scene is not None:
-                    shown = _shown(found)
-                    yield "/hypothesis_meshes", partial(self._scene.hypothesis_meshes, *shown)
-                    yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, *shown)
+                assert self._scene is not None
+                shown = _shown(found)
+                yield "/hypothesis_meshes", partial(self._scene.hypothesis_meshes, *shown)
+                yield "/hypothesis_surfaces", partial(self._scene.hypothesis_surfaces, *shown)
             case Decided():
                 yield "/next_probe", partial(next_probe, event)
 
@@ -166,8 +163,8 @@ class SceneMessages:
             placed = serialized(TriangleListPrimitive(pose=pose))
             colored = serialized(TriangleListPrimitive(color=color))
             triangles = (placed, self._points, colored, self._indices)
-            parts += (length_prefix(_TRIANGLES, triangles), *triangles)
-        return b"".join((length_prefix(_ENTITIES, parts), *parts))
+            parts += (_length_prefix(_TRIANGLES, triangles), *triangles)
+        return b"".join((_length_prefix(_ENTITIES, parts), *parts))
 
 
 class CumulativePoints:
@@ -261,6 +258,17 @@ def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str =
 def empty_cloud(time: int) -> bytes:
     """A cloud of no points."""
     return colored_cloud(np.zeros((0, 3)), np.zeros(3, np.uint8), time)
+
+
+def _length_prefix(field: int, parts: Sequence[bytes]) -> bytes:
+    """What stands before a message in a field, given its number and all bytes of the message."""
+    prefix = bytearray()
+    for value in (field << 3 | 2, sum(map(len, parts))):  # 2: bytes with their length
+        while value > 0x7F:
+            prefix.append(value & 0x7F | 0x80)
+            value >>= 7
+        prefix.append(value)
+    return bytes(prefix)
 
 
 def _poses(poses: FloatArray) -> list[Pose]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
 
 from chsel.errors import RecordingError
 from chsel.next_probe.decision_problem import DecisionProblem
@@ -26,23 +30,23 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
-from replay.lost_attachment import is_lost
-from replay.mcap.attachments import MESH, SDF_GRID, mesh_to_ply, sdf_to_bytes
-from replay.mcap.contents import Contents
-from replay.mcap.encoding import check_message, encode
-from replay.mcap.event_messages import (
-    archive_values,
-    event_values,
-    is_steered,
+from replay.files import sync_folder
+from replay.mcap.attachments import MEDIA_TYPES, mesh_to_ply, sdf_to_bytes
+from replay.mcap.encoding import (
+    check_message,
+    descriptor_set,
+    encode,
+    message_class,
     shared_values,
-    version_of,
 )
-from replay.mcap.foxglove_messages import CLOUDS, POINT_CLASSES, log_line, point_cloud
-from replay.mcap.schemas import RECORDS
-from replay.mcap.seal import CONTENTS
-from replay.mcap.sealed_file import SealedFile
+from replay.mcap.event_messages import archive_values, event_values
+from replay.mcap.foxglove_messages import CLOUDS, FOXGLOVE, POINT_CLASSES, log_line, point_cloud
+from replay.mcap.schemas import BEFORE_ALL_STEPS, MESH, PROFILE, RECORDS, SDF_GRID, STEP_TIME
 from replay.mcap.validation import EventOrder
 from replay.mcap.viewer_messages import STARTING_EMPTY, Views, empty_cloud
+
+_CHUNK_SIZE = 8 * 2**20  # bytes: flushing ends a chunk after every probe, well before this
+_LIBRARY = "chsel-replay"  # without versions of packages, which stand in the session's environment
 
 
 class McapRecorder(Recorder):
@@ -55,8 +59,8 @@ class McapRecorder(Recorder):
     """
 
     def __init__(self, path: str | Path) -> None:
-        self._file = SealedFile(Path(path))
-        self._contents = Contents()
+        self._path = Path(path)
+        self._closed = False
         self._order = EventOrder()
         self._views = Views()
         self._points: GrowingPoints | None = None  # all that is known, once a session has started
@@ -64,52 +68,56 @@ class McapRecorder(Recorder):
         self._offered: ActionsOffered | None = None
         self._last_snapshot: SnapshotTaken | None = None
         self._last_elites: FloatArray | None = None
-
-    @property
-    def digest(self) -> str:
-        """The digest of all that is sealed so far: of the recording, once it is closed."""
-        return self._file.chain.last
+        self._count = 0  # messages written so far
+        self._channels: dict[str, int] = {}  # by topic
+        with self._writing():
+            self._file = self._path.open("xb")
+            self._writer = Writer(
+                self._file,
+                chunk_size=_CHUNK_SIZE,
+                compression=CompressionType.ZSTD,
+                enable_crcs=True,
+                enable_data_crcs=True,
+            )
+            self._writer.start(profile=PROFILE, library=_LIBRARY)
 
     def record(self, event: Event) -> None:
         """Write one event: its messages, then those for viewers."""
-        path = self._file.path
-        if self._file.closed:
-            raise RecordingError(f"recording {path} is closed")
+        if self._closed:
+            raise RecordingError(f"recording {self._path} is closed")
         if not isinstance(event, Event):
             raise RecordingError(f"{type(event).__name__} is not an event of a session")
         if isinstance(event, SessionStarted) is not (self._points is None):
-            raise RecordingError(f"recording {path} needs one SessionStarted, as first event")
-        with self._file.writing():
+            raise RecordingError(f"recording {self._path} needs one SessionStarted, as first event")
+        with self._writing():
             self._order.take(event.topic, event.step)
-            if event.step > self._file.step:
-                self._file.seal()
             self._write(event)
             for topic, make in self._views.after(event):
-                self._file.add(topic, event.step, make)
+                self._add(topic, event.step, make)
             if isinstance(event, SessionStarted | RigDescribed | ActionsOffered):
-                self._file.end_chunk()  # so that it is read, or lost, apart from what follows
-        self._contents.take(event)
+                self._writer.flush()  # so that it is read, or lost, apart from what follows
 
     def flush(self) -> None:
         """End the chunk in progress and hand it to the operating system."""
-        if not self._file.closed:
-            with self._file.writing():
-                self._file.end_chunk()
-                self._file.check_in_place()
+        if not self._closed:
+            with self._writing():
+                self._writer.flush()
+                self._check_in_place()
 
     def close(self) -> None:
-        """Write contents and checksums, and wait until all is on the disk.
+        """Write index and checksums, and wait until all is on the disk.
 
         Until then, and after a failure, the file is unfinished.
         """
-        if not self._file.closed:
-            with self._file.writing():
-                if self._points is not None:
-                    self._file.seal()
-                    chain = self._file.chain
-                    ends = {"session": chain.session, "digest": chain.last}
-                    self._record(CONTENTS, self._file.step, self._contents.values() | ends)
-                self._file.finish()
+        if not self._closed:
+            with self._writing():
+                self._writer.finish()
+                self._file.flush()
+                self._check_in_place()
+                os.fsync(self._file.fileno())
+                self._file.close()
+                self._closed = True
+                sync_folder(self._path.parent)
 
     def _write(self, event: Event) -> None:
         match event:
@@ -121,7 +129,8 @@ class McapRecorder(Recorder):
             case ProblemPosed():
                 self._write_problem(event)
             case ActionsOffered():
-                self._write_actions(event)
+                self._record(event.topic, event.step, event_values(event))
+                self._offered = event
             case Decided():
                 self._write_decision(event)
             case SnapshotTaken():
@@ -130,22 +139,20 @@ class McapRecorder(Recorder):
             case HypothesesFound():
                 self._write_hypotheses(event)
             case Logged():
-                self._file.add(event.topic, event.step, partial(log_line, event.level, event.text))
+                self._add(event.topic, event.step, partial(log_line, event.level, event.text))
             case _:
                 self._record(event.topic, event.step, event_values(event))
 
     def _write_session(self, event: SessionStarted) -> None:
         values = event_values(event)
         check_message("Session", values)
-        self._file.describe(version_of(event))
-        if not is_lost(event.mesh):
-            self._file.attach(MESH, mesh_to_ply(event.mesh))
-        if not is_lost(event.sdf):
-            self._file.attach(SDF_GRID, sdf_to_bytes(event.sdf))
+        self._describe_topics()
+        for name, data in ((MESH, mesh_to_ply(event.mesh)), (SDF_GRID, sdf_to_bytes(event.sdf))):
+            self._writer.add_attachment(0, 0, name, MEDIA_TYPES[name], data)
         self._start = event
         self._record(event.topic, event.step, values)
         for topic in STARTING_EMPTY:
-            self._file.add(topic, event.step, empty_cloud)
+            self._add(topic, event.step, empty_cloud)
         self._points = GrowingPoints(KnownPoints())
         self._write_points(event.step, event.initial_points)
 
@@ -155,11 +162,11 @@ class McapRecorder(Recorder):
         known = np.column_stack([new.known, new.sdf])
         for topic, points in zip(CLOUDS, (new.free, new.occupied, known), strict=True):
             if len(points) > 0:
-                self._file.add(topic, step, partial(point_cloud, points))
+                self._add(topic, step, partial(point_cloud, points))
         self._points.add(new)
         values = {name: getattr(self._points, name) for name in POINT_CLASSES}
         values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
-        values |= {"step": step, "new_digest": new.digest, "digest": ""}
+        values |= {"step": step, "new_digest": new.digest}
         self._record("/known_points", step, values)
 
     def _write_problem(self, event: ProblemPosed) -> None:
@@ -173,16 +180,6 @@ class McapRecorder(Recorder):
         if self._last_elites is not None and same_bits(problem.low_cost_set, self._last_elites):
             values["low_cost_set"] = None
         self._record(event.topic, event.step, values)
-
-    def _write_actions(self, event: ActionsOffered) -> None:
-        assert self._start is not None
-        if not is_steered(self._start):
-            raise RecordingError(
-                "the session offers actions but has no policy; accepted: a configuration with a "
-                "group policy"
-            )
-        self._record(event.topic, event.step, event_values(event))
-        self._offered = event
 
     def _write_decision(self, event: Decided) -> None:
         problem, start, offered = event.problem, self._start, self._offered
@@ -229,4 +226,54 @@ class McapRecorder(Recorder):
         """
         check_message(RECORDS[topic], values | repeated)
         data = encode(RECORDS[topic], values)
-        self._file.add(topic, step, lambda time: data)
+        self._add(topic, step, lambda time: data)
+
+    def _add(self, topic: str, step: int, make: Callable[[int], bytes]) -> None:
+        """Write a message of a step; make: its bytes, from its log time."""
+        time = (step - BEFORE_ALL_STEPS) * STEP_TIME + self._count
+        self._writer.add_message(
+            self._channels[topic], time, make(time), time, sequence=self._count
+        )
+        self._count += 1
+
+    def _describe_topics(self) -> None:
+        """Describe all topics, used or not, and the attachments."""
+        topics: dict[str, Any] = {topic: message_class(name) for topic, name in RECORDS.items()}
+        schemas: dict[str, int] = {}
+
+        def schema(kind: Any) -> int:
+            name = kind.DESCRIPTOR.full_name
+            if name not in schemas:
+                described = descriptor_set(kind)
+                schemas[name] = self._writer.register_schema(name, "protobuf", described)
+            return schemas[name]
+
+        for topic, kind in {**topics, **FOXGLOVE}.items():
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema(kind))
+        schema(message_class("SdfGrid"))
+
+    def _check_in_place(self) -> None:
+        """Raise RecordingError if nobody will find what is written: the file has no name left."""
+        if os.fstat(self._file.fileno()).st_nlink == 0:
+            self._abandon()
+            raise RecordingError(f"recording {self._path} was removed while it was written")
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Turn errors of the disk into one RecordingError; leave the file alone after any break."""
+        try:
+            yield
+        except OSError as error:
+            self._abandon()
+            reason = error.strerror or str(error)
+            raise RecordingError(f"recording {self._path} cannot be written: {reason}") from error
+        except KeyboardInterrupt:
+            self._abandon()  # it may have come within a record
+            raise
+
+    def _abandon(self) -> None:
+        """Close the file as it stands: unfinished, whole up to the last flush."""
+        self._closed = True
+        if hasattr(self, "_file"):
+            with suppress(OSError):
+                self._file.close()

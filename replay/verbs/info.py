@@ -1,6 +1,6 @@
 """Show what is in recordings: session, steps, points, results, sizes, versions, integrity.
 
-Of MCAP files of other programs, such as robots' logs: topics, types, counts, rates, frames.
+Of MCAP files of other programs, such as robots' logs: topics, types, counts, rates.
 Status 0 if all files are whole, 1 if one is unfinished or damaged, 2 if one cannot be used.
 """
 
@@ -18,19 +18,17 @@ from rich.table import Table
 
 from chsel.errors import RecordingError, SessionError
 from replay.console import Console, plain_table, print_error
+from replay.content.log_info import LogInfo, is_other_programs, log_info
 from replay.content.recording_info import RecordingInfo, recording_info
-from replay.raw.log_display import fact_table, log_overview, show_log
-from replay.raw.log_info import LogInfo, is_other_programs, log_info
 
 _IN_FULL = 3  # files; of more, each is a line
 _EITHER_END = 5  # steps that are shown of many
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, how thoroughly, how much, and as what."""
+    """Files, how much, and as what."""
     parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or any MCAP files")
-    parser.add_argument("--check", action="store_true", help="read everything, check every digest")
-    parser.add_argument("--steps", action="store_true", help="show all steps or topics")
+    parser.add_argument("--steps", action="store_true", help="show all steps")
     parser.add_argument("--json", action="store_true", help="print all as one JSON document")
 
 
@@ -41,8 +39,7 @@ def run(given: argparse.Namespace) -> int:
     status = 0
     for file in given.files:
         try:
-            read = log_info if is_other_programs(file) else recording_info
-            info = read(file, check=given.check)
+            info = log_info(file) if is_other_programs(file) else recording_info(file)
         except (RecordingError, SessionError) as error:
             print_error(str(error))
             documents.append({"path": file, "error": str(error)})
@@ -68,9 +65,10 @@ def _show(
             continue
         console.print(str(info.path), style="bold", soft_wrap=True)
         if isinstance(info, LogInfo):
-            show_log(console, info, all_=all_)
+            console.print(_fact_table(_log_facts(info)))
+            console.print(_topic_table(info))
             continue
-        console.print(_facts(info))
+        console.print(_fact_table(_facts(info)))
         if info.steps:
             console.print(_step_table(info.steps, all_=all_))
 
@@ -78,7 +76,9 @@ def _show(
 def _overview(info: RecordingInfo | LogInfo) -> str:
     """One line about a file."""
     if isinstance(info, LogInfo):
-        return log_overview(info)
+        facts = [f"{len(info.topics)} topics, {info.count} messages", f"{info.seconds:.3f} s"]
+        facts += [decimal(info.size), info.damage or "whole"]
+        return f"{info.path}: log of another program, {', '.join(facts)}"
     session = info.session
     facts = [
         f"{session['object']}, {session['session']}, {session['method']}",
@@ -89,13 +89,44 @@ def _overview(info: RecordingInfo | LogInfo) -> str:
     return f"{info.path}: {', '.join(facts)}"
 
 
-def _facts(info: RecordingInfo) -> Table:
+def _log_facts(info: LogInfo) -> dict[str, str]:
+    return {
+        "kind": "log of another program; not a recording of a session",
+        "time": f"{info.span}, {info.seconds:.3f} s" if info.count else "",
+        "messages": f"{info.count} on {len(info.topics)} topics",
+        "size": decimal(info.size),
+        "integrity": info.damage or "",
+    }
+
+
+def _topic_table(info: LogInfo) -> Table:
+    table = plain_table("", texts=("topic", "type"), numbers=("messages", "Hz"))
+    for channel, count in info.topics:
+        rate = info.rate(count)
+        usual = channel.encoding in ("cdr", "protobuf")
+        kind = channel.schema if usual else f"{channel.schema} ({channel.encoding})".strip()
+        table.add_row(channel.topic, kind, str(count), "" if rate is None else f"{rate:.4g}")
+    return table
+
+
+def _fact_table(facts: Mapping[str, str]) -> Table:
+    """Names and what they are, without those of which nothing is known."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, fact in facts.items():
+        if fact:
+            table.add_row(f"  {name}", fact)
+    return table
+
+
+def _facts(info: RecordingInfo) -> dict[str, str]:
     """Names and what they are, but for the steps."""
     session = info.session
     preset = f", preset {session['preset']}" if session["preset"] else ""
     counts = f"probes {len(info.steps)}, registrations {info.registrations}"
     files = ", ".join(f"{name} {decimal(size)}" for name, size in info.attachments.items())
-    facts = {
+    return {
         "object": session["object"],
         "session": f"{session['session']}, runner {session['runner']}; {counts}",
         "method": f"{session['method']}{preset}, seed {session['seed']}",
@@ -104,7 +135,6 @@ def _facts(info: RecordingInfo) -> Table:
         "rig": "" if info.rig is None else f"{info.rig['name']}, raw log {info.rig['source']}",
         "true pose": "known" if session["true_pose"] else "unknown",
         "outcome": info.outcome or "unknown: the session did not end",
-        "lost": ", ".join(session["lost"]),
         "size": f"{decimal(info.size)}, of that, uncompressed: {files}",
         "messages": _messages(info),
         "environment": _environment(session["environment"]),
@@ -112,7 +142,6 @@ def _facts(info: RecordingInfo) -> Table:
         "digest": info.digest,
         "integrity": info.integrity,
     }
-    return fact_table(facts)
 
 
 def _policy(info: RecordingInfo) -> str:
@@ -128,12 +157,8 @@ def _policy(info: RecordingInfo) -> str:
 
 
 def _messages(info: RecordingInfo) -> str:
-    """How many on each topic, with bytes where they are known, the most first."""
-    counts = _grouped(info.messages)
-    if info.message_bytes is None:
-        ordered = sorted(counts.items(), key=lambda item: -item[1])
-        return ", ".join(f"{count} {topic}" for topic, count in ordered)
-    sizes = _grouped(info.message_bytes)
+    """How many on each topic, with their bytes, the most first."""
+    counts, sizes = _grouped(info.messages), _grouped(info.message_bytes)
     return ", ".join(
         f"{counts[topic]} {topic} ({decimal(size)})"
         for topic, size in sorted(sizes.items(), key=lambda item: -item[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,16 +17,16 @@ from chsel.methods import METHODS, default_method, preset_settings
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
-from runners.command.arguments import hydra_arguments
+from runners.objects.loader import OBJECTS
+from runners.objects.scans import URL
+from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
+from runners.sessions import SESSIONS
 from runners.sessions.faults import CLEAN, LEVELS
 from runners.sessions.probing_settings import ProbingSettings
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
-NESTED_GROUPS = (
-    "session/rig",
-    "session/faults",
-)  # choices of their own, not options of the group around them
+_OWN_GROUPS = ("presets", "rig", "faults")  # not options of the group around them
 
 
 def calls_for_anchored(session: str, policy: str) -> str:
@@ -39,24 +40,24 @@ def _method(session: str, policy: str, preset: str) -> str:
     return default_method(preset) if calls_for_anchored(session, policy) else "chsel"
 
 
-# Here, as processes of launchers compose configurations and have no more than the imports.
-OmegaConf.register_new_resolver("default_method", _method, replace=True)
-
-
-def prepared(config_name: str, words: list[str]) -> list[str]:
-    """The arguments of a command as Hydra takes them, which has all choices to choose from."""
-    store_choices()
-    OmegaConf.register_new_resolver("options", _options, replace=True)
-    return hydra_arguments(config_name, words)
-
-
 @cache
 def store_choices() -> None:
-    """Offer presets, methods, policies, definitions, simulated sessions and their faults, by name.
-
-    Once in a process.
-    session/presets/rig/default has all keys of a rig, so that each can be changed by its name.
-    """
+    """Offer all that the code knows by name, with its settings. Once in a process."""
+    _store("", "base", {"hydra": {"output_subdir": None, "run": {"dir": "."}}}, package="_global_")
+    assets = '${oc.env:CHSEL_ASSETS,"~/.cache/chsel/ycb"}'
+    _store("assets", "default", {"dir": assets, "url": URL})
+    for choice, config in OBJECTS.items():
+        group, _, name = f"object/{choice}".rpartition("/")
+        _store(group, name, settings_mapping(config), package="object")
+    mesh = {"name": "mesh", "kind": "file", "scale": 1.0, "epsilon": 0.001, "scan": None}
+    _store("object", "mesh", {**mesh, "configuration": "drill", "path": None})
+    for name, written in (
+        ("both", RecordingConfig()),
+        ("mcap", RecordingConfig(rerun=False)),
+        ("rerun", RecordingConfig(mcap=False)),
+        ("none", RecordingConfig(mcap=False, rerun=False)),
+    ):
+        _store("recording", name, settings_mapping(written))
     for preset in PRESETS:
         _store("preset", preset, {"name": preset})
     for method in METHODS:
@@ -64,20 +65,42 @@ def store_choices() -> None:
     for policy in POLICIES:
         with suppress(SettingError):  # of an installed policy; who chooses it gets the message
             _store("policy", policy, {"name": policy, **settings_mapping(policy_settings(policy))})
+    for name in DEFINITIONS:
+        values = settings_mapping(plausible_settings(name, 1.0))
+        # None: that of the object.
+        _store("definition", name, {"name": name, **values, "epsilon": None})
+    _store_sessions()
+
+
+def _store_sessions() -> None:
+    """session/presets/rig/default has all keys of a rig, so that each can be changed by name."""
     for kind in ("simulated", "kinematic"):  # in PyBullet, and by geometry without an engine
         # configuration: a key of the top file, for short commands
         node = {"kind": kind, "configuration": "${configuration}"}
         settings = partial(in_preset, ProbingSettings())
         _store_with_presets("session", kind, settings, node, {"faults": CLEAN})
+    for kind, settings_class in SESSIONS.items():
+        if settings_class is not ProbingSettings:
+            values: dict[str, Any] = {"kind": kind, **_defaults(settings_class)}
+            if kind == "sensors":
+                values["defaults"] = [{"presets/rig@rig": "default"}, {"rig": "cabinet"}, "_self_"]
+            _store("session", kind, values)
     for level, faults in LEVELS.items():
         _store("session/faults", level, settings_mapping(faults))
-    for name in DEFINITIONS:
-        values = settings_mapping(plausible_settings(name, 1.0))
-        # None: that of the object.
-        _store("definition", name, {"name": name, **values, "epsilon": None})
     rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out
     del rig["name"], rig["world"]
     _store("session/presets/rig", "default", rig)
+
+
+def _defaults(settings: type) -> dict[str, Any]:
+    """The defaults of the fields of a dataclass that have any."""
+    found = {}
+    for field in fields(settings):
+        make = field.default_factory
+        value = field.default if make is MISSING else make()
+        if value is not MISSING:
+            found[field.name] = asdict(value) if is_dataclass(value) else value  # type: ignore[arg-type]
+    return found
 
 
 def _store_with_presets(
@@ -99,30 +122,30 @@ def _store_with_presets(
     _store(group, name, node)
 
 
-def _store(group: str, name: str, node: dict[str, Any]) -> None:
-    ConfigStore.instance().store(group=group, name=name, node=node)
-
-
-def choices(group: str) -> list[str]:
-    """The options of a group: the files of conf/, of nested folders with their path, and more.
-
-    These are what `store_choices` offers, such as methods.
-    """
-    folder = CONF / group
-    nested = [CONF / name for name in NESTED_GROUPS if name != group]
-    files = [file.relative_to(folder) for file in folder.rglob("*.yaml")]
-    names = [
-        str(file.with_suffix(""))
-        for file in files
-        if not any((folder / file).is_relative_to(other) for other in nested)
-    ]
-    stored = ConfigStore.instance().repo
-    for part in group.split("/"):
-        stored = stored.get(part, {})
-    names += [Path(name).stem for name in stored if name.endswith(".yaml")]
-    return sorted(names, key=lambda name: (name.count("/"), name))
+def _store(group: str, name: str, node: dict[str, Any], package: str | None = None) -> None:
+    ConfigStore.instance().store(name, node, group or None, package)
 
 
 def _options(*groups: str) -> str:
     """What the help texts in conf/ use: ${options:object,session} lists the options of groups."""
-    return "\n".join(f"  {group}={'|'.join(choices(group))}" for group in groups)
+    return "\n".join(f"  {group}={'|'.join(_choices(group))}" for group in groups)
+
+
+def _choices(group: str) -> list[str]:
+    """The options of a group: files of conf/, and what is stored, also one folder below."""
+    stored = ConfigStore.instance().repo
+    for part in group.split("/"):
+        stored = stored.get(part, {})
+    names = [file.stem for file in (CONF / group).glob("*.yaml")]
+    for name, option in stored.items():
+        if not isinstance(option, dict):
+            names.append(Path(name).stem)
+        elif name not in _OWN_GROUPS:
+            names += [f"{name}/{Path(nested).stem}" for nested in option]
+    return sorted(names, key=lambda name: (name.count("/"), name))
+
+
+# Here, as processes of launchers compose configurations and have no more than the imports.
+OmegaConf.register_new_resolver("default_method", _method, replace=True)
+OmegaConf.register_new_resolver("options", _options, replace=True)
+store_choices()

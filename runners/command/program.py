@@ -8,21 +8,20 @@ import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from importlib import import_module
+from string import Template
 from typing import Any
 
 import hydra
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from chsel.errors import ChselError
 from replay.console import print_error, print_page, print_warning
-from replay.startup import ready
-from runners.command.arguments import TRACEBACK
-from runners.command.at_once import asks_for_help, help_text
-from runners.command.choices import CONF, prepared
+from replay.startup import package_version, ready
+from runners.command.arguments import TRACEBACK, hydra_arguments
+from runners.command.choices import CONF
 from runners.command.error_message import error_message
 
 _USER_ERRORS = (ChselError, HydraException, OmegaConfBaseException, OSError)
@@ -38,26 +37,19 @@ def command(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callab
     def decorate(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         def program() -> None:
             ready()
+            if "--version" in sys.argv:
+                print_page(f"chsel-replay {package_version()}")
+                return
             show_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1" or TRACEBACK in sys.argv
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them
             warnings.showwarning = print_warning
             job = _Job(_importable(main), config_name, show_traceback)
-            _exit_on_error(partial(_start, job), config_name, show_traceback)
+            _exit_on_error(job.start, config_name, show_traceback)
 
         program.main = main  # type: ignore[attr-defined]
         return program
 
     return decorate
-
-
-def _start(job: _Job) -> None:
-    """Print the help of a command, or have Hydra run it once or, as a sweep, many times."""
-    words = prepared(job.config_name, sys.argv[1:])
-    if asks_for_help(words):
-        print_page(help_text(job.config_name, words))
-        return
-    sys.argv[1:] = words  # where hydra.main takes them from; no other call of it runs sweeps
-    hydra.main(version_base="1.3", config_path=str(CONF), config_name=job.config_name)(job)()
 
 
 @dataclass(frozen=True)
@@ -69,6 +61,15 @@ class _Job:
     show_traceback: bool
     process: int = field(default_factory=os.getpid)
 
+    def start(self) -> None:
+        """Have Hydra run it once or, as a sweep, many times, or print its help."""
+        words = hydra_arguments(self.config_name, sys.argv[1:])
+        if {"--help", "-h"}.intersection(words):
+            print_page(_help(self.config_name, words))
+            return
+        sys.argv[1:] = words  # where hydra.main takes them from
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=self.config_name)(self)()
+
     def __call__(self, config: DictConfig) -> None:
         main = import_module(self.module).main.main
         if os.getpid() == self.process:
@@ -78,6 +79,20 @@ class _Job:
             # Joblib's name for how it started this process says nothing to those started from it.
             multiprocessing.set_start_method("spawn", force=True)
             main(config)  # the process that waits for it reports what it raises
+
+
+def _help(config_name: str, words: list[str]) -> str:
+    """The help of a command, with the settings among its words.
+
+    Hydra's own would list all options of all groups, those of presets included, for 20 seconds.
+    """
+    settings = [word for word in words if not word.startswith("-")]
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        config = hydra.compose(config_name, settings, return_hydra_config=True)
+    template = Template(config.hydra.help.template)
+    with open_dict(config):
+        del config["hydra"]
+    return template.safe_substitute(CONFIG=OmegaConf.to_yaml(config))
 
 
 def _importable(main: Callable[[DictConfig], None]) -> str:

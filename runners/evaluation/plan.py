@@ -40,7 +40,7 @@ OWN = "own"
 OUTSIDE = "outside"
 """What the table has for a preset of hypothesis sets from elsewhere."""
 OBJECTS = {"models": "", "scans": "ycb/"}
-"""Folders of conf/object by the name of what is in them."""
+"""Of the names of objects, by what `objects` says they are."""
 
 
 @dataclass(frozen=True, eq=False)

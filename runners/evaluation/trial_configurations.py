@@ -10,9 +10,8 @@ from typing import Any
 import yaml
 
 from chsel.errors import SettingError
-from chsel.problem.settings import build_settings
-from runners.command.choices import CONF
-from runners.objects.loader import ObjectConfig
+from chsel.problem.settings import build_settings, settings_mapping
+from runners.objects.loader import OBJECTS, ObjectConfig
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.faults import CLEAN, LEVELS
 from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
@@ -20,7 +19,7 @@ from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
 SENSORS = "sensors"
 MOST_PROBES = 1_000
 OBJECT_FILE = "object.yaml"
-_ACCEPTED = "accepted: a name of conf/object, with any other of its keys, such as name: drill"
+_ACCEPTED = "accepted: a choice of object=, with any other of its keys, such as name: drill"
 
 
 @dataclass(frozen=True)
@@ -79,25 +78,25 @@ def faulty_name(configuration: str, level: str) -> str:
 
 
 def object_values(name: str) -> dict[str, Any]:
-    """What conf/object/NAME.yaml says."""
-    path = CONF / "object" / f"{name}.yaml"
-    if not path.is_file():
-        known = sorted(str(file.relative_to(path.parent).with_suffix("")) for file in _objects())
-        raise SettingError(f"object {name!r} does not exist; accepted: {', '.join(known)}")
-    return dict(yaml.safe_load(path.read_text()))
+    """What the choice object=NAME says."""
+    if name not in OBJECTS:
+        raise SettingError(
+            f"object {name!r} does not exist; accepted: {', '.join(sorted(OBJECTS))}"
+        )
+    return settings_mapping(OBJECTS[name])
 
 
 def recorded_object(configuration: TrialConfiguration) -> ObjectConfig:
     """The object of a folder of logs, at its real size unless its file gives another scale.
 
     `name` alone, of a model of our own (or `ycb/NAME` of a scan), or with other keys of
-    conf/object; a `path` is relative to the folder. Raises SettingError for anything else.
+    the object; a `path` is relative to the folder. Raises SettingError for anything else.
     """
     assert configuration.log_folder is not None
     file = configuration.log_folder / OBJECT_FILE
     given = _object_file(file)
     name = str(given["name"])
-    known = name in {str(path.relative_to(CONF / "object").with_suffix("")) for path in _objects()}
+    known = name in OBJECTS
     values = object_values(name) if known else {"kind": "file", "epsilon": 0.001}
     values |= {"scale": 1.0, "configuration": configuration.name}
     values |= {**given, "name": values.get("name", name)}
@@ -123,7 +122,3 @@ def _object_file(path: Path) -> Mapping[str, Any]:
     if not isinstance(values, dict) or not isinstance(values.get("name"), str):
         raise SettingError(f"{path} has no name; {_ACCEPTED}")
     return {str(key): value for key, value in values.items()}
-
-
-def _objects() -> list[Path]:
-    return list((CONF / "object").rglob("*.yaml"))

@@ -11,10 +11,10 @@ import numpy as np
 
 from chsel.errors import MeshWarning, SettingError, require_choice, require_positive
 from chsel.problem.defaults import object_grid
-from chsel.problem.mesh import clean_mesh, load_mesh
+from chsel.problem.mesh import load_mesh
 from chsel.problem.points import Workspace
 from chsel.problem.sdf_grid import SdfGrid
-from runners.objects.scans import scan_file
+from runners.objects.scans import SCANS, scan_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -42,6 +42,24 @@ class ObjectConfig:
             raise SettingError("path is missing; pass object.path=FILE, a mesh file")
         if self.kind == "scan" and not self.scan:
             raise SettingError("scan is missing; pass object.scan=FOLDER, such as 035_power_drill")
+
+
+_TRIALS = {
+    "drill": (2.5, 0.001, "drill"),
+    "mustard": (2.5, 0.0003, "mustard"),
+    "hammer": (2.5, 0.001, "hammer"),
+    "cracker_box": (1.5, 0.0005, "box"),
+    "spam_can": (2.5, 0.0003, "can"),
+    "clamp": (5.0, 0.0007, "clamp"),
+}
+"""Scale, epsilon and configuration of the objects in the paper's trials."""
+MODELS = tuple(_TRIALS)
+"""Our own models of these objects of the YCB Object and Model Set, files in `models/`."""
+OBJECTS = {name: ObjectConfig(name, *trial) for name, trial in _TRIALS.items()} | {
+    f"ycb/{name}": ObjectConfig(name, *_TRIALS[name], kind="scan", scan=scan)
+    for scan, (name, _) in SCANS.items()
+}
+"""The choices of `object=` but for mesh files."""
 
 
 class GridSettings(Protocol):
@@ -115,13 +133,15 @@ def check_size(model: ObjectModel, workspace: Workspace) -> list[MeshWarning]:
     return [MeshWarning("object_size", text)]
 
 
+def load_model(name: str, scale: float = 1.0) -> trimesh.Trimesh:
+    """One of MODELS in the frame of its YCB mesh; metres at scale 1."""
+    require_choice("object.name", name, MODELS)
+    return load_mesh(Path(__file__).parent / "models" / f"{name}.ply", scale=scale)
+
+
 def _load(config: ObjectConfig, assets: Path) -> trimesh.Trimesh:
     if config.kind == "file":
         return load_mesh(config.path or "", scale=config.scale)
     if config.kind == "scan":
         return load_mesh(scan_file(assets, config.scan or ""), scale=config.scale)
-    from runners.objects.models import MODELS  # takes manifold3d, which scans and files do not
-
-    require_choice("object.name", config.name, MODELS)
-    model = MODELS[config.name]()
-    return clean_mesh(model.vertices, model.faces, name=f"model {config.name}", scale=config.scale)
+    return load_model(config.name, config.scale)

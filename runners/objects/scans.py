@@ -1,16 +1,21 @@
-"""Scans of the YCB Object and Model Set: where they lie, and what they have to look like."""
+"""Scans of the YCB Object and Model Set: where they lie, what they must be, and their download."""
 
 from __future__ import annotations
 
+import os
 import re
+import tarfile
+import tempfile
 import warnings
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, cast
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from chsel.errors import MeshError, SettingError
+from chsel.errors import ChselError, MeshError, SettingError
 from chsel.problem.mesh import load_mesh
 
 # By official folder: the choice's name, and the scan's extents in metres.
@@ -23,8 +28,14 @@ SCANS = {
     "050_medium_clamp": ("clamp", (0.0435, 0.0625, 0.0835)),
 }
 EXTENT_TOLERANCE = 0.01  # of the expected extent
+URL = "http://ycb-benchmarks.s3-website-us-east-1.amazonaws.com/data/google"
+TIMEOUT = 30.0  # seconds without a byte of a download
 RESOLUTION = "google_16k"
 MESH_FILE = "nontextured.ply"
+
+
+class DownloadError(ChselError):
+    """A scan could not be downloaded, or is not what was asked for."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +97,38 @@ def check_scan(path: Path, scan: str) -> str:
             f"expected: {_millimetres(expected)}, to 1 % along each axis"
         )
     return f"{len(mesh.vertices)} vertices, {_millimetres(extents)}, watertight"
+
+
+def download_scan(scan: str, assets: AssetsConfig) -> str:
+    """Download a scan, check and place it; what it is, in one line.
+
+    Of the archive only the mesh is unpacked. Raises DownloadError, and leaves nothing, if the
+    archive cannot be had or its mesh is not the scan.
+    """
+    import pooch
+
+    pooch.get_logger().setLevel("ERROR")
+    url, folder = assets.archive_url(scan), scan_folder(assets.folder, scan)
+    assets.folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=assets.folder, prefix=".download_") as temporary:
+        downloader = pooch.HTTPDownloader(timeout=TIMEOUT)
+        try:
+            archive = pooch.retrieve(url, None, path=temporary, downloader=downloader)
+        except OSError as error:
+            reason = " ".join(str(error).split())
+            raise DownloadError(f"{url} cannot be downloaded ({reason}); try again") from None
+        mesh, wanted = Path(temporary) / MESH_FILE, Path(scan, RESOLUTION, MESH_FILE)
+        try:
+            with tarfile.open(archive, "r:gz") as tar:
+                found = [one for one in tar if Path(one.name) == wanted and one.isfile()]
+                for member in found[:1]:
+                    mesh.write_bytes(cast(IO[bytes], tar.extractfile(member)).read())
+            described = check_scan(mesh, scan)
+        except (tarfile.TarError, zlib.error, EOFError, OSError, MeshError) as error:
+            raise DownloadError(f"{url} is not the archive of the scan: {error}") from None
+        folder.mkdir(parents=True)
+        os.replace(mesh, folder / MESH_FILE)
+    return described
 
 
 def _require_web_address(name: str, url: str) -> None:

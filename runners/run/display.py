@@ -12,16 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.filesize import decimal
 from rich.progress import BarColumn, TimeElapsedColumn
 from rich.table import Table
 
 from chsel.errors import InputWarning
+from chsel.numerics.compiler import watched
 from chsel.policies.steering import Steering
 from chsel.problem.poses import quaternions
 from chsel.problem.registration_problem import Trust
-from replay.console import Console, Progress, TextColumn
+from replay.console import Console, Progress, TextColumn, plain_table
 from runners.run.session_run import FROM_SESSION, StepWarning
 from runners.sensors.session_report import Counts, Report
 
@@ -31,29 +31,68 @@ MEANINGS = {
     "wide": "many poses explain the points; probe further sides",
     "nothing fits": "no pose explains the points; see the warning",
 }
-
-
 STOPPED = {
     "spread": "the plausible poses are as close together as policy.stop.spread asks for",
     "gain": "no probe promises to bring them closer by policy.stop.gain",
     "actions": "no probe is left that can be made",
     "budget": "policy.probes allows no more",
 }
+_LEFT_OUT = {
+    "no pose": "lost",
+    "bad": "unusable",
+    "outline": "outline",
+    "small": "small",
+    "far": "far",
+    "spikes": "spikes",
+    "out of reach": "outside",
+    "points": "contacts",
+    "new voxels": "free",
+}
+"""Columns of the table of sensors that are counts, by their fields of `Counts`."""
+
+
+def counting_bar(console: Console) -> Progress:
+    """A bar for a terminal that shows how much is done, and is gone as soon as it is."""
+    return Progress(
+        TextColumn("  {task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+
+
+@contextmanager
+def compiling_line() -> Iterator[None]:
+    """Within this context, kernels that are compiled are counted on a line that stays.
+
+    Where all are on disk, there is none.
+    """
+    counted = TextColumn("compiling kernels, once: {task.completed} compiled,")
+    progress = Progress(counted, TimeElapsedColumn(), console=Console())
+
+    def show(count: int) -> None:
+        if not progress.tasks:
+            progress.add_task("", total=None)
+            progress.start()
+        progress.update(progress.task_ids[0], completed=count)
+
+    with watched(show):
+        try:
+            yield
+        finally:
+            if progress.tasks:
+                progress.stop_task(progress.task_ids[0])
+                progress.stop()
 
 
 class Bar:
-    """What is being done, and how much of it is done; gone as soon as it is."""
+    """What is being done, and how much of it is done."""
 
     def __init__(self, console: Console) -> None:
-        self._progress = Progress(
-            TextColumn("  {task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed}/{task.total}"),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
+        self._progress = counting_bar(console)
         self._task: Any = None
 
     def show(self, stage: str, done: int, total: int) -> None:
@@ -125,7 +164,7 @@ class Display:
         for warning in warnings:
             if warning.code not in self._warned:
                 self._warned.add(warning.code)
-                self._line("warning", warning.text)
+                self.say(f"warning: {warning.text}")
 
     def say(self, text: str) -> None:
         """A line of its own."""
@@ -144,11 +183,8 @@ class Display:
                 "; errors to the true pose modulo the object's symmetries, at its centre: "
                 "best hypothesis, closest one by its surface"
             )
-        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
-        names = ["probe", "contacts", "best cost"]
         errors = ["mm", "°", "mm", "°"] if truth else []
-        for name in [*names, *errors, "time"]:
-            table.add_column(name, justify="right")
+        table = plain_table(title, numbers=["probe", "contacts", "best cost", *errors, "time"])
         table.add_column("verdict", no_wrap=True)
         for row in rows:
             cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
@@ -163,7 +199,7 @@ class Display:
         if report.by_probe:
             self._console.print(_sensor_table(report))
         for level, text in report.lines:
-            self._line(level, text)
+            self.say(f"warning: {text}" if level == "warning" else text)
 
     def written(self, folder: Path, files: Mapping[str, int]) -> None:
         """What lies in the run's folder, and how to look at it; paths on lines of their own."""
@@ -204,10 +240,6 @@ class Display:
         """Give the terminal back."""
         self._bar.clear()
 
-    def _line(self, level: str, text: str) -> None:
-        line = f"warning: {text}" if level == "warning" else text
-        self._console.print(line)
-
 
 def _program(name: str) -> str:
     """How to start a program of this environment from here."""
@@ -226,25 +258,14 @@ def _sensor_table(report: Report) -> Table:
         rows += [("" if k else str(step), *entry) for k, entry in enumerate(used)]
     columns = {
         "used": [f"{counts.used}/{counts.images}" for _, _, counts in rows],
-        "no pose": [str(counts.lost or "") for _, _, counts in rows],
-        "bad": [str(counts.unusable or "") for _, _, counts in rows],
         "invalid": [_share(counts.invalid, counts.pixels) for _, _, counts in rows],
         "edge": [_share(counts.edges, counts.pixels) for _, _, counts in rows],
-        "outline": [str(counts.outline or "") for _, _, counts in rows],
-        "small": [str(counts.small or "") for _, _, counts in rows],
-        "far": [str(counts.far or "") for _, _, counts in rows],
-        "spikes": [str(counts.spikes or "") for _, _, counts in rows],
-        "out of reach": [str(counts.outside or "") for _, _, counts in rows],
-        "points": [str(counts.contacts or "") for _, _, counts in rows],
-        "new voxels": [str(counts.free or "") for _, _, counts in rows],
     }
+    for name, field in _LEFT_OUT.items():
+        columns[name] = [str(getattr(counts, field) or "") for _, _, counts in rows]
     columns = {name: cells for name, cells in columns.items() if any(cells)}
     title = "sensors; left out: invalid, edge in % of pixels, others in pixels or points"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True)
-    table.add_column("probe", justify="right")
-    table.add_column("sensor", no_wrap=True)
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
+    table = plain_table(title, texts=["probe", "sensor"], numbers=list(columns))
     for index, (step, sensor, _) in enumerate(rows):
         table.add_row(step, sensor, *(cells[index] for cells in columns.values()))
     return table

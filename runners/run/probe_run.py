@@ -12,9 +12,8 @@ from typing import Self
 
 from chsel.errors import RecordingError
 from chsel.methods.method import Method
-from replay.content.recording_info import recording_digest
 from replay.events import Logged, Recorder, SessionEnded, SessionStarted
-from replay.files import WritingError
+from replay.files import WritingError, file_digest
 from replay.registration import symmetry_for_errors
 from runners.run.display import Display
 from runners.run.recording import open_recorder, write_in_run_folder
@@ -152,6 +151,7 @@ class _Ending:
         """Write the outcome, warnings, and the numbers of every step, times included."""
         started, trust, report = self.started, self.session_run.trust, self.scene.report
         sensors = report.total().items() if report else ()
+        recording = self.folder / "recording.mcap"
         summary = {
             "runner": started.runner,
             "object": started.object,
@@ -159,7 +159,7 @@ class _Ending:
             "method": started.method,
             "seed": started.seed,
             "outcome": outcome,
-            "recording_digest": recording_digest(self.folder / "recording.mcap"),
+            "recording_digest": file_digest(recording) if recording.is_file() else None,
             "trust": None if trust is None else asdict(trust),  # of the last result
             "warnings": [asdict(warning) for warning in self.session_run.warnings],
             "sensors": {name: asdict(counts) for name, counts in sensors},

@@ -117,22 +117,22 @@ def open_scene(config: ProbeConfig, show: Progress = unwatched) -> Scene:
     kind = str(session_config.pop("kind", None))
     settings = session_settings(kind, session_config)
     policy = _policy(config.policy)
+    found: list[InputWarning] = []
+    session: Session
     if kind == "recorded":
-        recorded = RecordedSession(settings)
-        of = recorded.recorded
-        steering = _steering(policy, kind, recorded, of.sdf, config.seed)
-        start = recorded.start if policy is None else FIRST_CONTACT
-        return Scene(recorded, of.object, of.mesh, of.sdf, start, steering=steering)
-    object_model, found = _load_object(config)
-    session = open_session(kind, settings, object_model, config.seed, watcher)
-    sdf = object_model.grid(settings, watcher)
-    start = Start(settings.start_contacts, settings.start_probe)
+        session = RecordedSession(settings)
+        of, start = session.recorded, session.start
+        name, mesh, sdf = of.object, of.mesh, of.sdf
+    else:
+        model, found = _load_object(config)
+        session = open_session(kind, settings, model, config.seed, watcher)
+        name, mesh, sdf = model.name, model.mesh, model.grid(settings, watcher)
+        start = Start(settings.start_contacts, settings.start_probe)
+        if kind in _OF_REAL_OBJECTS:
+            found += check_size(model, session.workspace)
     steering = _steering(policy, kind, session, sdf, config.seed)
     if steering is not None:
         start = FIRST_CONTACT
-    if kind in _OF_REAL_OBJECTS:
-        found += check_size(object_model, session.workspace)
-    name, mesh = object_model.name, object_model.mesh
     return Scene(session, name, mesh, sdf, start, watcher, tuple(found), steering)
 
 

@@ -29,33 +29,33 @@ class View:
     world_from_camera: FloatArray
 
 
-class DepthSource:
-    """The images of one camera."""
-
-    def __init__(self, rig: CameraRig | BubbleRig, camera: PinholeCamera, cell: RobotCell) -> None:
-        self.rig, self.camera, self.cell = rig, camera, cell
-
-    def view(self, time: int, message: ImageMessage, counts: Counts) -> View | None:
-        """The image and its pose; None, counted, where it cannot be used."""
-        shape = (self.camera.height, self.camera.width)
-        if message.values.shape != shape:
-            height, width = message.values.shape
-            self.cell.warnings.warn(
-                f"{self.rig.name}: left out, as the image has {width} x {height} pixels and its "
-                f"camera {shape[1]} x {shape[0]}"
-            )
-            counts.unusable += 1
-            return None
-        frame = self.rig.frame or message.frame
-        world_from_camera = self.cell.world_from(frame, time, self.rig.name)
-        if world_from_camera is None:
-            counts.lost += 1
-            return None
-        depth = metres(message.values, self.rig.unit)
-        valid = valid_pixels(depth, nearest=self.rig.range[0], furthest=self.rig.range[1])
-        counts.pixels += valid.size
-        counts.invalid += int(valid.size - valid.sum())
-        return View(depth, valid, world_from_camera)
+def view_of(
+    message: ImageMessage,
+    time: int,
+    rig: CameraRig | BubbleRig,
+    camera: PinholeCamera,
+    cell: RobotCell,
+    counts: Counts,
+) -> View | None:
+    """An image at a time, nanoseconds, and its pose; None, counted, where it cannot be used."""
+    shape = (camera.height, camera.width)
+    if message.values.shape != shape:
+        height, width = message.values.shape
+        cell.warnings.warn(
+            f"{rig.name}: left out, as the image has {width} x {height} pixels and its "
+            f"camera {shape[1]} x {shape[0]}"
+        )
+        counts.unusable += 1
+        return None
+    world_from_camera = cell.world_from(rig.frame or message.frame, time, rig.name)
+    if world_from_camera is None:
+        counts.lost += 1
+        return None
+    depth = metres(message.values, rig.unit)
+    valid = valid_pixels(depth, nearest=rig.range[0], furthest=rig.range[1])
+    counts.pixels += valid.size
+    counts.invalid += int(valid.size - valid.sum())
+    return View(depth, valid, world_from_camera)
 
 
 def metres(values: np.ndarray, unit: float | None) -> FloatArray:
@@ -87,41 +87,35 @@ def edge_pixels(rig: CameraRig, depth: FloatArray, valid: BoolArray) -> BoolArra
     return occlusion_edges(depth, valid, rig.edge, reach=rig.edge_reach)
 
 
-def ray_ends(
-    depth: FloatArray, valid: BoolArray, usable: BoolArray, camera: PinholeCamera, gate: GateRig
-) -> tuple[FloatArray, int]:
-    """Depths (H, W) up to which rays of usable pixels are free, and how many end before their own.
-
-    The rays of speckles end at the least depth of the valid pixels around them.
-    """
-    regions = depth_regions(depth, usable, camera, gate.jump)
-    return speckle_free(depth, valid, regions, gate.speckle)
-
-
 def mark_rays(
     grid: FreeGrid,
     rig: CameraRig,
-    ends: FloatArray,
+    gate: GateRig,
     camera: PinholeCamera,
-    world_from_camera: FloatArray,
+    view: View,
     usable: BoolArray,
-) -> None:
-    """Mark what the rays of usable pixels (H, W) pass on their way to `ends` (H, W), metres."""
+) -> int:
+    """Mark what the rays of usable pixels (H, W) pass; how many end before their own depth.
+
+    The rays of speckles end at the least depth of the valid pixels around them.
+    """
+    regions = depth_regions(view.metres, usable, camera, gate.jump)
+    ends, small = speckle_free(view.metres, view.valid, regions, gate.speckle)
     if rig.rays == "scaled_images":
-        grid.scaled_images(ends, camera, world_from_camera, usable)
+        grid.scaled_images(ends, camera, view.world_from_camera, usable)
     else:
-        grid.from_depth(ends, camera, world_from_camera, usable, fraction=rig.fraction)
+        grid.from_depth(ends, camera, view.world_from_camera, usable, fraction=rig.fraction)
+    return small
 
 
 class DepthCamera:
     """Marks what it sees through (CHSEL, Sec. V-B: rays to 95 % of the depth)."""
 
     def __init__(self, rig: CameraRig, camera: PinholeCamera, cell: RobotCell) -> None:
-        self._rig, self._cell = rig, cell
-        self._source = DepthSource(rig, camera, cell)
-        free = cell.free
+        self._rig, self._camera, self._cell = rig, camera, cell
         several = rig.views > 1
-        self._own = FreeGrid(free.workspace, cell.spacing, views=rig.views) if several else None
+        workspace = cell.free.workspace
+        self._own = FreeGrid(workspace, cell.spacing, views=rig.views) if several else None
         self._last_time: int | None = None
         self._last: tuple[View, BoolArray] | None = None
 
@@ -131,7 +125,7 @@ class DepthCamera:
         if self._too_soon(time):
             counts.spared += 1
             return
-        view = self._source.view(time, message, counts)
+        view = view_of(message, time, self._rig, self._camera, self._cell, counts)
         if view is None:
             return
         edges = edge_pixels(self._rig, view.metres, view.valid)
@@ -158,7 +152,7 @@ class DepthCamera:
             values,
             unit,
             usable,
-            intrinsics_of(self._source.camera),
+            intrinsics_of(self._camera),
             view.world_from_camera,
         )
 
@@ -168,11 +162,8 @@ class DepthCamera:
         return 0 <= time - self._last_time < _EARLY * 1e9 / self._rig.rate
 
     def _mark(self, view: View, usable: BoolArray, counts: Counts) -> None:
-        camera = self._source.camera
-        ends, small = ray_ends(view.metres, view.valid, usable, camera, self._cell.gate)
-        counts.small += small
         with self._cell.free.by(counts) as grid:
-            target = grid if self._own is None else self._own
-            mark_rays(target, self._rig, ends, camera, view.world_from_camera, usable)
+            target, gate = grid if self._own is None else self._own, self._cell.gate
+            counts.small += mark_rays(target, self._rig, gate, self._camera, view, usable)
             if self._own is not None:
                 grid.at(self._own.new())

@@ -1,35 +1,34 @@
-"""One depth image as plain files: a YAML that names the image, its intrinsics and its pose."""
+"""One depth image as plain files, and its known points: free space, the object's surface."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from math import sqrt
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
 
-from chsel.errors import ChselError, SessionError
-from chsel.numerics.arrays import BoolArray, FloatArray, frozen
-from chsel.problem.poses import nearest_rigid
+from chsel.errors import ChselError, SessionError, SettingError
+from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.problem.points import KnownPoints, Lattice, Workspace
+from chsel.problem.poses import apply
 from chsel.problem.settings import CheckedSettings, build_settings, not_negative, positive
-from chsel.sensing.depth_camera import PinholeCamera
-from runners.sensors.depth_camera import metres
+from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
+from chsel.sensing.free_space import FreeGrid
+from chsel.sensing.regions import depth_regions, main_regions
+from runners.sensors.depth_camera import View, edge_pixels, mark_rays, metres
 from runners.sensors.log.images import read_image
+from runners.sensors.pose_file import pose_of_rows
+from runners.sensors.rig import Rig
+from runners.sensors.session_report import Counts
 from runners.sensors.yaml_file import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
-MOST_BYTES = 2**16
+LABEL_MARGIN = 2  # pixels: by so much a label's outline may be off the depth image's
 _MOST_LISTED = 20
-_LONGEST_PATH = 1000  # characters
-
-
-def _path(name: str, value: Any) -> None:
-    """The path of a file."""
-    if not value or len(value) > _LONGEST_PATH or "\0" in value:
-        raise SessionError(f"{name} is {value[:80]!r}; accepted: the path of a file")
-
-
-FilePath = Annotated[str, _path]
 
 
 @dataclass(frozen=True)
@@ -46,14 +45,14 @@ class Intrinsics:
 class FrameFile(CheckedSettings):
     """The keys of the YAML; paths in it are relative to it."""
 
-    depth: FilePath  # .png or .tiff of integers, .tiff or .npy of floating point
+    depth: str  # .png or .tiff of integers, .tiff or .npy of floating point
     intrinsics: Intrinsics
     depth_scale: Annotated[float | None, positive] = None
     """Metres a unit; null: 0.001 for integers, 1 for floating point."""
 
-    label: Annotated[str | None, _path] = None  # image of classes
+    label: str | None = None  # image of classes
     object_class: Annotated[int | None, not_negative] = None  # the object's; null: all but 0
-    object: Annotated[str | None, _path] = None  # mesh of the object
+    object: str | None = None  # mesh of the object
     world_from_camera: tuple[Any, ...] | None = None  # (4, 4); null: the camera is the world
     world_from_object: tuple[Any, ...] | None = None  # (4, 4), the true pose
     factor_depth_in_file: Any = None  # this and the following keys are for people
@@ -87,26 +86,27 @@ def read_depth_frame(path: str | Path) -> DepthFrame:
     """
     path = Path(path).expanduser()
     try:
-        if path.suffix.lower() not in SUFFIXES:
-            raise SessionError(f"of no known kind; accepted: {', '.join(SUFFIXES)}")
-        return _frame(build_settings(FrameFile, read_yaml(path, MOST_BYTES), "frame"), path.parent)
-    except ChselError as error:
+        return _frame(build_settings(FrameFile, read_yaml(path), "frame"), path.parent)
+    except (ChselError, OverflowError) as error:  # an integer of many digits
         raise SessionError(f"depth frame {path}: {error}") from None
-    except (OverflowError, ValueError):  # an integer of thousands of digits
-        raise SessionError(f"depth frame {path}: a number out of range") from None
 
 
 def _frame(file: FrameFile, folder: Path) -> DepthFrame:
     depth = _depth(file, _beside(folder, file.depth))
     height, width = depth.shape
-    world_from_camera = _pose("world_from_camera", file.world_from_camera)
-    label = None if file.label is None else _label(file, _beside(folder, file.label), depth.shape)
+    poses = {
+        name: pose_of_rows(name, rows)
+        for name in ("world_from_camera", "world_from_object")
+        if (rows := getattr(file, name)) is not None
+    }
     return DepthFrame(
         camera=PinholeCamera(width=width, height=height, **asdict(file.intrinsics)),
         depth=depth,
-        world_from_camera=np.eye(4) if world_from_camera is None else world_from_camera,
-        label=label,
-        world_from_object=_pose("world_from_object", file.world_from_object),
+        world_from_camera=poses.get("world_from_camera", np.eye(4)),
+        label=None
+        if file.label is None
+        else _label(file, _beside(folder, file.label), depth.shape),
+        world_from_object=poses.get("world_from_object"),
         mesh=None if file.object is None else _beside(folder, file.object),
     )
 
@@ -144,8 +144,124 @@ def _label(file: FrameFile, path: Path, shape: tuple[int, ...]) -> BoolArray:
     return mask
 
 
-def _pose(name: str, rows: Any) -> FloatArray | None:
-    """A rigid transform (4, 4), its rotation made exact."""
-    if rows is None:
-        return None
-    return nearest_rigid(name, frozen(name, rows, (4, 4), error=SessionError)[None])[0]
+@dataclass(frozen=True, eq=False)
+class FramePoints:
+    """What follows from a frame, and how many of its pixels do not count."""
+
+    points: KnownPoints  # free voxels' centres, and surface points; metres, world
+    workspace: Workspace  # where the object can be
+    rays: BoolArray  # (H, W), pixels whose rays are free
+    surface: BoolArray  # (H, W), pixels on the object
+    counts: Counts  # of the whole image
+    labelled: Counts | None  # of the pixels of the object's label, if there is one
+
+
+def depth_frame_points(
+    frame: DepthFrame, rig: Rig, *, free_resolution: float, diameter: float | None = None
+) -> FramePoints:
+    """The known points of a frame, by the thresholds of the rig's only camera.
+
+    free_resolution: metres. diameter: of the object, metres; without a workspace in the rig, it is
+    the bounds of the surface points, padded by this. Raises SettingError for a rig that does not
+    fit, SessionError for a frame without a usable pixel.
+    """
+    if len(rig.cameras) != 1:
+        raise SettingError(f"rig {rig.name} has {len(rig.cameras)} cameras; accepted: 1, a frame's")
+    (camera,) = rig.cameras
+    nearest, furthest = camera.range
+    valid = valid_pixels(frame.depth, nearest=nearest, furthest=furthest)
+    if not valid.any():
+        typical = float(np.median(frame.depth[np.isfinite(frame.depth) & (frame.depth > 0.0)]))
+        raise SessionError(
+            f"no pixel of depth lies in the range of camera {camera.name}, {nearest:g} m to "
+            f"{furthest:g} m; its median is {typical:.4g} m: check depth_scale"
+        )
+    edges = edge_pixels(camera, frame.depth, valid)
+    measured = frame.camera.back_project(frame.depth)
+    counts = Counts(images=1, used=1, pixels=valid.size, invalid=int((~valid).sum()))
+    counts.edges = int(edges.sum())
+    rays = valid & ~edges
+    surface, labelled = np.zeros_like(valid), None
+    if frame.label is not None:
+        surface, labelled = _surface_pixels(frame, rig, valid, edges, measured, diameter)
+        rays &= surface | ~frame.label
+        counts.outline, counts.far = labelled.outline, labelled.far
+    on_object = apply(frame.world_from_camera, measured[surface])
+    workspace = _workspace(rig, on_object, diameter)
+    grid = FreeGrid(workspace, free_resolution)  # there is one view, whatever the rig asks
+    view = View(frame.depth, valid, frame.world_from_camera)
+    counts.small = mark_rays(grid, camera, rig.gate, frame.camera, view, rays)
+    counts.small += 0 if labelled is None else labelled.small
+    points = KnownPoints(
+        free=_outside_of(on_object, grid.new(), free_resolution),
+        known=one_per_voxel(on_object, rig.surface_resolution),
+    )
+    counts.contacts, counts.free = len(points.known), len(points.free)
+    return FramePoints(points, workspace, rays, surface, counts, labelled)
+
+
+def one_per_voxel(points: FloatArray, side: float) -> FloatArray:
+    """Of points (N, 3), those nearest to the centre of their voxel (M, 3), in the given order."""
+    lattice = Lattice((0.0, 0.0, 0.0), side)
+    voxels = lattice.voxels(points)
+    distance = ((points - lattice.centres(voxels)) ** 2).sum(axis=1)
+    nearest_first = np.argsort(distance, kind="stable")
+    _, first = np.unique(voxels[nearest_first], axis=0, return_index=True)
+    return points[np.sort(nearest_first[first])]
+
+
+def _surface_pixels(
+    frame: DepthFrame,
+    rig: Rig,
+    valid: BoolArray,
+    edges: BoolArray,
+    measured: FloatArray,
+    diameter: float | None,
+) -> tuple[BoolArray, Counts]:
+    """The object's pixels (H, W) but for those at its outline, where others are mixed in.
+
+    Of these, those in regions that can be the object's; the others are counted by reason.
+    """
+    label, square = frame.label, np.ones((3, 3), dtype=bool)
+    assert label is not None
+    within = binary_erosion(label, square, iterations=LABEL_MARGIN, border_value=1)
+    surface = within & valid & ~edges
+    if not surface.any():
+        raise SessionError(
+            f"none of the {int(label.sum())} pixels of label is of the surface: outlines "
+            "and edges of depth are left out, and pixels out of range"
+        )
+    regions = depth_regions(frame.depth, surface, frame.camera, rig.gate.jump)
+    found = main_regions(
+        regions[surface], part=rig.gate.part, points=measured[surface], diameter=diameter
+    )
+    surface[surface] = found.kept
+    counts = Counts(images=1, used=1, pixels=int(label.sum()), small=found.small, far=found.far)
+    counts.invalid = int((label & ~valid).sum())
+    counts.edges = int((label & edges).sum())
+    counts.outline = int((label & valid & ~edges & ~within).sum())
+    return surface, counts
+
+
+def _workspace(rig: Rig, on_object: FloatArray, diameter: float | None) -> Workspace:
+    if rig.workspace is not None:
+        return rig.box()
+    if len(on_object) == 0 or diameter is None:
+        raise SettingError(
+            "workspace is missing, and no label says where the object is; accepted: "
+            "[[x0, x1], [y0, y1], [z0, z1]]"
+        )
+    return Workspace.around(on_object, diameter)
+
+
+def _outside_of(on_object: FloatArray, free: FloatArray, spacing: float) -> FloatArray:
+    """Free centres (N, 3) but for those that a measured surface point can lie behind.
+
+    A ray that passes a voxel passes its centre at up to half the voxel's diagonal, so that nearer
+    to the surface than this a centre may be inside the object.
+    """
+    if len(on_object) == 0 or len(free) == 0:
+        return free
+    margin = sqrt(0.75) * spacing
+    nearest = cKDTree(on_object).query(free, distance_upper_bound=margin)[0]
+    return free[~(nearest <= margin)]

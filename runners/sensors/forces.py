@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections import deque
 from dataclasses import dataclass
 
@@ -16,12 +15,12 @@ from chsel.sensing.contact_sensing import contact_ahead, contact_on_axis
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import Contacts
 from runners.sensors.hand import HandModel
+from runners.sensors.log.joints import JointHistory
 from runners.sensors.log.messages import WrenchMessage
-from runners.sensors.log.motion import JointHistory
 from runners.sensors.rig import ForceRig, HandRig
 from runners.sensors.session_report import Counts
 
-_MOST_KEPT = 50  # samples of a probe, the strongest
+_MOST_LOOKED_AT = 50  # samples of a probe, the strongest
 _MOST_TARED = 4096  # samples
 _NANOSECONDS = 1e9
 
@@ -55,7 +54,7 @@ class Forces:
         self._tare: FloatArray | None = None
         self._within = self._has_torque = self._in_contact = False
         self._row: list[_Sample] = []  # not yet long enough for a contact
-        self._strongest: list[_Sample] = []
+        self._felt: list[_Sample] = []
 
     def take(self, time: int, message: WrenchMessage, counts: Counts, *, within: bool) -> None:
         """Use a message; `within` a probe's begin and end, forces are of contacts."""
@@ -85,7 +84,7 @@ class Forces:
     def contacts(self, counts: Counts) -> Contacts:
         """The contacts since the last call, the strongest first."""
         self._end_row(counts)
-        samples, self._strongest = sorted(self._strongest, reverse=True), []
+        samples, self._felt = sorted(self._felt, reverse=True)[:_MOST_LOOKED_AT], []
         found: dict[tuple[int, ...], tuple[FloatArray, FloatArray]] = {}
         for sample in samples:
             contact = self._contact(sample, counts)
@@ -115,10 +114,7 @@ class Forces:
         if not self._in_contact and len(self._row) < self._rig.samples:
             return
         self._in_contact = True
-        for strong in self._row:
-            heapq.heappush(self._strongest, strong)
-            if len(self._strongest) > _MOST_KEPT:
-                heapq.heappop(self._strongest)
+        self._felt += self._row
         self._row.clear()
 
     def _end_row(self, counts: Counts) -> None:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
 
 from chsel.errors import SettingError
-from chsel.numerics.arrays import frozen
 from chsel.problem.poses import compose, roll_pitch_yaw
 from runners.sensors.rig import BoxRig, HandRig
-from runners.sensors.urdf import Linkage
 
 if TYPE_CHECKING:
     import trimesh
+
+_MOVING = ("revolute", "continuous", "prismatic")
+_TYPES = (*_MOVING, "fixed", "floating", "planar")
+_CYLINDER_SIDES = 32  # the prism lies within the cylinder, so it claims no free space too much
 
 
 class HandModel:
@@ -24,8 +30,8 @@ class HandModel:
     """
 
     def __init__(self, rig: HandRig) -> None:
-        self._boxes = [_solid(box, f"hand.boxes[{i}]") for i, box in enumerate(rig.boxes)]
-        self._linkage = None if rig.urdf is None else Linkage(Path(rig.urdf), rig.root)
+        self._boxes = [_box(box) for box in rig.boxes]
+        self._linkage = None if rig.urdf is None else _Linkage(Path(rig.urdf), rig.root)
         self.joint_names = () if self._linkage is None else self._linkage.joint_names
         self.warnings = () if self._linkage is None else self._linkage.warnings
 
@@ -33,7 +39,7 @@ class HandModel:
         """Closed solids in the hand's frame, metres; they may overlap.
 
         joints: values by name, radians or metres. Those of other joints do not matter, missing
-        ones are 0. Raises SettingError for a value that is not finite.
+        ones are 0.
         """
         links = [] if self._linkage is None else self._linkage.solids(joints or {})
         return self._boxes + links
@@ -47,12 +53,230 @@ class HandModel:
         return joined
 
 
-def _solid(box: BoxRig, where: str) -> trimesh.Trimesh:
+def _box(box: BoxRig) -> trimesh.Trimesh:
     import trimesh
 
-    values = {
-        name: frozen(f"{where}.{name}", getattr(box, name), (3,), error=SettingError)
-        for name in ("size", "position", "rotation")
-    }
-    hand_from_box = compose(roll_pitch_yaw(values["rotation"]), values["position"])
-    return trimesh.creation.box(values["size"], hand_from_box)
+    hand_from_box = compose(roll_pitch_yaw(np.array(box.rotation)), np.array(box.position))
+    return trimesh.creation.box(box.size, hand_from_box)
+
+
+class _Linkage:
+    """The links of a URDF below one of them, which move with it; kinematics by yourdfpy.
+
+    path: of the file. root: the link whose frame is the hand's; None: the link that is below no
+    other. joint_names: joints whose values move any link. warnings: on how the file was taken.
+    Raises SettingError, which names the file, for one that cannot be used.
+    """
+
+    def __init__(self, path: Path, root: str | None = None) -> None:
+        self._where = f"hand.urdf {path}"
+        path = path.expanduser()
+        robot = self._read(path)
+        links = {link.name: link for link in robot.links}
+        joints = {joint.name: joint for joint in robot.joints}
+        for joint in robot.joints:
+            self._check_joint(joint, links)
+        self._root = self._chosen_root(root, [link.name for link in robot.links], robot.joints)
+        below = [self._root]
+        for link in below:  # grows while it is walked
+            below += [joint.child for joint in robot.joints if joint.parent == link]
+        robot.links = [links[name] for name in below]
+        robot.joints = [joint for name in below for joint in robot.joints if joint.parent == name]
+        moving = [joint for joint in robot.joints if joint.type in _MOVING]
+        self._drivers = {joint.name: self._driver(joint, joints) for joint in moving}
+        self.joint_names = tuple(dict.fromkeys(name for name, _, _ in self._drivers.values()))
+        self.warnings = [
+            f"{self._where}: joint {joint.name} is {joint.type}; it stays at its origin"
+            for joint in robot.joints
+            if joint.type in ("floating", "planar")
+        ]
+        self._shapes = [
+            (link.name, self._solid(collision, path, f"{self._where} link {link.name}"))
+            for link in robot.links
+            for collision in link.collisions
+        ]
+        if not self._shapes:
+            raise self._error(
+                f"has no collision shape at or below link {self._root}; accepted: at least one"
+            )
+        self._model = self._kinematics(robot)
+
+    def solids(self, joints: Mapping[str, float]) -> list[trimesh.Trimesh]:
+        """Closed solids in the root's frame; joints: values, radians or metres, 0 if missing."""
+        values = {
+            name: joints[name] if name in joints else factor * joints.get(driver, 0.0) + offset
+            for name, (driver, factor, offset) in self._drivers.items()
+        }
+        self._model.update_cfg(values)
+        return [
+            mesh.copy().apply_transform(self._model.get_transform(link, self._root))
+            for link, mesh in self._shapes
+        ]
+
+    def _read(self, path: Path) -> Any:
+        """The file as a Robot of yourdfpy: its links and joints."""
+        if not path.is_file():
+            kind = "is a folder" if path.is_dir() else "does not exist"
+            raise self._error(f"{kind}; accepted: a URDF file")
+        try:
+            from yourdfpy import URDF  # optional: rigs of boxes need none
+        except ImportError:
+            raise self._error(
+                "needs the package yourdfpy; install it where the project is: "
+                "pip install -e '.[urdf]'"
+            ) from None
+        content = path.read_bytes()
+        if b"<xacro:" in content:
+            raise self._error("holds xacro macros; accepted: what the tool xacro makes")
+        try:
+            ElementTree.fromstring(content)  # yourdfpy logs what is wrong, and goes on
+            file = io.BytesIO(content)
+            robot = URDF.load(file, build_scene_graph=False, load_meshes=False).robot
+        except Exception as error:  # it raises whatever it stumbles over
+            raise self._error(
+                f"is not a URDF ({type(error).__name__}: {_one_line(error)}); accepted: a robot of "
+                "links and joints with all their attributes"
+            ) from None
+        return robot
+
+    def _check_joint(self, joint: Any, links: Mapping[str, Any]) -> None:
+        for link in (joint.parent, joint.child):
+            if link not in links:
+                raise self._error(f"joint {joint.name} holds link {link!r}, which is missing")
+        if joint.type not in _TYPES:
+            raise self._error(
+                f"joint {joint.name} has type {joint.type!r}; accepted: {', '.join(_TYPES)}"
+            )
+        if joint.type in _MOVING and not (len(joint.axis) == 3 and np.any(joint.axis)):
+            raise self._error(f"joint {joint.name}: axis is {joint.axis}; accepted: x y z")
+
+    def _chosen_root(self, root: str | None, links: list[str], joints: list[Any]) -> str:
+        children = [joint.child for joint in joints]
+        bases = [name for name in links if name not in children]
+        if len(set(links)) < len(links) or len(set(children)) < len(children) or not bases:
+            raise self._error("is not a tree; accepted: each link once, with one parent at most")
+        if root is None and len(bases) > 1:
+            raise self._error(f"has several base links; set hand.root, accepted: {_some(bases)}")
+        if root is not None and root not in links:
+            raise SettingError(
+                f"hand.root {root!r} is no link of {self._where}; accepted: {_some(links)}"
+            )
+        return root or bases[0]
+
+    def _driver(self, joint: Any, joints: Mapping[str, Any]) -> tuple[str, float, float]:
+        """The joint at the end of a chain of mimics, and the factor and offset from its value."""
+        name, factor, offset = joint.name, 1.0, 0.0
+        for _ in joints:
+            if joint.mimic is None:
+                return joint.name, factor, offset
+            mimicked = joint.mimic.joint
+            if mimicked not in joints:
+                break
+            offset += factor * joint.mimic.offset
+            factor *= joint.mimic.multiplier
+            joint = joints[mimicked]
+        raise self._error(
+            f"joint {name} mimics {mimicked!r}; accepted: another joint, which does not in turn "
+            "mimic it"
+        )
+
+    def _kinematics(self, robot: Any) -> Any:
+        """The model whose transforms follow from values of joints.
+
+        yourdfpy follows one mimic alone, looks up another joint's value after a planar or floating
+        one, and moves prismatic joints by the length of their axes: values are resolved here.
+        """
+        from yourdfpy import URDF
+
+        for joint in robot.joints:
+            joint.mimic = None
+            if joint.type in _MOVING:
+                joint.axis = joint.axis / np.sqrt((joint.axis**2).sum())
+        for link in robot.links:
+            link.visuals = []
+        return URDF(robot, load_meshes=False)
+
+    def _solid(self, collision: Any, urdf: Path, where: str) -> trimesh.Trimesh:
+        """The closed solid of a Collision of yourdfpy in its link's frame."""
+        import trimesh
+
+        shape = collision.geometry
+        sizes = []
+        if shape.box is not None:
+            sizes = list(shape.box.size)
+        elif shape.sphere is not None:
+            sizes = [shape.sphere.radius]
+        elif shape.cylinder is not None:
+            sizes = [shape.cylinder.radius, shape.cylinder.length]
+        if not all(size > 0.0 for size in sizes) or (shape.box is not None and len(sizes) != 3):
+            raise SettingError(f"{where}: size {sizes} of a shape; accepted: finite, above 0")
+        if shape.box is not None:
+            solid = trimesh.creation.box(sizes)
+        elif shape.sphere is not None:
+            solid = trimesh.creation.icosphere(subdivisions=2, radius=sizes[0])
+        elif shape.cylinder is not None:
+            solid = trimesh.creation.cylinder(*sizes, sections=_CYLINDER_SIDES)
+        else:
+            solid = self._mesh(shape.mesh, urdf, where)
+        if collision.origin is not None:
+            solid.apply_transform(collision.origin)
+        if not np.isfinite(solid.vertices).all():
+            raise SettingError(f"{where}: a collision shape is not finite")
+        return solid
+
+    def _mesh(self, described: Any, urdf: Path, where: str) -> trimesh.Trimesh:
+        """The closed solid in a file; its convex hull if it is open."""
+        import trimesh
+
+        path = _mesh_file(described.filename or "", urdf, where)
+        try:
+            loaded: Any = trimesh.load(
+                str(path), force="mesh", process=False, skip_materials=True, ignore_broken=True
+            )
+            mesh = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
+            mesh.merge_vertices()
+            closed = mesh.is_watertight and mesh.is_winding_consistent and mesh.volume != 0.0
+            mesh = mesh if closed else mesh.convex_hull
+        except Exception as error:  # readers of damaged files raise whatever they stumble over
+            raise SettingError(
+                f"{where}: mesh {path} cannot be read, or is no solid: {_one_line(error)}"
+            ) from None
+        if not closed:
+            self.warnings.append(f"{where}: mesh {path} is open; its convex hull is used")
+        if mesh.volume < 0.0:
+            mesh.invert()
+        if described.scale is not None:
+            scale = np.broadcast_to(described.scale, (3,))
+            mesh.apply_transform(np.diag([*scale, 1.0]))
+        return mesh
+
+    def _error(self, text: str) -> SettingError:
+        return SettingError(f"{self._where} {text}")
+
+
+def _mesh_file(name: str, urdf: Path, where: str) -> Path:
+    """The path of a mesh; a package is one of the folders above the URDF, or in one."""
+    folder = urdf.resolve().parent
+    scheme, _, rest = name.partition("://")
+    if not rest:
+        tried = [folder / name]
+    elif scheme == "file":
+        tried = [Path(rest)]
+    else:
+        within = PurePosixPath(*PurePosixPath(rest).parts[1:])
+        above = (folder, *folder.parents)
+        tried = [parent / part for parent in above for part in (within, rest)]
+    for path in tried:
+        if path.is_file():
+            return path
+    places = ", ".join(map(str, tried[:5]))
+    raise SettingError(f"{where}: mesh {name} does not exist; looked for {places}")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _some(names: list[str]) -> str:
+    """Names for a message, which stays a line."""
+    return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")

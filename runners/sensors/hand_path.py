@@ -14,7 +14,7 @@ from chsel.sensing.swept import interior_lattice, poses_between
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import PushEnd
 from runners.sensors.hand import HandModel
-from runners.sensors.log.motion import JointHistory
+from runners.sensors.log.joints import JointHistory
 from runners.sensors.log.probe_windows import ProbeWindow
 from runners.sensors.rig import HandRig
 from runners.sensors.session_report import Counts
@@ -41,7 +41,6 @@ class HandPath:
         """times (T,): of all transforms, nanoseconds, ascending."""
         self._rig, self._model, self._joints, self._times = rig, model, joints, times
         self._cell = cell
-        self._filled: tuple[dict[str, float], FloatArray] | None = None
         self._filled_parts: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     def follow(self, window: ProbeWindow, counts: Counts) -> FloatArray:
@@ -97,12 +96,10 @@ class HandPath:
 
     def _interior(self, joints: dict[str, float]) -> FloatArray:
         """Points (M, 3) in the hand, dense enough to miss no voxel."""
-        if self._filled is None or self._filled[0] != joints:
-            parts = enumerate(self._model.parts(joints))
-            points = np.concatenate([np.zeros((0, 3)), *(self._nodes(*part) for part in parts)])
-            lattice = Lattice((0.0, 0.0, 0.0), 0.5 * self._cell.spacing)
-            self._filled = joints, lattice.centres(np.unique(lattice.voxels(points), axis=0))
-        return self._filled[1]
+        parts = enumerate(self._model.parts(joints))
+        points = np.concatenate([np.zeros((0, 3)), *(self._nodes(*part) for part in parts)])
+        lattice = Lattice((0.0, 0.0, 0.0), 0.5 * self._cell.spacing)
+        return lattice.centres(np.unique(lattice.voxels(points), axis=0))
 
     def _nodes(self, number: int, part: trimesh.Trimesh) -> FloatArray:
         """Points (M, 3) in a part; found again only once it has moved in the hand."""

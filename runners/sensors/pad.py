@@ -16,7 +16,7 @@ from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from chsel.sensing.regions import depth_regions, main_regions, small_regions
 from replay.events import SensorImage
 from runners.sensors.cell import RobotCell
-from runners.sensors.depth_camera import DepthSource, View, intrinsics_of, metres, recorded
+from runners.sensors.depth_camera import View, intrinsics_of, metres, recorded, view_of
 from runners.sensors.log.images import read_image
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
@@ -31,22 +31,15 @@ def membrane_reference(
     By the rig's file, relative to the folder `beside` unless it is found as it stands; or the
     median of images (H, W). Raises SessionError if there are none, or of another size.
     """
+    images = samples if rig.kind == "depth" else []
     if rig.reference is not None:
         path = Path(rig.reference).expanduser()
-        if not path.is_absolute() and not path.is_file():
-            path = beside / path
+        path = path if path.is_file() else beside / path
         images = [read_image(path, f"reference of {rig.name}")]
-    elif rig.kind == "deformation":
-        raise SessionError(
-            f"{rig.name} has images of deformation and no reference; accepted: reference=FILE, the "
-            "depth of its untouched membrane"
-        )
-    else:
-        images = samples
     if not images:
         raise SessionError(
-            f"{rig.name} has no image before the first probe to be its reference; accepted: "
-            "reference=FILE, or a log that begins before its first probe"
+            f"{rig.name} has images of {rig.kind} and no reference; accepted: reference=FILE, the "
+            "depth of its untouched membrane, or a log of depth that begins before its first probe"
         )
     shape = (camera.height, camera.width)
     for image in images:
@@ -114,7 +107,6 @@ class Pad:
         """
         self._rig, self._contact, self._cell = rig, contact, cell
         self._camera, self._reference, self._inside = camera, reference, inside
-        self._source = DepthSource(rig, camera, cell)
         self._lengths = np.sqrt((camera.directions() ** 2).sum(axis=-1))
         self._last_pose: FloatArray | None = None
         self._best: Imprint | None = None
@@ -177,7 +169,7 @@ class Pad:
         return apply(view.world_from_camera, points)
 
     def _imprint(self, time: int, message: ImageMessage, counts: Counts) -> Imprint | None:
-        view = self._source.view(time, message, counts)
+        view = view_of(message, time, self._rig, self._camera, self._cell, counts)
         if view is None:
             return None
         known = self._reference > 0.0

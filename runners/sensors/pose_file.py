@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from chsel.errors import PoseError, SessionError
-from chsel.numerics.arrays import FloatArray
+from chsel.errors import ChselError, SessionError
+from chsel.numerics.arrays import FloatArray, frozen
 from chsel.problem.poses import nearest_rigid
 from replay.files import new_file, whole_file
 from runners.sensors.yaml_file import read_yaml
 
 SUFFIX = ".pose.yaml"
 KEY = "world_from_object"
-_MOST_BYTES = 1_000_000
 _ACCEPTED = (
     f"accepted: YAML with {KEY}, four rows of four numbers: a rotation and a position in metres, "
     "last row 0 0 0 1"
@@ -34,16 +33,14 @@ def read_pose(path: str | Path) -> FloatArray:
     """world_from_object (4, 4) of a file. Raises SessionError unless it holds a rigid one."""
     path = Path(path).expanduser()
     try:
-        rows = read_yaml(path, _MOST_BYTES).get(KEY)
-    except SessionError as error:
+        return pose_of_rows(KEY, read_yaml(path).get(KEY))
+    except ChselError as error:
         raise SessionError(f"pose file {path}: {error}; {_ACCEPTED}") from None
-    if not _is_matrix(rows):
-        raise SessionError(f"pose file {path} has no {KEY} of 4 x 4 numbers; {_ACCEPTED}")
-    try:
-        # Entries may have been written by hand, with a few digits.
-        pose = nearest_rigid(KEY, np.array(rows, dtype=np.float64)[None])[0]
-    except PoseError:
-        raise SessionError(f"pose file {path}: {KEY} is not rigid; {_ACCEPTED}") from None
+
+
+def pose_of_rows(name: str, rows: Any) -> FloatArray:
+    """A rigid transform (4, 4) of a file, its rotation made exact: people write a few digits."""
+    pose = nearest_rigid(name, frozen(name, rows, (4, 4), error=SessionError)[None])[0]
     pose.setflags(write=False)
     return pose
 
@@ -60,13 +57,3 @@ def write_pose(
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     with whole_file(path) if overwrite else new_file(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
-
-
-def _is_matrix(rows: Any) -> bool:
-    """Whether a value is four lists of four finite numbers."""
-    if not isinstance(rows, list) or len(rows) != 4:
-        return False
-    if not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        return False
-    numbers = [value for row in rows for value in row]
-    return all(type(value) in (int, float) and abs(value) < 1e6 for value in numbers)

@@ -9,13 +9,7 @@ from typing import Annotated, Any
 from chsel.errors import SettingError
 from chsel.numerics.arrays import frozen
 from chsel.problem.points import Workspace
-from chsel.problem.settings import Check, CheckedSettings, at_most, not_negative, one_of, positive
-
-_LARGEST = 1e6  # seconds, newtons, metres
-_LARGEST_HAND = 100.0  # metres
-_LEAST_FORCE = 0.001  # N
-_LONGEST = 1e9  # seconds; they are counted in nanoseconds
-_MOST = 1_000_000  # pixels, metres, shares
+from chsel.problem.settings import Check, CheckedSettings, not_negative, one_of, positive
 
 
 def _fits(accepted: str, is_accepted: Callable[[Any], bool]) -> Check:
@@ -45,7 +39,6 @@ Depths = Annotated[
 Fraction = Annotated[float, _fits("above 0, at most 1", lambda part: 0.0 < part <= 1.0)]
 Part = Annotated[float, _fits("from 0 to 1", lambda part: 0.0 <= part <= 1.0)]
 Quantile = Annotated[float, _fits("from 0 to below 1", lambda part: 0.0 <= part < 1.0)]
-Force = Annotated[float, _fits(f"from {_LEAST_FORCE:g} N", lambda force: force >= _LEAST_FORCE)]
 
 
 @dataclass(frozen=True)
@@ -68,7 +61,7 @@ class CameraRig(CheckedSettings):
     """Traversal of every voxel, or the reference's scaled images."""
 
     views: Annotated[int, positive] = 1  # in so many images a voxel must have been seen to be free
-    edge_reach: Annotated[int, positive, at_most(100)] = 5  # pixels
+    edge_reach: Annotated[int, positive] = 5  # pixels
 
 
 @dataclass(frozen=True)
@@ -94,7 +87,7 @@ class BubbleRig(CheckedSettings):
 class ContactRig(CheckedSettings):
     """How contacts follow from deformations (CHSEL, Sec. V-B; methods, Sec. 10.2)."""
 
-    filter: Annotated[int, positive, at_most(200)] = 10  # side of the mean filter, pixels
+    filter: Annotated[int, positive] = 10  # side of the mean filter, pixels
     quantile: Quantile = 0.9
     """A pixel is in contact if its deformation is above this quantile of its image's, and above
     `threshold`."""
@@ -117,12 +110,10 @@ class BoxRig:
     rotation: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw, radians
 
     def __post_init__(self) -> None:
-        largest = at_most(_LARGEST_HAND)
         for side in self.size:
             positive("size", side)
-            largest("size", side)
-        for distance in frozen("position", self.position, (3,), error=SettingError).tolist():
-            largest("distance from the hand's frame", abs(distance))
+        for name in ("position", "rotation"):
+            frozen(name, getattr(self, name), (3,), error=SettingError)
 
 
 @dataclass(frozen=True)
@@ -158,10 +149,10 @@ class ForceRig(CheckedSettings):
 
     topic: str
     frame: str | None = None  # in which, and about whose origin, they are; null: the messages'
-    threshold: Annotated[Force, at_most(_LARGEST)] = 3.0
+    threshold: Annotated[float, positive] = 3.0
     """Newtons beyond the tare, above which there is a contact."""
 
-    samples: Annotated[int, positive, at_most(1000)] = 3  # so many in a row; fewer are a spike
+    samples: Annotated[int, positive] = 3  # so many in a row; fewer are a spike
     acts: Annotated[str, one_of("on_hand", "by_hand")] = "on_hand"
     """Whether forces are those on the hand, as the object pushes it, or by it, as it pushes."""
 
@@ -169,13 +160,13 @@ class ForceRig(CheckedSettings):
     """Whether torques locate the contact; otherwise it is where the hand is furthest against
     the force. Also used while all torques are 0."""
 
-    tare: Annotated[float, positive, at_most(_LARGEST)] = 1.0
+    tare: Annotated[float, positive] = 1.0
     """Seconds before a probe's begin, whose median is subtracted: the hand's weight and drift."""
 
-    reach: Annotated[float, positive, at_most(_LARGEST)] = 0.01
+    reach: Annotated[float, positive] = 0.01
     """Metres by which the line of force may miss the hand."""
 
-    points: Annotated[int, positive, at_most(1000)] = 5
+    points: Annotated[int, positive] = 5
     """Of a probe at most, the strongest of those in different voxels."""
 
 
@@ -183,11 +174,11 @@ class ForceRig(CheckedSettings):
 class GateRig(CheckedSettings):
     """When pixels and points are connected, and which of their regions are left out."""
 
-    jump: Annotated[float, positive, at_most(_MOST)] = 0.01
+    jump: Annotated[float, positive] = 0.01
     """Neighbouring pixels are connected unless their depths differ by more than this share of the
     depth, besides what a surface inclined by up to 76 degrees explains."""
 
-    gap: Annotated[float, positive, at_most(_MOST)] = 0.02
+    gap: Annotated[float, positive] = 0.02
     """Points of clouds are connected up to this distance, metres, or up to four times the typical
     distance between neighbours where that is more."""
 
@@ -195,7 +186,7 @@ class GateRig(CheckedSettings):
     """Of an object, regions with fewer pixels or points than this share of the largest are left
     out; 0: none is for its size."""
 
-    speckle: Annotated[int, not_negative, at_most(_MOST)] = 100
+    speckle: Annotated[int, not_negative] = 100
     """Where fewer pixels than this are connected, a camera's rays are free up to the least depth
     around them alone; 0: nowhere."""
 
@@ -232,14 +223,14 @@ class ClockRig(CheckedSettings):
     """Which times count."""
 
     stamp: Annotated[str, one_of("header", "log")] = "header"  # of the sender, or of the log
-    offset: Annotated[float, positive, at_most(_LONGEST)] = 1.0
+    offset: Annotated[float, positive] = 1.0
     """Seconds by which a topic's stamps may differ from the log's clock more than those of other
     topics do; beyond that they are shifted."""
 
-    gap: Annotated[float, positive, at_most(_LONGEST)] = 0.5
+    gap: Annotated[float, positive] = 0.5
     """Seconds between two transforms over which none is interpolated."""
 
-    jump: Annotated[float, positive, at_most(_LONGEST)] = 10.0
+    jump: Annotated[float, positive] = 10.0
     """Seconds by which the log's time may step before it is reported."""
 
 

@@ -64,9 +64,7 @@ class SecondPass:
                 force.topic: Forces(force, parts, cell, rig.surface_resolution)
                 for force in rig.forces
             }
-            self._hand = HandPath(
-                rig.hand, hand, first_pass.joints, first_pass.transform_times, cell
-            )
+            self._hand = HandPath(rig.hand, hand, first_pass.joints, first_pass.tree.times, cell)
             if self._asks_for_push_end():
                 self._push_end = PushWatch(rig.hand.frame, cell)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 
@@ -67,7 +68,7 @@ class Report:
         return totals
 
 
-MOST_KINDS = 100  # a hostile log must not flood the recording
+MOST_KINDS = 100  # what is wrong with messages may name their numbers
 LONGEST = 400  # characters of a line
 
 
@@ -76,32 +77,25 @@ class LogWarnings:
 
     def __init__(self, before: LogWarnings | None = None) -> None:
         """before: whose lines come ahead."""
-        self._counts: dict[tuple[str, str], int] = dict(before._counts) if before else {}
-        self._further: int = before._further if before else 0
+        self._counts: Counter[tuple[str, str]] = Counter(before._counts if before else {})
 
     def warn(self, text: str, count: int = 1) -> None:
         """Something is wrong, or was left out; `count` times."""
-        self._add("warning", text, count)
+        if count:
+            self._counts["warning", text[:LONGEST]] += count
 
     def note(self, text: str) -> None:
         """Something worth knowing."""
-        self._add("info", text, 1)
+        self._counts["info", text[:LONGEST]] += 1
 
     def lines(self) -> list[tuple[str, str]]:
         """Level and text of every kind; "(12 times)" stands behind what happened repeatedly."""
+        kinds = list(self._counts.items())
         lines = [
             (level, text if count == 1 else f"{text} ({count} times)")
-            for (level, text), count in self._counts.items()
+            for (level, text), count in kinds[:MOST_KINDS]
         ]
-        if self._further:
-            lines.append(("warning", f"further kinds of trouble ({self._further} times)"))
+        further = sum(count for _, count in kinds[MOST_KINDS:])
+        if further:
+            lines.append(("warning", f"further kinds of trouble ({further} times)"))
         return lines
-
-    def _add(self, level: str, text: str, count: int) -> None:
-        key = (level, text if len(text) <= LONGEST else text[: LONGEST - 1] + "…")
-        if count < 1:
-            return
-        if key not in self._counts and len(self._counts) >= MOST_KINDS:
-            self._further += count
-            return
-        self._counts[key] = self._counts.get(key, 0) + count

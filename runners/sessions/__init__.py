@@ -10,6 +10,7 @@ from chsel.problem.settings import build_settings
 from runners.objects.loader import ObjectModel
 from runners.sessions.configurations import find_configuration
 from runners.sessions.points import PointsSession, PointsSettings
+from runners.sessions.probing import open_probing
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 from runners.sessions.sensors import SensorsSettings, open_sensors
@@ -49,10 +50,4 @@ def open_session(
         return open_sensors(settings, object_model, seed, progress)
     configuration = settings.configuration or object_model.configuration
     find_configuration(configuration, object_model.name)
-    if kind == "kinematic":
-        from runners.sessions.kinematic import open_kinematic
-
-        return open_kinematic(object_model.mesh, configuration, settings, seed)
-    from runners.sessions.simulated import open_simulated  # imports the physics engine
-
-    return open_simulated(object_model.mesh, configuration, settings, seed)
+    return open_probing(kind, object_model.mesh, configuration, settings, seed)

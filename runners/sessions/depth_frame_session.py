@@ -12,8 +12,7 @@ from replay.events import Logged, Probe, RigDescribed, SensorImage
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel
 from runners.sensors.depth_camera import intrinsics_of, recorded
-from runners.sensors.depth_frame import DepthFrame, read_depth_frame
-from runners.sensors.depth_frame_points import FramePoints, depth_frame_points
+from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.rig import Rig
 from runners.sensors.session_report import Report
 from runners.sessions.session import SessionEvent
@@ -38,9 +37,9 @@ class DepthFrameSession:
         self.initial_points = KnownPoints()
         self.count = 1
         self._rig, self._path, self._images = rig, path, images
-        self._frame: DepthFrame = read_depth_frame(path)
+        self._frame = read_depth_frame(path)
         diameter = object_model.diameter
-        self._points: FramePoints = depth_frame_points(
+        self._points = depth_frame_points(
             self._frame, rig, free_resolution=free_resolution, diameter=diameter
         )
         self.workspace = self._points.workspace
@@ -57,28 +56,29 @@ class DepthFrameSession:
         count = len(found.points.known)
         text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
         yield Logged(0, "info", text)
-        by_sensor = {camera.name: found.counts, "label": found.labelled}
-        self.report.lines.clear()
-        for name, counts in by_sensor.items():
+        self.report.lines = list(self._remarks(camera.name))
+        yield from (Logged(0, level, text) for level, text in self.report.lines)
+        yield Probe(0, "points", found.points)
+
+    def _remarks(self, name: str) -> Iterator[tuple[str, str]]:
+        """Levels and texts on what was left out, and on what is suspicious."""
+        found, label = self._points, self._points.labelled
+        for sensor, counts in ((name, found.counts), ("label", label)):
             if counts is not None and (left_out := counts.left_out()):
-                self.report.lines.append(("info", f"{name}: {left_out}"))
-                yield Logged(0, "info", f"{name}: {left_out}")
-        label = found.labelled
+                yield "info", f"{sensor}: {left_out}"
         if label is not None and label.small + label.far > _MANY * label.pixels:
             share = 100 * (label.small + label.far) // label.pixels
-            text = (
+            yield (
+                "warning",
                 f"{share} % of the label's pixels are left out, as they are not connected with the "
-                "largest region; check label, object_class and gate.jump"
+                "largest region; check label, object_class and gate.jump",
             )
-            self.report.lines.append(("warning", text))
-            yield Logged(0, "warning", text)
         lower, upper = self.workspace.bounds
-        outside = ((found.points.known < lower) | (found.points.known > upper)).any(axis=1).sum()
+        known = found.points.known
+        outside = ((known < lower) | (known > upper)).any(axis=1).sum()
         if outside:
-            text = f"{outside} of {count} surface points are out of the workspace"
-            self.report.lines.append(("warning", text))
-            yield Logged(0, "warning", text)
-        yield Probe(0, "points", found.points)
+            text = f"{outside} of {len(known)} surface points are out of the workspace"
+            yield "warning", text
 
     def close(self) -> None:
         """Nothing is held open."""

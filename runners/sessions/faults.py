@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, Workspace
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
-from chsel.problem.settings import CheckedSettings, between
+from chsel.problem.settings import Check, CheckedSettings, between
 from chsel.problem.streams import Purpose, StreamKey, normals, uniforms
 
 if TYPE_CHECKING:
@@ -28,10 +27,14 @@ _NEIGHBOURS = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1
 _OF_SESSION, _OF_NOISE, _OF_FOREIGN, _OF_FREE = range(4)
 
 
-def _within(name: str, value: Any, low: float, high: float) -> None:
-    """Raise SettingError unless a number without a unit is from `low` to `high`."""
-    if not low <= value <= high:
-        raise SettingError(f"{name} is {value}; accepted: {low:g} to {high:g}")
+def number_between(low: float, high: float, unit: str = "") -> Check:
+    """A number from `low` to `high`."""
+
+    def check(name: str, value: Any) -> None:
+        if not low <= value <= high:
+            raise SettingError(f"{name} is {value}; accepted: {low:g} to {high:g}{unit}")
+
+    return check
 
 
 @dataclass(frozen=True)
@@ -47,18 +50,18 @@ class FaultSettings(CheckedSettings):
     # m: contacts are rounded to whole multiples of this in the world; 0: they are not.
     quantisation: Annotated[float, between(0.0, 0.1)] = 0.0
     # Share of all reported contacts that are not on the object, which come with true ones.
-    foreign_contacts: Annotated[float, partial(_within, low=0.0, high=0.5)] = 0.0
+    foreign_contacts: Annotated[float, number_between(0.0, 0.5)] = 0.0
     # m: greatest distance between a foreign contact and the true one that it comes with.
     foreign_reach: Annotated[float, between(_NEAREST, 1.0)] = 0.1
     # Share of the voxels reported free among those inside the object, beside swept ones, not deeper
     # than free_reach.
-    free_error: Annotated[float, partial(_within, low=0.0, high=1.0)] = 0.0
+    free_error: Annotated[float, number_between(0.0, 1.0)] = 0.0
     # Sides of a free voxel: greatest depth in the object of the centre of a wrong one.
-    free_reach: Annotated[float, partial(_within, low=0.0, high=2.0)] = 1.0
+    free_reach: Annotated[float, number_between(0.0, 2.0)] = 1.0
     # m: by which all contacts are shifted against free space, in one direction for the session.
     camera_bias: Annotated[float, between(0.0, 0.1)] = 0.0
     # Size of the registered mesh by that of the probed one, about the centre of its bounding box.
-    mesh_scale: Annotated[float, partial(_within, low=0.5, high=2.0)] = 1.0
+    mesh_scale: Annotated[float, number_between(0.5, 2.0)] = 1.0
 
 
 CLEAN = "clean"

@@ -11,32 +11,13 @@ import trimesh
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
-from runners.sessions.configurations import find_configuration
-from runners.sessions.described_hand import open_hand
-from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
-from runners.sessions.placement import laid_down
-from runners.sessions.probing import ProbingSession
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
 from runners.sessions.probing_settings import ProbingSettings
 
 SPACING = 0.001  # m: of the points on the hand that can touch
 PATCH = 0.010  # m: side of the patches of these points that are passed over as one
 PRECISION = 1e-6  # m: of the first contact along a mini-step
-
-
-def open_kinematic(
-    mesh: trimesh.Trimesh, configuration_name: str, settings: ProbingSettings, seed: int
-) -> ProbingSession:
-    """A session without a physics engine; mesh in its own frame, metres.
-
-    Raises SessionError for an unknown configuration.
-    """
-    configuration = find_configuration(configuration_name)
-    probed = probed_mesh(mesh, settings.faults)
-    hand = open_hand(settings.hand)
-    engine = KinematicEngine(probed, laid_down(mesh, configuration), settings, hand)
-    return ProbingSession(engine, mesh, configuration, settings, seed, hand)
 
 
 class KinematicEngine:

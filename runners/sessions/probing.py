@@ -21,13 +21,15 @@ from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
-from runners.sessions.configurations import WORKSPACE, Configuration
+from runners.sessions.configurations import WORKSPACE, Configuration, find_configuration
 from runners.sessions.faults import Faults, FaultSettings, probed_mesh
 from runners.sessions.free_space import box_shell, floor_slab, swept_voxels
 from runners.sessions.gripper import X_REST, Engine, Gripper
+from runners.sessions.placement import laid_down
 from runners.sessions.probing_hand import (
     ROTATION,
     ProbingHand,
+    open_hand,
     turned_from_forward,
     world_from_gripper,
 )
@@ -36,6 +38,27 @@ from runners.sessions.session import require_available
 
 if TYPE_CHECKING:
     import trimesh
+
+
+def open_probing(
+    kind: str, mesh: trimesh.Trimesh, configuration_name: str, settings: ProbingSettings, seed: int
+) -> ProbingSession:
+    """A session of kind "simulated", in PyBullet, or "kinematic"; mesh in its own frame, metres.
+
+    Raises SessionError for an unknown configuration, or where PyBullet is not installed.
+    """
+    configuration, hand = find_configuration(configuration_name), open_hand(settings.hand)
+    engine: Engine
+    if kind == "kinematic":
+        from runners.sessions.kinematic import KinematicEngine
+
+        probed = probed_mesh(mesh, settings.faults)
+        engine = KinematicEngine(probed, laid_down(mesh, configuration), settings, hand)
+    else:
+        from runners.sessions.simulated import PyBulletEngine
+
+        engine = PyBulletEngine(mesh, configuration, settings, hand)
+    return ProbingSession(engine, mesh, configuration, settings, seed, hand)
 
 
 class ProbingSession:

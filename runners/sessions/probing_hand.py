@@ -1,16 +1,21 @@
-"""The solid parts of a hand that probes in simulated sessions: where it touches, what it sweeps."""
+"""The hand that probes in simulated sessions: where it touches, and what it sweeps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from chsel.errors import SettingError
 from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
+from runners.sensors.hand import HandModel
+from runners.sensors.rig import BoxRig, HandRig
 
 if TYPE_CHECKING:
     import trimesh
@@ -18,8 +23,23 @@ if TYPE_CHECKING:
 # World axes of the hand's axes when it probes along world x: hand z is world x, and the wide side
 # of the hand (hand y) lies along world y.
 ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-
+LARGEST = 0.5  # m: extent of a hand along any axis
+MOST_SURFACE = 1.0  # m^2: of all parts, probed with a point to every square millimetre
+MOST_FACES = 20_000  # of the convex hulls of all parts
 _FLUSH = 1e-9  # m: of two solids that share a face
+
+
+@dataclass(frozen=True)
+class DescribedHand:
+    """Solid parts of a hand that probes along the z axis of its frame.
+
+    Each counts as its convex hull, as in physics engines. Nothing at all: the built-in hand, a
+    Franka hand with closed fingers.
+    """
+
+    urdf: str | None = None  # file whose links' collision shapes belong to the hand, joints at 0
+    root: str | None = None  # the link of the urdf whose frame is the hand's; None: its base
+    boxes: tuple[BoxRig, ...] = ()  # more parts, in the hand's frame
 
 
 class ProbingHand:
@@ -55,9 +75,7 @@ class ProbingHand:
         last = np.ceil(bounds[:, 1].max(axis=0) / spacing)
         axes = [np.arange(low, high + 1) * spacing for low, high in zip(first, last, strict=True)]
         nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        deepest = np.full(len(nodes), -np.inf)
-        for solid in self.solids:
-            np.maximum(deepest, _depth(solid, nodes), out=deepest)
+        deepest = np.max([_depth(solid, nodes) for solid in self.solids], axis=0)
         return nodes[deepest > depth]
 
     def _covering(self, index: int, spacing: float) -> FloatArray:
@@ -73,6 +91,48 @@ class ProbingHand:
                 margin = _FLUSH if other > index else -_FLUSH
                 points = points[_depth(beside, points) < margin]
         return points
+
+
+@cache
+def panda_hand() -> ProbingHand:
+    """A Franka hand with closed fingers, as two convex solids of its outer size.
+
+    The real hand is flat where these bulge by a few millimetres, so that they meet a flat object at
+    one point.
+    """
+    import trimesh
+
+    folder = Path(__file__).parent
+    files = [str(folder / f"panda_{part}.ply") for part in ("palm", "fingers")]
+    return ProbingHand([trimesh.load_mesh(file, process=False) for file in files])
+
+
+def open_hand(described: DescribedHand) -> ProbingHand:
+    """The hand of a session.
+
+    Raises SettingError for a URDF that cannot be used, and for a hand that is too large.
+    """
+    import trimesh
+
+    if described.urdf is None and not described.boxes:
+        if described.root is not None:
+            raise SettingError("hand.root without hand.urdf; accepted: both, or neither")
+        return panda_hand()
+    rig = HandRig(frame="hand", boxes=described.boxes, urdf=described.urdf, root=described.root)
+    parts = [np.asarray(part.vertices) @ ROTATION.T for part in HandModel(rig).parts()]
+    hulls = [trimesh.convex.convex_hull(vertices) for vertices in parts]
+    source = f" of {described.urdf}" if described.urdf else ""
+    for what, value, most in (
+        ("m, its largest extent", np.ptp(np.concatenate(parts), axis=0).max(), LARGEST),
+        ("m^2 of surface", sum(hull.area for hull in hulls), MOST_SURFACE),
+        ("faces", sum(len(hull.faces) for hull in hulls), MOST_FACES),
+    ):
+        if value > most:
+            raise SettingError(
+                f"the hand{source} has {value:.6g} {what}; accepted: at most {most:g}. Choose the "
+                "link of the gripper as hand.root, without the arm, or simpler shapes"
+            )
+    return ProbingHand(hulls)
 
 
 def turned_from_forward(rotation: FloatArray) -> FloatArray:

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 from chsel.errors import require_choice, require_positive
 from chsel.problem.settings import Presets, build_settings
-from runners.sessions.described_hand import DescribedHand
 from runners.sessions.faults import CLEAN, LEVELS, FaultSettings
+from runners.sessions.probing_hand import DescribedHand
 
 BOUNDARIES = ("floor_slab", "box_shell", "both")
 SWEEPS = ("mini_steps", "control_steps")

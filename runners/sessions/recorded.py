@@ -17,7 +17,7 @@ from chsel.problem.points import KnownPoints, check_points
 from chsel.problem.settings import build_settings
 from replay.events import Probe
 from replay.mcap.reader import read_recording
-from runners.sessions.described_hand import DescribedHand, open_hand
+from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.recorded_actions import RecordedActions
 from runners.sessions.session import require_available

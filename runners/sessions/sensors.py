@@ -13,7 +13,7 @@ from replay.events import Logged, RigDescribed
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import FreeMap, RobotCell
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
-from runners.sensors.first_pass import read_first_pass
+from runners.sensors.first_pass import FirstPass
 from runners.sensors.hand import HandModel
 from runners.sensors.log.clocks import in_time_order
 from runners.sensors.log.messages import Received
@@ -109,13 +109,13 @@ class SensorsSession:
         self._log = RawLog(path, progress=self._shown("looking for topics"))
         self._find_pose(path, settings.pose)
         joints = self._hand.joint_names if self._hand else ()
-        self._first_pass = read_first_pass(
+        self._first_pass = FirstPass(
             self._log, rig, joints, self._opening, self._shown("first pass over the log")
         )
         missing = [name for name in joints if name not in self._first_pass.joints.first()]
         if missing:
             self._opening.warn(f"joints without a value are at 0: {', '.join(missing)}")
-        self.source = self._log.digest(self._shown("digest of the log"))
+        self.source = self._log.digest()
         self.count = len(self._first_pass.windows)
         self.initial_points = KnownPoints(free=self._free_map()[1])
         annotated = {*rig.annotations.exclude, *(add.probe for add in rig.annotations.contacts)}

@@ -14,13 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
-from runners.sessions.configurations import Configuration, find_configuration
-from runners.sessions.described_hand import open_hand
+from runners.sessions.configurations import Configuration
 from runners.sessions.faults import probed_mesh
 from runners.sessions.gripper import START, Touch
 from runners.sessions.physics_engine import connect, silent
 from runners.sessions.placement import centre_of_mass, laid_down, lowest
-from runners.sessions.probing import ProbingSession
 from runners.sessions.probing_hand import ProbingHand, turned_from_forward
 from runners.sessions.probing_settings import ProbingSettings
 
@@ -39,19 +37,6 @@ READINGS = 50  # how many readings of contact are looked back upon
 ENOUGH_READINGS = 2
 
 
-def open_simulated(
-    mesh: trimesh.Trimesh, configuration_name: str, settings: ProbingSettings, seed: int
-) -> ProbingSession:
-    """A session in PyBullet; mesh in its own frame, metres.
-
-    Raises SessionError for an unknown configuration, or where PyBullet is not installed.
-    """
-    configuration = find_configuration(configuration_name)
-    hand = open_hand(settings.hand)
-    engine = PyBulletEngine(mesh, configuration, settings, hand)
-    return ProbingSession(engine, mesh, configuration, settings, seed, hand)
-
-
 class PyBulletEngine:
     """The hand is drawn along by a fixed constraint of limited force, and cannot turn."""
 
@@ -62,7 +47,10 @@ class PyBulletEngine:
         settings: ProbingSettings,
         hand: ProbingHand,
     ) -> None:
-        """Settle the object of a configuration, fix it, and put the hand at its start."""
+        """Settle the object of a configuration, fix it, and put the hand at its start.
+
+        Raises SessionError where PyBullet is not installed.
+        """
         self._max_force = settings.max_force
         self._readings: deque[_Reading | None] = deque(maxlen=READINGS)
         self._began: _Reading | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -10,15 +10,6 @@ import trimesh
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
 from runners.sensors.rig import BoxRig
-
-
-def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of the faces of several, nothing merged."""
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)]
-    vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
-
 
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
@@ -49,7 +40,8 @@ def boxes(*groups: dict[str, Bounds]) -> trimesh.Trimesh:
         lower, upper = np.array(bounds).T
         part = trimesh.creation.box(upper - lower)
         parts.append(part.apply_translation((lower + upper) / 2.0))
-    return joined(parts)
+    joined: Any = trimesh.util.concatenate(parts)
+    return joined
 
 
 def solids() -> tuple[BoxRig, ...]:

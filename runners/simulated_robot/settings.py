@@ -4,27 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import pi, tan
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from chsel.errors import SettingError
-from chsel.problem.settings import Check, CheckedSettings, at_most, not_negative, positive
+from chsel.problem.settings import CheckedSettings, at_most, not_negative, positive
 from chsel.sensing.depth_camera import PinholeCamera
+from runners.sessions.faults import number_between
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 
 _DEPTH = 0.25  # m: that a push may go
 
-
-def _from_to(low: float, high: float, unit: str = "") -> Check:
-    """A number between two."""
-
-    def check(name: str, value: Any) -> None:
-        if not low <= value <= high:
-            raise SettingError(f"{name} is {value}; accepted: {low:g} to {high:g}{unit}")
-
-    return check
-
-
-Width = Annotated[int, _from_to(16, 4096, " pixels")]
+Width = Annotated[int, number_between(16, 4096, " pixels")]
 Rate = Annotated[float, positive, at_most(50.0)]  # Hz: of the simulated clock at most
 Length = Annotated[float, not_negative]
 Speed = Annotated[float, positive]
@@ -51,7 +41,7 @@ class CameraSettings(CheckedSettings):
     """The depth camera outside. Its image is three quarters as high as wide."""
 
     width: Width = 640  # pixels
-    view: Annotated[float, _from_to(1, 150, " degrees")] = 80.0  # horizontal, degrees
+    view: Annotated[float, number_between(1, 150, " degrees")] = 80.0  # horizontal, degrees
     rate: Rate = 2.0  # images a second
     noise: Length = 0.0025  # standard deviation at 1 m, metres; it grows with the depth squared
     baseline: Length = 0.05
@@ -92,12 +82,12 @@ class RobotSettings(CheckedSettings):
     move_speed: Speed = 0.15
     standing: Duration = 1.5  # seconds before the first probe
     dwell: Duration = 0.6  # seconds at the end of a push
-    spread: Annotated[float, _from_to(0, 0.01, " m")] = 0.003
+    spread: Annotated[float, number_between(0, 0.01, " m")] = 0.003
     """Standard deviation of the wrist's place in a probe."""
 
     compressed: bool = False  # the outer camera's images as PNG
-    drop: Annotated[float, _from_to(0, 0.9)] = 0.02  # part of the images that are lost
-    clock_offset: Annotated[float, _from_to(-1e6, 1e6, " s")] = 0.0
+    drop: Annotated[float, number_between(0, 0.9)] = 0.02  # part of the images that are lost
+    clock_offset: Annotated[float, number_between(-1e6, 1e6, " s")] = 0.0
     """Seconds by which the outer camera's clock is ahead."""
 
     def __post_init__(self) -> None:

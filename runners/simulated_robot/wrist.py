@@ -6,6 +6,7 @@ Its frame `wrist` has z forward, along world +x; x points down and y to the left
 from __future__ import annotations
 
 from math import cos, pi, sin
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,7 +14,6 @@ import trimesh
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import axis_angle, compose
 from runners.sensors.rig import BoxRig
-from runners.simulated_robot.cabinet import joined
 
 ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -49,7 +49,8 @@ def rigid_parts() -> tuple[BoxRig, ...]:
 
 def rigid_mesh() -> trimesh.Trimesh:
     """The solid parts as one mesh, in the wrist's frame, metres."""
-    return joined([_box(part) for part in rigid_parts()])
+    joined: Any = trimesh.util.concatenate([_box(part) for part in rigid_parts()])
+    return joined
 
 
 def whole_mesh() -> trimesh.Trimesh:
@@ -59,7 +60,8 @@ def whole_mesh() -> trimesh.Trimesh:
         rotation, base = _pad(pad)
         cap = trimesh.creation.icosphere(subdivisions=3).apply_scale(CAP)
         caps.append(cap.apply_transform(compose(rotation, base)))
-    return joined([rigid_mesh(), *caps])
+    joined: Any = trimesh.util.concatenate([rigid_mesh(), *caps])
+    return joined
 
 
 def _pad(pad: str) -> tuple[FloatArray, FloatArray]:

@@ -37,6 +37,7 @@ from tests.determinism.machine_code import assembly, called, fused, host, loose,
 from tests.determinism.problems import grid, scene
 from tests.determinism.stages import run
 
+pytestmark = pytest.mark.slow  # compiles nearly all kernels
 REPOSITORY = Path(__file__).resolve().parents[2]
 ENOUGH = ("chsel default", "contacts alone", "chsel reference", "plane_angle", "deep alpha")
 ENOUGH += ("icp default", "svgd default", "SVGD, median", "cvo default", "cvo reference")

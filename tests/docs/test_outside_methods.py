@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pyarrow.parquet as parquet
+import pytest
 
 from tests.docs.page import commands, shell, write_files
 
+pytestmark = pytest.mark.slow
 PAGE = "outside_methods.md"
 
 

@@ -13,6 +13,7 @@ from replay.events import Decided
 from replay.mcap.reader import read_recording
 from tests.docs.page import commands, shell, write_files
 
+pytestmark = pytest.mark.slow
 PAGE = "writing_a_policy.md"
 
 

@@ -177,7 +177,7 @@ def test_a_full_disk_under_a_file_of_a_run_is_named(
     whole = {"summary.json": ["config.yaml", "recording.mcap"], "config.yaml": []}
     assert sorted(os.listdir(folder)) == whole[name]
     if name == "summary.json":
-        assert main(["info", str(folder / "recording.mcap"), "--check"]) == 0
+        assert main(["info", str(folder / "recording.mcap")]) == 0
 
 
 def test_a_run_folder_that_was_removed_is_not_made_again(tmp_path) -> None:

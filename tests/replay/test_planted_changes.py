@@ -9,6 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECORDING = REPOSITORY / "tests" / "replays" / "spam_can_gradient_descent.mcap"
 KERNEL = "chsel/cost/cost_kernels.py"

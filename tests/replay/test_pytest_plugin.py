@@ -105,17 +105,16 @@ def test_a_folder_that_does_not_exist_is_one_clear_line(pytester: pytest.Pyteste
 
 def test_every_object_and_method_has_stored_replays_of_a_modest_size() -> None:
     from chsel.methods import METHODS
+    from runners.objects.loader import MODELS
 
     files = list(REPLAYS.glob("*.mcap"))
     sizes = [file.stat().st_size for file in files]
     assert max(sizes) <= 2**20
     assert sum(sizes) <= 15 * 2**20
     starts = [read_recording(file).start for file in files]
-    models = Path(__file__).resolve().parents[2].glob("conf/object/*.yaml")
-    objects = {file.stem for file in models} - {"mesh"}
     found = {(start.object, start.method) for start in starts}
     chsel = ("chsel", "chsel_cma_me", "gradient_descent")
-    assert {(name, method) for name in objects for method in chsel} <= found
+    assert {(name, method) for name in MODELS for method in chsel} <= found
     for method in METHODS:
         assert len({name for name, stored in found if stored == method}) >= 4, method
     assert any("policy" in start.config for start in starts)

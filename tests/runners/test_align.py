@@ -23,7 +23,7 @@ from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from runners import align, plausible, probe
 from runners.evaluation.true_poses import sought_pose
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sensors.pose_file import beside, read_pose
 from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
@@ -145,7 +145,7 @@ def test_a_raw_log_is_read_first_and_its_object_is_named(tmp_path: Path) -> None
     small = RobotSettings(
         probes=1, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=96)
     )
-    model = MODELS["mustard"]()
+    model = load_model("mustard")
     mesh = clean_mesh(model.vertices, model.faces, name="mustard", scale=1.0)
     made = simulate_log(log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh, 0, small)
     x, y, z = (float(value) for value in made.world_from_object[:3, 3] + [0.01, 0.0, 0.005])

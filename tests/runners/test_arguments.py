@@ -16,27 +16,18 @@ from omegaconf import OmegaConf
 from chsel.errors import SettingError
 from replay.__main__ import main as replay
 from runners import evaluate, plausible, probe, real
-from runners.command.arguments import hydra_arguments, is_setting, quoted
+from runners.command.arguments import hydra_arguments, quoted
 from tests.runners.in_process import run
 
 NAMES = (
-    "a,b=[c]'d",
-    'it\'s "so"',
+    "a,b [1].obj",
+    "it's 'so'",
     "two words",
     "Prüfkörper",
     "物体",
-    "{x: 1}",
     "(a)",
-    "a\\",
     "a\\'b",
-    "${seed}",
-    "\\${seed}",
-    "a$b#c%d&e",
-    "null and void",
-    "12",
-    "true",
-    "glob(*)",
-    "~+x",
+    "a#b",
     "[/bold]",
 )
 SHORT = (
@@ -66,7 +57,7 @@ def value_of(word: str) -> object:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("key", ["object.path", "++session.path", "+outside.x", "logs", "out"])
+@pytest.mark.parametrize("key", ["object.path", "++session.hand.urdf", "+outside.x", "logs"])
 def test_a_path_reaches_the_configuration_as_typed(key: str, name: str) -> None:
     (word,) = hydra_arguments("probe", [f"{key}={name}"])
     assert word.startswith(f"{key}=")
@@ -74,30 +65,20 @@ def test_a_path_reaches_the_configuration_as_typed(key: str, name: str) -> None:
     assert value_of(f"x={quoted(name)}") == name
 
 
-def test_the_home_folder_is_put_in_and_what_is_quoted_stays(
+def test_the_home_folder_is_put_in_and_what_hydra_reads_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("HOME", "/home/somebody")
-    words = ["object.path=~/x.obj", "assets.dir=~", "session.rig.hand.urdf=~/a b.urdf"]
+    words = ["object.path=~/a,b [1].obj", "assets.dir=~", "session.rig.hand.urdf=~/a b.urdf"]
     assert [value_of(word) for word in hydra_arguments("probe", words)] == [
-        "/home/somebody/x.obj",
+        "/home/somebody/a,b [1].obj",
         "/home/somebody",
         "/home/somebody/a b.urdf",
     ]
-    unchanged = ['session.path="a,b"', "session.path='a,b'", "out=null", "out=", "object=drill"]
-    unchanged += ['session.path="a","b"', "name=~/x", "seed=1,2", "~object.path", "-m"]
+    unchanged = ['session.path="a,b"', "out=null", "out=", "methods=[chsel,icp]", "logs=${seed}"]
+    unchanged += ["settings={icp: {iterations: 3}}", "~object.path", "-m", "seed=1,2"]
     assert hydra_arguments("probe", unchanged) == unchanged
-
-
-def test_a_word_that_is_a_file_is_no_setting(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert is_setting("seed=1")
-    Path("seed=1").touch()
-    assert not is_setting("seed=1")
-    assert hydra_arguments("plausible", ["seed=1"]) == ["file='seed=1'"]
-    assert hydra_arguments("report", ["seed=1"]) == ["dir='seed=1'"]
+    assert hydra_arguments("probe", ["seed=1,2"]) == ["seed='1,2'"], "no sweep without -m"
 
 
 @pytest.fixture
@@ -106,7 +87,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("HOME", str(tmp_path))
     box = trimesh.creation.box((0.1, 0.06, 0.2))
     box.export(tmp_path / "mesh.obj")
-    shutil.copy(tmp_path / "mesh.obj", tmp_path / "a,b=[c]'d.obj")
+    shutil.copy(tmp_path / "mesh.obj", tmp_path / "a,b [c]'d.obj")
     points = trimesh.sample.sample_surface(box, 6, seed=0)[0]
     free = np.array([[0.4, 0.0, 0.0], [0.0, 0.4, 0.0]])
     np.savez(tmp_path / "Prüf körper,1.npz", surface=points, free=free, world_from_object=np.eye(4))
@@ -122,12 +103,12 @@ def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(
         "session=points",
         "session.path=~/Prüf körper,1.npz",
         "object=mesh",
-        "object.path=a,b=[c]'d.obj",
-        "logs=~/läufe [1],x=${seed}",
+        "object.path=a,b [c]'d.obj",
+        "logs=~/läufe [1],x",
         *SHORT,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    (folder,) = (home / "läufe [1],x=${seed}" / "probe").iterdir()
+    (folder,) = (home / "läufe [1],x" / "probe").iterdir()
     assert json.loads((folder / "summary.json").read_text())["outcome"] == "finished"
     drawn = home / "drawn.rrd"
     assert replay(["view", str(folder / "recording.mcap"), "--save=~/drawn.rrd"]) == 0
@@ -139,18 +120,13 @@ def test_a_session_of_strange_files_runs_from_the_command_to_the_replay(
     assert list((home / "s,1").iterdir())
 
 
-def test_a_sweep_keeps_commas_of_paths_and_quoted_files_are_several(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_over_files_and_seeds(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(home)
     shutil.copy(home / "Prüf körper,1.npz", "b.npz")
-    given = ["session=points", "object=mesh", "object.path=~/a,b=[c]'d.obj", *SHORT]
-    files = 'session.path="Prüf körper,1.npz","b.npz"'
-    done = run(probe.main, "-m", "seed=0,1", *given, files, "logs=l,1")
+    given = ["session=points", "object=mesh", "object.path=~/mesh.obj", *SHORT]
+    done = run(probe.main, "-m", "seed=0,1", *given, 'session.path="Prüf körper,1.npz",b.npz')
     assert (done.returncode, done.stderr) == (0, "")
-    finished = [
-        json.loads(path.read_text()) for path in (home / "l,1" / "probe").glob("*/summary.json")
-    ]
+    finished = [json.loads(path.read_text()) for path in home.glob("logs/probe/*/summary.json")]
     assert sorted(one["seed"] for one in finished) == [0, 0, 1, 1]
 
 
@@ -162,19 +138,25 @@ def test_a_missing_file_of_a_strange_name_is_named(home: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_words_without_a_key_get_that_of_the_command() -> None:
-    assert hydra_arguments("report", ["a b", "out=x", "--traceback"]) == ["out='x'", "dir='a b'"]
+def test_words_without_a_key_get_that_of_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert hydra_arguments("report", ["a b", "out=x", "--traceback"]) == ["out=x", "dir='a b'"]
     assert hydra_arguments("align", ["-cd", "x", "f.mcap"]) == ["-cd", "x", "file='f.mcap'"]
+    assert hydra_arguments("plausible", ["f", "3", "5..9"]) == ["file='f'", "steps='3,5..9'"]
     with pytest.raises(SettingError, match="'g' is one argument too many; accepted: FILE KEY"):
         hydra_arguments("align", ["f", "g"])
     assert hydra_arguments("probe", ["f", "-m"]) == ["f", "-m"]  # Hydra's to refuse
+    monkeypatch.chdir(tmp_path)
+    Path("seed=1").touch()
+    assert hydra_arguments("plausible", ["seed=1"]) == ["file='seed=1'"]
 
 
 def test_any_key_of_an_open_group_is_taken() -> None:
-    words = ["settings.icp.iterations=3", "outside.mine=~x", "seeds=0"]
+    words = ["settings.icp.iterations=3", "outside.mine=x [1]", "seeds=0"]
     assert hydra_arguments("evaluate", words) == [
         "++settings.icp.iterations=3",
-        "++outside.mine='~x'",
+        "++outside.mine='x [1]'",
         "seeds=0",
     ]
 

@@ -13,11 +13,6 @@ from runners.benchmarks.registrations import Steps
 from runners.command.choices import CONF
 from runners.evaluation.metrics import MetricsConfig
 from runners.published_package.environment import PackageConfig
-from runners.run.recording import RecordingConfig
-from runners.sessions.points import PointsSettings
-from runners.sessions.recorded import RecordedSettings
-from runners.sessions.sensors import SensorsSettings
-from runners.simulated_robot.settings import RobotSettings
 
 SHOWN = [
     ("align", "search", TruePoseSettings),
@@ -25,11 +20,6 @@ SHOWN = [
     ("published", "package", PackageConfig),
     ("plausible", "metrics", MetricsConfig),
     ("evaluate", "metrics", MetricsConfig),
-    ("simulate_rig", "", RobotSettings),
-    ("recording/both", "", RecordingConfig),
-    ("session/points", "", PointsSettings),
-    ("session/recorded", "", RecordedSettings),
-    ("session/sensors", "", SensorsSettings),
 ]
 
 

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import types
-from pathlib import Path
-
 import pytest
 import trimesh
 from hydra import compose, initialize_config_dir
@@ -16,11 +12,8 @@ from runners import fetch
 from runners.command.choices import CONF
 from runners.command.program import plain
 from runners.objects.loader import ObjectConfig, load_object
-from runners.objects.models import MODELS
 from runners.objects.scans import SCANS, check_scan, scan_file
 from tests.runners.in_process import run
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 # name: (simulated scale, epsilon in metres, default configuration), as the paper's trials have it
 TRIALS = {
@@ -49,14 +42,6 @@ def test_models_and_scans_share_the_scales_of_the_trials(name):
         assert (config.scale, config.epsilon, config.configuration) == TRIALS[name]
     assert scan.scan is not None
     assert SCANS[scan.scan][0] == name
-
-
-def test_every_model_and_every_scan_has_its_choice():
-    assert set(MODELS) == set(TRIALS)
-    assert {name for name, _ in SCANS.values()} == set(TRIALS)
-    folder = REPOSITORY / "conf/object"
-    files = {str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.yaml")}
-    assert files == {*TRIALS, *(f"ycb/{name}" for name in TRIALS), "mesh"}
 
 
 @pytest.mark.parametrize("name", TRIALS)
@@ -135,24 +120,17 @@ def test_a_setting_out_of_range_is_named(override, message):
         chosen("object=drill", override)
 
 
-@pytest.fixture
-def _one_model(monkeypatch):
-    models = types.ModuleType("runners.objects.models")
-    models.MODELS = {"drill": lambda: trimesh.creation.box((0.1, 0.2, 0.3))}  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "runners.objects.models", models)
-
-
-@pytest.mark.usefixtures("_one_model")
 def test_a_model_is_scaled(tmp_path):
-    loaded = load_object(chosen("object=drill", "object.scale=2"), tmp_path / "needs no assets")
-    assert loaded.mesh.extents == pytest.approx([0.2, 0.4, 0.6])
-    assert loaded.mesh.volume == pytest.approx(0.048)
+    small, large = (
+        load_object(chosen("object=spam_can", f"object.scale={scale}"), tmp_path / "no assets")
+        for scale in (1, 2)
+    )
+    assert large.mesh.extents == pytest.approx(2.0 * small.mesh.extents)
 
 
-@pytest.mark.usefixtures("_one_model")
 def test_a_model_that_does_not_exist_is_named(tmp_path):
-    with pytest.raises(SettingError, match=r"object\.name is 'hammer'; accepted: drill"):
-        load_object(chosen("object=hammer"), tmp_path)
+    with pytest.raises(SettingError, match=r"object\.name is 'cup'; accepted: drill, mustard"):
+        load_object(chosen("object=drill", "object.name=cup"), tmp_path)
 
 
 def test_the_command_downloads_nothing_that_is_there_and_leaves_no_traces(

@@ -88,7 +88,7 @@ def test_a_recording_gets_its_sets_and_its_hypotheses_are_measured(folder: Path)
         assert float(cells[9]) == pytest.approx(float(cells[7]) + float(cells[8]), rel=0.01)
         assert float(cells[10]) == pytest.approx(float(cells[9]) ** 0.5, rel=0.01)
     before = [file.stat().st_mtime_ns for file in files]
-    again = run(plausible.main, str(path), "--steps", "1", *SMALL, "threads=2")
+    again = run(plausible.main, str(path), "1", *SMALL, "threads=2")
     assert [row[-1] for row in rows(again.stdout)] == ["found"]
     assert rows(again.stdout)[0][:-1] == rows(done.stdout)[1][:-1]
     assert [file.stat().st_mtime_ns for file in files] == before
@@ -126,7 +126,7 @@ def test_a_points_file_needs_its_object_and_the_true_pose_in_it_or_beside_it(fol
     [
         (["nothing.mcap"], "recording nothing.mcap"),
         ([], "file is missing"),
-        (["{recording}", "--steps", "7"], "there is no step 7; accepted: 0, 1"),
+        (["{recording}", "7"], "there is no step 7; accepted: 0, 1"),
         (["{recording}", "definition=mine"], "definition has no option 'mine'"),
         (["{recording}", "definition.epsilon=-1"], "epsilon is -1.0"),
         (["{recording}", "metrics.quantile=2"], "quantile is 2.0"),
@@ -149,11 +149,5 @@ def test_arguments_may_stand_without_a_name() -> None:
         "definition=paper",
         "file='a b.mcap'",
         "steps='4..6,9'",
-    ]
-    assert hydra_arguments("plausible", ["file=x.mcap", "--steps=2", "--cfg", "job"]) == [
-        "file='x.mcap'",
-        "--cfg",
-        "job",
-        "steps='2'",
     ]
     assert hydra_arguments("plausible", ["it's"]) == ["file='it\\'s'"]

@@ -14,7 +14,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, axis_angle, compose
 from replay.events import Measured
 from replay.mcap.reader import Recording, read_recording
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.probe import main
 from tests.runners.in_process import run
 
@@ -24,7 +24,7 @@ POSE = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.5)), np.array([0
 @pytest.fixture(scope="module")
 def mesh_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("mesh") / "mustard.ply"
-    MODELS["mustard"]().export(path)
+    load_model("mustard").export(path)
     return path
 
 

@@ -94,7 +94,7 @@ def test_objects_of_logs_are_of_real_size_unless_their_file_says_otherwise(tmp_p
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "object.yaml is missing; accepted: a name of conf/object"),
+        (None, "object.yaml is missing; accepted: a choice of object="),
         ("[1]", "object.yaml has no name"),
         ("name: [", "object.yaml cannot be read"),
     ],

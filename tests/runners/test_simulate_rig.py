@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
 
-from chsel.problem.settings import build_settings, settings_mapping
+from chsel.problem.settings import build_settings
 from runners import simulate_rig
 from runners.command.choices import CONF
-from runners.command.program import plain
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sensors.rig import Rig
-from runners.simulate_rig import SimulateRigConfig
 from runners.simulated_robot import wrist
 from runners.simulated_robot.recorder import WORLD, WRIST
 from runners.simulated_robot.robot_configurations import (
@@ -23,7 +20,6 @@ from runners.simulated_robot.robot_configurations import (
     CABINET_WORKSPACE,
     stood_on_shelf,
 )
-from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 from tests.runners.in_process import run
 
@@ -44,7 +40,7 @@ def test_a_log_and_its_truth_are_written(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert sorted(file.name for file in log.parent.iterdir()) == ["log.mcap", "log.truth.yaml"]
     truth = yaml.safe_load(log.with_suffix(".truth.yaml").read_text())
-    pose = stood_on_shelf(MODELS["mustard"](), CABINET_CONFIGURATIONS["cabinet_mustard"])
+    pose = stood_on_shelf(load_model("mustard"), CABINET_CONFIGURATIONS["cabinet_mustard"])
     assert np.allclose(truth.pop("world_from_object"), pose, atol=1e-12)
     assert truth == {
         "configuration": "cabinet_mustard",
@@ -105,14 +101,6 @@ def test_a_log_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "x.mcap cannot be written" in done.stderr
     assert "out=FILE.mcap" in done.stderr
-
-
-def test_the_configuration_file_says_the_defaults_of_the_twin() -> None:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        values = plain(compose("simulate_rig"))
-    for name in SimulateRigConfig.__dataclass_fields__:
-        del values[name]
-    assert values == settings_mapping(RobotSettings())
 
 
 def test_the_rig_of_the_cabinet_describes_the_twin() -> None:

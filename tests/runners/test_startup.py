@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import signal
@@ -13,6 +14,8 @@ import pytest
 
 from replay.startup import WRONG_PACKAGE
 from replay.verbs import VERBS
+from runners import probe, report
+from tests.runners.in_process import run
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 COMMANDS = ("align", "benchmark", "evaluate", "fetch", "plausible", "probe", "published")
@@ -46,23 +49,20 @@ def ran(
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_a_command_waits_for_no_heavy_import(command: str, tmp_path: Path) -> None:
-    done = ran([f"runners.{command}", "--help"], tmp_path, LISTED)
-    assert (done.returncode, done.stderr) == (0, "[]\n")
+def test_every_command_has_help(command: str) -> None:
+    done = run(importlib.import_module(f"runners.{command}").main, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"python -m runners.{command}" in done.stdout
     assert "== Settings" in done.stdout
-    assert len(done.stdout.splitlines()) > 8
 
 
-def test_help_shows_the_choices_made_and_leaves_mistakes_to_the_command(tmp_path: Path) -> None:
-    words = ["runners.probe", "object=mustard", "method=icp", "seed=3", "-h"]
-    done = ran(words, tmp_path, LISTED)
-    assert "name: icp" in done.stdout
-    assert "name: mustard" in done.stdout
-    assert "seed: 3" in done.stdout
-    assert done.stderr == "[]\n"
-    mistaken = ran(["runners.report", "colour=red", "--help"], tmp_path, "")
-    assert mistaken.returncode == 2
-    assert "report has no key 'colour'" in mistaken.stderr
+def test_help_shows_the_choices_made_and_mistakes_are_errors() -> None:
+    done = run(probe.main, "object=mustard", "method=icp", "seed=3", "-h")
+    for shown in ("name: icp", "name: mustard", "seed: 3", "ycb/drill", "method=anchored|chsel|"):
+        assert shown in done.stdout
+    done = run(report.main, "colour=red", "--help")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: report has no key 'colour'; accepted: dir, out, ")
 
 
 @pytest.mark.parametrize("verb", ["", *VERBS])
@@ -127,9 +127,7 @@ def test_registrations_import_nothing_that_they_do_not_need() -> None:
 @pytest.mark.parametrize(
     ("words", "module"),
     [
-        (["runners.probe"], "hydra"),
         (["runners.probe"], "numba"),
-        (["runners.probe", "logs=l"], "igl"),
         (["runners.report", "x"], "pyarrow"),
         (["replay", "verify", "x.mcap"], "numba"),
     ],

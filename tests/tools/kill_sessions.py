@@ -224,7 +224,7 @@ def _recovered_probes(expected: list[Event], logs: Path, reported: int) -> int |
             raise
         return None
     events = list(read_recording(out).events())
-    if found.ended is None:
+    if not found.ended:
         assert isinstance(events[-1], SessionEnded)
         events = events[:-1]
         if tells_loss(events[-1]):  # killed within a write, of what was not yet reported

@@ -6,26 +6,27 @@ import heapq
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from chsel.numerics.arrays import IntArray
 from runners.sensors.log.messages import CloudMessage, ImageMessage, Received, TransformMessage
 from runners.sensors.rig import ClockRig
 
 _NANOSECONDS = 1e9
 _END_OF_TIME = 2**63 - 1
-_MOST_KEPT = 2**16  # offsets of a topic
 
 
 class Clocks:
-    """Gathers the stamps of a log's messages, in the order in which they were read.
+    """Gathers the times of a log's messages, in the order in which they were read.
 
     Static transforms do not count: their stamps are of long ago, and hold for all times.
     """
 
     def __init__(self, rig: ClockRig) -> None:
         self._rig = rig
-        self._offsets: dict[str, _Offsets] = {}
+        self._times: dict[str, tuple[array[int], array[int]]] = {}
         self._last: int | None = None
         self._steps = {"ahead": 0, "back": 0}
 
@@ -36,15 +37,28 @@ class Clocks:
             self._steps["ahead" if step > 0 else "back"] += 1
         self._last = received.log_time
         content = received.content
-        if received.stamp and not (isinstance(content, TransformMessage) and content.static):
-            offsets = self._offsets.setdefault(received.topic, _Offsets())
-            offsets.add(received.stamp - received.log_time)
+        if not (isinstance(content, TransformMessage) and content.static):
+            times = self._times.setdefault(received.topic, (array("q"), array("q")))
+            times[0].append(received.log_time)
+            times[1].append(received.stamp or 0)
+
+    def of(self, topic: str) -> tuple[IntArray, IntArray]:
+        """The log's times (N,) and stamps (N,), 0: none, of a topic's messages, nanoseconds."""
+        log_times, stamps = self._times.get(topic, (array("q"), array("q")))
+        return np.array(log_times, dtype=np.int64), np.array(stamps, dtype=np.int64)
 
     def correction(self) -> ClockCorrection:
         """What must be added to the stamps of each topic, by all messages so far."""
-        if self._rig.stamp == "log" or not self._offsets:
+        offsets = {}
+        for topic in self._times:
+            log_times, stamps = self.of(topic)
+            if stamps.any():
+                offsets[topic] = (stamps - log_times)[stamps != 0]
+        if self._rig.stamp == "log" or not offsets:
             return ClockCorrection(by_log=True, warnings=tuple(self._step_remarks()))
-        medians = {topic: offsets.median() for topic, offsets in self._offsets.items()}
+        medians = {
+            topic: int(np.sort(some)[(len(some) - 1) // 2]) for topic, some in offsets.items()
+        }
         typical = _typical(list(medians.values()))
         limit, jump = self._rig.offset * _NANOSECONDS, self._rig.jump * _NANOSECONDS
         shifts = {
@@ -56,8 +70,8 @@ class Clocks:
             f"the clock of {topic} is {_seconds(-shift)} other topics': its stamps are shifted"
             for topic, shift in sorted(shifts.items())
         ]
-        for topic, offsets in sorted(self._offsets.items()):
-            count = offsets.departing(medians[topic], jump)
+        for topic, some in sorted(offsets.items()):
+            count = int((np.abs(some.astype(float) - medians[topic]) > jump).sum())
             if count:
                 warnings.append(
                     f"{count} messages on {topic} have stamps more than {self._rig.jump:g} s off: "
@@ -83,61 +97,33 @@ class Clocks:
 
 @dataclass(frozen=True)
 class ClockCorrection:
-    """Times of messages by one clock. warnings: what a user should know of the clocks.
-
-    shifts: nanoseconds to add, of topics that depart. medians: of the stamps less the log's times,
-    by topic. typical: of all topics, 0 if small. jump: nanoseconds a stamp may be off at most.
-    by_log: whether the log's times count for all.
-    """
+    """Times of messages by one clock."""
 
     shifts: dict[str, int] = field(default_factory=dict)
-    medians: dict[str, int] = field(default_factory=dict)
-    typical: int = 0
-    jump: float = 0.0
-    by_log: bool = False
-    warnings: tuple[str, ...] = ()
+    """Nanoseconds to add, of topics that depart."""
 
-    def of(self, topic: str) -> int:
-        """Nanoseconds to add to a topic's stamps."""
-        return self.shifts.get(topic, 0)
+    medians: dict[str, int] = field(default_factory=dict)  # of stamps less the log's times, ns
+    typical: int = 0  # of all topics, ns; 0 if small
+    jump: float = 0.0  # ns by which a stamp may be off at most
+    by_log: bool = False  # whether the log's times count for all
+    warnings: tuple[str, ...] = ()  # what a user should know of the clocks
+
+    def times(self, topic: str, log_times: Any, stamps: Any) -> IntArray:
+        """When messages (N,) were true, nanoseconds: by their stamps, where they can be."""
+        logged, sent = np.asarray(log_times, np.int64), np.asarray(stamps, np.int64)
+        if self.by_log:
+            return logged
+        usual, shift = self.medians.get(topic), self.shifts.get(topic, 0)
+        times = logged + self.typical
+        if usual is not None:
+            is_off = np.abs((sent - logged).astype(float) - usual) > self.jump
+            by_stamp = np.where(is_off, logged + (usual + shift), sent + shift)
+            times = np.where(sent == 0, times, by_stamp)
+        return np.clip(times, 0, _END_OF_TIME)
 
     def time(self, received: Received) -> int:
-        """When a message was true, nanoseconds: by its stamp, where it has one that can be."""
-        if self.by_log:
-            return received.log_time
-        usual = self.medians.get(received.topic)
-        if not received.stamp or usual is None:
-            time = received.log_time + self.typical
-        elif abs(received.stamp - received.log_time - usual) > self.jump:
-            time = received.log_time + usual + self.of(received.topic)
-        else:
-            time = received.stamp + self.of(received.topic)
-        return min(max(time, 0), _END_OF_TIME)
-
-
-class _Offsets:
-    """Offsets of one topic, thinned out evenly so that they stay few."""
-
-    def __init__(self) -> None:
-        self._kept = array("q")
-        self._every, self._count = 1, 0
-
-    def add(self, offset: int) -> None:
-        """Take note of one, nanoseconds."""
-        if self._count % self._every == 0:
-            self._kept.append(offset)
-            if len(self._kept) > _MOST_KEPT:
-                self._kept, self._every = self._kept[::2], 2 * self._every
-        self._count += 1
-
-    def median(self) -> int:
-        """Of the offsets kept, the lower of two."""
-        return int(np.sort(np.array(self._kept))[(len(self._kept) - 1) // 2])
-
-    def departing(self, median: int, limit: float) -> int:
-        """About how many lie further than a limit from the median."""
-        away = np.abs(np.array(self._kept).astype(float) - float(median))
-        return int((away > limit).sum()) * self._every
+        """When one message was true, nanoseconds."""
+        return int(self.times(received.topic, received.log_time, received.stamp or 0))
 
 
 def _typical(medians: list[int]) -> int:

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cache
 from importlib import import_module
 from typing import Any
 
-from google.protobuf.message import DecodeError
-
-from chsel.errors import RecordingError
 from chsel.problem.poses import apply
-from replay.mcap.wire import check_wire
+from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log import message_fields as fields
 from runners.sensors.log.images import pixel_rows, png_pixels
 from runners.sensors.log.messages import (
@@ -23,44 +19,23 @@ from runners.sensors.log.messages import (
     ImageMessage,
     JointsMessage,
     MarkerMessage,
-    PoseMessage,
     UnusableMessage,
 )
-
-_MOST_TRANSFORMS = 10_000  # in one message
-_MATRIX = 9  # entries of intrinsics
 
 
 def foxglove_decoder(name: str) -> Decode | None:
     """Decodes messages of this name; None for one that is not read.
 
-    Its class is the installed package's, never one that a file describes.
+    Its class is the installed package's, whatever a file describes.
     """
-    contents, kind = _CONTENTS.get(name), _kind(name)
-    if contents is None or kind is None:
+    contents, short = _CONTENTS.get(name), name.removeprefix("foxglove.")
+    if contents is None:
         return None
-
-    def decode(data: bytes) -> Iterator[Decoded]:
-        try:
-            check_wire(kind.DESCRIPTOR, data)
-            message = kind.FromString(data)
-        except (DecodeError, RecordingError):
-            raise UnusableMessage(f"a message is no valid {name}") from None
-        return contents(message)
-
-    return decode
-
-
-@cache
-def _kind(name: str) -> Any:
-    """The class of a message; None where the package, of several versions, lacks it."""
-    if name not in _CONTENTS:
-        return None
-    short = name.removeprefix("foxglove.")
     try:
-        return getattr(import_module(f"foxglove_schemas_protobuf.{short}_pb2"), short)
-    except ImportError:
+        kind = getattr(import_module(f"foxglove_schemas_protobuf.{short}_pb2"), short)
+    except ImportError:  # the package, of several versions, lacks it
         return None
+    return fields.decoder(name, kind.FromString, contents)
 
 
 def _stamp(message: Any) -> int | None:
@@ -77,26 +52,13 @@ def _compressed_image(message: Any, frame: str) -> ImageMessage:
 
 
 def _calibration(message: Any, frame: str) -> CameraInfoMessage:
-    fields.require_length("entries", len(message.K), "of its intrinsics", _MATRIX)
     fx, _, cx, _, fy, cy, *_ = message.K
-    size = (message.width, message.height)
-    return fields.intrinsics(frame, size, (fx, fy), (cx, cy), message.D)
-
-
-def _pose(message: Any, frame: str) -> PoseMessage:
-    return PoseMessage(frame, fields.rigid(message.pose.position, message.pose.orientation))
-
-
-def _poses(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, fields.positions(pose.position for pose in message.poses))
-
-
-def _point(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, fields.positions([message.point]))
+    camera = PinholeCamera(message.width, message.height, fx, fy, cx, cy)
+    return CameraInfoMessage(frame, camera, distorted=any(message.D))
 
 
 def _cloud(message: Any, frame: str) -> CloudMessage:
-    named = fields.named_fields((field.name, field.offset, field.type) for field in message.fields)
+    named = {field.name: (field.offset, field.type) for field in message.fields}
     stride, data = message.point_stride, message.data
     if stride < 1 or len(data) % stride:
         raise UnusableMessage(f"a point cloud has {len(data)} bytes, of {stride} a point")
@@ -122,8 +84,6 @@ def _transform(message: Any) -> Iterator[Decoded]:
 
 
 def _transforms(message: Any) -> Iterator[Decoded]:
-    if len(message.transforms) > _MOST_TRANSFORMS:
-        raise UnusableMessage(f"it has {len(message.transforms)} transforms")
     for part in message.transforms:
         yield from _transform(part)
 
@@ -149,9 +109,9 @@ _CONTENTS: dict[str, Callable[[Any], Iterator[Decoded]]] = {
     "foxglove.CameraCalibration": _stamped(_calibration),
     "foxglove.FrameTransform": _transform,
     "foxglove.FrameTransforms": _transforms,
-    "foxglove.PoseInFrame": _stamped(_pose),
-    "foxglove.PosesInFrame": _stamped(_poses),
-    "foxglove.Point3InFrame": _stamped(_point),
+    "foxglove.PoseInFrame": _stamped(fields.pose),
+    "foxglove.PosesInFrame": _stamped(fields.poses),
+    "foxglove.Point3InFrame": _stamped(fields.point),
     "foxglove.PointCloud": _stamped(_cloud),
     "foxglove.JointStates": _stamped(_joints),
     "foxglove.Log": _stamped(_log),

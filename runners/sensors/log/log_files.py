@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import heapq
 import re
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from chsel.errors import SessionError
+from replay.mcap.log_file import ACCEPTED, RawMessage
 from replay.mcap.texts import one_line
-from replay.raw.raw_file import ACCEPTED
-from replay.raw.raw_reading import RawMessage
 from runners.sensors.yaml_file import read_yaml
 
 _METADATA = "metadata.yaml"
-_LONGEST_METADATA = 2**20  # bytes
 
 
 def log_files(path: Path, warnings: list[str]) -> list[Path]:
@@ -51,7 +48,7 @@ def _named_files(folder: Path, warnings: list[str]) -> list[Path]:
         warnings.append(f"{_METADATA} is missing: its .mcap files are read in the order of names")
         return []
     try:
-        about = read_yaml(folder / _METADATA, _LONGEST_METADATA)["rosbag2_bagfile_information"]
+        about = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
         storage, names = about.get("storage_identifier", "mcap"), about["relative_file_paths"]
         compression = about.get("compression_mode") or ""
     except (SessionError, LookupError, TypeError, AttributeError) as error:
@@ -120,9 +117,3 @@ def merged(
         following = next(messages, None)
         if following is not None:
             heapq.heappush(heads, (following.log_time, number, following, messages))
-
-
-def most_at_once(spans: Sequence[Span]) -> int:
-    """How many of the files are open at a time, at most."""
-    firsts, lasts = (sorted(span[end] for span in spans) for end in (0, 1))
-    return max(bisect_right(firsts, first) - bisect_left(lasts, first) for first in firsts)

@@ -9,6 +9,7 @@ import numpy as np
 
 from chsel.errors import ChselError
 from chsel.numerics.arrays import FloatArray
+from chsel.sensing.depth_camera import PinholeCamera
 
 
 class UnusableMessage(ChselError):
@@ -29,15 +30,10 @@ class ImageMessage:
 
 @dataclass(frozen=True)
 class CameraInfoMessage:
-    """Intrinsics of a camera, pixels. distorted: whether lens distortion was left in its images."""
+    """Intrinsics of a camera. distorted: whether lens distortion was left in its images."""
 
     frame: str
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    camera: PinholeCamera
     distorted: bool = False
 
 

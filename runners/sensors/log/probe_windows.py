@@ -6,12 +6,12 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from chsel.errors import SettingError
 from runners.sensors.rig import ProbeTimes
 from runners.sensors.session_report import LogWarnings
 
-MOST_PROBES = 100_000
 _TEXT = re.compile(r"(begin|end)\s*(\d{1,6})?")
 _INTEGER = re.compile(r"\s*(-?\d{1,6})\s*")
 _SECOND = 1_000_000_000  # ns
@@ -45,17 +45,35 @@ def marked_windows(
     Texts are "begin N", "begin", "end N", "end", integers (below 0: end) and true or false.
     Other texts, and begins and ends that do not fit, are warnings.
     """
-    spans = _Spans(warnings)
+    spans: list[_Span] = []
+    begun: tuple[int, int | None] | None = None
     for time, text in sorted(markers, key=lambda marker: marker[0]):
         marker = _parsed(text)
         if marker is None:
             warnings.warn(f"a marker is {text[:40]!r}; accepted: begin N, end")
-        elif marker.begins:
-            spans.begin(time, marker)
+        elif begun is None:
+            if marker.begins:
+                begun = time, marker.index
+            elif not marker.is_state:
+                warnings.warn(f"{_name(marker.index)} has an end and no begin; ignored")
+        elif not marker.begins:
+            begin, index = begun
+            if None not in (marker.index, index) and marker.index != index:
+                warnings.warn(f"the end of probe {marker.index} is taken as that of probe {index}")
+            spans.append((begin, time, index))
+            begun = None
+        elif marker.index == begun[1] and (marker.is_state or marker.index is not None):
+            if not marker.is_state:
+                warnings.warn(f"probe {marker.index} begins twice without an end; taken as one")
         else:
-            spans.end(time, marker)
-    spans.close(last)
-    return _windows(spans.whole, first, last, warnings)
+            if not marker.is_state:
+                warnings.warn(f"{_name(begun[1])} has a begin and no end; the next begin ends it")
+            spans.append((begun[0], time, begun[1]))
+            begun = time, marker.index
+    if begun is not None:
+        warnings.warn(f"{_name(begun[1])} has a begin and no end; the log's end ends it")
+        spans.append((begun[0], max(last, begun[0]), begun[1]))
+    return _windows(spans, first, last, warnings)
 
 
 def timed_windows(
@@ -86,57 +104,10 @@ def whole_log(first: int, last: int) -> list[ProbeWindow]:
     return [ProbeWindow(0, first, first, last, last + 1)]
 
 
-@dataclass(frozen=True)
-class _Marker:
-    """index: of the probe, where given. repeated: such markers are sent all the time, as states."""
-
+class _Marker(NamedTuple):
     begins: bool
-    index: int | None
-    repeated: bool
-
-
-class _Spans:
-    """Spans (begin, end, index) of probes from markers in their order."""
-
-    def __init__(self, warnings: LogWarnings) -> None:
-        self.whole: list[_Span] = []
-        self._begun: tuple[int, int | None] | None = None
-        self._warnings = warnings
-
-    def begin(self, time: int, marker: _Marker) -> None:
-        """A begin; within the same probe it changes nothing."""
-        if self._begun is not None:
-            index = self._begun[1]
-            if marker.index == index and (marker.repeated or index is not None):
-                if not marker.repeated:
-                    self._warnings.warn(f"probe {index} begins twice without an end; taken as one")
-                return
-            if not marker.repeated:
-                text = "has a begin and no end; the next begin ends it"
-                self._warnings.warn(f"{_name(index)} {text}")
-            self.whole.append((self._begun[0], time, index))
-        self._begun = (time, marker.index)
-
-    def end(self, time: int, marker: _Marker) -> None:
-        """An end of whatever probe has begun."""
-        if self._begun is None:
-            if not marker.repeated:
-                self._warnings.warn(f"{_name(marker.index)} has an end and no begin; ignored")
-            return
-        begin, index = self._begun
-        if marker.index is not None and index is not None and marker.index != index:
-            self._warnings.warn(
-                f"the end of probe {marker.index} is taken as that of probe {index}"
-            )
-        self.whole.append((begin, time, index))
-        self._begun = None
-
-    def close(self, last: int) -> None:
-        """The log ends."""
-        if self._begun is not None:
-            begin, index = self._begun
-            self._warnings.warn(f"{_name(index)} has a begin and no end; the log's end ends it")
-            self.whole.append((begin, max(last, begin), index))
+    index: int | None  # of the probe, where given
+    is_state: bool  # sent all the time, so that repeating it says nothing new
 
 
 def _parsed(text: str) -> _Marker | None:
@@ -160,9 +131,6 @@ def _name(index: int | None) -> str:
 
 def _windows(spans: list[_Span], first: int, last: int, warnings: LogWarnings) -> list[ProbeWindow]:
     """Windows of spans (begin, end, index) in order of time; indices that do not rise are new."""
-    if len(spans) > MOST_PROBES:
-        warnings.warn(f"the log marks {len(spans)} probes; the first {MOST_PROBES} count")
-        spans = spans[:MOST_PROBES]
     named = [index for _, _, index in spans if index is not None]
     rising = all(a < b for a, b in itertools.pairwise(named))
     steps = list(range(len(spans)))

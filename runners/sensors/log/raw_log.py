@@ -9,15 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from chsel.errors import SessionError
+from replay.files import file_digest
+from replay.mcap.log_file import Channel, Fault, RawFile, RawMessage
 from replay.mcap.texts import one_line
-from replay.raw.channels import Channel
-from replay.raw.raw_file import RawFile
-from replay.raw.raw_reading import Fault, RawMessage, Wanted
 from runners.sensors.log.foxglove import foxglove_decoder
-from runners.sensors.log.log_files import Span, log_files, merged, most_at_once
+from runners.sensors.log.log_files import Span, log_files, merged
 from runners.sensors.log.messages import (
     Decode,
-    Decoded,
     Received,
     TransformMessage,
     UnusableMessage,
@@ -27,11 +25,9 @@ from runners.sensors.log.ros2 import ros2_decoder
 Progress = Callable[[int, int], None]  # bytes so far, and of all
 
 _PROGRESS_STEP = 2**22  # bytes
-_BLOCK = 2**22  # bytes
 _DIGEST_SIZE = 16  # bytes
-_MOST_FAULTS = 200  # different texts
 _MOST_LISTED = 60
-_STATIC = "tf_static"
+_STATIC = "tf_static"  # what a topic of transforms that hold for all times ends with
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ class RawLog:
         if not known:
             named = ", ".join(sorted(topics)) or "none"
             raise SessionError(f"log {self.path} has no topic {named}; it has {self.listing()}")
-        return self._received(Wanted(known), progress)
+        return self._received(known, progress)
 
     def listing(self) -> str:
         """All topics with their schemas, for messages to the user."""
@@ -96,29 +92,18 @@ class RawLog:
         damage = "".join(f" ({fault})" for fault, _ in self.faults.most_common(1))
         return ", ".join(shown[:_MOST_LISTED] + more) or f"no topics{damage}"
 
-    def digest(self, progress: Progress | None = None) -> str:
+    def digest(self) -> str:
         """BLAKE2b (128 bit, hexadecimal) of the file, or of the digests of a folder's files."""
-        report, done, digests = _seldom(progress, self.size), 0, []
-        for path in self.files:
-            state = hashlib.blake2b(digest_size=_DIGEST_SIZE)
-            try:
-                with path.open("rb") as file:
-                    while block := file.read(_BLOCK):
-                        state.update(block)
-                        done += len(block)
-                        report(done)
-            except OSError as error:
-                raise SessionError(f"log {path} cannot be read: {error.strerror}") from None
-            digests.append(state.hexdigest())
+        digests = [file_digest(path) for path in self.files]
         if self.path.is_file():
             return digests[0]
         whole = "".join(f"{digest}\n" for digest in digests).encode()
         return hashlib.blake2b(whole, digest_size=_DIGEST_SIZE).hexdigest()
 
-    def _received(self, wanted: Wanted, progress: Progress | None) -> Iterator[Received]:
+    def _received(self, topics: frozenset[str], progress: Progress | None) -> Iterator[Received]:
         fault, report = self._new_faults(), _seldom(progress, self.size)
         decoders: dict[Channel, Decode | UnusableMessage] = {}
-        for message in self._raw_messages(wanted, fault, report):
+        for message in self._raw_messages(topics, fault, report):
             channel = message.channel
             if channel not in decoders:
                 decoders[channel] = _decoder(channel)
@@ -129,23 +114,24 @@ class RawLog:
                 for stamp, content in decode(message.data):
                     if isinstance(content, UnusableMessage):
                         fault(f"{channel.topic}: {content}")
-                    else:
-                        yield Received(channel.topic, message.log_time, stamp, content)
+                        continue
+                    if isinstance(content, TransformMessage) and channel.topic.endswith(_STATIC):
+                        content = replace(content, static=True)
+                    yield Received(channel.topic, message.log_time, stamp, content)
             except UnusableMessage as error:
                 fault(f"{channel.topic}: {error}")
 
     def _raw_messages(
-        self, wanted: Wanted, fault: Fault, report: Callable[[int], None]
+        self, topics: frozenset[str], fault: Fault, report: Callable[[int], None]
     ) -> Iterator[RawMessage]:
         done = [0] * len(self._parts)
-        at_once = most_at_once(self._spans)
 
         def read(number: int) -> Iterator[RawMessage]:
             def report_file(of_file: int) -> None:
                 done[number] = of_file
                 report(sum(done))
 
-            return self._parts[number].messages(wanted, fault, report_file, at_once=at_once)
+            return self._parts[number].messages(topics, fault, report_file)
 
         yield from merged(self._spans, read)
         report(self.size)
@@ -157,15 +143,12 @@ class RawLog:
         for part in self._parts:
             counts: dict[Channel, int] = {}
             times = list(part.times or ())
-            if part.counts is not None:
-                for number, channel in part.channels.by_id.items():
-                    counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
-            else:
-                for message in part.messages(Wanted(), fault, _after(done, report)):
+            if not part.is_indexed:
+                for message in part.messages(None, fault, _after(done, report)):
                     counts[message.channel] = counts.get(message.channel, 0) + 1
                     times = [min([message.log_time, *times]), max([message.log_time, *times])]
-                for channel in part.channels.by_id.values():
-                    counts.setdefault(channel, 0)
+            for number, channel in part.channels.items():
+                counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
             for channel, count in counts.items():
                 self._add_topic(channel, count)
             done += part.size
@@ -192,10 +175,6 @@ class RawLog:
 
         def fault(text: str) -> None:
             text = one_line(text)
-            if text not in self.faults and len(self.faults) >= _MOST_FAULTS:
-                text = f"{text.partition(':')[0]}: further reasons"
-                if text not in self.faults and len(self.faults) >= 2 * _MOST_FAULTS:
-                    text = "further faults"
             found[text] += 1
             self.faults[text] = max(self.faults[text], found[text])
 
@@ -214,19 +193,7 @@ def _decoder(channel: Channel) -> Decode | UnusableMessage:
     if decode is None:
         encoding = channel.encoding or "unknown bytes"
         return UnusableMessage(f"messages {channel.schema} as {encoding} are not read")
-    return _held(decode) if channel.topic.endswith(_STATIC) else decode
-
-
-def _held(decode: Decode) -> Decode:
-    """Transforms that hold for all times."""
-
-    def static(data: bytes) -> Iterator[Decoded]:
-        for stamp, content in decode(data):
-            if isinstance(content, TransformMessage):
-                content = replace(content, static=True)
-            yield stamp, content
-
-    return static
+    return decode
 
 
 def _after(before: int, report: Callable[[int], None]) -> Callable[[int], None]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from runners.sensors.log import message_fields
+from chsel.sensing.depth_camera import PinholeCamera
+from runners.sensors.log import message_fields as fields
 from runners.sensors.log.images import compressed_pixels, pixel_rows
 from runners.sensors.log.messages import (
     CameraInfoMessage,
@@ -20,76 +20,36 @@ from runners.sensors.log.messages import (
     Decoded,
     ImageMessage,
     JointsMessage,
-    PoseMessage,
     UnusableMessage,
     WrenchMessage,
 )
-from runners.sensors.log.ros2_definitions import (
-    DEFINITIONS,
-    Fields,
-    defined_fields,
-    full_definition,
-    short_name,
-)
+from runners.sensors.log.ros2_definitions import DEFINITIONS, full_definition, short_name
 
-_ERRORS = (ValueError, struct.error, IndexError, OverflowError, MemoryError)  # of the decoder
-_SMALL = 2**20  # bytes; what has no pixels or points is smaller
-_BULKY = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud2")
-_HEAD = 2**12  # bytes of a cloud that must hold all before its points
 _LARGEST_FORCE = 1e6  # N, Nm
-_TEXT_AT = 8  # bytes before the text of std_msgs/String
-
-
-_Decoder = tuple[Callable[[bytes], Any], int | None]
-"""Decodes so many bytes at the start of a message, or all."""
 
 
 def ros2_decoder(name: str, definition: str | None = None) -> Decode | None:
     """Decodes messages of this name; None for one that is not read.
 
-    definition: of the schema in the file, where there is one. Raises UnusableMessage if it lacks a
-    field of ROS 2's, or has others than numbers and texts besides.
+    definition: of the schema in the file, by which messages are decoded; by default that of ROS 2.
+    Raises UnusableMessage for one that is not understood.
     """
     short = short_name(name)
     contents = _CONTENTS.get(short)
     if contents is None:
         return None
-    fields = defined_fields(short, definition or "")
-    if fields is None:
-        raise UnusableMessage(f"messages {name} have other fields than those of ROS 2")
-    decoders: list[_Decoder] = [(_decoder(short, fields), None)]
-    if short == "sensor_msgs/PointCloud2":
-        # A hostile one could otherwise claim more fields than fit into memory.
-        before_points = [field for _, field in fields].index("is_bigendian")
-        decoders.insert(0, (_decoder(short, fields[:before_points]), _HEAD))
-    return lambda data: contents(_message(short, decoders, data))
-
-
-def _message(name: str, decoders: Sequence[_Decoder], data: bytes) -> Any:
-    if len(data) > _SMALL and name not in _BULKY:
-        raise UnusableMessage(f"a {name} of {len(data)} bytes; accepted: up to {_SMALL}")
-    message: Any = None
+    text = definition if definition and definition.strip() else full_definition(short)
+    schema = Schema(id=1, data=text.encode(), encoding="ros2msg", name=short)
     try:
-        for decode, size in decoders:
-            message = decode(data[:size])
-    except _ERRORS:
-        raise UnusableMessage(f"a message is no whole {name}") from None
-    if name == "std_msgs/String" and _TEXT_AT + len(message.data.encode()) + 1 > len(data):
-        raise UnusableMessage("a text ends early")
-    return message
-
-
-def _decoder(name: str, fields: Fields) -> Callable[[bytes], Any]:
-    """The decoder of a message of these fields."""
-    text = full_definition(name, fields)
-    schema = Schema(id=1, data=text.encode(), encoding="ros2msg", name=name)
-    decoder = DecoderFactory().decoder_for("cdr", schema)
-    assert decoder is not None
-    return decoder
+        parse = DecoderFactory().decoder_for("cdr", schema)
+    except Exception as error:  # the parser raises whatever it stumbles over
+        raise UnusableMessage(f"the definition of {name} is not read: {error}") from None
+    assert parse is not None
+    return fields.decoder(name, parse, contents)
 
 
 def _stamp(header: Any) -> int | None:
-    return message_fields.stamp_of(header.stamp.sec, header.stamp.nanosec)
+    return fields.stamp_of(header.stamp.sec, header.stamp.nanosec)
 
 
 def _image(message: Any, frame: str) -> ImageMessage:
@@ -111,33 +71,21 @@ def _camera_info(message: Any, frame: str) -> CameraInfoMessage:
     """Of the pixels that are sent: a region of the sensor, and several of its pixels as one."""
     region, across, down = message.roi, max(message.binning_x, 1), max(message.binning_y, 1)
     fx, _, cx, _, fy, cy, *_ = message.k
-    return message_fields.intrinsics(
-        frame,
-        ((region.width or message.width) // across, (region.height or message.height) // down),
-        (fx / across, fy / down),
-        ((cx - region.x_offset) / across, (cy - region.y_offset) / down),
-        message.d,
+    camera = PinholeCamera(
+        (region.width or message.width) // across,
+        (region.height or message.height) // down,
+        fx / across,
+        fy / down,
+        (cx - region.x_offset) / across,
+        (cy - region.y_offset) / down,
     )
-
-
-def _pose(message: Any, frame: str) -> PoseMessage:
-    return PoseMessage(frame, message_fields.rigid(message.pose.position, message.pose.orientation))
-
-
-def _poses(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, message_fields.positions(pose.position for pose in message.poses))
-
-
-def _point(message: Any, frame: str) -> CloudMessage:
-    return CloudMessage(frame, message_fields.positions([message.point]))
+    return CameraInfoMessage(frame, camera, distorted=any(message.d))
 
 
 def _cloud(message: Any, frame: str) -> CloudMessage:
-    points = message_fields.packed_points(
+    points = fields.packed_points(
         message.data,
-        message_fields.named_fields(
-            (part.name, part.offset, part.datatype) for part in message.fields
-        ),
+        {part.name: (part.offset, part.datatype) for part in message.fields},
         message.point_step,
         size=(message.width, message.height),
         row=message.row_step,
@@ -147,20 +95,19 @@ def _cloud(message: Any, frame: str) -> CloudMessage:
 
 
 def _wrench(message: Any, frame: str) -> WrenchMessage:
-    force, torque = message_fields.positions([message.wrench.force, message.wrench.torque])
+    force, torque = fields.positions([message.wrench.force, message.wrench.torque])
     if not (np.abs([force, torque]) <= _LARGEST_FORCE).all():  # NaN is not
         raise UnusableMessage(f"a force or torque is not finite, or above {_LARGEST_FORCE:g}")
     return WrenchMessage(frame, force, torque)
 
 
 def _joints(message: Any, _: str) -> JointsMessage:
-    message_fields.require_length("positions", len(message.position), "names", len(message.name))
-    return message_fields.joints(zip(message.name, message.position, strict=True))
+    return fields.joints(zip(message.name, message.position, strict=True))
 
 
 def _transform(message: Any) -> Iterator[Decoded]:
     parent, child, moved = message.header.frame_id, message.child_frame_id, message.transform
-    content = message_fields.transform(parent, child, moved.translation, moved.rotation)
+    content = fields.transform(parent, child, moved.translation, moved.rotation)
     yield _stamp(message.header), content
 
 
@@ -171,14 +118,14 @@ def _transforms(message: Any) -> Iterator[Decoded]:
 
 def _marker(message: Any) -> Iterator[Decoded]:
     value = message.data
-    yield None, message_fields.marker(str(value).lower() if isinstance(value, bool) else str(value))
+    yield None, fields.marker(str(value).lower() if isinstance(value, bool) else str(value))
 
 
 def _stamped(content: Callable[[Any, str], Content]) -> Callable[[Any], Iterator[Decoded]]:
     """One content of a message with a header."""
 
     def contents(message: Any) -> Iterator[Decoded]:
-        frame = message_fields.frame_name(message.header.frame_id)
+        frame = fields.frame_name(message.header.frame_id)
         yield _stamp(message.header), content(message, frame)
 
     return contents
@@ -192,9 +139,9 @@ _CONTENTS: dict[str, Callable[[Any], Iterator[Decoded]]] = {
     "sensor_msgs/JointState": _stamped(_joints),
     "tf2_msgs/TFMessage": _transforms,
     "geometry_msgs/TransformStamped": _transform,
-    "geometry_msgs/PoseStamped": _stamped(_pose),
-    "geometry_msgs/PoseArray": _stamped(_poses),
-    "geometry_msgs/PointStamped": _stamped(_point),
+    "geometry_msgs/PoseStamped": _stamped(fields.pose),
+    "geometry_msgs/PoseArray": _stamped(fields.poses),
+    "geometry_msgs/PointStamped": _stamped(fields.point),
     "geometry_msgs/WrenchStamped": _stamped(_wrench),
     **{
         name: _marker

@@ -1,8 +1,6 @@
-"""The ROS 2 messages that are read and simulated, and what definitions in files may add."""
+"""The ROS 2 messages that are read and simulated."""
 
 from __future__ import annotations
-
-import re
 
 _HEADER = "std_msgs/Header header"
 _POSE = "geometry_msgs/Pose pose"
@@ -48,17 +46,7 @@ DEFINITIONS = {
 }
 """Fields by the name of the message, of which names in files have "/msg" besides."""
 
-Fields = tuple[tuple[str, str], ...]
-"""Types and names of the fields of a message, in their order."""
-
-_LONGEST_TEXT = 2**16
 _SEPARATOR = "\n" + "=" * 80 + "\n"
-_SAME = {"byte": "uint8", "char": "uint8"}
-_SCALARS = {"bool", "string", "float32", "float64"} | {
-    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
-}
-_NAME = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")  # of a field, by ROS 2
-_LIMIT = re.compile(r"<=\d+")
 
 
 def short_name(name: str) -> str:
@@ -66,68 +54,18 @@ def short_name(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def full_definition(name: str, fields: Fields | None = None) -> str:
-    """The definition of a message with those of all that it contains, as ROS 2 writes them.
-
-    fields: in place of its own.
-    """
-    fields = _fields(DEFINITIONS[name]) if fields is None else fields
-    parts = ["\n".join(f"{kind} {field}" for kind, field in fields)]
-    for inner in _nested(fields):
-        parts.append(f"MSG: {inner}\n" + DEFINITIONS[inner].replace("; ", "\n"))
+def full_definition(name: str) -> str:
+    """The definition of a message with those of all that it contains, as ROS 2 writes them."""
+    parts = [DEFINITIONS[name].replace("; ", "\n")]
+    parts += [f"MSG: {inner}\n" + DEFINITIONS[inner].replace("; ", "\n") for inner in _nested(name)]
     return _SEPARATOR.join(parts) + "\n"
 
 
-def defined_fields(name: str, text: str) -> Fields | None:
-    """The fields of a message by its definition in a file.
-
-    Those of ROS 2 in their order, and among them further numbers and texts. None for others, as an
-    array of messages that a file defines could make the decoder run for ever. Of the definition's
-    other parts, those of ROS 2 itself are taken in their place, as for a message without a text.
-    """
-    if len(text) > _LONGEST_TEXT:
-        return None
-    own = re.split(r"^={3,}\s*$", text, maxsplit=1, flags=re.MULTILINE)[0]
-    lines = "; ".join(line.split("#")[0] for line in own.splitlines())
-    missing = list(_fields(DEFINITIONS[name]))
-    if not lines.strip("; "):
-        return tuple(missing)
-    fields: list[tuple[str, str]] = []
-    for kind, field in map(_normalised, _fields(lines)):
-        if missing and (kind, field) == _normalised(missing[0]):
-            fields.append(missing.pop(0))
-        elif kind in _SCALARS and _NAME.fullmatch(field):
-            fields.append((kind, field))
-        else:
-            return None
-    is_readable = not missing and len({field for _, field in fields}) == len(fields)
-    return tuple(fields) if is_readable else None
-
-
-def _nested(fields: Fields) -> list[str]:
-    """The messages that fields are made of, each once, in the order of their use."""
+def _nested(name: str) -> list[str]:
+    """The messages that a message is made of, each once, in the order of their use."""
     found: dict[str, None] = {}
-    for kind, _ in fields:
-        inner = kind.partition("[")[0]
+    for field in DEFINITIONS[name].split("; "):
+        inner = field.split()[0].partition("[")[0]
         if inner in DEFINITIONS:
-            found |= dict.fromkeys([inner, *_nested(_fields(DEFINITIONS[inner]))])
+            found |= dict.fromkeys([inner, *_nested(inner)])
     return list(found)
-
-
-def _normalised(field: tuple[str, str]) -> tuple[str, str]:
-    """A type without package and limit, and a name in small letters: what all texts agree in."""
-    base, bracket, size = _LIMIT.sub("", field[0]).rsplit("/", 1)[-1].partition("[")
-    return _SAME.get(base, base) + bracket + size, field[1].lower()
-
-
-def _fields(text: str) -> Fields:
-    """Types and names of the fields of a definition without comments; constants are none."""
-    parts = [part.split(maxsplit=2) for part in text.split(";")]
-    return tuple(
-        (words[0], words[1]) for words in parts if len(words) >= 2 and not _is_constant(words)
-    )
-
-
-def _is_constant(words: list[str]) -> bool:
-    """Whether type, name and rest of a line are those of NAME=VALUE."""
-    return "=" in words[1] or words[-1].startswith("=")

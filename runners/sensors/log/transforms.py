@@ -12,10 +12,10 @@ import numpy as np
 from chsel.errors import SessionError
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.problem.poses import compose, inverse, rotation_matrices, slerp
-from runners.sensors.log.messages import TransformMessage
+from runners.sensors.log.clocks import ClockCorrection
+from runners.sensors.log.messages import Received, TransformMessage
 
 _NANOSECONDS = 1e9
-_MOST_FRAMES = 1024
 _MOST_LISTED = 30
 _NUMBERS = 7  # of a pose: position, quaternion
 _SAME = 1e-6  # metres, and parts of a quaternion
@@ -29,10 +29,12 @@ class TransformTree:
     """Poses of frames in one another at any time.
 
     faults: transforms that contradict others, with how often; the ones that came first count.
+    times (T,): of all transforms that move, nanoseconds, ascending.
     """
 
     def __init__(self) -> None:
         self.faults: Counter[str] = Counter()
+        self.times: IntArray = np.zeros(0, dtype=np.int64)
         self._edges: dict[str, _Edge] = {}  # by child
 
     @property
@@ -40,22 +42,28 @@ class TransformTree:
         """The names of all frames."""
         return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
 
-    def add(self, stamp_ns: int, message: TransformMessage) -> None:
-        """Take note of a transform at a time, in any order."""
-        edge = self._edges.get(message.child)
+    def add(self, received: Received, message: TransformMessage) -> None:
+        """Take note of a transform, in any order; it counts once the clocks are settled."""
+        parent, child = message.parent, message.child
+        edge = self._edges.get(child)
         if edge is None:
-            fault = self._objection(message.parent, message.child)
-            if fault:
-                self.faults[fault] += 1
+            if child in self._ancestry(parent):
+                self.faults[f"frame {child} is its own ancestor, by way of {parent}"] += 1
                 return
-            edge = self._edges[message.child] = _Edge(message.parent)
-        elif edge.parent != message.parent:
-            fault = f"frame {message.child} has two parents, {edge.parent} and {message.parent}"
-            is_new = fault not in self.faults and len(self.faults) >= _MOST_FRAMES
-            self.faults["more frames have two parents" if is_new else fault] += 1
+            edge = self._edges[child] = _Edge(parent)
+        elif edge.parent != parent:
+            self.faults[f"frame {child} has two parents, {edge.parent} and {parent}"] += 1
             return
-        if not edge.add(stamp_ns, message):
-            self.faults[f"frame {message.child} is static in several places"] += 1
+        if not edge.add(received, message):
+            self.faults[f"frame {child} is static in several places"] += 1
+
+    def settle(self, clocks: ClockCorrection) -> None:
+        """All transforms were added; their times are those by the clocks."""
+        for edge in self._edges.values():
+            edge.settle(clocks)
+        nothing = np.zeros(0, dtype=np.int64)
+        times = [edge.times for edge in self._edges.values()]
+        self.times = np.unique(np.concatenate([nothing, *times]))
 
     def lookup(self, target: str, source: str, stamp_ns: int, *, gap_s: float) -> FloatArray:
         """target_from_source (4, 4) at a time, nanoseconds.
@@ -90,14 +98,6 @@ class TransformTree:
             poses = inverse(root) @ poses if flip else root @ poses
         poses[~valid] = np.nan
         return poses, valid
-
-    def _objection(self, parent: str, child: str) -> str | None:
-        """Why a frame cannot become the child of another, None if it can."""
-        if len(self._edges) >= _MOST_FRAMES:
-            return f"there are more than {_MOST_FRAMES} frames"
-        if child in self._ancestry(parent):
-            return f"frame {child} is its own ancestor, by way of {parent}"
-        return None
 
     def _ancestry(self, frame: str) -> list[str]:
         """A frame, its parent, and so on to the root of its tree."""
@@ -146,35 +146,45 @@ class TransformTree:
 
 
 class _Edge:
-    """Poses of one frame in its parent's over time, 64 bytes each."""
+    """Poses of one frame in its parent's over time."""
 
     def __init__(self, parent: str) -> None:
         self.parent = parent
+        self.times: IntArray = np.zeros(0, dtype=np.int64)  # (N,), rising
+        self._numbers: FloatArray = np.zeros((0, _NUMBERS))
         self._static: tuple[int, FloatArray] | None = None
-        self._stamps, self._numbers = array("q"), array("d")
-        self._is_sorted = True
+        self._added: dict[str, tuple[array[int], array[int], array[float]]] = {}
+        """The log's times, stamps and poses by topic."""
 
-    def add(self, stamp: int, message: TransformMessage) -> bool:
+    def add(self, received: Received, message: TransformMessage) -> bool:
         """Whether the pose agrees with earlier ones; of static ones the latest holds."""
         rows = message.parent_from_child.tolist()
         numbers = (rows[0][3], rows[1][3], rows[2][3], *unit_quaternion(rows))
         if message.static:
-            pose = np.array(numbers)
+            pose, stamp = np.array(numbers), received.stamp or received.log_time
             before, self._static = self._static, self._static or (stamp, pose)
             if stamp >= self._static[0]:
                 self._static = (stamp, pose)
             return before is None or _agree(before[1], pose)
-        if self._stamps and stamp <= self._stamps[-1]:
-            if stamp == self._stamps[-1]:
-                return True
-            self._is_sorted = False
-        self._stamps.append(stamp)
-        self._numbers.extend(numbers)
+        added = self._added.setdefault(received.topic, (array("q"), array("q"), array("d")))
+        added[0].append(received.log_time)
+        added[1].append(received.stamp or 0)
+        added[2].extend(numbers)
         return True
+
+    def settle(self, clocks: ClockCorrection) -> None:
+        """Sort the poses by time; of equal times the first that came counts."""
+        if not self._added:
+            return
+        times = [clocks.times(topic, *some[:2]) for topic, some in self._added.items()]
+        numbers = np.concatenate([np.frombuffer(some[2]) for some in self._added.values()])
+        self.times, chosen = np.unique(np.concatenate(times), return_index=True)
+        self._numbers = numbers.reshape(-1, _NUMBERS)[chosen]
+        self._added.clear()
 
     def at(self, stamps: IntArray, gap_s: float) -> tuple[FloatArray, BoolArray]:
         """Poses (N, 4, 4) at times (N,), and whether (N,) they are known."""
-        known_at, numbers = self._sorted()
+        known_at, numbers = self.times, self._numbers
         if len(known_at) == 0:
             assert self._static is not None
             poses = compose(rotation_matrices(self._static[1][None, 3:]), self._static[1][None, :3])
@@ -195,20 +205,8 @@ class _Edge:
 
     def nearest(self, stamp: int) -> float:
         """Seconds from a time to the nearest sample."""
-        away = (self._sorted()[0] - stamp) / _NANOSECONDS
+        away = (self.times - stamp) / _NANOSECONDS
         return float(away[np.argmin(np.abs(away))])
-
-    def _sorted(self) -> tuple[IntArray, FloatArray]:
-        """Times (N,), rising, and poses (N, 7); of equal times the first that came."""
-        if not self._is_sorted:
-            stamps = np.frombuffer(self._stamps, dtype=np.int64)
-            times, chosen = np.unique(stamps, return_index=True)
-            numbers = np.frombuffer(self._numbers).reshape(-1, _NUMBERS)[chosen]
-            del stamps
-            self._stamps, self._numbers = array("q", times.tobytes()), array("d", numbers.tobytes())
-            self._is_sorted = True
-        stamps = np.frombuffer(self._stamps, dtype=np.int64)
-        return stamps, np.frombuffer(self._numbers).reshape(-1, _NUMBERS)
 
 
 def unit_quaternion(rows: Sequence[Sequence[float]]) -> tuple[float, float, float, float]:

@@ -11,9 +11,9 @@ from chsel.next_probe.first_contact import first_contacts
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse, random_rotations
 from chsel.problem.sdf_grid import SdfGrid
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.kinematic import KinematicEngine
-from runners.sessions.panda_hand import panda_hand
+from runners.sessions.probing_hand import panda_hand
 from runners.sessions.probing_settings import ProbingSettings
 from tests.chsel.next_probe.decisions import RADIUS, along_x, at, ball, box_hand, facing
 
@@ -35,7 +35,7 @@ def exactly(engine: KinematicEngine, world_from_hand: FloatArray) -> tuple[float
 
 @pytest.mark.parametrize("name", ["drill", "cracker_box", "clamp"])
 def test_first_contacts_are_those_of_the_meshes(name: str) -> None:
-    mesh = MODELS[name]().apply_scale(_SCALE)
+    mesh = load_model(name).apply_scale(_SCALE)
     stream = np.random.default_rng(2)
     world_from_object = compose(random_rotations(stream, 1)[0], np.array([0.3, 0.1, 0.2]))
     middle = apply(world_from_object, mesh.bounds.mean(axis=0)[None])[0]

@@ -14,7 +14,7 @@ from chsel.problem.poses import axis_angle, compose, inverse, rotation_vector
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from tests.chsel.samples import hypotheses_at
 
 TRUTH = compose(rotation_vector(np.array([0.7, -0.4, 1.1])), np.array([0.3, -0.2, 0.9]))
@@ -68,7 +68,7 @@ def test_half_way_between_two_symmetric_poses_the_error_is_largest() -> None:
 
 def test_a_mirror_image_is_not_a_symmetry() -> None:
     """A quarter turn of a box is an error, and so is half a turn of a drill."""
-    drill = object_symmetry(MODELS["drill"]())
+    drill = object_symmetry(load_model("drill"))
     turned = TRUTH @ compose(axis_angle(Z, np.array(np.pi)), np.zeros(3))
     _, rotation = pose_errors(inverse(turned)[None], TRUTH, drill)
     assert rotation[0] == pytest.approx(np.pi)

@@ -22,7 +22,7 @@ from chsel.plausible.symmetry import (
 from chsel.problem.mesh import load_mesh
 from chsel.problem.poses import axis_angle, compose, rotation_vector
 from chsel.problem.sdf_grid import SdfGrid
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 
 ANYWHERE = compose(rotation_vector(np.array([0.7, -0.4, 1.1])), np.array([0.3, -2.0, 0.9]))
 X, Y, Z = np.eye(3)
@@ -90,7 +90,7 @@ FINITE = {
     "prism of 3": (trimesh.creation.cylinder(0.05, 0.1, sections=3), dihedral(3)),
     "sheet": (trimesh.creation.box((0.2, 0.1, 0.0005)), dihedral(2)),
     "mug": (mug(), np.eye(3)[None]),
-    "drill": (MODELS["drill"](), np.eye(3)[None]),
+    "drill": (load_model("drill"), np.eye(3)[None]),
 }
 
 
@@ -253,13 +253,13 @@ def test_a_mesh_of_a_million_faces_is_merged_first() -> None:
 
 
 def test_the_same_mesh_gives_the_same_bits() -> None:
-    first = object_symmetry(MODELS["spam_can"]())
+    first = object_symmetry(load_model("spam_can"))
     symmetry._symmetry.cache_clear()
-    second = object_symmetry(MODELS["spam_can"]())
+    second = object_symmetry(load_model("spam_can"))
     assert second is not first
     np.testing.assert_array_equal(first.rotations, second.rotations)
     np.testing.assert_array_equal(first.centre, second.centre)
-    assert object_symmetry(MODELS["spam_can"]()) is second
+    assert object_symmetry(load_model("spam_can")) is second
 
 
 @pytest.mark.parametrize(("name", "count"), SCANS.items())
@@ -279,7 +279,7 @@ def test_models_and_scans_have_the_symmetries_of_their_objects(
     [("cracker_box", 4), ("mustard", 2), ("spam_can", 2), ("hammer", 1), ("clamp", 1)],
 )
 def test_our_models_have_the_symmetries_of_the_objects(name: str, count: int) -> None:
-    assert len(object_symmetry(MODELS[name]()).rotations) == count
+    assert len(object_symmetry(load_model(name)).rotations) == count
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,7 @@ import pytest
 from chsel.errors import ChselError, RecordingError, SettingError
 from chsel.next_probe.hand_shape import HandShape
 from replay.events import ActionsOffered, Decided, Event, Measured, Probe, ProblemPosed
-from replay.mcap import event_reader
 from replay.mcap.reader import read_recording
-from replay.mcap.schemas import FORMAT_VERSION, UNSTEERED_VERSION
 
 Write = Callable[[list[Event]], Path]
 
@@ -34,7 +32,6 @@ def test_a_recording_gives_actions_and_decisions_back(
     steered_events: list[Event], write: Write, assert_same: Callable[[Any, Any], None]
 ) -> None:
     recording = read_recording(write(steered_events))
-    assert recording.version == FORMAT_VERSION
     assert recording.decision_steps == (-1, 0, 1, 2)
     written = [event for event in steered_events if isinstance(event, Decided | ActionsOffered)]
     read = [recording.offered, *map(recording.decision, recording.decision_steps)]
@@ -42,17 +39,6 @@ def test_a_recording_gives_actions_and_decisions_back(
     assert_same(read[1:], [e for e in recording.events() if isinstance(e, Decided)])
     with pytest.raises(RecordingError, match=r"no decision of step 3; accepted: -1, 0, 1, 2$"):
         recording.decision(3)
-
-
-def test_only_steered_sessions_need_a_program_that_knows_decisions(
-    events: list[Event], steered_events: list[Event], write: Write, monkeypatch: Any
-) -> None:
-    path = write(steered_events)
-    unsteered = read_recording(write(events))
-    assert (unsteered.version, unsteered.offered, unsteered.decision_steps) == (3, None, ())
-    monkeypatch.setattr(event_reader, "FORMAT_VERSION", UNSTEERED_VERSION)
-    with pytest.raises(RecordingError, match="newer version: format 4; this one reads up to 3"):
-        read_recording(path)
 
 
 @pytest.mark.parametrize(
@@ -111,12 +97,10 @@ def test_actions_are_offered_once_at_the_start_of_a_steered_session(
 ) -> None:
     (offered,) = (event for event in steered_events if isinstance(event, ActionsOffered))
     rest = [event for event in steered_events if event is not offered]
-    unsteered = dataclasses.replace(rest[0], config={})
     for events, message in (
         (rest, "a decision of step -1 has no actions before it"),
         ([rest[0], offered, offered], "accepted: once, before all steps"),
         ([rest[0], dataclasses.replace(offered, step=0)], "accepted: once, before all steps"),
-        ([unsteered, offered], "offers actions but has no policy; accepted: a configuration with"),
     ):
         with pytest.raises(RecordingError, match=message):
             write(events)

@@ -160,14 +160,17 @@ def test_values_that_do_not_fit_their_field_are_refused(values: dict[str, Any]) 
 def test_bytes_that_are_no_message_and_truth_values_other_than_0_and_1_are_refused() -> None:
     with pytest.raises(RecordingError, match=r"a message is not a valid chsel\.Probe"):
         decode("Probe", b"\xff\xff\xff")
-    flags = message_class("Contents")()
-    for name, kind in field_kinds("Contents").items():
-        if kind.dtype is not None:
-            array = getattr(flags, name)
-            array.dtype, array.data = kind.dtype.str, b"\2" * kind.dtype.itemsize
-            array.shape.append(1)
-    with pytest.raises(RecordingError, match=r"posed holds bytes other than 0 and 1"):
-        decode("Contents", flags.SerializeToString())
+    values = {
+        name: np.zeros(1, kind.dtype)
+        for name, kind in field_kinds("Hypotheses").items()
+        if kind.dtype is not None
+    }
+    values["object_from_world"] = values["elites"] = np.eye(4)[None]
+    rest = {"step": 0, "archive": None, "archive_is_last_snapshot": False, "digest": ""}
+    flags: Any = message_class("Hypotheses").FromString(encode("Hypotheses", values | rest))
+    flags.duplicate.data = b"\2"
+    with pytest.raises(RecordingError, match=r"duplicate holds bytes other than 0 and 1"):
+        decode("Hypotheses", flags.SerializeToString())
 
 
 @given(points=arrays.arrays(np.float64, st.tuples(st.integers(0, 4), st.sampled_from([3, 4]))))

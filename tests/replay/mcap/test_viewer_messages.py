@@ -25,10 +25,10 @@ from replay.events import Event, HypothesesFound, Probe, SessionStarted
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, SCENE, VIEWS
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
-from replay.mcap.sealed_file import SealedFile
 from replay.mcap.viewer_messages import CumulativePoints, poses_in_world, simple_mesh
+from replay.mcap.writer import McapRecorder
 
-_ADD = SealedFile.add
+_ADD = McapRecorder._add
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"
 
 
@@ -210,7 +210,7 @@ def test_rerun_draws_points_of_the_recording_by_itself(events, write):
 
 def test_readers_do_not_look_at_what_viewers_get(events, write, assert_same, monkeypatch):
     monkeypatch.setattr(
-        "replay.mcap.sealed_file.SealedFile.add", _with_nonsense_for_viewers, raising=True
+        "replay.mcap.writer.McapRecorder._add", _with_nonsense_for_viewers, raising=True
     )
     path = write(events)
     monkeypatch.undo()

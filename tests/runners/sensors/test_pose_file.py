@@ -54,16 +54,12 @@ def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "no mapping of keys to values"),
-        ("world_from_object: [1, 2, 3]", "no world_from_object of 4 x 4 numbers"),
-        (ROWS.replace("0.5", ".nan"), "no world_from_object of 4 x 4 numbers"),
-        (ROWS.replace("0.5", "true"), "no world_from_object of 4 x 4 numbers"),
-        (ROWS.replace("[[1,", "[[2,"), "world_from_object is not rigid"),
-        (ROWS.replace("[[1,", "[[-1,"), "world_from_object is not rigid"),
+        ("world_from_object: [1, 2, 3]", r"world_from_object has shape \(3,\)"),
+        ("x: 1", "accepted: YAML with world_from_object"),
+        (ROWS.replace("0.5", ".nan"), "not finite"),
+        (ROWS.replace("[[1,", "[[2,"), "world_from_object.* not a rigid"),
+        (ROWS.replace("[[1,", "[[-1,"), "world_from_object.* not a rigid"),
         ("world_from_object: [[[", "not YAML"),
-        ("a: &a [*a, *a]\nworld_from_object: *a", "an alias"),
-        ("[" * 20_000, "nested too deep"),
-        ("x: " + "y" * 1_000_001, "too large"),
-        ("world_from_object: !!python/object/apply:os.getcwd []", "not YAML"),
     ],
 )
 def test_another_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:

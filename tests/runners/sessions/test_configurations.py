@@ -10,7 +10,7 @@ import trimesh
 from chsel.errors import SessionError, SettingError
 from chsel.problem.poses import apply, axis_angle, compose, rotation_angle
 from chsel.problem.settings import build_settings, in_preset
-from runners.objects.models import MODELS
+from runners.objects.loader import MODELS, load_model
 from runners.sessions.configurations import (
     CONFIGURATIONS,
     find_configuration,
@@ -213,7 +213,7 @@ def test_a_box_tilted_beyond_its_balance_falls_over() -> None:
 @pytest.mark.parametrize("name", ["drill_fallen", "mustard_fallen", "hammer_straight", "clamp"])
 def test_objects_rest_on_the_floor_above_what_they_stand_on(name: str) -> None:
     configuration = CONFIGURATIONS[name]
-    mesh = MODELS[configuration.object]().apply_scale(2.5)
+    mesh = load_model(configuration.object).apply_scale(2.5)
     resting = laid_down(mesh, configuration)
     assert lowest(mesh, resting) == pytest.approx(0.0, abs=1e-6)
     centre = apply(resting, np.asarray(mesh.center_mass)[None])[0]

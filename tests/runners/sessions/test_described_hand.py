@@ -14,9 +14,8 @@ from chsel.next_probe.action_lattice import ActionSettings
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings
-from runners.sessions.described_hand import DescribedHand, open_hand
-from runners.sessions.kinematic import open_kinematic
-from runners.sessions.probing import ProbingSession
+from runners.sessions.probing import ProbingSession, open_probing
+from runners.sessions.probing_hand import DescribedHand, open_hand
 from runners.sessions.probing_settings import ProbingSettings
 
 STICK = """<robot name="stick">
@@ -79,12 +78,9 @@ def test_both_engines_touch_with_the_described_hand(kind: str, stick: DescribedH
 
 
 def _open(kind: str, mesh: trimesh.Trimesh, settings: ProbingSettings) -> ProbingSession:
-    if kind == "kinematic":
-        return open_kinematic(mesh, "can", settings, 0)
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-    from runners.sessions.simulated import open_simulated
-
-    return open_simulated(mesh, "can", settings, 0)
+    if kind == "simulated":
+        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+    return open_probing(kind, mesh, "can", settings, 0)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +107,7 @@ def test_a_hand_that_cannot_be_is_an_error(
 
     def opened() -> ProbingSession:
         settings = build_settings(ProbingSettings, {"hand": hand}, "session")
-        return open_kinematic(trimesh.creation.box((0.2, 0.3, 0.3)), "can", settings, 0)
+        return open_probing("kinematic", trimesh.creation.box((0.2, 0.3, 0.3)), "can", settings, 0)
 
     with pytest.raises(SettingError, match=re.escape(message)) as caught:
         opened()

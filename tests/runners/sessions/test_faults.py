@@ -14,7 +14,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import FreeVoxels, Lattice, Workspace
 from chsel.problem.settings import build_settings, settings_mapping
 from replay.events import Probe
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.faults import (
     CLEAN,
     LEVELS,
@@ -23,8 +23,7 @@ from runners.sessions.faults import (
     level_name,
     probed_mesh,
 )
-from runners.sessions.kinematic import open_kinematic
-from runners.sessions.probing import ProbingSession
+from runners.sessions.probing import ProbingSession, open_probing
 from runners.sessions.probing_settings import ProbingSettings, without_defaults
 
 RADIUS, SIDE = 0.1, 0.02
@@ -154,7 +153,7 @@ def test_the_probed_mesh_is_smaller_about_the_same_centre() -> None:
 
 def kinematic(**faults: float) -> tuple[ProbingSession, list[Probe]]:
     settings = ProbingSettings(faults=FaultSettings(**faults))
-    session = open_kinematic(MODELS["cracker_box"]().apply_scale(1.5), "box", settings, 0)
+    session = open_probing("kinematic", load_model("cracker_box", 1.5), "box", settings, 0)
     return session, list(session.probes())
 
 

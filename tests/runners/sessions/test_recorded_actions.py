@@ -12,10 +12,10 @@ from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings, ReachBall
 from chsel.numerics.arrays import FloatArray
 from replay.events import Probe
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.free_space import swept_voxels
-from runners.sessions.kinematic import open_kinematic
+from runners.sessions.probing import open_probing
 from runners.sessions.probing_hand import ROTATION
 from runners.sessions.probing_settings import ProbingSettings
 from runners.sessions.recorded import RecordedSession, RecordedSettings
@@ -83,8 +83,8 @@ def in_order(points: FloatArray) -> FloatArray:
 
 
 def test_a_probe_that_is_taken_first_shows_nearly_all_that_it_swept() -> None:
-    mesh = MODELS["mustard"]().apply_scale(2.5)
-    session = open_kinematic(mesh, "mustard", ProbingSettings(), 0)
+    mesh = load_model("mustard").apply_scale(2.5)
+    session = open_probing("kinematic", mesh, "mustard", ProbingSettings(), 0)
     probes, swept = [], []
     for probe in session.probes():
         path, lattice = np.array(session._gripper.path), session._voxels.lattice

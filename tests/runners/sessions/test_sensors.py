@@ -11,8 +11,6 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap.writer import Writer
 from omegaconf import OmegaConf
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
@@ -28,7 +26,6 @@ from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
 from runners.command.choices import CONF
 from runners.objects.loader import ObjectConfig, load_object
-from runners.run.display import Display
 from runners.run.recording import RecordingConfig
 from runners.run.session_run import SessionRun
 from runners.sensors.pose_file import beside, write_pose
@@ -45,7 +42,7 @@ from runners.sessions import session_settings
 from runners.sessions.sensors import SensorsSession, SensorsSettings
 from tests.replay.conftest import same_bits
 from tests.runners.sensors.foxglove_log import in_foxgloves_messages
-from tests.runners.sensors.small_logs import ros2_cloud, ros2_transform, write_ros2
+from tests.runners.sensors.small_logs import Sent, ros2_cloud, ros2_transform, write_ros2
 from tests.runners.sensors.sphere_log import (
     ASIDE,
     BEGIN,
@@ -326,40 +323,27 @@ def test_a_log_of_foxgloves_messages_gives_the_same_to_the_bit(
         assert same_bits(one, before), f"{type(one).__name__} of probe {one.step}"
 
 
-def joined(path: Path, *parts: Path) -> Path:
-    """One log of the messages of several, in order of their log times."""
-    found = []
-    for part in parts:
-        with part.open("rb") as file:
-            found += [(each[2].log_time, *each) for each in make_reader(file).iter_messages()]
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channels: dict[str, int] = {}
-        for time, schema, channel, message in sorted(found, key=lambda each: each[0]):
-            if channel.topic not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
-            writer.add_message(channels[channel.topic], time, message.data, time)
-        writer.finish()
-    return path
-
-
 LIDAR = np.array([0.72, 0.1, 0.55])  # m: its place in the world
 
 
 def log_with_clouds(folder: Path, points: np.ndarray) -> Path:
     """The sphere's log with points (N, 3) in the lidar's frame on /lidar and /skin, twice each."""
-    SphereLog().write(folder / "a.mcap")
+    sent: list[Sent] = []
+
+    class Collector:
+        def add(self, topic: str, kind: str, message: Any, stamp: int, log_time: int) -> None:
+            sent.append((topic, kind, message, log_time))
+
+    SphereLog().send(Collector())
     fixed = {"transforms": [ros2_transform("world", "lidar", LIDAR, BEGIN)]}
-    sent = [("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN)]
+    sent.append(("/tf_static", "tf2_msgs/TFMessage", fixed, BEGIN))
     for seconds in (0.5, 2.0):
         stamp = BEGIN + round(seconds * SECOND)
         for topic in ("/lidar", "/skin"):
             cloud = ros2_cloud(points, stamp)
             sent.append((topic, "sensor_msgs/PointCloud2", cloud, stamp + LATENCY))
-    write_ros2(folder / "b.mcap", sent)
-    return joined(folder / "log.mcap", folder / "a.mcap", folder / "b.mcap")
+    write_ros2(folder / "log.mcap", sorted(sent, key=lambda one: one[3]), chunk_size=10**6)
+    return folder / "log.mcap"
 
 
 def test_clouds_are_rays_or_surface_or_contacts(tmp_path: Path) -> None:
@@ -471,32 +455,6 @@ def test_a_camera_whose_clock_is_ahead_is_put_right(tmp_path: Path, events: list
         np.testing.assert_array_equal(one.new_points.free, other.new_points.free)
 
 
-def test_marks_that_do_not_fit_are_reported(tmp_path: Path) -> None:
-    marks = (
-        (0.5, "end 9"),
-        (0.9, "begin 2"),
-        (1.0, "hello"),
-        (3.0, "begin 2"),
-        (3.1, "begin 1"),
-    )
-    log = SphereLog(marks=marks).write(tmp_path / "log.mcap")
-    events = list(open_log(log).probes())
-    assert [(probe.step, probe.outcome) for probe in probes(events)] == [
-        (0, "contact"),
-        (1, "free"),
-    ]
-    said = lines(events)
-    for part in (
-        "probe 9 has an end and no begin; ignored",
-        "a marker is 'hello'; accepted: begin N, end",
-        "probe 2 begins twice without an end; taken as one",
-        "probe 2 has a begin and no end; the next begin ends it",
-        "probe 1 has a begin and no end; the log's end ends it",
-        "probes are marked 2, 1; as these do not rise, they are counted from 0 to 1",
-    ):
-        assert part in said
-
-
 def test_a_pose_beside_the_log_is_the_true_one(tmp_path: Path) -> None:
     log = SphereLog().write(tmp_path / "log.mcap")
     assert open_log(log).world_from_object is None
@@ -533,20 +491,6 @@ def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) 
         session_settings("sensors", values)
     with pytest.raises(SettingError, match=r"path is missing; pass session.path=LOG"):
         build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")
-
-
-def test_progress_is_told_in_megabytes(log: Path) -> None:
-    told: list[tuple[str, int, int]] = []
-    session = SensorsSession(
-        SensorsSettings(RIG, str(log)), 0, lambda *progress: told.append(progress)
-    )
-    list(session.probes())
-    assert {stage for stage, _, _ in told} >= {
-        "first pass over the log, MB",
-        "digest of the log, MB",
-        "reading images, MB",
-    }
-    assert all(0 <= done <= total == 1 for _, done, total in told)
 
 
 @settings(max_examples=24, derandomize=True, deadline=None)
@@ -653,16 +597,3 @@ def test_recordings_of_such_sessions_can_be_read_and_registered_again(
     assert [probe.new_points.digest for probe in recording.probes] == [
         probe.new_points.digest for probe in probes(session.probes())
     ]
-
-
-def test_the_report_is_a_table_of_what_was_used(
-    log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session = open_log(log)
-    list(session.probes())
-    display = Display("title")
-    display.sensed(session.report)
-    shown = capsys.readouterr().out
-    rows = {tuple(line.split()[:3]) for line in shown.splitlines()}
-    assert {("0", "camera", "7/7"), ("pad", "22/31", "0.0"), ("all", "camera", "11/11")} <= rows
-    assert "no pose" not in shown

@@ -13,13 +13,12 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
 from replay.events import Probe
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.configurations import CONFIGURATIONS
-from runners.sessions.kinematic import open_kinematic
-from runners.sessions.panda_hand import panda_hand
 from runners.sessions.placement import laid_down, lowest
+from runners.sessions.probing import open_probing
+from runners.sessions.probing_hand import panda_hand
 from runners.sessions.probing_settings import ProbingSettings
-from runners.sessions.simulated import open_simulated
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
 
@@ -28,10 +27,10 @@ AGREEMENT = 0.003  # m
 PRESSED = 0.0005  # m: how far 30 N press the hand into the object before the engine resists
 
 DIGESTS = """
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.probing_settings import ProbingSettings
-from runners.sessions.simulated import open_simulated
-session = open_simulated(MODELS["spam_can"]().apply_scale(2.5), "can", ProbingSettings(), 5)
+from runners.sessions.probing import open_probing
+session = open_probing("simulated", load_model("spam_can", 2.5), "can", ProbingSettings(), 5)
 print(session.world_from_object.tobytes().hex(), session.initial_points.digest)
 for probe, _ in zip(session.probes(), range(4)):
     print(probe.new_points.digest, probe.gripper_path.tobytes().hex()[-200:], probe.outcome)
@@ -50,14 +49,14 @@ class _Pair:
 
 def _mesh(configuration_name: str) -> trimesh.Trimesh:
     name = CONFIGURATIONS[configuration_name].object
-    return MODELS[name]().apply_scale(SCALES.get(name, 2.5))
+    return load_model(name).apply_scale(SCALES.get(name, 2.5))
 
 
 @pytest.fixture(scope="module", params=list(CONFIGURATIONS))
 def pair(request: pytest.FixtureRequest) -> _Pair:
     mesh = _mesh(request.param)
-    simulated = open_simulated(mesh, request.param, ProbingSettings(), 0)
-    kinematic = open_kinematic(mesh, request.param, ProbingSettings(), 0)
+    simulated = open_probing("simulated", mesh, request.param, ProbingSettings(), 0)
+    kinematic = open_probing("kinematic", mesh, request.param, ProbingSettings(), 0)
     assert simulated.world_from_object is not None
     both = list(simulated.probes()), list(kinematic.probes())
     simulated.close()
@@ -140,7 +139,7 @@ def test_a_seed_gives_the_same_bytes_in_every_process() -> None:
 
 def test_contacts_can_be_with_the_convex_parts(capfd: pytest.CaptureFixture[str]) -> None:
     settings = replace(ProbingSettings(), collision_mesh="vhacd")
-    session = open_simulated(_mesh("can"), "can", settings, 0)
+    session = open_probing("simulated", _mesh("can"), "can", settings, 0)
     probe = next(session.probes())
     session.close()
     assert len(probe.contacts) >= 1
@@ -152,4 +151,4 @@ def test_without_pybullet_the_error_names_the_other_session(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(SessionError, match="session=kinematic"):
-        open_simulated(_mesh("can"), "can", ProbingSettings(), 0)
+        open_probing("simulated", _mesh("can"), "can", ProbingSettings(), 0)

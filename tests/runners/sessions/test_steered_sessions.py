@@ -16,31 +16,25 @@ from chsel.next_probe.first_contact import first_contacts
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from replay.events import Probe
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.sessions.gripper import START, X_REST, Touch
-from runners.sessions.kinematic import open_kinematic
-from runners.sessions.probing import ProbingSession
+from runners.sessions.probing import ProbingSession, open_probing
 from runners.sessions.probing_settings import ProbingSettings
 
 Opener = Callable[..., ProbingSession]
 
 
-def open_pybullet(*arguments: object) -> ProbingSession:
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
-    from runners.sessions.simulated import open_simulated
-
-    return open_simulated(*arguments)  # type: ignore[arg-type]
-
-
-@pytest.fixture(params=[open_kinematic, open_pybullet])
+@pytest.fixture(params=["kinematic", "simulated"])
 def session(request: pytest.FixtureRequest) -> Iterator[ProbingSession]:
-    opened = request.param(_mustard(), "mustard", ProbingSettings(), 0)
+    if request.param == "simulated":
+        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
+    opened = open_probing(request.param, _mustard(), "mustard", ProbingSettings(), 0)
     yield opened
     opened.close()
 
 
 def _mustard() -> trimesh.Trimesh:
-    return MODELS["mustard"]().apply_scale(2.5)
+    return load_model("mustard").apply_scale(2.5)
 
 
 def _taken(session: ProbingSession, actions: Actions, count: int) -> list[tuple[int, Probe]]:
@@ -103,9 +97,9 @@ def test_an_action_is_taken_once(session: ProbingSession) -> None:
 
 
 def test_the_grid_as_actions_has_the_outcomes_of_the_grid() -> None:
-    paper = open_kinematic(_mustard(), "mustard", ProbingSettings(), 0)
+    paper = open_probing("kinematic", _mustard(), "mustard", ProbingSettings(), 0)
     grid = list(islice(paper.probes(), 3))
-    session = open_kinematic(_mustard(), "mustard", ProbingSettings(), 0)
+    session = open_probing("kinematic", _mustard(), "mustard", ProbingSettings(), 0)
     actions = session.offer(ActionSettings(choice="configuration"))
     assert len(actions) == session.count
     np.testing.assert_allclose(actions.length, 0.3)

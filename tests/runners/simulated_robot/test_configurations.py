@@ -7,7 +7,7 @@ import pytest
 
 from chsel.errors import SessionError
 from chsel.problem.poses import apply, inverse
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.simulated_robot import wrist
 from runners.simulated_robot.robot_configurations import (
     CABINET_CONFIGURATIONS,
@@ -37,7 +37,7 @@ def test_the_probes_are_those_of_the_paper() -> None:
 @pytest.mark.parametrize("name", GRIDS)
 def test_objects_stand_on_the_shelf_within_the_workspace(name: str) -> None:
     configuration = CABINET_CONFIGURATIONS[name]
-    mesh = MODELS[configuration.object]()
+    mesh = load_model(configuration.object)
     pose = stood_on_shelf(mesh, configuration)
     placed = apply(pose, mesh.vertices)
     assert placed[:, 2].min() == pytest.approx(SHELF, abs=1e-9)
@@ -49,7 +49,7 @@ def test_objects_stand_on_the_shelf_within_the_workspace(name: str) -> None:
 @pytest.mark.parametrize("name", GRIDS)
 def test_several_but_not_all_probes_reach_the_object(name: str) -> None:
     configuration, settings = CABINET_CONFIGURATIONS[name], RobotSettings()
-    mesh = MODELS[configuration.object]()
+    mesh = load_model(configuration.object)
     surface = apply(stood_on_shelf(mesh, configuration), mesh.sample(4000, seed=0))
     way = np.linspace(0.0, settings.push_step * settings.push_steps, 51)
     reached = 0
@@ -69,7 +69,7 @@ def test_several_but_not_all_probes_reach_the_object(name: str) -> None:
 def test_an_object_that_is_too_large_is_refused() -> None:
     configuration = CABINET_CONFIGURATIONS["cabinet_drill"]
     with pytest.raises(SessionError, match="more than the cabinet has"):
-        stood_on_shelf(MODELS["drill"]().apply_scale(2.5), configuration)
+        stood_on_shelf(load_model("drill").apply_scale(2.5), configuration)
 
 
 def test_an_unknown_configuration_names_all() -> None:

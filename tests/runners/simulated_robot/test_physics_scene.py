@@ -13,7 +13,7 @@ import trimesh
 from chsel.errors import SessionError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.simulated_robot import cabinet, wrist
 from runners.simulated_robot.physics_scene import NEAR, PhysicsScene
 from runners.simulated_robot.robot_configurations import (
@@ -25,7 +25,7 @@ from runners.simulated_robot.settings import BubbleSettings, CameraSettings, Ren
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
 
-MESH = MODELS["drill"]()
+MESH = load_model("drill")
 POSE = stood_on_shelf(MESH, CABINET_CONFIGURATIONS["cabinet_drill"])
 HAND = wrist.world_from_wrist(np.add(REST, [0.12, 0.0, 0.0]))
 EXACT = 2e-5  # m

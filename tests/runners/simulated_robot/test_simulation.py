@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
-from runners.objects.models import MODELS
+from runners.objects.loader import load_model
 from runners.simulated_robot.recorder import START, TICK
 from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS, REST
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
@@ -29,7 +29,7 @@ from runners.simulated_robot.simulation import SimulatedLog, simulate_log
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")
 
 CONFIGURATION = CABINET_CONFIGURATIONS["cabinet_mustard"]
-MESH = MODELS["mustard"]()
+MESH = load_model("mustard")
 SEED = 3
 SMALL = RobotSettings(
     probes=2,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from runners.sensors.log.images import compressed_pixels, pixel_rows, png_pixels
-from runners.sensors.log.message_fields import named_fields, packed_points
+from runners.sensors.log.message_fields import packed_points
 from runners.sensors.log.messages import UnusableMessage
 from tests.runners.sensors.small_logs import png
 
@@ -30,8 +30,7 @@ def test_rows_of_pixels(encoding: str, kind: str, big_endian: bool, padding: int
     [
         ((7, 5), 14, "cannot have 56 bytes"),
         ((7, 4), 13, "cannot have 56 bytes"),
-        ((0, 4), 14, "0 x 4 pixels"),
-        ((2**16, 2**16), 2**17, "accepted: 1 to 33554432"),
+        ((2**16, 2**16), 2**17, "cannot have 56 bytes"),
     ],
 )
 def test_rows_that_do_not_fit_are_refused(size: tuple[int, int], step: int, reason: str) -> None:
@@ -43,22 +42,14 @@ def test_png_is_read_only_if_it_is_depth() -> None:
     np.testing.assert_array_equal(png_pixels(png(VALUES)), VALUES)
     colour = np.zeros((2, 2, 3), np.uint8)
     for data, reason in (
-        (png(VALUES.astype(np.uint8)), "8 bits, grey"),
-        (png(colour), "8 bits, RGB"),
+        (png(VALUES.astype(np.uint8)), "mode L"),
+        (png(colour), "mode RGB"),
         (png(VALUES)[:-40], "broken"),
-        (png(VALUES)[:20], "ends within its head"),
         (b"\xff\xd8\xff\xe0", "JPEG"),
         (b"", "accepted: PNG"),
     ):
         with pytest.raises(UnusableMessage, match=reason):
             png_pixels(data)
-
-
-def test_a_bomb_is_refused_before_it_is_unpacked() -> None:
-    bomb = bytearray(png(VALUES))
-    struct.pack_into(">II", bomb, 16, 60_000, 60_000)
-    with pytest.raises(UnusableMessage, match="60000 x 60000 pixels"):
-        png_pixels(bytes(bomb))
 
 
 def test_compressed_depth_is_that_of_image_transport() -> None:
@@ -89,21 +80,13 @@ def test_points_of_several_rows_with_gaps() -> None:
     for axis, name in enumerate("xyz"):
         packed[name] = points[:, :, axis]
     rows = np.pad(packed.view(np.uint8).reshape(2, 90), ((0, 0), (0, 40)))
-    fields = named_fields([("x", 8, 8), ("intensity", 24, 4), ("y", 16, 8), ("z", 0, 8)])
+    fields = {"x": (8, 8), "intensity": (24, 4), "y": (16, 8), "z": (0, 8)}
     found = packed_points(rows.tobytes(), fields, 30, size=(3, 2), row=130)
     np.testing.assert_array_equal(found, points.reshape(-1, 3))
-    for stride, size, row, reason in (
-        (23, (3, 2), 130, "out of its 23 bytes"),
-        (30, (5, 2), 130, "cannot have 260 bytes"),
-        (30, (3, 3), 130, "cannot have 260 bytes"),
-    ):
-        with pytest.raises(UnusableMessage, match=reason):
-            packed_points(rows.tobytes(), fields, stride, size=size, row=row)
+    for size in ((5, 2), (3, 3)):
+        with pytest.raises(UnusableMessage, match="cannot have 260 bytes"):
+            packed_points(rows.tobytes(), fields, 30, size=size, row=130)
+    for place in ({}, {"z": (0, 5)}):
+        with pytest.raises(UnusableMessage, match="has no field z of float32 or float64"):
+            packed_points(b"", {"x": (0, 7), "y": (4, 7), **place}, 30, size=(0, 1), row=0)
     assert packed_points(b"", fields, 30, size=(0, 1), row=0).shape == (0, 3)
-
-
-def test_clouds_without_places_are_refused() -> None:
-    with pytest.raises(UnusableMessage, match="lacks the field z"):
-        named_fields([("x", 0, 7), ("y", 4, 7)])
-    with pytest.raises(UnusableMessage, match="y of a point cloud is no float"):
-        named_fields([("x", 0, 7), ("y", 4, 5), ("z", 8, 7)])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from runners.sensors.log.clocks import SLACK, in_time_order
-from runners.sensors.log.messages import JointsMessage, MarkerMessage, Received
-from runners.sensors.log.motion import MOST_OF_A_PROBE, JointHistory
+from runners.sensors.log.clocks import SLACK, ClockCorrection, in_time_order
+from runners.sensors.log.joints import MOST_OF_A_PROBE, JointHistory
+from runners.sensors.log.messages import MarkerMessage, Received
 from runners.sensors.log.probe_windows import marked_windows
 from runners.sensors.session_report import MOST_KINDS, LogWarnings
 
@@ -51,6 +51,19 @@ def test_begins_without_number_are_counted() -> None:
     assert said == ["a probe has a begin and no end; the next begin ends it"]
 
 
+def test_marks_that_do_not_fit_are_reported() -> None:
+    found, said = spans("end 9", "begin 2", "hello", "begin 2", "begin 1")
+    assert found == [(0, 0, 20, 50, 50), (1, 50, 50, 100, 101)]
+    assert said == [
+        "probe 9 has an end and no begin; ignored",
+        "a marker is 'hello'; accepted: begin N, end",
+        "probe 2 begins twice without an end; taken as one",
+        "probe 2 has a begin and no end; the next begin ends it",
+        "probe 1 has a begin and no end; the log's end ends it",
+        "probes are marked 2, 1; as these do not rise, they are counted from 0 to 1",
+    ]
+
+
 def test_no_marker_that_is_understood_is_no_window() -> None:
     found, said = spans("begin 99999999999", "stop", "")
     assert found == []
@@ -78,17 +91,22 @@ def test_messages_come_in_the_order_of_their_times_if_they_are_not_too_late() ->
     assert got == [1, 2, 3, 4, 5, 9, 0, 30]
 
 
-def test_a_state_of_the_joints_holds_until_the_next() -> None:
+def history(*positions: dict[str, float]) -> JointHistory:
+    """Positions at times 0, 10, 20, ..."""
     joints = JointHistory(["finger"])
-    for time in range(0, 1000, 10):
-        moved = 0.1 if time >= 500 else 0.001 * (time % 20)
-        joints.add(time, JointsMessage({"finger": moved, "elbow": time}).positions)
+    for index, values in enumerate(positions):
+        joints.add(Received("/joints", 10 * index, None, MarkerMessage("")), values)
+    joints.settle(ClockCorrection())
+    return joints
+
+
+def test_a_state_of_the_joints_holds_until_the_next() -> None:
+    moved = [0.1 if time >= 500 else 0.001 * (time % 20) for time in range(0, 1000, 10)]
+    joints = history(*({"finger": value, "elbow": 10.0 * n} for n, value in enumerate(moved)))
     assert joints.first() == {"finger": 0.0}
     assert joints.during(100, 400) == [(100, {"finger": 0.0})]
     assert joints.during(400, 600) == [(400, {"finger": 0.0}), (500, {"finger": 0.1})]
     assert joints.during(600, 700) == [(600, {"finger": 0.1})]
-    assert JointHistory(["finger"]).during(0, 9) == [(0, {})]
-    busy = JointHistory(["finger"])
-    for time in range(1000):
-        busy.add(time, {"finger": float(time)})
-    assert len(busy.during(0, 1000)) <= MOST_OF_A_PROBE
+    assert history().during(0, 9) == [(0, {})]
+    busy = history(*({"finger": float(time)} for time in range(1000)))
+    assert len(busy.during(0, 10_000)) <= MOST_OF_A_PROBE

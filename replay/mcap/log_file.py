@@ -1,0 +1,186 @@
+"""MCAP files of other programs, such as robots' logs: their messages, in order of time."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from mcap import records
+from mcap.records import Chunk, ChunkIndex, DataEnd, McapRecord, Message
+from mcap.writer import MCAP0_MAGIC
+
+from chsel.errors import SessionError
+from replay.mcap.file import MALFORMED, chunk_at, file_records, file_summary, reason_of, unpacked
+from replay.mcap.texts import one_line
+
+ACCEPTED = "accepted: an .mcap file, or a rosbag2 folder with MCAP storage"
+ROS1_BAG = b"#ROSBAG "  # as long as MCAP0_MAGIC
+_CONVERT = (
+    "convert it with `pip install rosbags`, `rosbags-convert --src LOG.bag --dst LOG "
+    "--dst-storage mcap`, and pass the folder LOG"
+)
+_END_OF_TIME = 2**63
+_ROS_TEXTS = ("ros2msg", "ros1msg")
+
+Fault = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Messages of one topic and schema."""
+
+    topic: str
+    encoding: str
+    schema: str  # its name
+    definition: str | None = None  # the schema's text, if it is one of ROS
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it stands in the file; log_time in nanoseconds."""
+
+    channel: Channel
+    log_time: int
+    data: bytes
+
+
+class RawFile:
+    """Reads one file, as often as wanted. Raises SessionError if it is not MCAP.
+
+    is_indexed: whether messages come in order of log time, else in the file's. channels: by id, and
+    counts: of messages by channel, both empty without an index. times: first and last log time.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.remarks: list[str] = []  # how it is read
+        self.channels: dict[int, Channel] = {}
+        self.counts: dict[int, int] = {}
+        self.times: tuple[int, int] | None = None
+        self._schemas: dict[int, records.Schema] = {}
+        self._chunks: list[ChunkIndex] = []
+        try:
+            with path.open("rb") as file:
+                start = file.read(len(MCAP0_MAGIC))
+                if start == ROS1_BAG or (path.suffix == ".bag" and start != MCAP0_MAGIC):
+                    raise SessionError(f"log {path} is a ROS 1 bag; {ACCEPTED}: {_CONVERT}")
+                if start != MCAP0_MAGIC:
+                    raise SessionError(f"log {path} is no MCAP file; {ACCEPTED}")
+                self.size = file.seek(0, 2)
+                self.is_indexed = self._read_index(file)
+        except OSError as error:
+            raise SessionError(f"log {path} cannot be read: {error.strerror or error}") from None
+        if not self.is_indexed:
+            self.remarks.append("it is read without its index: it has none that can be used")
+
+    def messages(
+        self,
+        topics: frozenset[str] | None,
+        fault: Fault,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Iterator[RawMessage]:
+        """The messages on topics (None: all). fault: called with each damage. progress: with bytes.
+
+        Without an index, nothing is read behind the first damage.
+        """
+        try:
+            with self.path.open("rb") as file:
+                if self.is_indexed:
+                    yield from self._by_time(file, topics, fault, progress)
+                    return
+                try:
+                    for record in file_records(file, self.size):
+                        if isinstance(record, DataEnd):
+                            return
+                        progress(file.tell())
+                        inside = unpacked(record) if isinstance(record, Chunk) else [record]
+                        yield from self._messages(inside, topics, fault)
+                except MALFORMED as error:
+                    fault(f"{self.path.name}: {reason_of(error)}")
+        except OSError as error:
+            fault(f"{self.path.name}: it cannot be read on: {error.strerror or error}")
+
+    def _by_time(
+        self,
+        file: IO[bytes],
+        topics: frozenset[str] | None,
+        fault: Fault,
+        progress: Callable[[int], None],
+    ) -> Iterator[RawMessage]:
+        """A chunk is read once no message before it can be missing."""
+        waiting: list[tuple[int, int, int, RawMessage]] = []
+        done = 0
+        for chunk in self._chunks:
+            while waiting and waiting[0][0] < chunk.message_start_time:
+                yield heapq.heappop(waiting)[3]
+            channels = [self.channels.get(number) for number in chunk.message_index_offsets]
+            if not channels or any(_is_wanted(channel, topics) for channel in channels):
+                try:
+                    inside = unpacked(chunk_at(file, self.size, chunk.chunk_start_offset))
+                except MALFORMED as error:
+                    fault(f"{self.path.name}: {reason_of(error)}")
+                    inside = []
+                for number, message in enumerate(self._messages(inside, topics, fault)):
+                    place = (message.log_time, chunk.chunk_start_offset, number)
+                    heapq.heappush(waiting, (*place, message))
+            done += chunk.chunk_length
+            progress(done)
+        while waiting:
+            yield heapq.heappop(waiting)[3]
+
+    def _messages(
+        self, inside: list[McapRecord], topics: frozenset[str] | None, fault: Fault
+    ) -> Iterator[RawMessage]:
+        for record in inside:
+            self._describe(record)
+            if not isinstance(record, Message):
+                continue
+            channel = self.channels.get(record.channel_id)
+            if channel is None:
+                fault(f"{self.path.name}: a message of a channel that is not described")
+            elif record.log_time >= _END_OF_TIME:
+                fault(f"{channel.topic}: a message at a time beyond the end of time")
+            elif _is_wanted(channel, topics):
+                yield RawMessage(channel, record.log_time, record.data)
+
+    def _read_index(self, file: IO[bytes]) -> bool:
+        """Look at the end of the file; whether there is an index of all chunks."""
+        summary = file_summary(file, self.size)
+        if summary is None or summary.statistics is None:
+            return False
+        statistics = summary.statistics
+        if statistics.chunk_count != len(summary.chunk_indexes) or (
+            statistics.message_count and not summary.chunk_indexes
+        ):
+            return False
+        for described in (*summary.schemas.values(), *summary.channels.values()):
+            self._describe(described)
+        self.counts = statistics.channel_message_counts
+        if statistics.message_count:
+            self.times = statistics.message_start_time, statistics.message_end_time
+        self._chunks = sorted(
+            summary.chunk_indexes,
+            key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset),
+        )
+        return True
+
+    def _describe(self, record: McapRecord) -> None:
+        """Take note of a schema or channel; of two with one number the first stays."""
+        if isinstance(record, records.Schema):
+            self._schemas.setdefault(record.id, record)
+        elif isinstance(record, records.Channel) and record.id not in self.channels:
+            schema = self._schemas.get(record.schema_id)
+            text = None
+            if schema is not None and schema.encoding in _ROS_TEXTS:
+                text = schema.data.decode("utf-8", "replace")
+            name = "" if schema is None else one_line(schema.name)
+            topic, encoding = one_line(record.topic), one_line(record.message_encoding)
+            self.channels[record.id] = Channel(topic, encoding, name, text)
+
+
+def _is_wanted(channel: Channel | None, topics: frozenset[str] | None) -> bool:
+    """Whether a channel is on one of the topics, or may be; None: every topic is wanted."""
+    return topics is None or channel is None or channel.topic in topics
