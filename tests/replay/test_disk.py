@@ -16,7 +16,6 @@ from chsel.problem import online_registration as online
 from replay.__main__ import main
 from replay.files import WritingError, new_file, whole_file
 from replay.mcap.writer import McapRecorder
-from runners.benchmarks import benchmark_tables as report
 from runners.run.recording import write_in_run_folder
 from tests.runners.in_process import run
 
@@ -166,12 +165,6 @@ def test_a_full_disk_under_a_file_of_a_run_is_named(
     assert sorted(os.listdir(folder)) == whole[name]
     if name == "summary.json":
         assert main(["info", str(folder / "recording.mcap")]) == 0
-
-
-def test_a_full_disk_under_a_benchmark_is_named(tmp_path, full_disk) -> None:
-    full_disk("benchmark.json")
-    with pytest.raises(WritingError, match=r"benchmark\.json cannot be written \(No space left"):
-        report.write(tmp_path / "benchmark.json", {})
 
 
 def test_a_run_folder_that_was_removed_is_not_made_again(tmp_path) -> None:
