@@ -14,9 +14,9 @@ from typing import Any
 
 from chsel.methods.anchored.anchored_settings import AnchoredSettings
 from chsel.methods.chsel import ChselSettings
-from chsel.methods.cvo.cvo import CvoSettings
+from chsel.methods.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
-from chsel.methods.medial_constraint.medial_constraint import CmaEsSettings
+from chsel.methods.medial_constraint import CmaEsSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.qd.selection import OutputSettings
 

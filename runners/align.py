@@ -19,8 +19,8 @@ from chsel.errors import RecordingError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.pose_scan import TruePose, TruePoseSettings, find_true_pose
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
-from chsel.plausible.true_pose import TruePose, TruePoseSettings, find_true_pose
 from chsel.problem.poses import compose, inverse, roll_pitch_yaw
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings, settings_mapping

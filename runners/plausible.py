@@ -16,10 +16,14 @@ from rich.table import Table
 from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_threads, threads
-from chsel.plausible.plausible_file import load_plausible, save_plausible
-from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_set import (
+    PlausibleSet,
+    load_plausible,
+    plausible_set,
+    save_plausible,
+)
 from chsel.plausible.plausible_settings import PlausibleSettings
-from chsel.plausible.true_pose import find_true_pose
+from chsel.plausible.pose_scan import find_true_pose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey

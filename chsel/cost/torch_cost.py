@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chsel.cost.cost_settings import CostSettings
-from chsel.cost.interior_points import interior_points
+from chsel.cost.cost_settings import CostSettings, interior_points
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, VoxelGrid, require_parts
 from chsel.problem.poses import stacked

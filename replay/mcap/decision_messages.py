@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from chsel.errors import RecordingError
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.numerics.arrays import digest
 from chsel.problem.points import KnownPoints
 from chsel.problem.streams import StreamKey

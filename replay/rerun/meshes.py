@@ -14,7 +14,7 @@ from replay.events import Probe
 if TYPE_CHECKING:
     import trimesh
 
-    from chsel.next_probe.hand_shape import HandShape
+    from chsel.next_probe.decision_problem import HandShape
 
 DISPLAY_FACES = 6000
 """Meshes with more faces are coarsened for display."""

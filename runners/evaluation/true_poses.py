@@ -16,8 +16,8 @@ import trimesh
 from chsel.errors import SessionError
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.pose_scan import TruePose, find_true_pose
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
-from chsel.plausible.true_pose import TruePose, find_true_pose
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import RegistrationProblem

@@ -13,9 +13,8 @@ from chsel.errors import SessionError, SettingError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply
-from chsel.sensing.depth_camera import valid_pixels
+from chsel.sensing.depth_camera import depth_regions, main_regions, valid_pixels
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.regions import depth_regions, main_regions
 from runners.sensors.depth_camera import edge_pixels, mark_rays, ray_ends
 from runners.sensors.depth_frame import DepthFrame
 from runners.sensors.rig import Rig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
 
