@@ -4,6 +4,8 @@ Zhong, Fazeli and Berenson, "CHSEL: Producing Diverse Plausible Pose Estimates f
 Free Space Data", Robotics: Science and Systems, 2023.
 """
 
+# ruff: noqa: F401
+
 import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -15,7 +17,7 @@ if os.path.exists(os.path.join(os.path.dirname(__file__), "wrapper.py")):  # a f
         "chsel-replay, and install this project again, in an environment of its own"
     )
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the same, for type checkers and editors
     from chsel.api import register
     from chsel.cost.compiled_cost import CompiledCost
     from chsel.cost.cost_settings import CostSettings
@@ -28,8 +30,13 @@ if TYPE_CHECKING:
         forward_actions,
         straight_actions,
     )
-    from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
-    from chsel.next_probe.hand_shape import HandShape
+    from chsel.next_probe.decision_problem import (
+        Actions,
+        Belief,
+        Decision,
+        DecisionProblem,
+        HandShape,
+    )
     from chsel.numerics.threads import set_threads
     from chsel.policies import build_policy
     from chsel.policies.steering import Steering
@@ -44,84 +51,32 @@ if TYPE_CHECKING:
     )
     from chsel.problem.sdf_grid import SdfGrid
     from chsel.problem.trust import trust_in
-    from chsel.sensing.free_space import FreeGrid
-    from chsel.sensing.swept import interior_lattice, poses_between
+    from chsel.sensing.free_space import FreeGrid, interior_lattice, poses_between
 
     __version__: str
 
-__all__ = [
-    "ActionSettings",
-    "Actions",
-    "ArchiveSnapshot",
-    "Belief",
-    "ChselError",
-    "CompiledCost",
-    "CostSettings",
-    "Decision",
-    "DecisionProblem",
-    "FreeGrid",
-    "HandShape",
-    "Hypotheses",
-    "InputWarning",
-    "KnownPoints",
-    "MeshWarning",
-    "OnlineRegistration",
-    "PointsWarning",
-    "RegistrationProblem",
-    "RelaxedCost",
-    "SdfGrid",
-    "Steering",
-    "Trust",
-    "Workspace",
-    "around_actions",
-    "build_method",
-    "build_policy",
-    "forward_actions",
-    "interior_lattice",
-    "load_mesh",
-    "poses_between",
-    "register",
-    "set_threads",
-    "straight_actions",
-    "trust_in",
-]
-
-_PLACES = {
-    "ActionSettings": "next_probe.action_lattice",
-    "Actions": "next_probe.decision_problem",
-    "ArchiveSnapshot": "problem.registration_problem",
-    "Belief": "next_probe.decision_problem",
-    "ChselError": "errors",
-    "CompiledCost": "cost.compiled_cost",
-    "CostSettings": "cost.cost_settings",
-    "Decision": "next_probe.decision_problem",
-    "DecisionProblem": "next_probe.decision_problem",
-    "FreeGrid": "sensing.free_space",
-    "HandShape": "next_probe.hand_shape",
-    "Hypotheses": "problem.registration_problem",
-    "InputWarning": "errors",
-    "KnownPoints": "problem.points",
-    "MeshWarning": "errors",
-    "OnlineRegistration": "problem.online_registration",
-    "PointsWarning": "errors",
-    "RegistrationProblem": "problem.registration_problem",
-    "RelaxedCost": "cost.torch_cost",
-    "SdfGrid": "problem.sdf_grid",
-    "Steering": "policies.steering",
-    "Trust": "problem.registration_problem",
-    "Workspace": "problem.points",
-    "around_actions": "next_probe.action_lattice",
-    "build_method": "methods",
-    "build_policy": "policies",
-    "forward_actions": "next_probe.action_lattice",
-    "interior_lattice": "sensing.swept",
-    "load_mesh": "problem.mesh",
-    "poses_between": "sensing.swept",
-    "register": "api",
-    "set_threads": "numerics.threads",
-    "straight_actions": "next_probe.action_lattice",
-    "trust_in": "problem.trust",
+_NAMES = {
+    "api": "register",
+    "cost.compiled_cost": "CompiledCost",
+    "cost.cost_settings": "CostSettings",
+    "cost.torch_cost": "RelaxedCost",
+    "errors": "ChselError InputWarning MeshWarning PointsWarning",
+    "methods": "build_method",
+    "next_probe.action_lattice": "ActionSettings around_actions forward_actions straight_actions",
+    "next_probe.decision_problem": "Actions Belief Decision DecisionProblem HandShape",
+    "numerics.threads": "set_threads",
+    "policies": "build_policy",
+    "policies.steering": "Steering",
+    "problem.mesh": "load_mesh",
+    "problem.online_registration": "OnlineRegistration",
+    "problem.points": "KnownPoints Workspace",
+    "problem.registration_problem": "ArchiveSnapshot Hypotheses RegistrationProblem Trust",
+    "problem.sdf_grid": "SdfGrid",
+    "problem.trust": "trust_in",
+    "sensing.free_space": "FreeGrid interior_lattice poses_between",
 }
+_PLACES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_PLACES)
 
 
 def __getattr__(name: str) -> Any:

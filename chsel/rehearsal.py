@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from chsel.methods.method import Method
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.compiler import cache_directory
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies.policy import Policy, StopSettings

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import Actions, Decision, DecisionProblem
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, Decision, DecisionProblem, HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem

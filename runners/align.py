@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from chsel.errors import RecordingError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_threads, threads
-from chsel.plausible.true_pose import TruePoseSettings
+from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.poses import compose, roll_pitch_yaw
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings, settings_mapping

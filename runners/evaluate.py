@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from chsel.errors import SettingError, require_choice, require_positive
 from chsel.methods import METHODS
 from chsel.numerics.threads import require_threads
-from chsel.plausible.true_pose import TruePoseSettings
+from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.settings import build_settings
 from replay.console import Console, Progress
 from runners.command.program import command, plain

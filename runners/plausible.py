@@ -13,8 +13,12 @@ from omegaconf import DictConfig
 from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_threads, threads
-from chsel.plausible.plausible_file import load_plausible, save_plausible
-from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_set import (
+    PlausibleSet,
+    load_plausible,
+    plausible_set,
+    save_plausible,
+)
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings

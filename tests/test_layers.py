@@ -79,7 +79,7 @@ BUILT_OF = {
 }
 """Files and folders of chsel/methods, and those beside them that they are built of."""
 EVERY_METHOD = {"method"}  # the protocol that they implement
-ALL_METHODS = {"", "registry"}  # chsel/methods/__init__.py, and the table of all methods
+ALL_METHODS = {""}  # chsel/methods/__init__.py, the table of all methods
 
 
 def module_name(file: Path, root: Path) -> str:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from chsel.cost.cost_kernels import LANES, Model, costs_of_poses, work_of
-from chsel.cost.cost_settings import CostSettings
+from chsel.cost.cost_settings import CostSettings, InteriorPoints, interior_points
 from chsel.cost.free_kernels import FreeTerm
-from chsel.cost.interior_points import InteriorPoints, interior_points
 from chsel.errors import require_choice
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import bounds_of, box_of, cell_set_of, triple

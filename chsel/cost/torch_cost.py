@@ -14,8 +14,7 @@ except ModuleNotFoundError as error:
         "RelaxedCost needs torch: pip install 'chsel-replay[torch]'", name="torch"
     ) from error
 
-from chsel.cost.cost_settings import CostSettings
-from chsel.cost.interior_points import interior_points
+from chsel.cost.cost_settings import CostSettings, interior_points
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, VoxelGrid, require_parts
 from chsel.problem.poses import stacked

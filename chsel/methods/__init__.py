@@ -1,21 +1,85 @@
-"""Registration methods: each a file, or a folder with its parts."""
+"""Registration methods by name: ours, each a file or folder here, and those of other packages."""
 
-from chsel.methods.registry import (
-    METHODS,
-    OURS,
-    build_method,
-    default_method,
-    noise_of,
-    preset_settings,
-    trust_by,
+from __future__ import annotations
+
+from typing import Any
+
+from chsel.errors import require_choice
+from chsel.methods.anchored.anchored import Anchored
+from chsel.methods.anchored.anchored_settings import AnchoredSettings
+from chsel.methods.chsel import Chsel, ChselSettings
+from chsel.methods.cvo import Cvo, CvoSettings
+from chsel.methods.gradient_descent import GradientDescent, GradientDescentSettings
+from chsel.methods.icp import Icp, IcpSettings
+from chsel.methods.medial_constraint import (
+    MedialConstraint,
+    MedialConstraintCmaMe,
+    MedialConstraintCmaMeSettings,
+    MedialConstraintSettings,
 )
+from chsel.methods.method import Method
+from chsel.methods.svgd import Svgd, SvgdSettings
+from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem, Trust
+from chsel.problem.settings import PRESETS, Entry, NamedChoices
+from chsel.problem.trust import DETERMINED, MANY_CONTACTS, SENSOR_NOISE, has_pose, trust_in
 
-__all__ = [
-    "METHODS",
-    "OURS",
-    "build_method",
-    "default_method",
-    "noise_of",
-    "preset_settings",
-    "trust_by",
-]
+_OURS: dict[str, Entry[Method]] = {
+    "chsel": (Chsel, ChselSettings()),
+    "chsel_cma_me": (Chsel, ChselSettings(search="cma_me")),
+    "gradient_descent": (GradientDescent, GradientDescentSettings()),
+    "icp": (Icp, IcpSettings()),
+    "svgd": (Svgd, SvgdSettings()),
+    "cvo": (Cvo, CvoSettings()),
+    "cvo_no_free_space": (Cvo, CvoSettings(free_space=False)),
+    "medial_constraint": (MedialConstraint, MedialConstraintSettings()),
+    "medial_constraint_cma_me": (MedialConstraintCmaMe, MedialConstraintCmaMeSettings()),
+    "anchored": (Anchored, AnchoredSettings()),
+}
+OURS = tuple(_OURS)
+
+
+def _lacks(method: Any) -> str | None:
+    """What an object with settings lacks to be a method, and what is accepted."""
+    if not isinstance(getattr(method, "online", None), OnlineSettings):
+        return "no `online`; accepted: a property that returns OnlineSettings"
+    if not callable(getattr(method, "register", None)):
+        return "no `register`; accepted: register(problem, observer=None)"
+    return None
+
+
+_CHOICES = NamedChoices[Method](
+    "method", "chsel.methods", "docs/writing_a_method.md", _OURS, _lacks
+)
+METHODS = _CHOICES.names
+build_method, preset_settings = _CHOICES.build, _CHOICES.settings
+
+
+def default_method(preset: str = "default") -> str:
+    """The method for points of one's own; of presets that are the paper's, the paper's method."""
+    require_choice("preset", preset, PRESETS)
+    return "anchored" if preset == "default" else "chsel"
+
+
+def noise_of(method: Method) -> float:
+    """The noise of known points by a method's settings, metres; SENSOR_NOISE if it has none."""
+    settings = getattr(method, "settings", None)
+    return settings.noise if isinstance(settings, AnchoredSettings) else SENSOR_NOISE
+
+
+def trust_by(method: Method, problem: RegistrationProblem, hypotheses: Hypotheses) -> Trust | None:
+    """How far to trust what a method found, by the noise in its settings; None without a pose.
+
+    A single mode has to stand beside what a search for other poses finds, among them turns under
+    which the object looks nearly alike, and poses that leave out one of few contacts. Of many
+    contacts, `anchored` has done this search itself.
+    """
+    if not has_pose(hypotheses):
+        return None
+    noise = noise_of(method)
+    trust = trust_in(problem, hypotheses, noise)
+    searched = isinstance(method, Anchored) and len(problem.points.known) >= MANY_CONTACTS
+    if trust.verdict == DETERMINED and not searched:
+        rivals = Anchored(AnchoredSettings(noise=noise)).minima(problem)
+        trust = trust_in(problem, hypotheses, noise, rivals)
+    return trust

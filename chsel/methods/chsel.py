@@ -16,17 +16,12 @@ from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
-from chsel.problem.registration_problem import (
-    Hypotheses,
-    NullObserver,
-    Observer,
-    RegistrationProblem,
-)
+from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import CheckedSettings, Presets, at_most, one_of, positive
 from chsel.problem.streams import Purpose, normals
 from chsel.qd.archive import GridArchive, evaluated
-from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings
+from chsel.qd.emitters import SEARCHES, EmitterSettings, fill_archive
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
     ArchiveSettings,
@@ -85,11 +80,8 @@ class Chsel(ConfiguredMethod[ChselSettings]):
 
     settings_class = ChselSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first."""
-        algorithm = _Algorithm1(problem, self.settings, observer or NullObserver())
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
+        algorithm = _Algorithm1(problem, self.settings, observer)
         initial_set, low_cost_set = Poses.of(problem.initial_set), Poses.of(problem.low_cost_set)
         hypotheses = algorithm.run(initial_set, low_cost_set, 0)
         for index in range(1, self.settings.passes):
@@ -143,9 +135,17 @@ class _Algorithm1:
         settings, start = self.settings.emitter, archive.best_solution
         if settings.start == "initial":
             start = self.space.encode(initial_set[:1])[0]
-        search, count = self.settings.search, len(initial_set)
-        draws, watch = Draws(self.problem.key, index), ArchiveWatch(self.observer, index, search)
-        SEARCHES[search](self.objective, archive, start, count, settings, draws, watch)
+        fill_archive(
+            self.settings.search,
+            self.objective,
+            archive,
+            start,
+            len(initial_set),
+            settings,
+            self.problem.key,
+            self.observer,
+            index,
+        )
 
     def lowest_cost_cells(self, archive: GridArchive, index: int) -> Hypotheses:
         """Line 7."""

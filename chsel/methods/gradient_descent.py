@@ -52,7 +52,9 @@ class DescentSettings(CheckedSettings):
         require_at_most("restarts x iterations", self.restarts * self.iterations, MOST_ITERATIONS)
         if self.stop_below is not None and not np.isfinite(self.stop_below):
             raise SettingError(f"stop_below is {self.stop_below}; accepted: a number, or null")
-        if self.race is not None and not _falls_from_1(self.race):
+        shares = self.race or (0.0,)
+        falling = all(share <= before for before, share in pairwise((1.0, *shares)))
+        if self.race is not None and not (falling and shares[-1] > 0.0):
             raise SettingError(
                 f"race is {list(self.race)}; accepted: null, or shares above 0 and at most 1, none "
                 "above the one before"
@@ -63,15 +65,6 @@ class DescentSettings(CheckedSettings):
         if self.race is None:
             return starts
         return math.ceil(self.race[min(block, len(self.race) - 1)] * starts)
-
-    def ends_after(self, gain: float) -> bool:
-        """Whether no block follows one of such a mean gain."""
-        return self.stop_below is not None and gain <= self.stop_below
-
-
-def _falls_from_1(shares: tuple[float, ...]) -> bool:
-    falling = all(share <= before for before, share in pairwise((1.0, *shares)))
-    return bool(shares) and falling and shares[-1] > 0.0
 
 
 def descend(
@@ -92,12 +85,14 @@ def descend(
         moved, after = objective.block(
             vectors[running], len(starts), settings.rate, settings.iterations
         )
-        gain = _mean_gain(costs[running], after)
+        before = costs[running]
+        # By which fraction costs fell, on average over the starts; a cost of 0 gains nothing.
+        gain = np.where(before > 0.0, (before - after) / np.where(before > 0.0, before, 1.0), 0.0)
         vectors[running], costs[running] = moved, after
         done = (block + 1) * settings.iterations
         _show(observer, done, vectors, costs)
         observer.progress("descent", done, total)
-        if settings.ends_after(gain):
+        if settings.stop_below is not None and float(gain.mean()) <= settings.stop_below:
             break
     return space.poses(vectors), costs
 
@@ -105,12 +100,6 @@ def descend(
 def _show(observer: Observer, iteration: int, vectors: FloatArray, costs: FloatArray) -> None:
     if type(observer) is not NullObserver:
         observer.trace("descent", iteration, vectors.copy(), costs.copy())
-
-
-def _mean_gain(before: FloatArray, after: FloatArray) -> float:
-    """Mean over the starts of the fraction by which the cost fell; a cost of 0 gains nothing."""
-    gain = np.where(before > 0.0, (before - after) / np.where(before > 0.0, before, 1.0), 0.0)
-    return float(gain.mean())
 
 
 @dataclass(frozen=True)
@@ -130,12 +119,9 @@ class GradientDescent(ConfiguredMethod[GradientDescentSettings]):
 
     settings_class = GradientDescentSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first."""
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
         starts = Poses.of(problem.initial_set)
-        estimates, _ = descend(objective, starts, self.settings.descent, observer or NullObserver())
+        estimates, _ = descend(objective, starts, self.settings.descent, observer)
         return ranked_hypotheses(objective, estimates, elites=estimates)

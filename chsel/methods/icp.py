@@ -14,15 +14,10 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
 from chsel.numerics.pose_tuples import finite, moved, pose_at, turned
-from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.numerics.threads import spread
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
-from chsel.problem.registration_problem import (
-    Hypotheses,
-    NullObserver,
-    Observer,
-    RegistrationProblem,
-)
+from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey
 from chsel.problem.surface import surface_points
@@ -70,12 +65,7 @@ class Icp(ConfiguredMethod[IcpSettings]):
 
     settings_class = IcpSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the contacts of a problem, best first."""
-        require_ieee_arithmetic()
-        observer = observer or NullObserver()
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
         contacts, poses = problem.points.contacts, Poses.of(problem.initial_set)
         if len(contacts) == 0:
             return ranked(problem.initial_set, np.zeros(len(poses)))

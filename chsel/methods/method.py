@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Generic, Protocol, TypeVar
 
+from chsel.numerics.threads import require_ieee_arithmetic
 from chsel.problem.online_registration import OnlineSettings
-from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
+from chsel.problem.registration_problem import (
+    Hypotheses,
+    NullObserver,
+    Observer,
+    RegistrationProblem,
+)
 
 
 class Method(Protocol):
@@ -36,7 +42,10 @@ Settings = TypeVar("Settings", bound=MethodSettings)
 
 
 class ConfiguredMethod(Generic[Settings]):
-    """Base of a method whose settings have a field `online`; `settings_class` makes the default."""
+    """Base of a method whose settings have a field `online`; `settings_class` makes the default.
+
+    A method has `_hypotheses`, or a `register` of its own.
+    """
 
     settings_class: type[Settings]
 
@@ -47,3 +56,13 @@ class ConfiguredMethod(Generic[Settings]):
     def online(self) -> OnlineSettings:
         """How a session makes the next problem for this method."""
         return self.settings.online
+
+    def register(
+        self, problem: RegistrationProblem, observer: Observer | None = None
+    ) -> Hypotheses:
+        """Hypotheses for the known points of a problem, best first."""
+        require_ieee_arithmetic()
+        return self._hypotheses(problem, observer or NullObserver())
+
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
+        raise NotImplementedError

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 
 from chsel.cost.compiled_cost import CompiledCost
-from chsel.cost.cost_kernels import LANES, Model, Work, evaluate, gradient_of, put_pose, work_of
+from chsel.cost.cost_kernels import LANES, evaluate, gradient_of, put_pose, work_of
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.free_kernels import MOST_SLACK
 from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective, adam_step
@@ -20,12 +20,7 @@ from chsel.numerics.elementary import exp, log
 from chsel.numerics.pose_tuples import decode, pull_back
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
-from chsel.problem.registration_problem import (
-    Hypotheses,
-    NullObserver,
-    Observer,
-    RegistrationProblem,
-)
+from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.qd.selection import ranked_hypotheses
@@ -68,12 +63,6 @@ class SteinStep(NamedTuple):
     scale: float  # h of the kernel
     median: bool  # h follows from the particles instead
     rate: float  # of Adam
-
-
-def surroundings_of(model: Model, count: int) -> Work:
-    """Scratch in which so many particles remember their neighbours, if it is not too large."""
-    size = model.free.tree.points.shape[1]
-    return work_of(model, count if count * size <= _MOST_REMEMBERED else LANES)
 
 
 @compiled
@@ -215,19 +204,12 @@ class Svgd(ConfiguredMethod[SvgdSettings]):
 
     settings_class = SvgdSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first.
-
-        Raises SettingError for too many poses in E_0.
-        """
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
         require_at_most("number of poses in E_0", len(problem.initial_set), MOST_PARTICLES)
         space = search_space(self.settings.plane, problem.sdf)
         objective = Objective(CompiledCost.of(problem, self.settings.cost), space)
-        vectors = self._moved(
-            objective, space.encode(Poses.of(problem.initial_set)), observer or NullObserver()
-        )
+        starts = space.encode(Poses.of(problem.initial_set))
+        vectors = self._moved(objective, starts, observer)
         estimates = space.poses(vectors)
         return ranked_hypotheses(objective, estimates, elites=estimates)
 
@@ -237,7 +219,10 @@ class Svgd(ConfiguredMethod[SvgdSettings]):
         median = settings.kernel == "median"
         step = SteinStep(settings.sharpness, settings.scale, median, settings.rate)
         particles = particles_at(vectors)
-        around = surroundings_of(objective.model, len(vectors))
+        # Scratch in which particles remember their neighbours, if it is not too large.
+        size = len(vectors) * objective.model.free.tree.points.shape[1]
+        remembered = len(vectors) if size <= _MOST_REMEMBERED else LANES
+        around = work_of(objective.model, remembered)
         observer.trace("svgd", 0, vectors.copy(), objective.costs(vectors))
         for first in range(0, total, _BLOCK):
             last = min(first + _BLOCK, total)

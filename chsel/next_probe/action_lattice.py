@@ -9,8 +9,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
 from chsel.problem.poses import compose

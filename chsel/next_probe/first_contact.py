@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import Actions, Belief
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, Belief, HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.threads import spread

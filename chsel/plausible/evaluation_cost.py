@@ -159,24 +159,14 @@ def scratch_for(model: EvaluationModel) -> EvaluationScratch:
 
 
 @compiled
-def costs_below(
-    model: EvaluationModel,
-    poses: FloatArray,
-    limit: float,
-    out: FloatArray,
-    first: int,
-    last: int,
-    scratch: EvaluationScratch,
-) -> None:
+def costs_below(model, poses, limit, out, first, last, scratch):
     """Fill out (B,) with the costs below a limit, else inf, of poses (B, 12) from first to last."""
     for n in range(first, last):
         out[n] = cost_below(model, pose_at(poses, n), limit, scratch)
 
 
 @inner
-def cost_below(
-    model: EvaluationModel, pose: Pose, limit: float, scratch: EvaluationScratch
-) -> float:
+def cost_below(model, pose, limit, scratch):
     """The evaluation cost of a pose; infinite if it is not below the limit."""
     if not finite(pose):
         return np.inf
@@ -224,14 +214,7 @@ def _occupied_count(model: EvaluationModel, pose: Pose, scratch: EvaluationScrat
 
 
 @spliced
-def _may_be_below(
-    model: EvaluationModel,
-    pose: Pose,
-    occupied: int,
-    total: float,
-    limit: float,
-    scratch: EvaluationScratch,
-) -> bool:
+def _may_be_below(model, pose, occupied, total, limit, scratch):
     """False if the free points near some points inside of the object violate too often."""
     voxels, inside, points, hits = model.voxels, model.inside, model.tree.points, 0
     for n in range(inside.shape[1]):

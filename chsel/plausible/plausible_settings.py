@@ -100,7 +100,7 @@ class PoseGridSettings(CheckedSettings):
 
 @dataclass(frozen=True)
 class ModeSearchSettings(CheckedSettings):
-    """How members are sought in modes between the poses of the grid, see chsel.plausible.off_grid.
+    """How members are sought in modes between the poses of the grid, see modes_between.
 
     Poses of the grid climb if their mean over known points is less than `distance` above the true
     pose's, and few points are deeper than `depth` on the wrong side.

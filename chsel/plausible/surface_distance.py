@@ -21,7 +21,7 @@ from chsel.numerics.pose_tuples import composed, inverted, pose_at
 from chsel.numerics.threads import spread
 from chsel.problem.poses import Poses, compose, inverse, product, rotated, stacked
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.sdf_lookup import DistanceField, distance_field, distance_in_place
+from chsel.problem.sdf_lookup import distance_field, distance_in_place
 from chsel.problem.settings import CheckedSettings, at_most, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 
@@ -165,17 +165,7 @@ def _nearest(distances: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 @compiled
-def add_mean_squares(
-    field: DistanceField,
-    points: FloatArray,
-    to_object: FloatArray,
-    to_world: FloatArray,
-    back: bool,
-    out: FloatArray,
-    first: int,
-    last: int,
-    places: Places,
-) -> None:
+def add_mean_squares(field, points, to_object, to_world, back, out, first, last, places):
     """Add the means of s^2 over moved points (3, Q), m^2, to rows first to last of out (B, P).
 
     Points are moved by every pose of to_world (P, 12), then by every one of to_object (B, 12);

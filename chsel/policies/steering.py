@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from chsel.errors import ChselError, SettingError, quoted, require_instance
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.next_probe.forecast import belief_after, belief_before, surprise
-from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.policies.policy import Policy
 from chsel.problem.points import KnownPoints, Workspace, require_parts

@@ -12,10 +12,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from chsel.next_probe.decision_problem import DecisionProblem
+from chsel.next_probe.decision_problem import DecisionProblem, HandFront
 from chsel.next_probe.first_contact import moves_by_orientation, touched_points
 from chsel.next_probe.forecast import Forecast
-from chsel.next_probe.hand_shape import HandFront
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled
 from chsel.numerics.elementary import logs

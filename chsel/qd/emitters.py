@@ -2,24 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from chsel.cost.objective import EPSILON, Objective
+from chsel.cost.objective import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    adam_step,
+    cost_and_gradient_of,
+    costs_of,
+)
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.compiler import compiled, inner, spliced
+from chsel.numerics.pose_tuples import all_finite
 from chsel.problem.registration_problem import NullObserver, Observer
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
-from chsel.qd import emitter_kernels as kernels
-from chsel.qd.archive import GridArchive, SearchObjective, batch_of
-from chsel.qd.emitter_kernels import Adam, Landscape, MegaSearch, MeSearch, SearchDraws
-from chsel.qd.evolution_kernels import strategy_around
+from chsel.qd.archive import (
+    Batch,
+    Cells,
+    GridArchive,
+    SearchObjective,
+    batch_of,
+    cell_for,
+    insert,
+    keep_better,
+    rank,
+    sampled_cell,
+)
+from chsel.qd.evolution_kernels import Strategy, ask, reset, stopped, strategy_around, tell
+from chsel.qd.measures import measure_gradients_of, measures_of
 
+SEARCHES = "cma_mega", "cma_me"  # Fontaine and Nikolaidis, 2021; Fontaine et al., 2020
 MOST_ITERATIONS = 1_000_000
+_TRACED = 10  # iterations between two traces
 _MOST_DRAWN = 4_000_000  # normal draws held at once, 8 bytes each
+_EPSILON = 1e-8  # keeps the normalisation of a zero gradient finite
 
 
 @dataclass(frozen=True)
@@ -39,32 +61,167 @@ class EmitterSettings(CheckedSettings):
     }
 
 
-@dataclass(frozen=True)
-class Draws:
-    """The random numbers of one search; none depends on how others are used."""
+class Landscape(NamedTuple):
+    """What search vectors are evaluated by, see SearchObjective."""
 
-    key: StreamKey
-    refinement: int = 0  # index of the pass
+    model: Any
+    space: Any
+    measure: Any  # MeasureCode
+    work: Any  # scratch
 
-    def blocks(self, iterations: int, batch: int, dimension: int) -> Iterator[FloatArray]:
-        """Standard normal draws for the strategy, `block` iterations at a time.
 
-        Each has shape (iterations, batch, dimension).
-        """
-        stream = self.key.stream(Purpose.EMITTER, self.refinement)
-        size = self.block(batch, dimension)
-        for first in range(0, iterations, size):
-            yield normals(stream, (min(size, iterations - first), batch, dimension))
+class SearchDraws(NamedTuple):
+    """Random numbers of some iterations."""
 
-    @staticmethod
-    def block(batch: int, dimension: int) -> int:
-        """Iterations that are drawn at a time: a multiple of 10, so that no pair is split."""
-        step = ArchiveWatch.trace_interval
-        return max(1, min(100, _MOST_DRAWN // (step * batch * dimension))) * step
+    normals: FloatArray  # (iterations, L, n), standard normal, for the strategy
+    elites: FloatArray  # (iterations,), uniform, each chooses an elite for a restart
 
-    def elites(self, iterations: int) -> FloatArray:
-        """Uniform draws (iterations,) that choose an elite for a restart."""
-        return self.key.stream(Purpose.RESTART, self.refinement).random(iterations)
+
+class Adam(NamedTuple):
+    """State of Adam, see adam_step."""
+
+    rate: float
+    epsilon: float
+    moments: FloatArray  # (2, d)
+    powers: FloatArray  # (2,), of the two betas
+
+
+class MegaSearch(NamedTuple):
+    """State of CMA-MEGA: theta, and the branches around it."""
+
+    theta: FloatArray  # (d,)
+    measures: FloatArray  # (k,), at theta
+    gradient: FloatArray  # (d,), of the cost at theta
+    measure_gradients: FloatArray  # (k, d), at theta
+    directions: FloatArray  # (k + 1, d), normalised gradients, that of the objective first
+    coefficients: FloatArray  # (L, k + 1), of the directions, which the strategy adapts
+    branches: Batch
+    strategy: Strategy
+    adam: Adam  # moves theta
+
+
+class MeSearch(NamedTuple):
+    """State of CMA-ME: the strategy adapts the search vectors themselves."""
+
+    samples: Batch
+    strategy: Strategy
+
+
+@compiled
+def mega_iterations(landscape, archive, search, draws, first, last):
+    """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`."""
+    model, space, measure, work = landscape
+    theta, measures, gradient = search.theta, search.measures, search.gradient
+    measure_gradients, directions = search.measure_gradients, search.directions
+    coefficients, branches, strategy = search.coefficients, search.branches, search.strategy
+    for iteration in range(first, last):
+        objective = -cost_and_gradient_of(model, space, theta, gradient, work)
+        measures_of(space, measure, theta, measures)
+        measure_gradients_of(space, measure, theta, measure_gradients)
+        keep_better(
+            archive, cell_for(archive, objective, theta, measures), objective, theta, measures
+        )
+        _normalise(gradient, -1.0, directions[0])
+        for i in range(len(measures)):
+            _normalise(measure_gradients[i], 1.0, directions[i + 1])
+        ask(strategy, draws.normals[iteration], coefficients)
+        _branch(theta, directions, coefficients, branches.vectors)
+        _evaluate(landscape, branches)
+        insert(archive, branches)
+        parents = rank(branches.status, branches.value, branches.order)
+        tell(strategy, coefficients, branches.order, parents)
+        if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
+            _move_to_elite(archive, draws.elites[iteration], theta)
+            _forget(search.adam)
+            reset(strategy)
+            strategy.mean[:] = 0.0
+        else:
+            _move_towards(theta, branches, strategy.weights, parents, search.adam)
+
+
+@compiled
+def me_iterations(landscape, archive, search, draws, first, last):
+    """Iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`."""
+    samples, strategy = search.samples, search.strategy
+    for iteration in range(first, last):
+        ask(strategy, draws.normals[iteration], samples.vectors)
+        _evaluate(landscape, samples)
+        insert(archive, samples)
+        parents = rank(samples.status, samples.value, samples.order)
+        tell(strategy, samples.vectors, samples.order, parents)
+        if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
+            _move_to_elite(archive, draws.elites[iteration], strategy.mean)
+            reset(strategy)
+
+
+@spliced
+def _evaluate(landscape: Landscape, batch: Batch) -> None:
+    """Fill objectives and measures; a vector that is not finite is looked up nowhere."""
+    model, space, measure, work = landscape
+    costs_of(model, space, batch.vectors, batch.objectives, work)
+    for n in range(len(batch.vectors)):
+        if all_finite(batch.vectors[n]):
+            batch.objectives[n] = -batch.objectives[n]
+            measures_of(space, measure, batch.vectors[n], batch.measures[n])
+        else:
+            batch.objectives[n] = -np.inf
+
+
+@inner
+def _normalise(gradient: FloatArray, sign: float, out: FloatArray) -> None:
+    """Fill out (d,) with the direction of a gradient (d,); zero if its length is not finite."""
+    squares = 0.0
+    for x in gradient:
+        squares += x * x
+    length = sign * (np.sqrt(squares) + _EPSILON)
+    for j in range(len(gradient)):
+        out[j] = gradient[j] / length if np.isfinite(length) else 0.0
+
+
+@inner
+def _branch(
+    theta: FloatArray, directions: FloatArray, coefficients: FloatArray, out: FloatArray
+) -> None:
+    """Fill out (L, d) with theta + sum_i c_i g_i: coefficients c (L, n), directions g (n, d)."""
+    for b in range(len(out)):
+        for j in range(len(theta)):
+            total = 0.0
+            for i in range(len(directions)):
+                total += coefficients[b, i] * directions[i, j]
+            out[b, j] = theta[j] + total
+
+
+@inner
+def _move_to_elite(archive: Cells, uniform: float, vector: FloatArray) -> None:
+    """Make a vector (d,) that of an elite, chosen by a number from [0, 1), if there is any."""
+    cell = sampled_cell(archive.objectives, uniform)
+    if cell >= 0:
+        for j in range(len(vector)):
+            vector[j] = archive.solutions[cell, j]
+
+
+@inner
+def _move_towards(
+    theta: FloatArray, branches: Batch, weights: FloatArray, parents: int, adam: Adam
+) -> None:
+    """One step of Adam from theta to the weighted mean of the best branches, its parents."""
+    vectors, order = branches.vectors, branches.order
+    moments, powers = adam.moments, adam.powers
+    powers[0] *= BETA1
+    powers[1] *= BETA2
+    for j in range(len(theta)):
+        towards = 0.0
+        for i in range(parents):
+            towards += weights[i] * (vectors[order[i], j] - theta[j])
+        theta[j] += adam_step(towards, moments, j, powers, adam.rate, adam.epsilon)
+
+
+@inner
+def _forget(adam: Adam) -> None:
+    """Start Adam again."""
+    for j in range(adam.moments.shape[1]):
+        adam.moments[0, j] = adam.moments[1, j] = 0.0
+    adam.powers[0] = adam.powers[1] = 1.0
 
 
 def mega_search(
@@ -97,114 +254,52 @@ def me_search(start: FloatArray, measures: int, batch: int, settings: EmitterSet
     return MeSearch(batch_of(batch, len(start), measures), strategy)
 
 
-def cma_mega(
-    objective: Objective,
-    archive: GridArchive,
-    start: FloatArray,
-    count: int,
-    settings: EmitterSettings,
-    draws: Draws,
-    watch: ArchiveWatch,
-) -> None:
-    """Fill the archive along gradients of cost and measures (Fontaine and Nikolaidis, 2021).
-
-    start (d,): the first theta. An iteration evaluates theta with its gradients, and count - 1
-    branches around it.
-    """
-    search = mega_search(start, archive.measure.count, max(count - 1, 1), settings)
-    _iterate(kernels.cma_mega, objective, archive, search, settings.iterations, draws, watch)
-
-
-def cma_me(
+def fill_archive(
+    name: str,
     objective: SearchObjective,
     archive: GridArchive,
     start: FloatArray,
     count: int,
     settings: EmitterSettings,
-    draws: Draws,
-    watch: ArchiveWatch,
+    key: StreamKey,
+    observer: Observer,
+    refinement: int = 0,
 ) -> None:
-    """Fill the archive by an evolution strategy on the search vectors (Fontaine et al., 2020).
+    """Fill the archive by one of SEARCHES, of which an iteration evaluates `count` vectors.
 
-    start (d,): the first mean. An iteration evaluates count samples.
+    CMA-MEGA: theta, at first `start` (d,), with its gradients, and branches around it. CMA-ME:
+    samples of an evolution strategy, whose first mean is `start`. refinement: index of the pass.
+    No random number depends on how many are drawn at a time.
     """
-    search = me_search(start, archive.measure.count, count, settings)
-    _iterate(kernels.cma_me, objective, archive, search, settings.iterations, draws, watch)
-
-
-def _iterate(
-    kernel: Callable[..., None],
-    objective: SearchObjective,
-    archive: GridArchive,
-    search: MegaSearch | MeSearch,
-    iterations: int,
-    draws: Draws,
-    watch: ArchiveWatch,
-) -> None:
-    """Run the iterations of a kernel, segment by segment."""
+    measures, total = archive.measure.count, settings.iterations
+    search: MegaSearch | MeSearch
+    if name == "cma_mega":
+        run, search = mega_iterations, mega_search(start, measures, max(count - 1, 1), settings)
+    else:
+        run, search = me_iterations, me_search(start, measures, count, settings)
     batch, dimension = search.strategy.batch, len(search.strategy.mean)
     model, space = objective.model, objective.space_arrays
     landscape = Landscape(model, space, archive.measure.code, objective.work())
-    normals, elites = draws.blocks(iterations, batch, dimension), draws.elites(iterations)
-    drawn = draws.block(batch, dimension)
-    watch.start(archive)
-    for first, last in watch.segments(iterations, drawn):
-        if first % drawn == 0:
-            block = SearchDraws(next(normals), elites[first : first + drawn])
-        before = first - first % drawn
-        kernel(landscape, archive.cells, search, block, first - before, last - before)
-        watch.after(last, iterations, archive)
-
-
-class ArchiveWatch:
-    """Shows an observer the archive: traces every 10 iterations, snapshots at its interval."""
-
-    trace_interval = 10
-
-    def __init__(self, observer: Observer, refinement: int, stage: str) -> None:
-        self._observer = observer
-        self._refinement = refinement
-        self._stage = stage
-        self._nobody_watches = type(observer) is NullObserver
-
-    def start(self, archive: GridArchive) -> None:
-        """Show the archive before the first iteration."""
-        if self._nobody_watches:
-            return
-        self._observer.trace(self._stage, 0, archive.solutions, archive.costs)
-        self._observer.snapshot(archive.snapshot(0, self._refinement))
-
-    def segments(self, total: int, most: int = trace_interval) -> Iterator[tuple[int, int]]:
-        """The iterations (first, last), of `total`, between two calls of the observer.
-
-        most: of a segment if nobody watches.
-        """
-        first, interval = 0, most if self._nobody_watches else self.trace_interval
-        while first < total:
-            last = min(self._next(first, interval), total)
-            if self._observer.snapshot_interval:
-                last = min(last, self._next(first, self._observer.snapshot_interval))
-            yield first, last
-            first = last
-
-    @staticmethod
-    def _next(iteration: int, interval: int) -> int:
-        """The first multiple of the interval after an iteration."""
-        return (iteration // interval + 1) * interval
-
-    def after(self, iteration: int, total: int, archive: GridArchive) -> None:
-        """Show the archive after an iteration, where it is due."""
-        if self._nobody_watches:
-            return
-        interval = self._observer.snapshot_interval
-        if iteration % self.trace_interval == 0 or iteration == total:
-            self._observer.trace(self._stage, iteration, archive.solutions, archive.costs)
-            self._observer.progress(self._stage, iteration, total)
-        if iteration == total or (interval and iteration % interval == 0):
-            self._observer.snapshot(archive.snapshot(iteration, self._refinement))
-
-
-Search = Callable[
-    [Objective, GridArchive, FloatArray, int, EmitterSettings, Draws, ArchiveWatch], None
-]
-SEARCHES: dict[str, Search] = {"cma_mega": cma_mega, "cma_me": cma_me}
+    stream = key.stream(Purpose.EMITTER, refinement)
+    elites = key.stream(Purpose.RESTART, refinement).random(total)
+    # A multiple of 10, so that no pair of normal numbers is split.
+    block = 10 * max(1, min(100, _MOST_DRAWN // (10 * batch * dimension)))
+    is_watched = type(observer) is not NullObserver
+    interval = observer.snapshot_interval or _TRACED
+    if is_watched:
+        observer.trace(name, 0, archive.solutions, archive.costs)
+        observer.snapshot(archive.snapshot(0, refinement))
+    for begin in range(0, total, block):
+        end = min(begin + block, total)
+        draws = SearchDraws(normals(stream, (end - begin, batch, dimension)), elites[begin:end])
+        between = range(begin + 1, end if is_watched else begin)
+        stops = [n for n in between if n % _TRACED == 0 or n % interval == 0]
+        for first, last in pairwise([begin, *stops, end]):
+            run(landscape, archive.cells, search, draws, first - begin, last - begin)
+            if is_watched and (last % _TRACED == 0 or last == total):
+                observer.trace(name, last, archive.solutions, archive.costs)
+                observer.progress(name, last, total)
+            if is_watched and (
+                last == total or (observer.snapshot_interval and last % interval == 0)
+            ):
+                observer.snapshot(archive.snapshot(last, refinement))

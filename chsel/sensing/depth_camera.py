@@ -1,14 +1,19 @@
-"""Pinhole cameras, and which pixels of a depth image are reliable."""
+"""Pinhole cameras, which pixels of a depth image are reliable, and regions that belong together."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import label
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from chsel.errors import PointsError, SettingError, require_at_most, require_positive
-from chsel.numerics.arrays import BoolArray, FloatArray
+from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 
 MOST_PIXELS = 100_000  # on a side
 
@@ -123,3 +128,110 @@ def _least_around(image: FloatArray, reach: int) -> FloatArray:
         least = np.minimum(least[:, step:], least[:, :-step])
         side += step
     return least
+
+
+_STEEPEST = 4.0  # tangent of the angle between a surface's normal and the ray: 76 degrees
+_SPACINGS = 4.0  # random points on a surface are one region up to so many typical distances
+_MOST_ASKED = 2000  # points whose nearest neighbours give the typical distance
+
+
+@dataclass(frozen=True, eq=False)
+class MainRegions:
+    """The measurements that belong together, and how many were left out by which reason."""
+
+    kept: BoolArray  # (N,)
+    small: int  # measurements in regions that are too small
+    far: int  # measurements in regions that are too far from the largest
+
+
+def depth_regions(
+    depth: FloatArray, counts: BoolArray, camera: PinholeCamera, jump: float
+) -> IntArray:
+    """The region (H, W) of each pixel of a depth image, from 1; 0 for pixels that do not count.
+
+    Pixels that share a side are connected unless their depths, metres along z, jump: differ by
+    more than `jump` times the depth, besides what a surface steeply inclined to the ray explains.
+    counts (H, W): pixels with a depth above 0.
+    """
+    depth = np.where(counts, np.asarray(depth, dtype=np.float64), 0.0)
+    height, width = depth.shape
+    cells = np.zeros((2 * height - 1, 2 * width - 1), dtype=bool)  # pixels, and links between them
+    cells[::2, ::2] = counts
+    cells[::2, 1::2] = _linked(depth[:, 1:], depth[:, :-1], jump + _STEEPEST / camera.fx)
+    cells[1::2, ::2] = _linked(depth[1:], depth[:-1], jump + _STEEPEST / camera.fy)
+    return np.asarray(label(cells)[0][::2, ::2])
+
+
+def point_regions(points: FloatArray, gap: float) -> IntArray:
+    """The region (N,) of each of points (N, 3), finite, metres; from 1.
+
+    Points up to `gap` metres apart are connected, or up to four times the typical distance between
+    neighbours where that is more. Points more than 3.5 times as far apart are not.
+    """
+    if len(points) < 2:
+        return np.ones(len(points), dtype=np.int64)
+    asked = points[:: -(-len(points) // _MOST_ASKED)]
+    spacing = float(np.median(cKDTree(points).query(asked, k=2)[0][:, 1]))
+    side = max(gap, _SPACINGS * spacing)
+    voxels, of_point = np.unique(
+        np.floor((points - points.min(axis=0)) / side), axis=0, return_inverse=True
+    )
+    pairs = cKDTree(voxels).query_pairs(1.5, p=np.inf, output_type="ndarray")
+    links = csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(voxels), len(voxels)))
+    regions = connected_components(links, directed=False)[1]
+    return regions[of_point.reshape(-1)].astype(np.int64) + 1
+
+
+def main_regions(
+    regions: IntArray,
+    *,
+    part: float,
+    points: FloatArray | None = None,
+    diameter: float | None = None,
+) -> MainRegions:
+    """Keep the largest region of measurements, and others that can belong to the same object.
+
+    regions (N,): the region of each measurement, from 1. A region is left out if it has fewer than
+    `part` times the measurements of the largest. points (N, 3) and the object's diameter, metres:
+    it is also left out if its mean is further from that of the largest than the diameter, as no two
+    means of points on one object are.
+    """
+    if len(regions) == 0:
+        return MainRegions(np.zeros(0, dtype=bool), 0, 0)
+    sizes = np.bincount(regions)
+    sizes[0] = 0
+    largest = int(np.argmax(sizes))
+    small = sizes < part * sizes[largest]
+    far = np.zeros_like(small)
+    if points is not None and diameter is not None:
+        sums = np.stack([np.bincount(regions, weights=axis) for axis in points.T], axis=1)
+        means = sums / np.maximum(sizes, 1)[:, None]
+        far = ~small & (((means - means[largest]) ** 2).sum(axis=1) > diameter**2)
+    kept: BoolArray = ~(small | far)[regions]
+    return MainRegions(kept, int(sizes[small].sum()), int(sizes[far].sum()))
+
+
+def small_regions(regions: IntArray, least: int) -> BoolArray:
+    """Pixels (H, W) in regions of fewer than `least` pixels."""
+    small = np.bincount(regions.reshape(-1)) < least
+    small[0] = False
+    return np.asarray(small[regions])
+
+
+def speckle_free(
+    depth: FloatArray, valid: BoolArray, regions: IntArray, least: int
+) -> tuple[FloatArray, int]:
+    """Depths (H, W) up to which rays are free, and how many pixels are in regions too small.
+
+    Pixels in regions of fewer than `least` pixels have the least depth of all valid ones (H, W)
+    around them, so far that some are not of their region: if those are right, no ray is too long.
+    """
+    speckles = small_regions(regions, least)
+    reach = isqrt(least) // 2 + 2
+    return nearest_around(depth, valid, speckles, reach=reach), int(speckles.sum())
+
+
+def _linked(one: FloatArray, other: FloatArray, share: float) -> BoolArray:
+    """Whether pairs of depths are connected; none is with 0."""
+    nearer = np.minimum(one, other)
+    return (nearer > 0.0) & (np.abs(one - other) <= share * nearer)

@@ -6,8 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from chsel.errors import RecordingError, require_choice
-from chsel.plausible.plausible_file import read_plausible
-from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.plausible_set import PlausibleSet, read_plausible
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.plausible.pose_metrics import plausible_diversity
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points

@@ -15,8 +15,7 @@ import numpy as np
 import zstandard
 
 from chsel.errors import RecordingError
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.numerics.arrays import digest
 from chsel.problem.mesh import mesh_digest
 from chsel.problem.points import KnownPoints, Workspace

@@ -28,7 +28,7 @@ from replay.mcap.viewer_messages import simple_mesh
 if TYPE_CHECKING:
     import trimesh
 
-    from chsel.next_probe.hand_shape import HandShape
+    from chsel.next_probe.decision_problem import HandShape
 
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")

@@ -14,7 +14,7 @@ from chsel.errors import require_choice
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.plausible.plausible_settings import PlausibleSettings
-from chsel.plausible.true_pose import TruePoseSettings
+from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.settings import build_settings
 from replay.arguments import chosen_steps
 from runners.evaluation.contenders import Contender

@@ -11,8 +11,12 @@ from typing import Any
 
 from chsel.errors import EvaluationError, RecordingError
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible.plausible_file import load_plausible, save_plausible
-from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_set import (
+    PlausibleSet,
+    load_plausible,
+    plausible_set,
+    save_plausible,
+)
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem

@@ -14,8 +14,8 @@ import trimesh
 from chsel.errors import SessionError
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import pose_errors
+from chsel.plausible.pose_scan import TruePoseSettings, find_true_pose
 from chsel.plausible.symmetry import object_symmetry
-from chsel.plausible.true_pose import TruePoseSettings, find_true_pose
 from chsel.problem.poses import apply, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 

@@ -7,7 +7,7 @@ import numpy as np
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply
-from chsel.sensing.regions import main_regions, point_regions
+from chsel.sensing.depth_camera import main_regions, point_regions
 from runners.sensors.cell import RobotCell
 from runners.sensors.log.messages import CloudMessage
 from runners.sensors.rig import CloudRig

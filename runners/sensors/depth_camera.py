@@ -7,9 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges, valid_pixels
+from chsel.sensing.depth_camera import (
+    PinholeCamera,
+    depth_regions,
+    occlusion_edges,
+    speckle_free,
+    valid_pixels,
+)
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.regions import depth_regions, speckle_free
 from replay.events import SensorImage
 from runners.sensors.cell import RobotCell
 from runners.sensors.log.messages import ImageMessage

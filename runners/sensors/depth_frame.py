@@ -16,9 +16,8 @@ from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply
 from chsel.problem.settings import CheckedSettings, build_settings, not_negative, positive
-from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
+from chsel.sensing.depth_camera import PinholeCamera, depth_regions, main_regions, valid_pixels
 from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.regions import depth_regions, main_regions
 from runners.sensors.depth_camera import View, edge_pixels, mark_rays, metres
 from runners.sensors.log.images import read_image
 from runners.sensors.pose_file import pose_of_rows

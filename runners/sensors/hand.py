@@ -215,7 +215,9 @@ class _Linkage:
         elif shape.sphere is not None:
             solid = trimesh.creation.icosphere(subdivisions=2, radius=sizes[0])
         elif shape.cylinder is not None:
-            solid = trimesh.creation.cylinder(*sizes, sections=_CYLINDER_SIDES)
+            solid = trimesh.creation.cylinder(
+                radius=sizes[0], height=sizes[1], sections=_CYLINDER_SIDES
+            )
         else:
             solid = self._mesh(shape.mesh, urdf, where)
         if collision.origin is not None:

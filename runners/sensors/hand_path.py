@@ -10,7 +10,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.points import Lattice
 from chsel.problem.poses import apply, inverse
-from chsel.sensing.swept import interior_lattice, poses_between
+from chsel.sensing.free_space import interior_lattice, poses_between
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import PushEnd
 from runners.sensors.hand import HandModel

@@ -12,8 +12,13 @@ from chsel.errors import SessionError
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.poses import apply, inverse, rotated, rotation_angle
 from chsel.sensing.contact_sensing import contact_mask, deformation, smooth
-from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
-from chsel.sensing.regions import depth_regions, main_regions, small_regions
+from chsel.sensing.depth_camera import (
+    PinholeCamera,
+    depth_regions,
+    main_regions,
+    small_regions,
+    valid_pixels,
+)
 from replay.events import SensorImage
 from runners.sensors.cell import RobotCell
 from runners.sensors.depth_camera import View, intrinsics_of, metres, recorded, view_of

@@ -14,8 +14,7 @@ from chsel.next_probe.action_lattice import (
     forward_actions,
     straight_actions,
 )
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, inverse

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from chsel.errors import SettingError
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose
 from runners.sensors.hand import HandModel

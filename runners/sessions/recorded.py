@@ -9,8 +9,7 @@ from typing import Any
 
 from chsel.errors import PointsError, PoseError, SessionError, SettingError
 from chsel.next_probe.action_lattice import ActionSettings
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray
 from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.points import KnownPoints, check_points

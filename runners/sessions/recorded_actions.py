@@ -9,13 +9,12 @@ import numpy as np
 
 from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings, straight_actions
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Lattice, Workspace
 from chsel.problem.poses import apply, nearest_rigid
 from chsel.problem.sdf_grid import mesh_sdf
-from chsel.sensing.swept import interior_lattice, poses_between
+from chsel.sensing.free_space import interior_lattice, poses_between
 from replay.events import Probe
 
 _ASIDE = 0.010  # m: from the line of a push, what is before it

@@ -7,8 +7,7 @@ from typing import Protocol, runtime_checkable
 
 from chsel.errors import SessionError
 from chsel.next_probe.action_lattice import ActionSettings
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from replay.events import Logged, Probe, RigDescribed, SensorImage

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem
+from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem, HandShape
 from chsel.next_probe.forecast import BeliefSettings, Forecast, belief_before, surprise
-from chsel.next_probe.hand_shape import HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.policies import OURS, build_policy
 from chsel.problem.poses import axis_angle, compose, inverse, product, random_rotations

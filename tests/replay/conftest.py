@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.numerics.arrays import digest
 from chsel.problem.points import GrowingPoints, KnownPoints, Workspace
 from chsel.problem.poses import compose, random_rotations

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chsel.plausible.plausible_file import save_plausible
-from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_set import plausible_set, save_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem import online_registration as online
 from replay.__main__ import main

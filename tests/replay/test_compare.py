@@ -18,8 +18,7 @@ from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
 from chsel.errors import EngineError, RecordingError, SettingError
 from chsel.methods import build_method
-from chsel.plausible.plausible_file import save_plausible
-from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_set import plausible_set, save_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import plausible_diversity
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points

@@ -12,7 +12,7 @@ import yaml
 
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import EvaluationCostSettings
-from chsel.plausible.true_pose import TruePoseSettings
+from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.mesh import clean_mesh
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from chsel.plausible.true_pose import TruePoseSettings
+from chsel.plausible.pose_scan import TruePoseSettings
 from runners.benchmarks.registrations import Steps
 from runners.command.choices import CONF
 from runners.evaluation.metrics import MetricsConfig

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from chsel.errors import ChselError, RecordingError, SettingError
 from chsel.methods.icp import Icp
 from chsel.numerics.arrays import BoolArray, FloatArray
-from chsel.plausible.plausible_file import read_plausible
+from chsel.plausible.plausible_set import read_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.plausible.plausible_file import load_plausible, read_plausible
-from chsel.plausible.plausible_set import plausible_set
+from chsel.plausible.plausible_set import load_plausible, plausible_set, read_plausible
 from chsel.problem.poses import apply, axis_angle, compose
 from replay.mcap.reader import read_recording
 from runners import plausible, probe

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from chsel.errors import SettingError
+from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.plausible.symmetry import object_symmetry
-from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.poses import compose, inverse, roll_pitch_yaw, rotation_angle, rotation_vector
 from replay.events import RigDescribed
 from replay.mcap.reader import read_recording

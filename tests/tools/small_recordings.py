@@ -12,8 +12,7 @@ import trimesh
 
 from chsel.methods import build_method, trust_by
 from chsel.methods.method import Method
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.policies import build_policy
 from chsel.policies.steering import Steering

@@ -53,23 +53,23 @@ def marked_windows(
             warnings.warn(f"a marker is {text[:40]!r}; accepted: begin N, end")
         elif begun is None:
             if marker.begins:
-                begun = time, marker.index
+                begun = time, marker.probe
             elif not marker.is_state:
-                warnings.warn(f"{_name(marker.index)} has an end and no begin; ignored")
+                warnings.warn(f"{_name(marker.probe)} has an end and no begin; ignored")
         elif not marker.begins:
             begin, index = begun
-            if None not in (marker.index, index) and marker.index != index:
-                warnings.warn(f"the end of probe {marker.index} is taken as that of probe {index}")
+            if None not in (marker.probe, index) and marker.probe != index:
+                warnings.warn(f"the end of probe {marker.probe} is taken as that of probe {index}")
             spans.append((begin, time, index))
             begun = None
-        elif marker.index == begun[1] and (marker.is_state or marker.index is not None):
+        elif marker.probe == begun[1] and (marker.is_state or marker.probe is not None):
             if not marker.is_state:
-                warnings.warn(f"probe {marker.index} begins twice without an end; taken as one")
+                warnings.warn(f"probe {marker.probe} begins twice without an end; taken as one")
         else:
             if not marker.is_state:
                 warnings.warn(f"{_name(begun[1])} has a begin and no end; the next begin ends it")
             spans.append((begun[0], time, begun[1]))
-            begun = time, marker.index
+            begun = time, marker.probe
     if begun is not None:
         warnings.warn(f"{_name(begun[1])} has a begin and no end; the log's end ends it")
         spans.append((begun[0], max(last, begun[0]), begun[1]))
@@ -106,7 +106,7 @@ def whole_log(first: int, last: int) -> list[ProbeWindow]:
 
 class _Marker(NamedTuple):
     begins: bool
-    index: int | None  # of the probe, where given
+    probe: int | None  # its index, where given
     is_state: bool  # sent all the time, so that repeating it says nothing new
 
 

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel import CostSettings, KnownPoints, RelaxedCost, SdfGrid
-from chsel.cost.compiled_cost import CompiledCost
+from chsel.cost.compiled_cost import CULLINGS, CompiledCost
 from chsel.cost.cost_kernels import LANES
 from chsel.cost.objective import BETA1, BETA2, EPSILON, Objective
 from chsel.errors import PoseError, SettingError
@@ -405,6 +405,23 @@ def test_rare_sets_of_points_cost_what_the_torch_cost_says(name: str, free_term:
         assert_same_bits(one, other)
     plain = descended_plainly(direct, vectors, 4.0, 0.01, 30)
     assert_same_bits(culled.descended(vectors, 4.0, 0.01, 30), plain)
+
+
+def test_an_object_that_comes_into_free_space_meets_it_at_once() -> None:
+    """A ball of 4 cm is pulled by 1 cm a step to a contact in a slab of free points."""
+    slab = np.indices((10, 20, 20)).reshape(3, -1).T * 0.005 + [0.1, -0.05, -0.05]
+    points = KnownPoints(slab, known=[[0.15, 0.0, 0.0]])
+    translations = -np.linspace(0.0, 0.06, 16)[:, None] * [1.0, 0.0, 0.0]
+    turns = np.tile(np.eye(3), (16, 1, 1))
+    vectors = SE3Space().encode(Poses.of(compose(turns, translations)))
+    culled, direct = (
+        Objective(CompiledCost(ball_grid(0.02, 0.004, 9), points, culling=culling), SE3Space())
+        for culling in CULLINGS
+    )
+    moved = culled.descended(vectors, 1.0, 0.01, 12)
+    assert_same_bits(moved, descended_plainly(direct, vectors, 1.0, 0.01, 12))
+    centres = SE3Space().poses(moved).origins
+    assert (centres[:, 0] > 0.08).any()
 
 
 @pytest.mark.parametrize("free_term", ["direct", "interior"])

@@ -8,8 +8,7 @@ import numba
 import numpy as np
 import trimesh
 
-from chsel.methods.cvo.cvo import flow_at
-from chsel.methods.cvo.rkhs_fields import Kernel, Product, free_field, surface_field
+from chsel.methods.cvo import Kernel, Product, class_field, flow_at
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.pose_tuples import pose_at
 from chsel.problem.points import KnownPoints
@@ -34,7 +33,8 @@ def scene(count: int = 60) -> KnownPoints:
 def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Product:
     """The inner product by fields, with a surface band of a voxel."""
     band = sdf.resolution
-    free, surface = free_field(sdf, kernel, band), surface_field(sdf, kernel, band)
+    free = class_field(sdf, kernel, band, "free")
+    surface = class_field(sdf, kernel, band, "surface")
     nothing = free.term(np.zeros((0, 3)), 1.0)
     return Product(free.term(points.free, 1.0), nothing, surface.term(points.contacts, 1.0))
 

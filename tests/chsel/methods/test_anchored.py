@@ -10,10 +10,10 @@ import pytest
 import trimesh
 
 from chsel.errors import ChselError
+from chsel.methods import build_method, trust_by
 from chsel.methods.anchor_sampling import AnchorSampler
 from chsel.methods.anchored.anchored import Anchored, Search
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
-from chsel.methods.registry import build_method, trust_by
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.noise import LATER, WRONG, noise_model

@@ -11,8 +11,8 @@ import numba
 import numpy as np
 import pytest
 
-from chsel.methods.medial_constraint import medial_constraint
-from chsel.methods.medial_constraint.medial_constraint import (
+from chsel.methods import medial_constraint
+from chsel.methods.medial_constraint import (
     CmaEsSettings,
     Run,
     evolved,

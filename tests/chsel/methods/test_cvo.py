@@ -8,10 +8,8 @@ import pytest
 import trimesh
 
 from chsel import KnownPoints, RegistrationProblem, Workspace
-from chsel.methods import preset_settings
-from chsel.methods.cvo import cvo
-from chsel.methods.cvo.cvo import Ascent, Cvo, CvoSettings, climb, climbers_at
-from chsel.methods.cvo.rkhs_fields import Product, values_of
+from chsel.methods import cvo, preset_settings
+from chsel.methods.cvo import Ascent, Cvo, CvoSettings, Product, climb, climbers_at, values_of
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chsel.errors import SettingError
-from chsel.methods.medial_constraint.medial_balls import Balls, medial_balls
+from chsel.methods.medial_constraint import Balls, medial_balls
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.cell_set import squared_clearances
 from chsel.problem.points import Workspace

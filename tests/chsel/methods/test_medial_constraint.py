@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from chsel.methods import preset_settings
-from chsel.methods.medial_constraint.medial_constraint import (
+from chsel.methods.medial_constraint import (
     CmaEsSettings,
     MedialConstraint,
     MedialConstraintCmaMe,

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from chsel.cost.objective import costs_of
-from chsel.methods.medial_constraint.medial_balls import Balls
-from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
+from chsel.methods.medial_constraint import Balls, MedialCost, MedialCostSettings
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints, Workspace

@@ -14,11 +14,10 @@ from chsel.errors import SettingError
 from chsel.methods import OURS, build_method, preset_settings
 from chsel.methods.anchor_sampling import AnchoredStarts, AnchorSettings
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
-from chsel.methods.cvo.cvo import CvoSettings
+from chsel.methods.cvo import CvoSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.methods.icp import Icp, IcpSettings
-from chsel.methods.medial_constraint.medial_constraint import CmaEsSettings
-from chsel.methods.medial_constraint.medial_cost import MedialCostSettings
+from chsel.methods.medial_constraint import CmaEsSettings, MedialCostSettings
 from chsel.methods.svgd import SvgdSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.settings import PRESETS, NamedChoices, settings_mapping

@@ -11,7 +11,7 @@ from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
 from chsel.errors import ChselError
 from chsel.methods import METHODS, build_method, preset_settings
-from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
+from chsel.methods.medial_constraint import MedialCost, MedialCostSettings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads

@@ -6,14 +6,13 @@ import trimesh
 
 from chsel import KnownPoints, SdfGrid
 from chsel.errors import SettingError
-from chsel.methods.cvo import rkhs_fields
-from chsel.methods.cvo.rkhs_fields import (
+from chsel.methods import cvo
+from chsel.methods.cvo import (
     Kernel,
     Product,
+    class_field,
     cloud_norm,
-    free_field,
     full_cubes,
-    surface_field,
     values_of,
 )
 from chsel.numerics.arrays import FloatArray
@@ -78,17 +77,17 @@ def test_a_coarser_field_stands_for_a_fine_grid_all_the_same() -> None:
 
 def test_a_field_is_made_once_for_a_grid() -> None:
     sdf = SdfGrid(SDF.origin, SDF.resolution, SDF.values, SDF.gradients)
-    assert free_field(sdf, KERNEL, 0.01) is free_field(sdf, KERNEL, 0.01)
-    assert free_field(sdf, KERNEL, 0.01) is not free_field(sdf, KERNEL, 0.02)
-    assert free_field(sdf, KERNEL, 0.01) is not surface_field(sdf, KERNEL, 0.01)
+    assert class_field(sdf, KERNEL, 0.01, "free") is class_field(sdf, KERNEL, 0.01, "free")
+    assert class_field(sdf, KERNEL, 0.01, "free") is not class_field(sdf, KERNEL, 0.02, "free")
+    assert class_field(sdf, KERNEL, 0.01, "free") is not class_field(sdf, KERNEL, 0.01, "surface")
 
 
 def test_a_field_too_large_for_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rkhs_fields, "MOST_NODES", 1000)
+    monkeypatch.setattr(cvo, "MOST_NODES", 1000)
     with pytest.raises(SettingError, match="a smaller ell"):
-        surface_field(SDF, Kernel(0.02, 1.0), 0.0123)
+        class_field(SDF, Kernel(0.02, 1.0), 0.0123, "surface")
     with pytest.raises(SettingError, match="a smaller ell"):
-        surface_field(SDF, Kernel(1e6, 1.0), 0.0123)
+        class_field(SDF, Kernel(1e6, 1.0), 0.0123, "surface")
 
 
 def pair_sum(points: FloatArray) -> float:
@@ -119,7 +118,7 @@ def test_points_all_over_the_world_are_summed_one_by_one(monkeypatch: pytest.Mon
     for scale in (1.0, 1e300):
         points[0] = scale * 1e6
         assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points), 1e-9)
-    monkeypatch.setattr(rkhs_fields, "_MANY", 2050)
+    monkeypatch.setattr(cvo, "_MANY", 2050)
     with pytest.raises(SettingError, match="2100 points of one class are far apart"):
         cloud_norm(points, KERNEL, 0.01)
 
@@ -132,10 +131,10 @@ def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
     side = 5 if spacing == 0.01 else 2
     assert len(alone) + side**3 * len(centres) == len(points)
     assert len(alone) < 0.6 * len(points)
-    field = free_field(SDF, KERNEL, 0.01)
+    field = class_field(SDF, KERNEL, 0.01, "free")
     nothing = field.term(np.zeros((0, 3)), 1.0)
     all_alone = Product(field.term(points, 1.0), nothing, nothing)
-    cubes = free_field(SDF, wide, 0.01).term(centres, 1.0)
+    cubes = class_field(SDF, wide, 0.01, "free").term(centres, 1.0)
     with_cubes = Product(field.term(alone, 1.0), cubes, nothing)
     transforms = nearby(5, 2)
     expected, wanted = values(all_alone, transforms), flow(all_alone, transforms)

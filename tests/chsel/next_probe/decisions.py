@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 import trimesh
 
-from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, Belief, DecisionProblem, HandShape
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose

@@ -13,8 +13,7 @@ from chsel.next_probe.action_lattice import (
     around_actions,
     forward_actions,
 )
-from chsel.next_probe.decision_problem import Actions
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
 
@@ -42,7 +41,7 @@ def corners(actions: Actions, share: float) -> FloatArray:
 
 @settings(deadline=None, max_examples=40)
 @given(workspaces, st.floats(0.02, 0.5), st.integers(6, 300))
-def test_actions_around_start_outside_cross_the_middle_and_stay_above_the_floor(
+def test_actions_around_start_outside_cross_the_workspace_and_stay_above_the_floor(
     workspace: Workspace, spacing: float, most: int
 ) -> None:
     try:
@@ -59,9 +58,10 @@ def test_actions_around_start_outside_cross_the_middle_and_stay_above_the_floor(
         assert corners(actions, share)[..., 2].min() >= CLEARANCE - 1e-6
     directions = actions.world_from_hand[:, :3, 2]
     tips = actions.world_from_hand[:, :3, 3] + (actions.length[:, None] + UPPER[2]) * directions
-    middle = 0.5 * (lower + upper)
+    far_side = np.where(directions > 0.0, upper, lower)
     horizontal = directions[:, 2] == 0.0
-    assert (((tips - middle) * directions).sum(axis=1)[horizontal] > 0.0).all()
+    beyond = ((tips - far_side) * directions).sum(axis=1)[horizontal]
+    np.testing.assert_allclose(beyond, 0.0, atol=1e-9)
     np.testing.assert_allclose(tips[~horizontal, 2], CLEARANCE, atol=1e-9)
 
 
@@ -81,6 +81,14 @@ def test_each_direction_covers_the_workspace_with_no_gap_wider_than_a_spacing() 
             np.testing.assert_allclose(np.diff(nodes), 0.1)
             assert nodes[0] - low < 0.1
             assert high - nodes[-1] < 0.1
+
+
+def test_lattices_of_opposite_sides_are_half_a_spacing_apart() -> None:
+    actions = around_actions(ActionSettings(spacing=0.1), WORKSPACE, HAND)
+    starts, directions = actions.world_from_hand[:, :3, 3], actions.world_from_hand[:, :3, 2]
+    for along, across in ((0, 1), (1, 0)):
+        first, second = (starts[directions[:, along] == sign, across][0] for sign in (-1.0, 1.0))
+        assert (first - second) / 0.1 % 1.0 == pytest.approx(0.5, abs=1e-9)
 
 
 def test_a_forward_lattice_keeps_its_start_and_length() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from chsel.next_probe.decision_problem import Actions, Belief
-from chsel.next_probe.first_contact import first_contacts
+from chsel.next_probe.decision_problem import Actions, Belief, HandShape
+from chsel.next_probe.first_contact import first_contacts, touched_points
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse, random_rotations
 from chsel.problem.sdf_grid import SdfGrid
@@ -85,6 +85,51 @@ def test_a_hand_that_passes_beside_the_object_misses_it() -> None:
         ball(), Belief(at((0.0, 0.0, 0.0)), np.ones(1)), along_x(places), box_hand()
     )
     assert np.isfinite(found.travel[0]).tolist() == [True, False, True, False]
+
+
+def by_definition(
+    sdf: SdfGrid, pose: FloatArray, world_from_hand: FloatArray, hand: HandShape
+) -> tuple[float, FloatArray]:
+    """The least way over the fine points around the three of the seen points that are met first."""
+    surface, front = touched_points(sdf), hand.front
+    hand_from_object = inverse(world_from_hand) @ inverse(pose)
+
+    def ways(points: FloatArray) -> FloatArray:
+        cells = np.floor((points[:, :2] - front.lower) / front.cell).astype(int)
+        over = ((cells >= 0) & (cells < front.heights.shape)).all(axis=1)
+        i, j = np.where(over[:, None], cells, 0).T
+        return np.where(over, points[:, 2] - front.heights[i, j], np.inf)
+
+    points = apply(hand_from_object, surface.points)
+    width = 2.0 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
+    assert width < 60 * 0.005  # so that cells are as small as they get
+    cells = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / 0.005).astype(int)
+    order = np.lexsort((points[:, 2], *cells.T))
+    seen = order[np.unique(cells[order], axis=0, return_index=True)[1]]  # the nearest of a cell
+    best = seen[np.argsort(ways(points[seen]), kind="stable")[:3]]
+    best = best[ways(points[best]) < np.inf]
+    fine = [surface.fine[surface.first[b] : surface.first[b + 1]] for b in best]
+    near = np.concatenate([points[best], apply(hand_from_object, np.concatenate(fine))])
+    least = int(np.argmin(ways(near)))
+    return ways(near)[least], apply(world_from_hand, near[least : least + 1])[0]
+
+
+def test_first_contacts_are_those_of_the_definition() -> None:
+    stream, sdf = np.random.default_rng(8), SdfGrid.from_mesh(load_model("clamp"), 0.005)
+    centre = sdf.bounds.mean(axis=0)
+    pose = inverse(compose(random_rotations(stream, 1)[0], np.zeros(3)))
+    middle = apply(inverse(pose), centre[None])[0]
+    turns = random_rotations(stream, 20)
+    beside = stream.uniform(-0.03, 0.03, (20, 2))
+    starts = middle + np.einsum("aij,aj->ai", turns[:, :, :2], beside) - 0.4 * turns[:, :, 2]
+    actions = Actions(compose(turns, starts), np.full(20, _WAY))
+    found = first_contacts(sdf, Belief(pose[None], np.ones(1)), actions, box_hand())
+    met = np.flatnonzero(np.isfinite(found.travel[0]))
+    assert len(met) >= 10
+    for n in met:
+        way, place = by_definition(sdf, pose, actions.world_from_hand[n], box_hand())
+        assert found.travel[0, n] == pytest.approx(way, abs=1e-12)
+        np.testing.assert_allclose(found.contact[0, n], place, rtol=0, atol=1e-12)
 
 
 def test_contacts_move_with_pose_and_hand() -> None:

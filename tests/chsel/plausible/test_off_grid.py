@@ -13,9 +13,13 @@ from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import threads
 from chsel.plausible.evaluation_cost import EvaluationCost
-from chsel.plausible.off_grid import stepped
-from chsel.plausible.plausible_file import load_plausible, save_plausible
-from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_set import (
+    PlausibleSet,
+    load_plausible,
+    plausible_set,
+    save_plausible,
+    stepped,
+)
 from chsel.plausible.plausible_settings import (
     DEFINITIONS,
     EvaluationCostSettings,

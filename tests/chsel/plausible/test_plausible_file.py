@@ -10,8 +10,13 @@ import pytest
 
 from chsel.errors import EvaluationError
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible.plausible_file import load_plausible, plausible_path, save_plausible
-from chsel.plausible.plausible_set import PlausibleSet, plausible_set
+from chsel.plausible.plausible_set import (
+    PlausibleSet,
+    load_plausible,
+    plausible_path,
+    plausible_set,
+    save_plausible,
+)
 from chsel.plausible.plausible_settings import Offsets, PlausibleSettings, PoseGridSettings
 from chsel.problem.poses import apply
 from chsel.problem.registration_problem import RegistrationProblem

@@ -9,11 +9,10 @@ import pytest
 
 from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible import true_pose
+from chsel.plausible import pose_scan
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import EvaluationCostSettings, Offsets
-from chsel.plausible.pose_scan import PoseGrid
-from chsel.plausible.true_pose import TruePoseSettings, find_true_pose
+from chsel.plausible.pose_scan import PoseGrid, TruePoseSettings, find_true_pose
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, compose, inverse, rotation_angle, rotation_vector
 from tests.chsel.plausible.scenes import box, scene
@@ -60,7 +59,7 @@ def test_every_pass_looks_closer_around_the_best_pose_so_far(
         seen.append(PoseGrid(centre, offsets, rotations))
         return seen[-1]
 
-    monkeypatch.setattr(true_pose, "PoseGrid", watched)
+    monkeypatch.setattr(pose_scan, "PoseGrid", watched)
     settings = replace(QUICK, reach=0.08, spacing=0.02, rotations=400, angle=0.2, passes=3)
     best = truth
     for passes in (1, 2, 3):

@@ -10,6 +10,7 @@ import pytest
 from chsel.errors import SettingError
 from chsel.next_probe.decision_problem import Actions
 from chsel.policies import POLICIES, build_policy
+from chsel.problem.poses import axis_angle, compose, inverse
 from tests.chsel.next_probe.decisions import along_x, at, ball_problem
 
 # Two places of the ball, apart in y and in depth; of the third action both are in the way, at
@@ -74,6 +75,16 @@ def test_the_nearest_way_is_to_the_mean_and_ends_where_the_action_ends() -> None
     assert policy.decide(short).score == pytest.approx([-0.3, -np.hypot(0.3, 0.05)], abs=3e-3)
 
 
+def test_the_nearest_way_is_to_the_centre_of_an_object_whose_origin_is_beside_it() -> None:
+    """The ball's centre is 5 cm from its origin; turned and moved, it is at the world's origin."""
+    quarter = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5 * np.pi))
+    pose = inverse(compose(quarter, np.array([0.05, 0.0, 0.0])))
+    problem = ball_problem(pose[None], along_x([(0.0, 0.0), (0.06, 0.0)]))
+    sdf = replace(problem.sdf, origin=np.add(problem.sdf.origin, [0.0, 0.05, 0.0]))
+    decision = build_policy("nearest_mean").decide(replace(problem, sdf=sdf))
+    assert decision.score == pytest.approx([0.0, -0.06], abs=3e-3)
+
+
 def test_random_takes_every_available_action_as_often() -> None:
     policy = build_policy("random", {"probes": 1000, "stop": {"gain": 0.0}})
     available = np.array([True, False, True, True])
@@ -86,16 +97,24 @@ def test_random_takes_every_available_action_as_often() -> None:
     assert counts[[0, 2, 3]].min() > 150
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in POLICIES if n not in ("grid", "random", "nearest_mean")]
-)
-def test_gains_are_a_second(name: str) -> None:
+@pytest.mark.parametrize("name", POLICIES)
+def test_gains_are_a_second_and_other_ratings_are_not(name: str) -> None:
     actions = along_x(PLACES)
     seconds = np.array([1.0, 2.0, 4.0, 1.0])
     timed = Actions(actions.world_from_hand, actions.length, seconds)
     usual = build_policy(name).decide(ball_problem(TWO, actions))
     decision = build_policy(name).decide(ball_problem(TWO, timed))
-    assert np.array_equal(decision.score, usual.score / seconds)
+    divisor = 1.0 if name in ("grid", "random", "nearest_mean") else seconds
+    assert np.array_equal(decision.score, usual.score / divisor)
+
+
+def test_no_gain_is_promised_by_an_action_that_cannot_be_taken() -> None:
+    """The last action misses both places of the ball, the first tells them apart."""
+    policy, actions = build_policy("information"), along_x(PLACES)
+    for available, chosen, stop in (([3], -1, "gain"), ([0, 3], 0, "")):
+        flags = np.isin(np.arange(4), available)
+        decision = policy.decide(ball_problem(TWO, actions, available=flags))
+        assert (decision.chosen, decision.stop) == (chosen, stop)
 
 
 def test_rules_that_are_switched_off_end_no_session() -> None:

@@ -80,6 +80,17 @@ def test_surprise_is_minus_the_logarithm_of_the_chance_of_what_happened() -> Non
     assert felt((1.0, 0.0), here + 0.01 * np.eye(3)[0], noise=0.01) < 1.0
 
 
+def test_what_a_probe_touches_first_is_what_surprises() -> None:
+    session = steering(_Somebody())
+    decision = session.decide(0, KnownPoints(), None, np.ones(3, dtype=bool)).decision
+    near = decision.contacts[np.isfinite(decision.contacts[:, 0])][0]
+    surprises = []
+    for contacts in ([near], [near, near + 5.0], [near + 5.0, near]):
+        session.felt(np.array(contacts))
+        surprises.append(session.surprise)
+    assert surprises[0] == surprises[1] < surprises[2]
+
+
 class _Somebody:
     """A policy of another package, which gives what it likes."""
 

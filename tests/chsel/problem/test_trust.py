@@ -22,6 +22,7 @@ from chsel.problem.trust import (
     LEAST_GAP,
     LEAST_LEVELS,
     MANY_CONTACTS,
+    MOST_MODES,
     MOST_NOISE,
     MOST_OFF,
     MOST_SYSTEMATIC,
@@ -247,6 +248,17 @@ def test_a_set_is_wide_where_any_mode_is() -> None:
         ([*narrow, *(lying(step) for step in steps)], "wide"),
     ):
         assert trust_in(posed, hypotheses(*poses)).verdict == verdict
+
+
+@pytest.mark.usefixtures("held")
+@pytest.mark.parametrize(("count", "verdict"), [(MOST_MODES, "several modes"), (9, "wide")])
+def test_a_set_of_very_many_modes_is_wide(count: int, verdict: str) -> None:
+    """Balls all around one contact, each a mode; a free point far away is the only evidence."""
+    contact, sides = CENTRE, trimesh.creation.icosahedron().vertices[:count]
+    centres = contact + RADIUS * sides / np.linalg.norm(sides, axis=1, keepdims=True)
+    points = chsel.KnownPoints(free=contact[None] + 0.9, known=contact[None])
+    found = hypotheses(*compose(np.tile(np.eye(3), (count, 1, 1)), centres))
+    assert trust_in(problem(points), found).verdict == verdict
 
 
 @pytest.mark.parametrize("movable", [0, 1])

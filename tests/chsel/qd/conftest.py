@@ -9,8 +9,7 @@ import numba
 import pytest
 
 from chsel.numerics.pose_tuples import all_finite
-from chsel.qd import emitter_kernels as kernels
-from chsel.qd.emitters import SEARCHES
+from chsel.qd import emitters
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +19,11 @@ def searches_around() -> Iterator[Callable[..., None]]:
 
         def around(*functions: Any) -> None:
             for function in functions[1:]:
-                patch.setattr(kernels, function.__name__, function)
-            patch.setattr(kernels, "costs_of", _one_by_one(functions[0]))
-            for name in SEARCHES:
-                loop: Any = getattr(kernels, name)
-                patch.setattr(kernels, name, numba.njit(error_model="numpy")(loop.py_func))
+                patch.setattr(emitters, function.__name__, function)
+            patch.setattr(emitters, "costs_of", _one_by_one(functions[0]))
+            for name in ("mega_iterations", "me_iterations"):
+                loop: Any = getattr(emitters, name)
+                patch.setattr(emitters, name, numba.njit(error_model="numpy")(loop.py_func))
 
         yield around
 

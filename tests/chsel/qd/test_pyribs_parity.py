@@ -13,9 +13,9 @@ import pytest
 import chsel.qd.emitters
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import NullObserver
-from chsel.problem.streams import StreamKey
+from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import GridArchive
-from chsel.qd.emitters import SEARCHES, ArchiveWatch, Draws, EmitterSettings, mega_search
+from chsel.qd.emitters import EmitterSettings, fill_archive, mega_search
 from chsel.qd.measures import VECTOR, Measure, MeasureCode
 
 ribs_archives = pytest.importorskip("ribs.archives", reason="pyribs is a test dependency")
@@ -93,10 +93,9 @@ def search(name: str, seed: int, **settings: Any) -> GridArchive:
     quadratic: Any = Quadratic()
     archive.add(START[None], -quadratic.costs(START[None]), START[None, 6:8])
     count = BATCH + 1 if name == "cma_mega" else BATCH
-    draws = Draws(StreamKey(seed, 0))
     options = EmitterSettings(ITERATIONS, **{"sigma0": 1.0, "rate": 0.05, **settings})
-    watch = ArchiveWatch(NullObserver(), 0, "search")
-    SEARCHES[name](quadratic, archive, START, count, options, draws, watch)
+    key = StreamKey(seed, 0)
+    fill_archive(name, quadratic, archive, START, count, options, key, NullObserver())
     return archive
 
 
@@ -150,12 +149,12 @@ def ribs_search(name: str, seed: int, *, sigma0: float = 1.0, shared: bool = Fal
     archive = ribs_archive()
     emitter = ribs_emitter(name, archive, seed, sigma0, {"epsilon": 0.0} if shared else {})
     dimension = 9 if name == "cma_me" else 3
-    draws = Draws(StreamKey(seed, 0))
+    key = StreamKey(seed, 0)
     iteration = 0
     if shared:
-        (block,) = draws.blocks(ITERATIONS, BATCH, dimension)
-        emitter._opt._rng = SharedNormals(emitter._opt, block)
-        elites = draws.elites(ITERATIONS)
+        drawn = normals(key.stream(Purpose.EMITTER), (ITERATIONS, BATCH, dimension))
+        emitter._opt._rng = SharedNormals(emitter._opt, drawn)
+        elites = key.stream(Purpose.RESTART).random(ITERATIONS)
 
         def our_elite(count: int, **_: Any) -> dict[str, FloatArray]:
             data = archive.data(["solution", "index"], return_type="dict")

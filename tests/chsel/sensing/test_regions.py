@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chsel.sensing.depth_camera import PinholeCamera
-from chsel.sensing.regions import (
+from chsel.sensing.depth_camera import (
+    PinholeCamera,
     depth_regions,
     main_regions,
     point_regions,

@@ -10,8 +10,7 @@ from chsel.errors import PoseError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import Workspace
 from chsel.problem.poses import apply, axis_angle, compose, inverse
-from chsel.sensing.free_space import FreeGrid
-from chsel.sensing.swept import interior_lattice, poses_between
+from chsel.sensing.free_space import FreeGrid, interior_lattice, poses_between
 from tests.chsel.samples import box_distance, random_poses
 
 SIZE = np.array([0.10, 0.04, 0.06])

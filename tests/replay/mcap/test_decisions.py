@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from chsel.errors import ChselError, RecordingError, SettingError
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import HandShape
 from replay.events import ActionsOffered, Decided, Event, Measured, Probe, ProblemPosed
 from replay.mcap.reader import read_recording
 

@@ -14,16 +14,14 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
-from chsel.cost.cost_settings import CostSettings
-from chsel.cost.interior_points import interior_points
+from chsel.cost.cost_settings import CostSettings, interior_points
 from chsel.errors import RecordingError, SdfError, SettingError
 from chsel.methods.chsel import ChselSettings
 from chsel.methods.gradient_descent import DescentSettings
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
-from chsel.problem.streams import Purpose, StreamKey, normals
-from chsel.qd.emitters import Draws, EmitterSettings
+from chsel.qd.emitters import EmitterSettings
 from chsel.qd.selection import ArchiveSettings
 from replay.events import (
     Event,
@@ -181,13 +179,3 @@ def test_grids_whose_nodes_cannot_be_told_apart_are_refused(events: list[Event])
     problem: RegistrationProblem = next(e.problem for e in events if isinstance(e, ProblemPosed))
     with pytest.raises(SettingError, match="free_resolution is 1e-300; accepted"):
         dataclasses.replace(problem, free_resolution=1e-300)
-
-
-def test_draws_made_in_blocks_are_those_made_at_once() -> None:
-    draws = Draws(StreamKey(5, 2), 1)
-    blocks = list(draws.blocks(2500, 3, 3))
-    assert [len(block) for block in blocks] == [1000, 1000, 500]
-    assert draws.block(100_000, 9) == 10
-    at_once = normals(draws.key.stream(Purpose.EMITTER, 1), (2500, 3, 3))
-    assert np.concatenate(blocks).tobytes() == at_once.tobytes()
-    assert list(draws.blocks(0, 3, 3)) == []

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem
-from chsel.next_probe.hand_shape import HandShape
+from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose
 from chsel.problem.sdf_grid import SdfGrid

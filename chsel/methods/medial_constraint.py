@@ -1,33 +1,36 @@
-"""Search on the Medial Constraint cost: CMA-ES (CHSEL, Sec. V-D), and CMA-ME (Sec. V-H)."""
+"""Medial Constraint (CHSEL, Sec. V-D): balls of free space must miss the object, contacts touch it.
+
+Its cost is searched by CMA-ES, and by CMA-ME as well (Sec. V-H).
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from chsel.cost.objective import costs_of
-from chsel.methods.medial_constraint.medial_cost import MedialCost, MedialCostSettings
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.compiler import compiled
+from chsel.numerics.cell_set import Places, locate, places_for, squared_clearances
+from chsel.numerics.compiler import compiled, implements, inner, spliced
 from chsel.numerics.elementary import logs
-from chsel.numerics.threads import spread
+from chsel.numerics.pose_tuples import all_finite, decode, finite, pose_at
+from chsel.numerics.threads import require_ieee_arithmetic, spread
 from chsel.problem.online_registration import OnlineSettings
+from chsel.problem.points import VoxelGrid, Workspace
 from chsel.problem.poses import Poses
-from chsel.problem.registration_problem import (
-    Hypotheses,
-    NullObserver,
-    Observer,
-    RegistrationProblem,
-)
-from chsel.problem.search_space import PlaneSettings, search_space
+from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
+from chsel.problem.sdf_grid import LOOKUPS, OUTSIDE
+from chsel.problem.sdf_lookup import DistanceField, distance_field, distance_in_place
+from chsel.problem.search_space import PlaneSettings, SE3Space, SearchSpace, search_space
 from chsel.problem.settings import CheckedSettings, Presets, at_most, not_negative, one_of, positive
 from chsel.problem.streams import Purpose, StreamKey, normals
 from chsel.qd.archive import Batch, GridArchive, batch_of, evaluated, rank
-from chsel.qd.emitters import ArchiveWatch, Draws, EmitterSettings, cma_me
+from chsel.qd.emitters import EmitterSettings, fill_archive
 from chsel.qd.evolution_kernels import Strategy, ask, stopped, strategy_around, tell
 from chsel.qd.measures import measure_named
 from chsel.qd.selection import (
@@ -45,6 +48,228 @@ MOST_SIGMA = 1e6
 _BLOCK = 50  # generations that are drawn at a time, or fewer
 _MOST_DRAWN = 1_000_000  # normal draws held at once by a run, 8 bytes each
 _RUN, _FINAL = 0, 1  # of a single run: which stream its generations and its result come from
+MOST_VOXELS = 30_000_000
+_TOLERANCE = 2e-3  # half sides, by which a ball may stick out of the one that holds it
+_POSES_PER_THREAD = 100  # fewer are costed faster than a thread wakes up
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """Balls in the world."""
+
+    centres: FloatArray  # (N_b, 3), metres
+    radii: FloatArray  # (N_b,), metres
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+
+def medial_balls(
+    free: FloatArray, workspace: Workspace, resolution: float, inflation: float
+) -> Balls:
+    """Balls within the known-free voxels of a workspace that cover them but for `inflation`.
+
+    Largest first. Each is the largest that touches no voxel that is not free, around a centre that
+    no ball covers so far; of equals, the first in row-major order.
+
+    free (N, 3): centres of free voxels of side `resolution`, metres, or any points, which make the
+    voxels free that hold them. All else is not free, nor is anything beyond the workspace.
+    inflation: metres by which a ball may be inflated to cover another.
+    Raises SettingError where the free points span too many voxels.
+    """
+    margin, (lower, upper) = 1e-6 * resolution, workspace.bounds
+    inside = free[((free >= lower - margin) & (free <= upper + margin)).all(axis=1)]
+    if len(inside) == 0:
+        return Balls(np.zeros((0, 3)), np.zeros(0))
+    flags = VoxelGrid.around(inside, resolution, MOST_VOXELS).flags
+    squared = np.empty(flags.shape, dtype=np.int64)
+    squared_clearances(flags, squared, 1)
+    medial = _is_medial(squared)
+    voxels = np.argwhere(medial)
+    radii = np.sqrt(squared[medial].astype(np.float64))  # half sides
+    order = np.argsort(-squared[medial], kind="stable")
+    chosen = order[_covering(voxels[order], radii[order], 2.0 * inflation / resolution)]
+    centres = inside.min(axis=0) + (voxels[chosen] - 1) * resolution
+    return Balls(centres, radii[chosen] * (resolution / 2.0))
+
+
+def _is_medial(squared: IntArray) -> BoolArray:
+    """Flags (nx, ny, nz) of voxels of the set whose ball is in the ball of no neighbour.
+
+    squared (nx, ny, nz): squared clearances, 0 outside of the set and on the outermost layer. Ball
+    u holds ball v if |c_u - c_v| + r_v <= r_u.
+    """
+    inner = squared[1:-1, 1:-1, 1:-1]
+    radii, medial = np.sqrt(squared.astype(np.float64)), np.zeros(squared.shape, dtype=np.bool_)
+    own, kept = radii[1:-1, 1:-1, 1:-1], inner > 0
+    for offset in np.ndindex(3, 3, 3):
+        apart = 2.0 * math.sqrt(sum((step - 1) ** 2 for step in offset))
+        around = tuple(
+            slice(step, step + side) for step, side in zip(offset, inner.shape, strict=True)
+        )
+        if apart > 0.0:
+            kept &= (apart + own > radii[around] + _TOLERANCE) | (squared[around] <= inner)
+    medial[1:-1, 1:-1, 1:-1] = kept
+    return medial
+
+
+@compiled
+def _covering(voxels: IntArray, radii: FloatArray, inflation: float) -> IntArray:
+    """Indices of balls that, inflated, cover all others: each the next that is not yet covered.
+
+    voxels (P, 3) with radii (P,). Ball i covers ball j if |c_i - c_j| + r_j <= r_i + inflation.
+    """
+    covered, chosen = np.zeros(len(radii), dtype=np.bool_), np.empty(len(radii), dtype=np.int64)
+    count = 0
+    for i in range(len(radii)):
+        if not covered[i]:
+            chosen[count] = i
+            count += 1
+            for j in range(i, len(radii)):
+                x, y = voxels[i, 0] - voxels[j, 0], voxels[i, 1] - voxels[j, 1]
+                z, margin = voxels[i, 2] - voxels[j, 2], radii[i] + inflation - radii[j]
+                covered[j] |= 4.0 * (x * x + y * y + z * z) <= margin * margin
+    return chosen[:count].copy()
+
+
+@dataclass(frozen=True)
+class MedialCostSettings(CheckedSettings):
+    """Settings of the Medial Constraint cost."""
+
+    inflation: Annotated[float, not_negative] = 0.04  # of balls, to cover others, at most, metres
+    # Weights of the two means; a ball_scale of 0 ignores free space, as the authors' released code
+    # does, whose balls never enter the cost.
+    ball_scale: Annotated[float, not_negative] = 1.0
+    known_scale: Annotated[float, not_negative] = 1.0
+    lookup: Annotated[str, one_of(*LOOKUPS)] = "trilinear"  # how the SDF is read, see SdfGrid.at
+    outside: Annotated[str, one_of(*OUTSIDE)] = "surface_point"  # and beyond its box
+
+    presets: ClassVar[Presets] = {
+        "paper": {"inflation": 0.02, "lookup": "nearest"},
+        "reference": {
+            "inflation": 0.02,
+            "ball_scale": 0.0,
+            "lookup": "nearest",
+            "outside": "bounding_box",
+        },
+    }
+
+
+class MedialModel(NamedTuple):
+    """All that determines the cost of a pose."""
+
+    field: DistanceField
+    centres: FloatArray  # (3, N_b), of the balls, world, metres
+    radii: FloatArray  # (N_b,)
+    known: FloatArray  # (3, N_k), world, metres
+    known_sdf: FloatArray  # (N_k,)
+    ball_scale: float
+    known_scale: float
+
+
+class MedialCost:
+    """C_M(X) = mean_b max(0, r_b - s(R c_b + t))^2 + mean_k (s(R x_k + t) - v_k)^2, in m^2.
+
+    Over the balls (c_b, r_b) of the free voxels in the workspace, and the points x_k of known
+    signed distance v_k. Occupied points have no term. A mean over nothing is 0. space: of the
+    vectors whose costs are asked for. balls: others than those of the problem's free points.
+    """
+
+    def __init__(
+        self,
+        problem: RegistrationProblem,
+        settings: MedialCostSettings | None = None,
+        *,
+        space: SearchSpace | None = None,
+        balls: Balls | None = None,
+    ) -> None:
+        require_ieee_arithmetic()
+        settings = settings or MedialCostSettings()
+        self.space = space or SE3Space()
+        self.space_arrays = self.space.arrays
+        if balls is None:
+            free = problem.points.free if settings.ball_scale > 0.0 else np.zeros((0, 3))
+            resolution, inflation = problem.free_resolution, settings.inflation
+            balls = medial_balls(free, problem.workspace, resolution, inflation)
+        self.balls = balls
+        self.model = MedialModel(
+            field=distance_field(problem.sdf, settings.lookup, settings.outside),
+            centres=balls.centres.T.copy(),
+            radii=balls.radii,
+            known=problem.points.known.T.copy(),
+            known_sdf=problem.points.sdf.copy(),
+            ball_scale=settings.ball_scale,
+            known_scale=settings.known_scale,
+        )
+
+    def costs(self, vectors: FloatArray) -> FloatArray:
+        """Costs (B,) of vectors (B, d) of the search space."""
+        return self.evaluate(self.space.poses(vectors))
+
+    def evaluate(self, poses: Poses) -> FloatArray:
+        """Costs (B,) of poses; infinite for one that is not finite."""
+        costs = np.empty(len(poses))
+        run = partial(_fill_costs, self.model, poses.numbers, costs)
+        spread(run, len(poses), self.work, least=_POSES_PER_THREAD)
+        return costs
+
+    def work(self) -> Places:
+        """Scratch for one thread."""
+        return places_for(max(len(self.model.radii), len(self.model.known_sdf)))
+
+
+@compiled
+def _fill_costs(model, poses, out, first, last, places):
+    """Fill out (B,) with the costs of poses (B, 12), from `first` to before `last`."""
+    for n in range(first, last):
+        out[n] = _cost(model, pose_at(poses, n), places)
+
+
+@implements(costs_of, MedialModel)
+def _medial_costs_of(model, space, vectors, costs, places):
+    for n in range(len(vectors)):
+        costs[n] = np.inf
+        if all_finite(vectors[n]):
+            costs[n] = _cost(model, decode(space, vectors[n]), places)
+
+
+@inner
+def _cost(model, pose, places):
+    """C_M, each mean scaled; infinite for a pose that is not finite."""
+    if not finite(pose):
+        return np.inf
+    cost = model.ball_scale * _ball_mean(model, pose, places)
+    cost += model.known_scale * _known_mean(model, pose, places)
+    return cost if cost < np.inf else np.inf  # NaN is infinite, too
+
+
+@spliced
+def _ball_mean(model, pose, places):
+    """The mean square of how deep balls reach into the object."""
+    field, radii = model.field, model.radii
+    xs, ys, zs = model.centres[0], model.centres[1], model.centres[2]
+    locate(pose, field.box, xs, ys, zs, places, len(radii))
+    total = 0.0
+    for n in range(len(radii)):
+        if places.beyond[n] < radii[n] * radii[n]:
+            s = distance_in_place(field, pose, xs[n], ys[n], zs[n], places, n)[0]
+            depth = max(radii[n] - s, 0.0)
+            total += depth * depth
+    return total / max(len(radii), 1)
+
+
+@spliced
+def _known_mean(model, pose, places):
+    """The mean square of s - v over points of known signed distance v, 0 for contacts."""
+    field, known_sdf = model.field, model.known_sdf
+    xs, ys, zs = model.known[0], model.known[1], model.known[2]
+    locate(pose, field.box, xs, ys, zs, places, len(known_sdf))
+    total = 0.0
+    for n in range(len(known_sdf)):
+        s = distance_in_place(field, pose, xs[n], ys[n], zs[n], places, n)[0]
+        difference = s - known_sdf[n]
+        total += difference * difference
+    return total / max(len(known_sdf), 1)
 
 
 @dataclass(frozen=True)
@@ -216,11 +441,7 @@ class MedialConstraint(ConfiguredMethod[MedialConstraintSettings]):
 
     settings_class = MedialConstraintSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first."""
-        observer = observer or NullObserver()
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
         space = search_space(self.settings.plane, problem.sdf)
         objective = MedialCost(problem, self.settings.cost, space=space)
         initial_set, settings = Poses.of(problem.initial_set), self.settings.cma_es
@@ -268,11 +489,8 @@ class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
 
     settings_class = MedialConstraintCmaMeSettings
 
-    def register(
-        self, problem: RegistrationProblem, observer: Observer | None = None
-    ) -> Hypotheses:
-        """Hypotheses for the known points of a problem, best first."""
-        observer, settings = observer or NullObserver(), self.settings
+    def _hypotheses(self, problem: RegistrationProblem, observer: Observer) -> Hypotheses:
+        settings = self.settings
         space = search_space(settings.plane, problem.sdf)
         objective = MedialCost(problem, settings.cost, space=space)
         key, count = problem.key, len(problem.initial_set)
@@ -284,8 +502,7 @@ class MedialConstraintCmaMe(ConfiguredMethod[MedialConstraintCmaMeSettings]):
         # M <- CMA-ME(M, C_M, n_o)
         first, best = space.encode(initial_set[:1])[0], archive.best_solution
         start = first if settings.emitter.start == "initial" else best
-        draws, watch = Draws(key), ArchiveWatch(observer, 0, "cma_me")
-        cma_me(objective, archive, start, count, settings.emitter, draws, watch)
+        fill_archive("cma_me", objective, archive, start, count, settings.emitter, key, observer)
         # E <- cells of M with the |E_0| lowest costs
         stream, elites = key.stream(Purpose.RESAMPLE), space.poses(archive.solutions)
         chosen = select_elites(archive.costs, elites, problem, space, settings.output, stream)

@@ -12,14 +12,14 @@ import pytest
 from chsel.numerics.arrays import FloatArray, digest
 from chsel.problem.registration_problem import ArchiveSnapshot, NullObserver
 from chsel.problem.streams import StreamKey
-from chsel.qd import emitter_kernels as kernels
+from chsel.qd import emitters
 from chsel.qd.archive import GridArchive
-from chsel.qd.emitter_kernels import MegaSearch, MeSearch
 from chsel.qd.emitters import (
     SEARCHES,
-    ArchiveWatch,
-    Draws,
     EmitterSettings,
+    MegaSearch,
+    MeSearch,
+    fill_archive,
     me_search,
     mega_search,
 )
@@ -114,8 +114,9 @@ def empty_archive() -> GridArchive:
 def found(name: str, kind: int, interval: int = 0, count: int = COUNT) -> GridArchive:
     """The archive after a search."""
     archive = empty_archive()
-    draws, watch = Draws(StreamKey(4, 0)), ArchiveWatch(Watcher(interval), 0, "search")
-    SEARCHES[name](LandscapeObjective(kind), archive, START, count, SETTINGS, draws, watch)  # type: ignore[arg-type]
+    objective: Any = LandscapeObjective(kind)
+    observer = Watcher(interval) if interval else NullObserver()
+    fill_archive(name, objective, archive, START, count, SETTINGS, StreamKey(4, 0), observer)
     return archive
 
 
@@ -129,14 +130,15 @@ class Stepper:
             if name == "cma_mega"
             else me_search(START, 2, COUNT, SETTINGS)
         )
-        self._loop = getattr(kernels, name)
+        loops = {"cma_mega": emitters.mega_iterations, "cma_me": emitters.me_iterations}
+        self._loop = loops[name]
         random, n = np.random.default_rng(0), len(self.search.strategy.mean)
         self._normals = random.standard_normal((ITERATIONS, COUNT, n))
         self.elites = random.random(ITERATIONS)
 
     def step(self, kind: int) -> None:
-        landscape = kernels.Landscape(Landscape(kind), 0, MEASURE.code, 0)
-        draws = kernels.SearchDraws(self._normals, self.elites)
+        landscape = emitters.Landscape(Landscape(kind), 0, MEASURE.code, 0)
+        draws = emitters.SearchDraws(self._normals, self.elites)
         span = self.iteration, self.iteration + 1
         self._loop(landscape, self.archive.cells, self.search, draws, *span)
         self.iteration += 1
@@ -163,19 +165,23 @@ def test_a_search_fills_the_archive_and_finds_the_optimum(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_segments_of_any_length_give_the_same_bytes(name: str) -> None:
-    assert len({bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}) == 1
+def test_iterations_between_calls_and_draws_change_no_byte(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_once = {bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}
+    monkeypatch.setattr(emitters, "_MOST_DRAWN", 1)  # ten iterations at a time
+    assert at_once == {bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 7)}
+    assert len(at_once) == 1
 
 
-def test_an_observer_hears_every_ten_iterations_and_at_its_interval() -> None:
-    watcher = Watcher(7)
-    watch = ArchiveWatch(watcher, 0, "cma_me")
-    assert list(watch.segments(16)) == [(0, 7), (7, 10), (10, 14), (14, 16)]
-    assert list(watch.segments(0)) == []
-    for _, last in watch.segments(16):
-        watch.after(last, 16, empty_archive())
+@pytest.mark.parametrize("total", [0, 16])
+def test_an_observer_hears_every_ten_iterations_and_at_its_interval(total: int) -> None:
+    watcher, objective, settings = Watcher(7), LandscapeObjective(QUADRATIC), EmitterSettings(total)
+    key, archive = StreamKey(4, 0), empty_archive()
+    fill_archive("cma_me", objective, archive, START, COUNT, settings, key, watcher)  # type: ignore[arg-type]
     expected = [("snapshot", 7), ("trace", 10), ("cma_me", 10), ("snapshot", 14)]
-    assert watcher.heard == [*expected, ("trace", 16), ("cma_me", 16), ("snapshot", 16)]
+    expected += [("trace", 16), ("cma_me", 16), ("snapshot", 16)]
+    assert watcher.heard == [("trace", 0), ("snapshot", 0), *(expected if total else [])]
 
 
 @pytest.mark.parametrize("name", SEARCHES)

@@ -1,1 +1,0 @@
-"""The relaxed cost of a pose (CHSEL, Eqs. 6 to 10), compiled and differentiable."""

@@ -1,1 +1,0 @@
-"""Where to touch next: a decision, what it forecasts, and the policies that make it."""

@@ -1,1 +1,0 @@
-"""The bit contract: compiled loops, arithmetic and geometry with the same bits everywhere."""

@@ -1,1 +1,0 @@
-"""The exact plausible set, and how hypotheses are measured by it (CHSEL, Sec. V)."""

@@ -1,1 +1,0 @@
-"""What a registration is: points, mesh, signed distances, poses, random streams, the problem."""

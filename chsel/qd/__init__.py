@@ -1,1 +1,0 @@
-"""Quality-diversity search: archive, measures, emitters, selection (CHSEL, Sec. IV-C)."""
