@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,12 +31,12 @@ CHOSEN: Rgb = (255, 250, 225)
 FORECAST: Rgb = (255, 170, 190)
 UNAVAILABLE: Rgb = (104, 108, 120)
 
-CURVES: dict[str, Rgb] = {
+COSTS: dict[str, Rgb] = {
     "lowest": (253, 220, 60),
     "median": (53, 183, 121),
     "highest": (120, 130, 200),
 }
-"""Colours of the three curves of a set of costs."""
+"""Curves of a set of costs."""
 SERIES: tuple[Rgb, ...] = (
     (86, 180, 233),
     (230, 159, 0),
@@ -70,7 +69,7 @@ _EMBERS = np.array(
     [(92, 44, 28), (160, 70, 20), (226, 110, 20), (255, 170, 60), (255, 240, 190)],
     dtype=np.float64,
 )
-_PLACES = 1024  # of the map, of which no two neighbours differ by more than one level of a colour
+_LEVELS = 1023  # no two neighbours differ by more than one in a colour
 _FLOOR = 1e-4  # costs below this fraction of the highest one have the colour of the lowest
 
 
@@ -88,10 +87,6 @@ class CostScale:
         values = values[np.isfinite(values)]
         return cls(float(values.min()), float(values.max())) if len(values) else cls(0.0, 0.0)
 
-    def including(self, other: CostScale) -> CostScale:
-        """The scale that covers both."""
-        return CostScale(min(self.low, other.low), max(self.high, other.high))
-
     def fraction(self, cost: ArrayLike) -> FloatArray:
         """Place of each cost on the scale, in [0, 1]."""
         values = np.asarray(cost, dtype=np.float64)
@@ -101,51 +96,22 @@ class CostScale:
         logs = np.log(np.clip(values, start, self.high) / start)
         return np.clip(logs / np.log(self.high / start), 0.0, 1.0)
 
-    def cost_at(self, fraction: float) -> float:
-        """The cost at a place on the scale: the inverse of `fraction`."""
-        start = max(self.low, self.high * _FLOOR)
-        if fraction <= 0.0 or not start < self.high:
-            return self.low
-        return float(start * (self.high / start) ** fraction)
 
-
-@dataclass(frozen=True)
-class ScoreScale:
-    """Linear scale from the lowest score (0, dark) to the highest (1, bright)."""
-
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, score: FloatArray) -> ScoreScale:
-        """The scale of scores (A,); finite ones count, of none at all the scale is 0 to 0."""
-        finite = score[np.isfinite(score)]
-        return cls(float(finite.min()), float(finite.max())) if len(finite) else cls(0.0, 0.0)
-
-    def fraction(self, score: FloatArray) -> FloatArray:
-        """Place of each finite score on the scale, in [0, 1]; 1 where all are equal."""
-        half = 0.5 * self.high - 0.5 * self.low  # the whole may be too large for a number
-        if not half > 0.0:
-            return np.ones(len(score))
-        return np.clip((0.5 * score - 0.5 * self.low) / half, 0.0, 1.0)
+def score_fractions(score: FloatArray) -> FloatArray:
+    """Place (A,) of each finite score, from the lowest (0) to the highest (1), or all 1."""
+    low, high = float(score.min(initial=np.inf)), float(score.max(initial=-np.inf))
+    return (score - low) / (high - low) if high > low else np.ones(len(score))
 
 
 def cost_colors(fraction: ArrayLike) -> ColorArray:
     """Colours (..., 3) of places on a cost scale (...): bright where the cost is low."""
-    place = np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0) * (_PLACES - 1)
-    colors: ColorArray = _color_map()[np.rint(place).astype(np.int64)]
-    return colors
+    place = np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0)
+    return _between(_VIRIDIS, 1.0 - np.rint(place * _LEVELS) / _LEVELS)
 
 
 def score_colors(fraction: ArrayLike) -> ColorArray:
     """Colours (..., 3) of places on a scale of scores (...): bright where the score is high."""
     return _between(_EMBERS, np.clip(np.asarray(fraction, dtype=np.float64), 0.0, 1.0))
-
-
-@cache
-def _color_map() -> ColorArray:
-    """The colours (_PLACES, 3) of a cost scale, from its lowest cost to its highest."""
-    return _between(_VIRIDIS, np.linspace(1.0, 0.0, _PLACES))
 
 
 def _between(colors: FloatArray, fraction: FloatArray) -> ColorArray:

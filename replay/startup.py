@@ -10,6 +10,7 @@ import signal
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from types import TracebackType
 
 THEIRS = "wrapper.py"  # a file of the published package that ours does not have
 OURS = "api.py"
@@ -19,12 +20,23 @@ WRONG_PACKAGE = (
     "again, in an environment of its own"
 )
 
+EXTRAS = {
+    "torch": ("torch",),
+    "sim": ("pooch", "pybullet", "requests"),
+    "sensors": ("PIL", "mcap_ros2", "yourdfpy"),
+    "evaluate": ("bokeh", "cryptography", "dask", "distributed", "markdown_it", "matplotlib"),
+    "slurm": ("dask_jobqueue",),
+}
+"""The modules that each extra of this package installs."""
+
 
 def begin() -> None:
     """For a command, before its imports: Ctrl-C ends it at once, and `chsel` must be ours.
 
-    A console script imports nothing from the current folder, nor does a Python that it starts.
+    A console script imports nothing from the current folder, nor does a Python that it starts. A
+    module of an extra that is not installed is an error of one line.
     """
+    sys.excepthook = _name_missing_extra
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     if sys.argv[:1] != ["-m"]:
@@ -35,6 +47,22 @@ def begin() -> None:
     if files != {OURS}:
         sys.stderr.write(f"error: {WRONG_PACKAGE.format(places[0] if places else 'no folder')}\n")
         sys.exit(2)
+
+
+def _name_missing_extra(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    name = ((error.name or "") if isinstance(error, ModuleNotFoundError) else "").split(".")[0]
+    extra = next((extra for extra, names in EXTRAS.items() if name in names), None)
+    if extra is None:
+        sys.__excepthook__(kind, error, trace)
+        return
+    sys.stderr.write(
+        f"error: {name} is not installed; accepted: after pip install 'chsel-replay[{extra}]', in "
+        f"a checkout pip install -e '.[{extra}]'\n"
+    )
+    sys.stderr.flush()
+    os._exit(2)  # an exception hook has no other way to a status
 
 
 def ready() -> None:

@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 import trimesh
 from omegaconf import DictConfig
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from chsel.errors import RecordingError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_threads, threads
-from chsel.plausible.pose_metrics import pose_errors
-from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
-from chsel.plausible.true_pose import TruePose, TruePoseSettings, find_true_pose
-from chsel.problem.poses import compose, inverse, roll_pitch_yaw
+from chsel.plausible.true_pose import TruePoseSettings
+from chsel.problem.poses import compose, roll_pitch_yaw
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.console import Console
-from replay.rerun.blueprint import at_last_probe, scene_view
-from replay.rerun.clock import PROBE
-from replay.rerun.meshes import display_mesh
 from replay.rerun.scene import Scene
-from replay.rerun.stream import new_file_stream
+from replay.rerun.stream import PROBE, new_file_stream
+from replay.rerun.views import at_last_probe, scene_view
 from runners.command.program import command, plain
+from runners.evaluation.true_poses import fit, sought_pose
 from runners.objects.scans import AssetsConfig
-from runners.sensors.alignment_fit import Fit, fit_of
+from runners.reporting.tables import Table, print_table, table_of
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
 from runners.sessions.problem_source import Source, open_source
 
@@ -99,45 +94,41 @@ def main(config: DictConfig) -> None:
     if checked.out is not None:
         pose_path = Path(checked.out).expanduser() / pose_path.name
     view_path = pose_path.with_name(pose_path.name.removesuffix(SUFFIX) + _VIEW)
-    _check_new(pose_path, view_path, overwrite=checked.overwrite)
-    source = open_source(path, checked.object, checked.session, checked.assets.folder, checked.seed)
-    problem = source.problems.problem(source.steps[-1])
-    if len(problem.points.known) == 0:
-        raise SettingError(f"{path} has no contact; accepted: a session that touched the object")
-    console, waiting = Console(), Console(stderr=True)
-    with threads(checked.threads):
-        if waiting.is_terminal:
-            with waiting.status("searching"):
-                found = find_true_pose(problem, guess, checked.search)
-        else:
-            found = find_true_pose(problem, guess, checked.search)
-    fits = {
-        "guess": fit_of(problem, guess, found.guess_cost, checked.search.cost),
-        "found": fit_of(problem, found.world_from_object, found.cost, checked.search.cost),
-    }
-    console.print(_title(source, problem), style="bold", soft_wrap=True)
-    console.print(_table(fits))
-    symmetry = object_symmetry(source.mesh)
-    moved = _between(found.world_from_object, guess, symmetry)
-    console.print(f"moved from the guess by {_apart(*moved)}")
-    if source.world_from_object is not None:
-        apart = _apart(*_between(found.world_from_object, source.world_from_object, symmetry))
-        console.print(f"from the true pose that the recording has: {apart}")
-    for warning in _warnings(found, guess, moved[1], fits["found"], checked.search):
-        console.print(f"warning: {warning}", soft_wrap=True)
-    pose_path.parent.mkdir(parents=True, exist_ok=True)
-    about = _about(checked, source, found, guess, fits["found"])
-    view_path.unlink(missing_ok=True)
-    save_view(view_path, source.mesh, problem, guess, found.world_from_object)
-    write_pose(pose_path, found.world_from_object, about, overwrite=checked.overwrite)
     for written in (pose_path, view_path):
-        console.print(str(written), soft_wrap=True)
-
-
-def _check_new(*paths: Path, overwrite: bool) -> None:
-    for path in paths:
-        if path.exists() and not overwrite:
-            raise RecordingError(f"{path} exists; accepted: overwrite=true, or another out=DIR")
+        if written.exists() and not checked.overwrite:
+            raise RecordingError(f"{written} exists; accepted: overwrite=true, or another out=DIR")
+    source = open_source(path, checked.object, checked.session, checked.assets.folder, checked.seed)
+    problem, search = source.problems.problem(source.steps[-1]), checked.search
+    console, waiting = Console(soft_wrap=True), Console(stderr=True)
+    with threads(checked.threads), ExitStack() as stack:
+        if waiting.is_terminal:
+            stack.enter_context(waiting.status("searching"))
+        truth = source.world_from_object
+        pose, numbers = sought_pose(problem, source.mesh, guess, search, truth)
+    guessed = {"cost": numbers["guess_cost"], **fit(problem, guess, search)}
+    print_table(Console(), _table(_title(source, problem), {"guess": guessed, "found": numbers}))
+    console.print(
+        f"found at {pose[:3, 3].round(4).tolist()} m, {_apart(numbers['from_guess'])} away"
+    )
+    if truth is not None:
+        apart = _apart(numbers["from_known"])
+        console.print(f"from the true pose that the recording has: {apart}")
+    for warning in _warnings(pose, guess, numbers, search):
+        console.print(f"warning: {warning}")
+    about = {
+        "object": source.object,
+        **numbers,
+        "search": settings_mapping(search),
+        "seed": checked.seed,
+        "source": source.digest,
+        "sdf": problem.sdf.digest,
+    }
+    pose_path.parent.mkdir(parents=True, exist_ok=True)
+    view_path.unlink(missing_ok=True)
+    save_view(view_path, source.mesh, problem, guess, pose)
+    write_pose(pose_path, pose, about, overwrite=checked.overwrite)
+    for written in (pose_path, view_path):
+        console.print(str(written))
 
 
 def _title(source: Source, problem: RegistrationProblem) -> str:
@@ -148,46 +139,30 @@ def _title(source: Source, problem: RegistrationProblem) -> str:
     )
 
 
-def _table(fits: dict[str, Fit]) -> Table:
-    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for heading in (
-        "",
-        "cost C",
-        "mean |SDF|\nmm",
-        "most\nmm",
-        "free points\ninside",
-        "position\nm",
-    ):
-        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
-    for name, fit in fits.items():
-        x, y, z = fit.world_from_object[:3, 3]
-        table.add_row(
-            name,
-            f"{fit.cost:.4g}",
-            f"{1000.0 * fit.mean_distance:.2f}",
-            f"{1000.0 * fit.most_distance:.2f}",
-            str(fit.violations),
-            f"{x:.4f} {y:.4f} {z:.4f}",
-        )
-    return table
+def _table(title: str, fits: dict[str, dict[str, Any]]) -> Table:
+    lines = [
+        {
+            "": name,
+            "cost C": numbers["cost"],
+            "mean |SDF|\nmm": 1000.0 * numbers["mean_distance"],
+            "most\nmm": 1000.0 * numbers["most_distance"],
+            "free points\ninside": numbers["violations"],
+        }
+        for name, numbers in fits.items()
+    ]
+    return table_of(title, lines)
 
 
-def _between(one: FloatArray, other: FloatArray, symmetry: ObjectSymmetry) -> tuple[float, float]:
-    """Metres and radians between two world_from_object (4, 4), as `pose_errors` defines them."""
-    position, rotation = pose_errors(inverse(one)[None], other, symmetry)
-    return float(position[0]), float(rotation[0])
-
-
-def _apart(position: float, rotation: float) -> str:
-    return f"{1000.0 * position:.1f} mm, {degrees(rotation):.1f} degrees"
+def _apart(distance: dict[str, float]) -> str:
+    return f"{1000.0 * distance['position']:.1f} mm, {degrees(distance['rotation']):.1f} degrees"
 
 
 def _warnings(
-    found: TruePose, guess: FloatArray, turned: float, fit: Fit, search: TruePoseSettings
+    pose: FloatArray, guess: FloatArray, numbers: dict[str, Any], search: TruePoseSettings
 ) -> list[str]:
-    """What speaks against the result. turned: from the guess, radians."""
+    """What speaks against the result."""
     warnings = []
-    offset = np.abs(found.world_from_object[:3, 3] - guess[:3, 3])
+    offset, turned = np.abs(pose[:3, 3] - guess[:3, 3]), numbers["from_guess"]["rotation"]
     if offset.max() > search.reach - search.spacing:
         axis = "xyz"[int(np.argmax(offset))]
         warnings.append(
@@ -200,30 +175,13 @@ def _warnings(
             f"than most that are looked at: start again from it, or with search.angle above "
             f"{search.angle:g} rad"
         )
-    if fit.violations:
+    if numbers["violations"]:
         warnings.append(
-            f"{fit.violations} free points are more than {1000.0 * search.cost.tolerance:g} mm "
-            "inside of the object: the guess, the log's frames or its depth may be off"
+            f"{numbers['violations']} free points are more than "
+            f"{1000.0 * search.cost.tolerance:g} mm inside of the object: the guess, the log's "
+            "frames or its depth may be off"
         )
     return warnings
-
-
-def _about(
-    config: AlignConfig, source: Source, found: TruePose, guess: FloatArray, fit: Fit
-) -> dict[str, Any]:
-    """What the pose file says beside the pose; metres."""
-    return {
-        "object": source.object,
-        "cost": found.cost,
-        "mean_distance": fit.mean_distance,
-        "violations": fit.violations,
-        "guess": guess.tolist(),
-        "guess_cost": found.guess_cost,
-        "search": settings_mapping(config.search),
-        "seed": config.seed,
-        "source": source.digest,
-        "sdf": source.problems.problem(source.steps[-1]).sdf.digest,
-    }
 
 
 def save_view(
@@ -245,9 +203,8 @@ def save_view(
         stream.send_blueprint(at_last_probe(rrb.Vertical(view)))
         scene = Scene(stream)
         scene.set_up(mesh, problem.workspace, found)
-        pose = rr.Transform3D(translation=guess[:3, 3], mat3x3=guess[:3, :3])
-        stream.log("scene/guess", display_mesh(mesh, _GUESS_COLOR), pose, static=True)
-        scene.add_points(problem.points, new=False)
+        scene.add_mesh("guess", mesh, guess, _GUESS_COLOR)
+        scene.add_points(problem.points)
 
 
 if __name__ == "__main__":

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
+from math import degrees
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from chsel.errors import RecordingError, SettingError, require_choice, require_positive
+from chsel.errors import SettingError, require_choice, require_positive
 from chsel.methods import METHODS
 from chsel.numerics.threads import require_threads
 from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.settings import build_settings
-from replay.console import Console
+from replay.console import Console, Progress
 from runners.command.program import command, plain
 from runners.evaluation.cluster import ClusterConfig, cluster_config, connected
 from runners.evaluation.contenders import chosen_contenders, drawn, require_label
@@ -36,26 +36,31 @@ from runners.evaluation.external_results import external_folders, read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
 from runners.evaluation.policy_contenders import chosen_policies
-from runners.evaluation.progress_display import Progress, ProgressDisplay
-from runners.evaluation.scheduling import Scheduling
 from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
 from runners.evaluation.sensor_logs import check_log, is_missing
+from runners.evaluation.tasks import do_tasks, is_finished, tasks_of
 from runners.evaluation.trial_configurations import SENSORS, faulty_name
 from runners.evaluation.true_poses import true_poses
 from runners.objects.scans import AssetsConfig, scan_file
+from runners.reporting.evaluation_folder import open_evaluation
+from runners.reporting.figures import method_styles, policy_styles
+from runners.reporting.method_sections import tables_by_faults
+from runners.reporting.policy_sections import error_table, needed_table
+from runners.reporting.steered_sessions import steered_sessions
+from runners.reporting.tables import Table, number, print_table, table_of
 from runners.run.scene import PresetName
 from runners.sessions.faults import CLEAN, LEVELS
 from runners.sessions.probing_settings import without_defaults
 
-_COLLECT = 300.0  # s between tables of what is finished so far
+_MOST_FAILURES = 12  # that are printed
 _OF_TRIAL = ("configuration", "logs")
 
 
 @dataclass(frozen=True)
 class IterationsConfig:
-    """every: iterations of the search between measures of it; None: none but of the result."""
+    """What is measured of searches."""
 
-    every: int | None
+    every: int | None  # iterations between measures; None: none but of the result
 
     def __post_init__(self) -> None:
         if self.every is not None:
@@ -121,99 +126,127 @@ def main(config: DictConfig) -> None:
     trials = [Trial(seed, name) for seed in seeds for name in configurations]
     _check_faults(plan, levels)
     _check(plan, trials)
-    display = ProgressDisplay()
-    with writing_alone(plan.folder, display.say):
+    console = Console(soft_wrap=True)
+    with writing_alone(plan.folder, console.print):
         join_experiment(plan, checked.name, configurations, seeds)
-        failed = evaluate(plan, trials, cluster, checked.workers, display)
+        for unfinished in plan.folder.glob("trials/*/*/.*"):  # of a run that was killed
+            unfinished.unlink()
+        failed = evaluate(plan, trials, cluster, checked.workers, console)
     if failed and HydraConfig.get().mode is not RunMode.MULTIRUN:  # the other jobs must go on
         sys.exit(1)
 
 
 def evaluate(
     plan: Plan,
-    trials: list[Trial],
+    trials: Sequence[Trial],
     cluster: ClusterConfig,
     workers: int | None,
-    display: ProgressDisplay,
+    console: Console,
 ) -> bool:
     """Do all tasks that are not finished, and write the tables; whether anything failed."""
-    collected = time.monotonic()
-
-    def show(progress: Progress) -> None:
-        nonlocal collected
-        display.progress(progress)
-        if time.monotonic() - collected > _COLLECT:
-            collected = time.monotonic()
-            with suppress(RecordingError):  # of a damaged part: it is an error at the end
-                collect(plan.folder)
-
-    scheduling = Scheduling(plan, trials, show)
-    before = scheduling.progress
-    contenders = f"{len(plan.contenders)} methods"
-    if plan.policies:
-        contenders = f"{len(plan.policies)} policies"
-    display.say(
-        f"evaluation in {plan.folder}: {len(trials)} trials, {contenders}, "
-        f"{before.total} tasks, of which {before.finished} are finished"
+    tasks = tasks_of(plan, trials)
+    missing = [task for task in tasks if not is_finished(plan, task)]
+    what = f"{len(plan.policies)} policies" if plan.policies else f"{len(plan.contenders)} methods"
+    console.print(
+        f"evaluation in {plan.folder}: {len(trials)} trials, {what}, {len(tasks)} tasks, of which "
+        f"{len(tasks) - len(missing)} are finished"
     )
+    failures: list[str] = []
+    environments = []
     try:
-        if before.finished < before.total:
-            with connected(cluster, workers, display.say) as connection:
-                scheduling.run(connection)
+        if missing:
+            with (
+                connected(cluster, workers, console.print) as (client, size),
+                Progress(console=console, transient=True, disable=not console.is_terminal) as bar,
+            ):
+                shown = bar.add_task("tasks", total=len(missing))
+                for ended in do_tasks(plan, missing, client, size):
+                    bar.update(shown, advance=1, description=str(ended.task))
+                    if ended.failure:
+                        failures.append(f"failed: {ended.task}: {ended.failure}")
+                    else:
+                        environments.append(ended.environment)
     finally:
-        display.close()
-        display.failures(before)
-        add_environments(plan.folder, scheduling.environments)
-        results = collect(plan.folder)
+        for line in failures[:_MOST_FAILURES]:
+            console.print(line)
+        if len(failures) > _MOST_FAILURES:
+            console.print(f"and {len(failures) - _MOST_FAILURES} more, see the table")
+        add_environments(plan.folder, environments)
+        results = collect(plan.folder).to_pandas()
         if sys.exc_info()[0] is KeyboardInterrupt:
-            display.say("interrupted: what is finished stays, and the same command goes on")
-    if plan.policies:
-        _print_policies(plan.folder)
-    else:
-        display.summary(results, _labels(plan.folder), definition_text(plan.definition))
-        _print_by_faults(plan.folder)
-        display.true_poses(true_poses(plan.folder, read_experiment(plan.folder)))
-    display.written(plan.folder, results, "probes" if plan.policies else "results")
-    return any(text.startswith("failed") for text in results["status"].to_pylist())
-
-
-def _print_by_faults(folder: Path) -> None:
-    """By level of faults: whether sets hold the truth, and how far hypotheses are from it."""
-    # Pandas and matplotlib take a second to import, which an evaluation starts without.
-    from runners.reporting.evaluation_folder import open_evaluation
-    from runners.reporting.figures import method_styles
-    from runners.reporting.method_sections import tables_by_faults
-    from runners.reporting.tables import print_table
-
-    evaluation = open_evaluation(folder)
-    for table in tables_by_faults(evaluation.rows, method_styles(evaluation.methods)):
+            console.print("interrupted: what is finished stays, and the same command goes on")
+    for table in _tables(plan, results):
         print_table(Console(), table)
+    for line in _true_poses(plan.folder):
+        console.print(line)
+    failed = int(results["status"].str.startswith("failed").sum())
+    name = "probes" if plan.policies else "results"
+    console.print(
+        f"{plan.folder / name}.parquet, {name}.csv: {len(results)} rows, {failed} of them failed"
+    )
+    return failed > 0
 
 
-def _print_policies(folder: Path) -> None:
-    """How far each policy has come after how many probes."""
-    from runners.reporting.evaluation_folder import open_evaluation
-    from runners.reporting.figures import policy_styles
-    from runners.reporting.policy_sections import error_table, needed_table
-    from runners.reporting.steered_sessions import steered_sessions
-    from runners.reporting.tables import print_table
+def _tables(plan: Plan, results: pd.DataFrame) -> list[Table]:
+    """What is shown of the results."""
+    evaluation = open_evaluation(plan.folder)
+    if not plan.policies:
+        faults = tables_by_faults(evaluation.rows, method_styles(evaluation.methods))
+        return [median_table(results, definition_text(plan.definition)), *faults]
+    sessions = steered_sessions(evaluation)
+    styles = policy_styles(sessions.policies)
+    return [error_table(sessions, styles), needed_table(sessions, styles)] * bool(sessions.count)
 
-    sessions = steered_sessions(open_evaluation(folder))
-    if sessions.count:
-        styles = policy_styles(sessions.policies)
-        for table in (error_table(sessions, styles), needed_table(sessions, styles)):
-            print_table(Console(), table)
+
+def median_table(results: pd.DataFrame, definition: str) -> Table:
+    """Median PD by object and method, and milliseconds a registration.
+
+    definition: of the plausible sets, as text.
+    """
+    medians = results.pivot_table("diversity", "method", "object", "median", dropna=False)
+    lines = [
+        {"method": label, **medians.loc[label].map(number), "ms": number(1000.0 * seconds)}
+        for label, seconds in results.groupby("method")["seconds"].median().items()
+    ]
+    title = "medians over all steps of all trials: PD in mm² by object, ms a registration"
+    return table_of(title, lines, note=f"plausible sets: {definition}")
+
+
+def _true_poses(folder: Path) -> list[str]:
+    """How far the true poses that were sought are from a simulated truth."""
+    found = pd.DataFrame(true_poses(folder, read_experiment(folder)))
+    if found.empty:
+        return []
+    lines = [
+        f"true poses were sought in {len(found)} trials: mean |SDF| of contacts "
+        f"{1000.0 * found['mean_distance'].mean():.2f} mm, {found['violations'].sum()} free points "
+        "inside of objects"
+    ]
+    known = found.dropna(subset=["position_error"])
+    if len(known):
+        positions = 1000.0 * known["position_error"]
+        rotations = degrees(1.0) * known["rotation_error"]
+        lines.append(
+            f"from the simulated truth of {len(known)}, modulo symmetries: {positions.mean():.1f} "
+            f"mm in the mean, {positions.max():.1f} mm at worst; {rotations.mean():.1f} and "
+            f"{rotations.max():.1f} degrees"
+        )
+    return lines
 
 
 def _plan(config: EvaluateConfig) -> Plan:
-    given = {str(name): Path(folder).expanduser() for name, folder in config.outside.items()}
+    def path(folder: object) -> Path:
+        """As workers elsewhere find it."""
+        return Path(str(folder)).expanduser().absolute()
+
+    given = {str(name): path(folder) for name, folder in config.outside.items()}
     chosen = chosen_contenders(config.methods, config.settings, config.preset.name)
     chosen = drawn(chosen, config.draws)
     policies = chosen_policies(config.policies, config.policy)
     logs = config.session.get("logs")
     session = without_defaults(config.session)
     return Plan(
-        folder=Path(config.out).expanduser(),
+        folder=path(config.out),
         preset=config.preset.name,
         session={key: value for key, value in session.items() if key not in _OF_TRIAL},
         objects=config.objects,
@@ -223,10 +256,10 @@ def _plan(config: EvaluateConfig) -> Plan:
         starts=config.starts,
         every=config.iterations.every,
         recordings=config.recordings,
-        assets=config.assets.folder,
+        assets=path(config.assets.folder),
         contenders={contender.label: contender for contender in chosen},
         outside=external_folders(given),
-        logs=Path(str(logs)).expanduser() if logs is not None else None,
+        logs=None if logs is None else path(logs),
         truth=config.truth,
         plausible=config.plausible and not policies,
         policies=policies,
@@ -301,11 +334,6 @@ def _check_sessions(plan: Plan, trials: list[Trial]) -> None:
     if to_simulate and importlib.util.find_spec("pybullet") is None:
         what = "a simulated log" if plan.kind == SENSORS else "session=simulated"
         raise SettingError(f"{what} needs PyBullet; accepted here: session=kinematic")
-
-
-def _labels(folder: Path) -> list[str]:
-    experiment = read_experiment(folder)
-    return [*experiment["methods"], *experiment["outside"]]
 
 
 if __name__ == "__main__":

@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
@@ -19,7 +16,6 @@ from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.plausible_file import load_plausible, save_plausible
 from chsel.plausible.plausible_set import PlausibleSet, plausible_set
 from chsel.plausible.plausible_settings import PlausibleSettings
-from chsel.plausible.true_pose import find_true_pose
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings
 from chsel.problem.streams import StreamKey
@@ -29,6 +25,7 @@ from runners.command.program import command, plain
 from runners.evaluation.definition import definition_label, definition_settings
 from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
 from runners.objects.scans import AssetsConfig
+from runners.reporting.tables import Table, print_table, table_of
 from runners.sensors.pose_file import beside, read_pose
 from runners.sessions.problem_source import Source, open_source
 
@@ -49,7 +46,6 @@ class PlausibleConfig:
     assets: AssetsConfig
     file: str | None
     steps: str | None
-    guess: tuple[tuple[float, ...], ...] | None
     out: str | None
     seed: int
     threads: int
@@ -74,12 +70,10 @@ def main(config: DictConfig) -> None:
     settings = _settings(checked.definition, source)
     folder = Path(checked.out).expanduser() if checked.out else path.parent / "plausible"
     console = Console()
+    truth = _truth(path, source, console)
     with threads(checked.threads):
-        truth = _truth(checked, source, settings, console)
         rows, failures = _rows(checked, source, steps, settings, truth, folder)
-    console.print(_title(checked, source, settings, truth), style="bold")
-    if rows:
-        console.print(_table(rows))
+    print_table(console, _table(_title(checked, source, settings, truth), rows))
     for failure in failures:
         console.print(failure, soft_wrap=True)
     console.print(f"written: {len(rows)} sets, in")
@@ -97,35 +91,16 @@ def _settings(definition: Any, source: Source) -> PlausibleSettings:
     return definition_settings(definition, source.epsilon)
 
 
-def _truth(
-    config: PlausibleConfig, source: Source, settings: PlausibleSettings, console: Console
-) -> FloatArray:
-    """The true pose that the file gives; else the one near a guess, or that of a pose file."""
+def _truth(path: Path, source: Source, console: Console) -> FloatArray:
+    """The true pose that the file gives, or the one beside it, which runners.align writes."""
     if source.world_from_object is not None:
-        if config.guess is not None:
-            raise SettingError("guess is for files without a true pose; this one has it")
         return source.world_from_object
-    if config.guess is None:
-        return _aligned(Path(config.file or "").expanduser(), console)
-    problem = source.problems.problem(source.steps[-1])
-    found = find_true_pose(problem, np.array(config.guess))
-    console.print(
-        f"true pose found near the guess, which costs {found.guess_cost:.4g}: it costs "
-        f"{found.cost:.4g}",
-        soft_wrap=True,
-    )
-    console.print(str(found.world_from_object.tolist()), soft_wrap=True)
-    return found.world_from_object
-
-
-def _aligned(path: Path, console: Console) -> FloatArray:
-    """The pose in the file beside, which runners.align writes."""
     there = beside(path)
     if not there.exists():
         raise SettingError(
             f"{path} has no true pose, and there is no {there.name} beside it; accepted: a pose "
             f"that `python -m runners.align {path} position=[x,y,z] rotation=[roll,pitch,yaw]` "
-            "finds, guess=[[...],[...],[...],[0,0,0,1]] near it, or a file with world_from_object"
+            "finds, or a file with world_from_object"
         )
     console.print(f"true pose: that of {there}", soft_wrap=True)
     return read_pose(there)
@@ -159,12 +134,12 @@ def _rows(
                     continue
                 save_plausible(folder, found)
             before = found
-            row = _row(problem, found, time.perf_counter() - begun if again else None)
+            row = _row(problem, found, time.perf_counter() - begun if again else "found")
             rows.append(row | metrics.compute(problem, found, source.problems.found(step)))
     return rows, failures
 
 
-def _row(problem: RegistrationProblem, found: PlausibleSet, seconds: float | None) -> Row:
+def _row(problem: RegistrationProblem, found: PlausibleSet, seconds: float | str) -> Row:
     return {
         "step": problem.key.step,
         "contacts": len(problem.points.contacts),
@@ -188,36 +163,26 @@ def _title(
 
 
 _COLUMNS = {
-    "step": ("step", "d"),
-    "contacts": ("con-\ntacts", "d"),
-    "free_points": ("free", "d"),
-    "true_cost": ("C(X*)", ".2g"),
-    "members": ("mem-\nbers", "d"),
-    "local": ("off\ngrid", "d"),
-    "distinct": ("dis-\ntinct", "d"),
-    "coverage": ("cover-\nage", ".1f"),
-    "plausibility": ("plausi-\nbility", ".1f"),
-    "diversity": ("PD\nmm²", ".1f"),
-    "root": ("√PD\nmm", ".1f"),
-    "rank": ("rank", ".2f"),
-    "seconds": ("time\ns", ".2f"),
+    "step": "step",
+    "contacts": "con-\ntacts",
+    "free_points": "free",
+    "true_cost": "C(X*)",
+    "members": "mem-\nbers",
+    "local": "off\ngrid",
+    "distinct": "dis-\ntinct",
+    "coverage": "cover-\nage",
+    "plausibility": "plausi-\nbility",
+    "diversity": "PD\nmm²",
+    "root": "√PD\nmm",
+    "rank": "rank",
+    "seconds": "time\ns",
 }
 
 
-def _table(rows: list[Row]) -> Table:
-    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 0))
+def _table(title: str, rows: list[Row]) -> Table:
     shown = [key for key in _COLUMNS if any(key in row for row in rows)]
-    for key in shown:
-        table.add_column(_COLUMNS[key][0], justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(*(_cell(row, key) for key in shown))
-    return table
-
-
-def _cell(row: Row, key: str) -> str:
-    if key == "seconds" and row[key] is None:
-        return "found"
-    return format(row[key], _COLUMNS[key][1]) if row.get(key) is not None else ""
+    lines = [{_COLUMNS[key]: row.get(key, "") for key in shown} for row in rows]
+    return table_of(title, lines, labels=0)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -15,14 +13,13 @@ from omegaconf import DictConfig
 
 from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
+from replay.console import Console, Progress
 from runners.command.program import command, plain
 from runners.evaluation.plan import Trial
-from runners.evaluation.progress_display import Progress, ProgressDisplay
-from runners.evaluation.repeats import repeat_seed, require_repeats
+from runners.evaluation.repeats import require_repeats
 from runners.evaluation.selection import chosen_seeds
 from runners.evaluation.trial_session import read_told
 from runners.published_package.environment import PackageConfig, interpreter
-from runners.published_package.files import PackageFiles
 from runners.published_package.package_session import PackageSession
 from runners.published_package.process import PublishedPackage
 
@@ -57,59 +54,35 @@ def main(config: DictConfig) -> None:
     """Register what is not registered yet."""
     checked = build_settings(PublishedConfig, plain(config), "published")
     trials = found_trials(checked)
-    display = ProgressDisplay()
-    with PublishedPackage(interpreter(checked.package, display.say)) as package:
-        files = [
-            PackageFiles(checked.folder, trial, draw, session, steps, package.versions)
+    console = Console(soft_wrap=True)
+    with PublishedPackage(interpreter(checked.package, console.print)) as package:
+        sessions = [
+            PackageSession(package, checked.folder, trial, draw, session, steps)
             for draw in range(checked.draws)
             for trial, session in trials
             if (steps := read_told(session.with_suffix(".json")).steps)
         ]
-        try:
-            register(files, package, display)
-        finally:
-            display.close()
-    failed = [line for one in files for line in failures(one)]
+        missing = [one for one in sessions if one.failures() is None]
+        console.print(
+            f"{len(sessions)} sessions, of which {len(sessions) - len(missing)} are finished"
+        )
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+            shown = bar.add_task("", total=sum(len(one.steps) for one in missing))
+            for one in missing:
+                bar.update(shown, description=str(one.unit))
+                for _ in one.register():
+                    bar.advance(shown)
+    failed = [
+        f"failed: {one.unit}: step {step}: {reason}"
+        for one in sessions
+        for step, reason in (one.failures() or {}).items()
+    ]
     for line in failed:
-        display.say(line)
-    display.say(f"sets of {len(files)} sessions, draws apart, are in {checked.folder}")
-    display.say(f"the evaluation's command ranks them with outside.package={checked.folder}")
+        console.print(line)
+    console.print(f"sets of {len(sessions)} sessions, draws apart, are in {checked.folder}")
+    console.print(f"the evaluation's command ranks them with outside.package={checked.folder}")
     if failed:
         sys.exit(1)
-
-
-def register(
-    files: Sequence[PackageFiles], package: PublishedPackage, display: ProgressDisplay
-) -> None:
-    """Write all files that are not there yet, and show how far it is."""
-    open_files = [one for one in files if one.finished() is None]
-    progress = Progress(len(files), finished=len(files) - len(open_files))
-    display.say(f"{len(files)} sessions, of which {progress.finished} are finished")
-    begun, warm = time.monotonic(), False
-    for one in open_files:
-        progress.running = [one.unit]
-        display.progress(progress)
-        run = PackageSession(package, repeat_seed(one.trial.seed, one.draw), warm)
-        found = {}
-        for step, result in run.sets(one.session, one.steps):
-            found[step] = result
-            display.progress(progress)
-        one.write(found)
-        warm = run.warm
-        progress.done += 1
-        left = len(open_files) - progress.done
-        progress.seconds_left = left * (time.monotonic() - begun) / progress.done
-    progress.running = []
-    display.progress(progress)
-
-
-def failures(files: PackageFiles) -> list[str]:
-    """A line for every step at which the package has found nothing."""
-    about = files.finished() or {}
-    return [
-        f"failed: {files.unit}: step {step}: {reason}"
-        for step, reason in about.get("failed", {}).items()
-    ]
 
 
 def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:

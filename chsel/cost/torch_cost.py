@@ -5,8 +5,14 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-import torch
-from torch import Tensor
+
+try:
+    import torch
+    from torch import Tensor
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "RelaxedCost needs torch: pip install 'chsel-replay[torch]'", name="torch"
+    ) from error
 
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.interior_points import interior_points

@@ -21,7 +21,7 @@ from chsel.problem.streams import StreamKey
 from docs.pictures.outlines import CONTACT, TRUE_POSE, Frame, Outlines, as_image, corners_in
 from replay.events import Probe
 from replay.mcap.reader import read_recording
-from replay.rerun.meshes import deepest, hand_mesh
+from replay.rerun.scene import coarsened, deepest
 from runners.reporting.figures import drawing, positive_scale
 
 _SIZE, _DPI = (9.0, 6.6), 80  # inches, and pixels of one
@@ -52,7 +52,7 @@ class _Session:
         for step in recording.decision_steps:
             met = recording.decision(step).decision.contacts
             self.forecasts[step + 1] = met[np.isfinite(met).all(axis=1)]
-        self.hand = None if recording.offered is None else hand_mesh(recording.offered.hand)
+        self.hand = None if recording.offered is None else coarsened(recording.offered.hand)
 
     def contacts(self, done: int) -> FloatArray:
         """Those of so many probes (C, 3)."""

@@ -51,8 +51,8 @@ def _run(command: str) -> None:
 
 
 def recording(sessions: Sessions) -> None:
-    """The viewer as it opens on a session."""
-    screenshot(sessions.drill() / "recording.rrd", Path("replay/recording.png"))
+    """The viewer on a session."""
+    screenshot(sessions.drill() / "recording.rrd", Path("replay/recording.png"), step=4)
 
 
 def session(sessions: Sessions) -> None:
@@ -75,7 +75,7 @@ def comparison(sessions: Sessions) -> None:
     """Another method on the problems of the same session."""
     rrd, file = sessions.folder / "comparison.rrd", sessions.drill() / "recording.mcap"
     _run(f"replay compare {file} --methods gradient_descent --save-rerun {rrd}")
-    screenshot(rrd, Path("replay/comparison.png"))
+    screenshot(rrd, Path("replay/comparison.png"), step=4)
 
 
 def anchored(sessions: Sessions) -> None:

@@ -2,187 +2,98 @@
 
 from __future__ import annotations
 
-from functools import cache
-from typing import NamedTuple
-
 import numpy as np
 import rerun as rr
 
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
-from replay.colors import EMPTY_CELL, ColorArray, CostScale, cost_colors, number
-from replay.rerun.clock import ITERATION, PROBE, REGISTRATION
+from replay.colors import EMPTY_CELL, TEXT, ColorArray, CostScale, cost_colors, number
 from replay.rerun.hypotheses import shown_hypotheses
-from replay.rerun.plane import Frame, Label, color_array, lines, on_screen, texts, ticks
+from replay.rerun.scene import on_screen
 
 _FLATTEST = 4  # a map wider or higher than this has its shorter side stretched
 _MARK = (255, 255, 255)
-_AT_ONCE = 8  # snapshots that are sent together
-_BAR = (0.06, 0.11)  # left and right edge of the colour bar, beyond the map, in map widths
-
-
-class _Moment(NamedTuple):
-    """A snapshot as it is drawn; costs, colors: the bytes of the two pictures."""
-
-    step: int
-    moment: int
-    costs: bytes
-    colors: bytes
-    labels: list[Label]
 
 
 class ArchiveMap:
-    """Draws snapshots of archives under the entity `root`; a unit of the view is one cell."""
+    """Draws snapshots of archives under the entity `archive`; a unit of the view is one cell."""
 
-    def __init__(self, stream: rr.RecordingStream, root: str = "archive") -> None:
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self.size: tuple[int, int] | None = None  # width and height of the last map, in cells
         self._stream = stream
-        self._root = root
-        self._scale: CostScale | None = None
+        self._scale: CostScale | None = None  # of this registration
         self._last: ArchiveSnapshot | None = None
-        self._framed: Frame | None = None
-        self._waiting: list[_Moment] = []
 
     def start(self) -> None:
         """A registration starts, with a new archive: the marks on the last one are gone."""
-        self.send()
         self._scale = self._last = None
         self._mark(np.zeros((0, 2)), [])
 
-    def draw(self, step: int, moment: int, archive: ArchiveSnapshot) -> None:
-        """The lowest cost in each cell, empty cells in grey; axes, colour bar and a caption.
-
-        moment: on the timeline of iterations. What is drawn is sent in blocks.
-        """
+    def draw(self, step: int, archive: ArchiveSnapshot) -> None:
+        """The lowest cost in each cell, empty cells in grey; a caption and the ranges of axes."""
         scale = CostScale.of(-archive.objectives)
-        scale = scale if self._scale is None else self._scale.including(scale)
+        if self._scale is not None:
+            ends = (scale.low, scale.high, self._scale.low, self._scale.high)
+            scale = CostScale.of(ends)
         self._scale, self._last = scale, archive
-        costs, frame = lowest_costs(archive), map_frame(archive)
-        colors = heat_map(costs, scale)
-        if frame != self._framed:
-            self.send()
-            self._framed = frame
-            self._lay_out(frame, costs.shape, colors.shape[:2])
-        labels = _labels(archive, frame, scale, step)
-        self._waiting.append(_Moment(step, moment, costs.tobytes(), colors.tobytes(), labels))
-        if len(self._waiting) == _AT_ONCE:
-            self.send()
-
-    def send(self) -> None:
-        """Send what is drawn and not sent yet."""
-        drawn, self._waiting = self._waiting, []
-        if not drawn:
-            return
-        times = [
-            rr.TimeColumn(PROBE, sequence=[one.step for one in drawn]),
-            rr.TimeColumn(REGISTRATION, sequence=[one.step for one in drawn]),
-            rr.TimeColumn(ITERATION, sequence=[one.moment for one in drawn]),
-        ]
-        costs = rr.Image.columns(buffer=[one.costs for one in drawn])
-        colors = rr.Image.columns(buffer=[one.colors for one in drawn])
-        labels = [label for one in drawn for label in one.labels]
-        axes = rr.Points2D.columns(
-            positions=np.array([label[:2] for label in labels], dtype=np.float32),
-            labels=[label[2] for label in labels],
-        ).partition([len(one.labels) for one in drawn])
-        for name, columns in (("cost", costs), ("colors", colors), ("axes", axes)):
-            self._stream.send_columns(f"{self._root}/{name}", times, columns)
-
-    def _lay_out(self, frame: Frame, costs: tuple[int, int], colors: tuple[int, int]) -> None:
-        """What stays from one snapshot to the next."""
+        costs = lowest_costs(archive)
+        height, width = costs.shape
+        self.size = width, height
         # The costs lie under the colours, so that the viewer shows them where the mouse points.
-        self._log("cost", _layer(costs, "L", rr.ChannelDatatype.F32, -30.0))
-        self._log("colors", _layer(colors, "RGBA", rr.ChannelDatatype.U8, -20.0))
-        self._log("axes", texts([]))
-        self._log("frame", lines(frame.outline()))
+        self._stream.log("archive/cost", rr.Image(costs, color_model="L", draw_order=-30.0))
+        self._stream.log("archive/colors", rr.Image(heat_map(costs, scale), draw_order=-20.0))
+        side = max(width, height)
+        labels = rr.Points2D(
+            [(width / 2, -0.12 * side), (width / 2, height + 0.03 * side)],
+            labels=_texts(step, archive, scale),
+            colors=[TEXT],
+            radii=on_screen(0.0),
+            show_labels=True,
+        )
+        self._stream.log("archive/text", labels)
 
-    def mark(self, step: int, moment: int, hypotheses: Hypotheses) -> None:
+    def mark(self, step: int, hypotheses: Hypotheses) -> None:
         """Mark the cells that the hypotheses come from, each with its cost."""
         if self._last is None and hypotheses.archive is not None:
-            self.draw(step, moment, hypotheses.archive)
-        if self._last is None:
+            self.draw(step, hypotheses.archive)
+        if self._last is None or self.size is None:
             return
         shown = shown_hypotheses(hypotheses)
         shown = shown[hypotheses.cell[shown] >= 0]
-        frame = map_frame(self._last)
         columns, rows = _places(self._last, hypotheses.cell[shown])
-        x = frame.x(1.0) * (columns + 0.5) / self._last.shape[0]
-        y = frame.height * (1.0 - (rows + 0.5) / _rows(self._last))
+        width, height = self.size
+        x = width * (columns + 0.5) / self._last.shape[0]
+        y = height * (1.0 - (rows + 0.5) / _rows(self._last))
         costs = hypotheses.cost[shown].tolist()
         self._mark(np.stack([x, y], axis=1), [f"cost {number(cost)}" for cost in costs])
 
     def _mark(self, places: FloatArray, labels: list[str]) -> None:
         points = rr.Points2D(
-            places.astype(np.float32),
-            labels=labels,
-            show_labels=False,
-            colors=color_array(_MARK),
-            radii=on_screen(2.5),
+            places, labels=labels, show_labels=False, colors=[_MARK], radii=on_screen(2.5)
         )
-        self._log("hypotheses", points)
-
-    def _log(self, name: str, what: rr.AsComponents) -> None:
-        self._stream.log(f"{self._root}/{name}", what)
-
-
-def map_frame(archive: ArchiveSnapshot) -> Frame:
-    """Size of the map, in cells: one measure alone makes a strip."""
-    across, up = _stretch(archive)
-    return Frame(archive.shape[0] * across, _rows(archive) * up)
+        self._stream.log("archive/hypotheses", points)
 
 
 def lowest_costs(archive: ArchiveSnapshot) -> np.ndarray:
     """The map (height, width) as float32: the lowest cost over all further measures, NaN if empty.
 
-    The first measure runs to the right, the second upwards; the map has the size of `map_frame`.
+    The first measure runs to the right, the second upwards; one measure alone makes a strip.
     """
     columns, rows = _places(archive, archive.cells)
-    costs = np.full((_rows(archive), archive.shape[0]), np.inf)
-    np.minimum.at(costs, (len(costs) - 1 - rows, columns), -archive.objectives)
+    width, height = archive.shape[0], _rows(archive)
+    costs = np.full((height, width), np.inf)
+    np.minimum.at(costs, (height - 1 - rows, columns), -archive.objectives)
     costs[np.isinf(costs)] = np.nan
-    across, up = _stretch(archive)
-    return np.repeat(np.repeat(costs, up, axis=0), across, axis=1).astype(np.float32)
+    wider, higher = max(1, height // (_FLATTEST * width)), max(1, width // (_FLATTEST * height))
+    return np.repeat(np.repeat(costs, higher, axis=0), wider, axis=1).astype(np.float32)
 
 
 def heat_map(costs: np.ndarray, scale: CostScale) -> ColorArray:
-    """The picture (height, width', 4) of costs (height, width), with the colour bar beside it."""
-    picture = _empty_map(*costs.shape).copy()
+    """The picture (height, width, 3) of costs (height, width)."""
     filled = ~np.isnan(costs)
-    picture[:, : costs.shape[1], :3][filled] = cost_colors(scale.fraction(costs[filled]))
+    picture = np.full((*costs.shape, 3), EMPTY_CELL, dtype=np.uint8)
+    picture[filled] = cost_colors(scale.fraction(costs[filled]))
     return picture
-
-
-@cache
-def _empty_map(height: int, width: int) -> ColorArray:
-    """The picture of an archive without a solution."""
-    left, right = _bar_edges(width)
-    picture = np.zeros((height, right, 4), dtype=np.uint8)
-    picture[:, :width] = (*EMPTY_CELL, 255)
-    picture[:, left:, :3] = cost_colors((np.arange(height) + 0.5) / height)[:, None]
-    picture[:, left:, 3] = 255
-    return picture
-
-
-def _layer(
-    shape: tuple[int, int], color_model: str, kind: rr.ChannelDatatype, draw_order: float
-) -> rr.Image:
-    """All of a picture but its pixels."""
-    height, width = shape
-    layout = rr.encodings.ImageFormat(
-        width, height, color_model=rr.ColorModel.auto(color_model), channel_datatype=kind
-    )
-    opacity = None if color_model == "L" else 1.0
-    return rr.Image.from_fields(format=layout, opacity=opacity, draw_order=draw_order)
-
-
-def _bar_edges(width: int) -> tuple[int, int]:
-    left = width + max(1, round(_BAR[0] * width))
-    return left, left + max(1, round((_BAR[1] - _BAR[0]) * width))
-
-
-def _stretch(archive: ArchiveSnapshot) -> tuple[int, int]:
-    """By how much a cell is drawn wider and higher, so that the map is not a thin line."""
-    width, height = archive.shape[0], _rows(archive)
-    return max(1, height // (_FLATTEST * width)), max(1, width // (_FLATTEST * height))
 
 
 def _rows(archive: ArchiveSnapshot) -> int:
@@ -197,35 +108,16 @@ def _places(archive: ArchiveSnapshot, cells: IntArray) -> tuple[IntArray, IntArr
     return columns, rows
 
 
-def _labels(archive: ArchiveSnapshot, frame: Frame, scale: CostScale, step: int) -> list[Label]:
-    """Caption, tick values and axis names."""
-    pad = 0.04 * max(frame.width, frame.height)
+def _texts(step: int, archive: ArchiveSnapshot, scale: CostScale) -> list[str]:
+    """Caption with what runs upwards, and what runs to the right."""
+    refinement = f", refinement {archive.refinement}" if archive.refinement else ""
     caption = (
-        f"probe {step}, iteration {archive.iteration}"
-        + (f", refinement {archive.refinement}" if archive.refinement else "")
-        + f": {len(archive.cells)} of {int(np.prod(archive.shape))} cells filled"
+        f"probe {step}, iteration {archive.iteration}{refinement}: {len(archive.cells)} of "
+        f"{int(np.prod(archive.shape))} cells filled, cost {number(scale.low)} to "
+        f"{number(scale.high)}"
     )
-    middle = frame.width / 2
-    labels: list[Label] = [(middle, -3.6 * pad, caption)]
-    labels += [(frame.x(f), frame.height + 0.3 * pad, text) for f, text in _ticks(archive, 0)]
-    labels += [(middle, frame.height + 2.2 * pad, archive.measure_names[0])]
-    if len(archive.shape) > 1:
-        labels += [(-1.4 * pad, frame.y(f) - 0.6 * pad, text) for f, text in _ticks(archive, 1)]
-        labels += [(0.0, -1.9 * pad, archive.measure_names[1])]
-    if len(archive.shape) > 2:
-        others = ", ".join(archive.measure_names[2:])
-        labels += [(middle, frame.height + 3.9 * pad, f"lowest cost over {others}")]
-    left, right = _bar_edges(round(frame.width))
-    places = [0.0, 0.5, 1.0] if scale.high > scale.low else [0.0]
-    for place in places:
-        text = number(scale.cost_at(place))
-        labels.append((right + 1.8 * pad, frame.y(1.0 - place) - 0.6 * pad, text))
-    labels.append(((left + right) / 2, -1.9 * pad, "cost"))
-    return labels
-
-
-def _ticks(archive: ArchiveSnapshot, measure: int) -> list[tuple[float, str]]:
-    """Round values of a measure: their place along its axis, in [0, 1], and their text."""
-    lower, upper = float(archive.lower[measure]), float(archive.upper[measure])
-    span = upper - lower if upper > lower else 1.0
-    return [((value - lower) / span, number(value)) for value in ticks(lower, upper)]
+    ranges = zip(archive.measure_names, archive.lower, archive.upper, strict=True)
+    across, *others = (f"{name}: {number(low)} to {number(high)}" for name, low, high in ranges)
+    upwards = f"\nupwards {others[0]}" if others else ""
+    lowest = "".join(f"; lowest over {name}" for name in archive.measure_names[2:])
+    return [f"{caption}{upwards}", f"{across}{lowest}"]

@@ -11,7 +11,7 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import Hypotheses
 from replay.colors import CostScale, cost_colors
-from replay.rerun.meshes import DISPLAY_FACES, HIDDEN, coarsened, display_mesh, mesh_poses
+from replay.rerun.scene import HIDDEN, display_mesh, mesh_poses
 
 if TYPE_CHECKING:
     import trimesh
@@ -20,11 +20,7 @@ LEVELS = 8
 """Steps of the cost scale; a mesh entity has one colour, so each step is an entity."""
 MOST = 200
 """More hypotheses than these are not drawn: the lowest in cost are."""
-ALPHA = (48, 10)
-"""Opacities of the lowest and the highest step, of 255."""
-
-_NO_POSES = np.zeros((0, 4, 4))
-_NO_COST = np.full(1, np.nan)
+_ALPHA = (48, 10)  # opacities of the lowest and the highest step, of 255
 _BEST_ALPHA = 150
 
 
@@ -34,27 +30,14 @@ class HypothesisMeshes:
     def __init__(self, stream: rr.RecordingStream, root: str = "scene/hypotheses") -> None:
         self._stream = stream
         self._root = root
-        self._best_color: tuple[int, int, int, int] | None = None
-        self._hidden: set[str] = set()  # entities that show nothing, by what was logged last
 
-    def set_up(
-        self,
-        mesh: trimesh.Trimesh,
-        *,
-        most_faces: int = DISPLAY_FACES,
-        alpha: tuple[int, int] = ALPHA,
-    ) -> None:
-        """Store the object's mesh once for each colour, and show none.
-
-        alpha: opacities of the lowest and the highest step, of 255.
-        """
-        coarse = coarsened(mesh, most_faces)
-        self._stream.log(f"{self._root}/best", display_mesh(coarse), static=True)
-        for level in range(LEVELS):
-            fraction = level / (LEVELS - 1)
-            opacity = round(alpha[0] + fraction * (alpha[1] - alpha[0]))
-            drawn = display_mesh(coarse, (*_rgb((level + 0.5) / LEVELS), opacity))
-            self._stream.log(self._level(level), drawn, static=True)
+    def set_up(self, mesh: trimesh.Trimesh) -> None:
+        """Store the object's mesh once for each colour, and show none."""
+        opacities = np.linspace(*_ALPHA, LEVELS).round().astype(int).tolist()
+        for level, opacity in enumerate(opacities):
+            drawn = display_mesh(mesh, _color(level, opacity))
+            self._stream.log(f"{self._root}/{_name(level)}", drawn, static=True)
+        self._stream.log(f"{self._root}/best", display_mesh(mesh), static=True)
         self.hide()
 
     def draw(self, hypotheses: Hypotheses, scale: CostScale | None = None) -> None:
@@ -63,42 +46,27 @@ class HypothesisMeshes:
         scale: of the colours; by default that of the hypotheses shown.
         """
         shown = shown_hypotheses(hypotheses)
-        poses = inverse(hypotheses.object_from_world[shown])
-        cost = hypotheses.cost[shown]
+        poses, cost = inverse(hypotheses.object_from_world[shown]), hypotheses.cost[shown]
         levels = cost_levels(cost, scale)
         if len(levels):
-            self._color_best(0.0 if scale is None else (levels[0] + 0.5) / LEVELS)
+            best = rr.Mesh3D.from_fields(albedo_factor=_color(levels[0], _BEST_ALPHA))
+            self._stream.log(f"{self._root}/best", best)
         levels[:1] = -1
-        self._poses(f"{self._root}/best", poses[:1], cost[:1])
+        self._poses("best", poses[:1], cost[:1])
         for level in range(LEVELS):
             chosen = levels == level
-            self._poses(self._level(level), poses[chosen], cost[chosen])
+            self._poses(_name(level), poses[chosen], cost[chosen])
 
     def hide(self) -> None:
-        """Show none, whatever was shown before on any timeline."""
-        self._hidden.clear()
-        for entity in (f"{self._root}/best", *map(self._level, range(LEVELS))):
-            self._poses(entity, _NO_POSES, np.zeros(0))
+        """Show none."""
+        for name in ("best", *map(_name, range(LEVELS))):
+            self._poses(name, HIDDEN[:0], np.zeros(0))
 
-    def _color_best(self, fraction: float) -> None:
-        """Colour the best hypothesis by its place on the scale, if it has another colour yet."""
-        color = (*_rgb(fraction), _BEST_ALPHA)
-        if color != self._best_color:
-            self._best_color = color
-            self._stream.log(f"{self._root}/best", rr.Mesh3D.from_fields(albedo_factor=color))
-
-    def _level(self, level: int) -> str:
-        return f"{self._root}/cost_step_{level + 1}"
-
-    def _poses(self, entity: str, world_from_object: FloatArray, cost: FloatArray) -> None:
+    def _poses(self, name: str, world_from_object: FloatArray, cost: FloatArray) -> None:
         if len(world_from_object) == 0:
-            if entity in self._hidden:
-                return
-            self._hidden.add(entity)
-            world_from_object, cost = HIDDEN, _NO_COST
-        else:
-            self._hidden.discard(entity)
-        self._stream.log(entity, mesh_poses(world_from_object), rr.AnyValues(cost=cost))
+            world_from_object, cost = HIDDEN, np.full(1, np.nan)
+        poses = mesh_poses(world_from_object)
+        self._stream.log(f"{self._root}/{name}", poses, rr.AnyValues(cost=cost))
 
 
 def shown_hypotheses(hypotheses: Hypotheses) -> IntArray:
@@ -112,6 +80,10 @@ def cost_levels(cost: FloatArray, scale: CostScale | None = None) -> IntArray:
     return np.minimum((fraction * LEVELS).astype(np.int64), LEVELS - 1)
 
 
-def _rgb(fraction: float) -> tuple[int, int, int]:
-    red, green, blue = cost_colors(fraction).tolist()
-    return red, green, blue
+def _name(level: int) -> str:
+    return f"cost_step_{level + 1}"
+
+
+def _color(level: int, opacity: int) -> tuple[int, int, int, int]:
+    red, green, blue = cost_colors((level + 0.5) / LEVELS).tolist()
+    return red, green, blue, opacity

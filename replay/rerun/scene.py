@@ -1,4 +1,4 @@
-"""The 3-D scene of a Rerun recording: workspace, object, known points, gripper, hypotheses."""
+"""The 3-D scene of a Rerun recording: workspace, object, known points, gripper, hand."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from replay.colors import (
     FREE,
     FREE_FAINT,
     GRIPPER,
+    HAND,
     KNOWN,
     OBJECT,
     OCCUPIED,
@@ -22,98 +23,131 @@ from replay.colors import (
     Rgb,
 )
 from replay.events import Probe
-from replay.rerun.meshes import display_mesh
-from replay.rerun.plane import color_array, on_screen
+from replay.mcap.viewer_messages import simple_mesh
 
 if TYPE_CHECKING:
     import trimesh
 
+    from chsel.next_probe.hand_shape import HandShape
+
 NORMAL_LENGTH = 0.035  # in diagonals of the workspace
 CUMULATIVE = ("free", "occupied", "contacts", "contacts/normals", "known", "gripper/past")
 """What each probe adds to: a view shows these over all probes up to the moment."""
+HIDDEN = np.zeros((1, 4, 4))
+"""A pose that shows nothing: without any, the viewer draws the mesh once, at the origin."""
+_DISPLAY_FACES = 6000  # meshes with more are coarsened for display
+_HAND_ALPHA = 80
 
 
 class Scene:
-    """Draws everything but the hypotheses under the entity `root`."""
+    """Draws everything but hypotheses and actions under the entity `scene`."""
 
-    def __init__(self, stream: rr.RecordingStream, root: str = "scene") -> None:
+    def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
-        self._root = root
         self._normal_length = 0.0
-        self._empty: set[str] = set()  # entities that show nothing, by what was logged last
+        self._has_hand = False
 
     def set_up(
         self, mesh: trimesh.Trimesh, workspace: Workspace, world_from_object: FloatArray | None
     ) -> None:
         """What does not change: the workspace, and the object at its true pose where known."""
-        self._log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         lower, upper = workspace.bounds
         self._normal_length = NORMAL_LENGTH * float(np.linalg.norm(upper - lower))
         box = rr.Boxes3D(
-            mins=[lower],
-            sizes=[upper - lower],
-            colors=color_array(FRAME),
-            radii=on_screen(0.6),
-            fill_mode="MajorWireframe",
+            mins=[lower], sizes=[upper - lower], colors=[FRAME], radii=on_screen(0.6), fill_mode=1
         )
-        self._log("workspace", box, static=True)
-        if world_from_object is None:
-            return
-        pose = rr.Transform3D(
-            translation=world_from_object[:3, 3], mat3x3=world_from_object[:3, :3]
-        )
-        self._log("object", display_mesh(mesh, (*OBJECT, 255)), pose, static=True)
+        self._stream.log("scene/workspace", box, static=True)
+        if world_from_object is not None:
+            self.add_mesh("object", mesh, world_from_object, (*OBJECT, 255))
 
-    def add_points(self, points: KnownPoints, *, new: bool) -> None:
-        """Points that become known; `new` ones are also shown stronger until the next probe."""
+    def add_mesh(
+        self,
+        name: str,
+        mesh: trimesh.Trimesh,
+        world_from_mesh: FloatArray,
+        color: tuple[int, int, int, int],
+    ) -> None:
+        """A mesh at one pose (4, 4) all the time."""
+        pose = rr.Transform3D(translation=world_from_mesh[:3, 3], mat3x3=world_from_mesh[:3, :3])
+        self._stream.log(f"scene/{name}", display_mesh(mesh, color), pose, static=True)
+
+    def add_hand(self, hand: trimesh.Trimesh | HandShape) -> None:
+        """The hand, which probes show where they are deepest."""
+        drawn = display_mesh(coarsened(hand), (*HAND, _HAND_ALPHA))
+        self._stream.log("scene/hand", drawn, static=True)
+        self._stream.log("scene/hand", mesh_poses(HIDDEN))
+        self._has_hand = True
+
+    def add_points(self, points: KnownPoints) -> None:
+        """Points that become known."""
         exact = points.sdf == 0.0
         self._points("free", points.free, FREE_FAINT, size=0.9)
         self._points("occupied", points.occupied, OCCUPIED, size=2.5)
         self._points("known", points.known[~exact], KNOWN, size=3.0)
         self._points("contacts", points.known[exact], CONTACT, size=5.0)
-        if new:
-            self._points("free/new", points.free, FREE, size=1.4)
 
     def add_probe(self, probe: Probe) -> None:
-        """The gripper's path, what it met, and what became known."""
-        self.add_points(probe.new_points, new=True)
-        path = probe.gripper_path[:, :3, 3].astype(np.float32)
-        self._log("gripper/past", _path(path, PAST, 0.8))
-        self._log("gripper/path", _path(path, GRIPPER, 1.6))
-        self._points("gripper/end", probe.gripper_path[-1:, :3, 3], GRIPPER, size=4.0)
-        self._normals(probe)
+        """The gripper's path, what it met, and what became known, shown stronger for this probe."""
+        path = probe.gripper_path
+        self.add_points(probe.new_points)
+        self._points("free/new", probe.new_points.free, FREE, size=1.4)
         self._points("contacts/new", probe.contacts, CONTACT, size=7.0)
-
-    def _normals(self, probe: Probe) -> None:
+        self._points("gripper/end", path[-1:, :3, 3], GRIPPER, size=4.0)
+        strips = [path[:, :3, 3]] if len(path) > 1 else []
+        for name, color, width in (("past", PAST, 0.4), ("path", GRIPPER, 0.8)):
+            line = rr.LineStrips3D(strips, colors=[color], radii=on_screen(width))
+            self._stream.log(f"scene/gripper/{name}", line)
         known = np.abs(probe.contact_normals).sum(axis=1) > 0.0
-        if self._stays_empty("contacts/normals", not known.any()):
-            return
-        arrows = rr.Arrows3D(
-            origins=probe.contacts[known].astype(np.float32),
-            vectors=(self._normal_length * probe.contact_normals[known]).astype(np.float32),
-            colors=color_array(CONTACT),
+        normals = rr.Arrows3D(
+            origins=probe.contacts[known],
+            vectors=self._normal_length * probe.contact_normals[known],
+            colors=[CONTACT],
             radii=on_screen(1.4),
         )
-        self._log("contacts/normals", arrows)
+        self._stream.log("scene/contacts/normals", normals)
+        if self._has_hand:
+            pose = path[None, deepest(path)] if len(path) else HIDDEN
+            self._stream.log("scene/hand", mesh_poses(pose))
 
     def _points(self, name: str, points: FloatArray, color: Rgb, *, size: float) -> None:
-        if self._stays_empty(name, len(points) == 0):
-            return
-        positions = np.ascontiguousarray(points, dtype=np.float32)
-        self._log(name, rr.Points3D(positions, colors=color_array(color), radii=on_screen(size)))
-
-    def _stays_empty(self, name: str, empty: bool) -> bool:
-        """Whether there is nothing to log about an entity, which was empty and is so now."""
-        before = name in self._empty
-        (self._empty.add if empty else self._empty.discard)(name)
-        return empty and before
-
-    def _log(
-        self, name: str, what: rr.AsComponents, *more: rr.AsComponents, static: bool = False
-    ) -> None:
-        self._stream.log(f"{self._root}/{name}" if name else self._root, what, *more, static=static)
+        drawn = rr.Points3D(points, colors=[color], radii=on_screen(size))
+        self._stream.log(f"scene/{name}", drawn)
 
 
-def _path(path: np.ndarray, color: Rgb, width: float) -> rr.LineStrips3D:
-    strips = [path] if len(path) > 1 else []
-    return rr.LineStrips3D(strips, colors=color_array(color), radii=on_screen(width / 2))
+def on_screen(radius: float) -> np.ndarray:
+    """A radius in points of the screen, however far away."""
+    return np.asarray(rr.Radius.ui_points(radius))
+
+
+def coarsened(mesh: trimesh.Trimesh | HandShape, most: int = _DISPLAY_FACES) -> trimesh.Trimesh:
+    """Vertices and faces alone, as an MCAP file keeps them, of a mesh for the eye."""
+    import trimesh
+
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    return whole if len(mesh.faces) <= most else trimesh.Trimesh(*simple_mesh(whole, most))
+
+
+def display_mesh(
+    mesh: trimesh.Trimesh, color: tuple[int, int, int, int] | None = None
+) -> rr.Mesh3D:
+    """A mesh for the viewer, smoothly shaded; None leaves its colour open."""
+    return rr.Mesh3D(
+        vertex_positions=mesh.vertices,
+        triangle_indices=mesh.faces,
+        vertex_normals=mesh.vertex_normals,
+        albedo_factor=color,
+    )
+
+
+def mesh_poses(world_from_mesh: FloatArray) -> rr.InstancePoses3D:
+    """Where the mesh of an entity is drawn, once at each pose (N, 4, 4)."""
+    return rr.InstancePoses3D(
+        translations=world_from_mesh[:, :3, 3], mat3x3=world_from_mesh[:, :3, :3]
+    )
+
+
+def deepest(gripper_path: FloatArray) -> int:
+    """Index of the pose (P, 4, 4) that is furthest forward: along z of the first, the approach."""
+    advance = (gripper_path[:, :3, 3] - gripper_path[0, :3, 3]) @ gripper_path[0, :3, 2]
+    return int(np.argmax(advance))

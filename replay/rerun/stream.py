@@ -1,27 +1,38 @@
-"""Streams of Rerun into new .rrd files, and whether these get what they are sent."""
+"""Streams of Rerun into new .rrd files and live viewers, and the times of what is logged."""
 
 from __future__ import annotations
 
-import os
-import time
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Thread
 
 import rerun as rr
 
 from chsel.errors import RecordingError
-from replay.files import require_new, sync_file, sync_folder
 
-_END = b"RRF2FOOT"  # near the end of every finished .rrd file
-_END_SIZE = 64  # bytes
+PROBE = "probe"
+ITERATION = "iteration"
 _FLUSH_SECONDS = 10.0
-_MOMENT = 2.0  # seconds in which any disk writes something of what waits
 
 
-def new_stream(application: str, *sinks: rr.FileSink | rr.GrpcSink) -> rr.RecordingStream:
-    """A stream without clocks, to all sinks. Raises OSError or RuntimeError if one fails."""
+def new_stream(
+    application: str, path: Path | None, viewer: rr.GrpcSink | None = None
+) -> rr.RecordingStream:
+    """A stream without clocks to a new file, a viewer, or both.
+
+    Raises RecordingError if the file exists or cannot be written.
+    """
+    sinks: list[rr.FileSink | rr.GrpcSink] = [] if viewer is None else [viewer]
+    if path is not None:
+        try:
+            path.open("xb").close()
+        except OSError as error:
+            raise RecordingError(
+                f"{path} cannot be written ({error.strerror or error}); accepted: a new .rrd file"
+            ) from None
+        sinks.append(rr.FileSink(path))
     stream = rr.RecordingStream(application, send_properties=False)
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
@@ -38,101 +49,65 @@ def new_file_stream(path: Path, application: str) -> Iterator[rr.RecordingStream
 
     Raises RecordingError if the file exists or cannot be written.
     """
-    require_new(path)
-    file = RrdFile(path)
+    stream = new_stream(application, path)
     try:
-        stream = new_stream(application, file.sink)
-        try:
-            yield stream
-        except BaseException:
-            stream.disconnect()
-            raise
-        try:
-            with suppress(RuntimeError):  # a writer that has failed, which shows in the file
-                stream.flush(timeout_sec=_FLUSH_SECONDS)
-            file.check(grown=True)
-            stream.disconnect()
-            file.finish()
-        except RecordingError:
-            abandon(stream)
-            raise
+        yield stream
+        flush(stream, path)
     except BaseException:
         path.unlink(missing_ok=True)
         raise
+    finally:
+        stream.disconnect()
 
 
-class RrdFile:
-    """A file that Rerun writes in a thread of its own, whose errors do not come to its callers."""
+def flush(stream: rr.RecordingStream, path: Path | None, *, must: bool = True) -> None:
+    """Hand all that was logged to the operating system, and to the viewer if there is one.
 
-    def __init__(self, path: Path) -> None:
-        """Raises RecordingError if the file cannot be written."""
-        self._path = path
-        self._size: int | None = 0  # at the last check
-        try:
-            path.open("wb").close()
-        except OSError as error:
-            raise self._error(error) from None
-
-    @property
-    def sink(self) -> rr.FileSink:
-        """Where to send what belongs into the file."""
-        return rr.FileSink(self._path)
-
-    def check(self, *, grown: bool, late: bool = False) -> None:
-        """Raise RecordingError if the file is gone, or has not grown though it should have.
-
-        grown: whether something that takes space was flushed since the last check. late: the flush
-        gave up, with much that waits to be written.
-        """
-        before = self._size
-        if late:
-            before = self._current_size()
-            time.sleep(_MOMENT)
-        self._size = self._current_size()
-        if self._size is None:
-            raise RecordingError(f"recording {self._path} is not there any more")
-        if grown and self._size == before:
-            raise RecordingError(f"recording {self._path} cannot be written: the disk may be full")
-
-    def finish(self, *, whole: bool = True) -> None:
-        """Wait until the file is on the disk. Raises RecordingError if it does not get there.
-
-        whole: whether to see to it that the file has its end.
-        """
-        self.check(grown=False)
-        try:
-            sync_file(self._path)
-        except OSError as error:
-            raise self._error(error) from None
-        sync_folder(self._path.parent)
-        if not whole:
-            return
-        with self._path.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _END_SIZE))
-            if _END not in file.read():
-                raise RecordingError(
-                    f"recording {self._path} cannot be written to its end: the disk may be full"
-                )
-
-    def _current_size(self) -> int | None:
-        """In bytes; None if the file is not there."""
-        try:
-            return self._path.stat().st_size
-        except OSError:
-            return None
-
-    def _error(self, error: OSError) -> RecordingError:
-        reason = error.strerror or error
-        return RecordingError(
-            f"{self._path} cannot be written ({reason}); accepted: a new .rrd file"
-        )
-
-
-def abandon(stream: rr.RecordingStream) -> None:
-    """Leave a stream as it is until the process ends.
-
-    Rerun waits for a writer that has failed, in its clean-up at exit and when a stream goes away,
-    and may do so for ever. So there is no clean-up, and a thread that waits for ever keeps it.
+    must: raise RecordingError, which names the file, if it is not taken, so that nothing more can
+    be logged; otherwise warn. After an error, Rerun would wait for the file when the stream or the
+    process ends, for ever: so neither is cleaned up.
     """
-    rr.unregister_shutdown()
-    Thread(target=lambda _: Event().wait(), args=(stream,), daemon=True).start()
+    try:
+        stream.flush(timeout_sec=_FLUSH_SECONDS)
+    except RuntimeError as error:
+        if not must:
+            warnings.warn(f"the live view or the file does not follow: {error}", stacklevel=2)
+            return
+        rr.unregister_shutdown()
+        Thread(target=lambda _: Event().wait(), args=(stream,), daemon=True).start()
+        message = f"recording {path} cannot be written: the disk may be full"
+        raise RecordingError(message) from None
+
+
+class Clock:
+    """Sets the times of what is logged.
+
+    On the timeline `probe` a moment is the step of a probe, and shows what was known and found by
+    its end. On `iteration` it is a running count of the iterations of all stages of all
+    registrations, one extra per registration, so that scrubbing it plays every snapshot in order,
+    with the scene of its time.
+    """
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self.iteration = 0
+        self._stream = stream
+        self._stages: dict[str, int] = {}
+
+    def set_probe(self, step: int) -> None:
+        """All that is logged from here on belongs to probe `step`."""
+        self._stream.set_time(PROBE, sequence=step)
+        self._set_iteration(self.iteration)
+
+    def tick(self) -> None:
+        """A registration starts, or a moment passes with something of its own to see."""
+        self._stages = {}
+        self._set_iteration(self.iteration + 1)
+
+    def advance(self, stage: str, iteration: int) -> None:
+        """A stage of this registration has done `iteration` iterations; stages come in turn."""
+        start = self._stages.setdefault(stage, self.iteration)
+        self._set_iteration(max(self.iteration, start + iteration))
+
+    def _set_iteration(self, iteration: int) -> None:
+        self.iteration = iteration
+        self._stream.set_time(ITERATION, sequence=iteration)

@@ -1,4 +1,4 @@
-"""What a session is, as text for people."""
+"""What a session and its results are, as text for people."""
 
 from __future__ import annotations
 
@@ -10,8 +10,23 @@ from typing import Any
 import yaml
 
 from chsel.problem.noise import FREEDOMS
-from chsel.problem.registration_problem import VERDICTS, Trust
+from chsel.problem.registration_problem import VERDICTS, Hypotheses, Trust
+from replay.colors import CostScale, number
 from replay.events import SessionStarted
+from replay.rerun.hypotheses import shown_hypotheses
+
+COLORS = """
+| in the scene | colour |
+|---|---|
+| contacts | red |
+| free space, of the last probe | blue, bright |
+| occupied, other known points | orange, violet |
+| gripper, its paths before | white, grey |
+| object at its true pose | white |
+| hypotheses by cost | yellow: lowest; green; violet: highest |
+| actions by score | pale: best; brown: worst; grey: not possible |
+| next action, contacts it forecasts | cream, pink |
+"""
 
 
 class _Dumper(yaml.SafeDumper):
@@ -30,20 +45,25 @@ def session_markdown(started: SessionStarted) -> str:
         "method": f"{started.method}, preset {preset}" if preset else started.method,
         "seed": started.seed,
         "true pose": "known" if started.world_from_object is not None else "unknown",
+        "policy": _find(started.config, "policy"),
+        "problems of": f"recording {started.source}" if started.source else "",
     }
-    if policy := _find(started.config, "policy"):
-        rows["policy"] = policy
-    if started.source:
-        rows["problems of"] = f"recording {started.source}"
-    lines = [f"| {name} | **{_literal(text)}** |" for name, text in rows.items()]
-    table = [lines[0], "|---|---|", *lines[1:]]
-    parts = ["\n".join(table)]
+    lines = [f"| {name} | **{literal(text)}** |" for name, text in rows.items() if text != ""]
+    parts = ["\n".join([lines[0], "|---|---|", *lines[1:]])]
     for title, mapping in (("Configuration", started.config), ("Environment", started.environment)):
         if mapping:
             text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False)
             fence = "`" * (1 + max([2, *map(len, re.findall("`+", text))]))
             parts.append(f"**{title}**\n{fence}\n{text}{fence}")
     return "\n\n".join(parts) + "\n"
+
+
+def costs_markdown(hypotheses: Hypotheses, scale: CostScale | None = None) -> str:
+    """How many hypotheses are drawn, and the costs at the ends of the scale of their colours."""
+    shown = shown_hypotheses(hypotheses)
+    scale = scale or CostScale.of(hypotheses.cost[shown])
+    colors = f"cost {number(scale.low)} (yellow) to {number(scale.high)} (violet)"
+    return f"{len(shown)} of {len(hypotheses.cost)} hypotheses drawn; {colors}"
 
 
 def verdict_markdown(values: Mapping[str, float], known: int) -> str:
@@ -61,13 +81,13 @@ def verdict_markdown(values: Mapping[str, float], known: int) -> str:
     return f"# {trust.verdict}\n\n{reasons.rstrip(')')}\n"
 
 
-def _literal(text: Any) -> str:
+def literal(text: Any) -> str:
     """Text that Markdown takes for nothing else."""
     return re.sub(r"([\\`*_\[\]<>|#~$&])", r"\\\1", str(text))
 
 
 def _find(config: Mapping[str, Any], name: str) -> Any:
-    """The choice of a group at the top of the configuration, or in its group `method`."""
+    """The choice of a group at the top of the configuration or in its group `method`, or ""."""
     method = config.get("method")
     found = config.get(name) or (method.get(name) if isinstance(method, Mapping) else None)
-    return found.get("name") if isinstance(found, Mapping) else found
+    return (found.get("name") if isinstance(found, Mapping) else found) or ""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
 import tempfile
 import webbrowser
 from contextlib import suppress
@@ -16,10 +18,10 @@ from replay.mcap.reader import Recording, read_recording
 from replay.rerun.rerun_recorder import draw_recording
 from replay.rerun.viewer import has_screen, web_server, window
 
-_STEP_HELP = (
-    "probe to show, by default the first with a registration; in a saved file and in a browser "
-    "none follows it"
-)
+_STEP_HELP = "last probe to show, by default that of the recording"
+
+
+_ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,12 +56,13 @@ def run(given: argparse.Namespace) -> int:
         return 0
     with tempfile.TemporaryDirectory(prefix="replay-view-") as folder:
         rrd = Path(folder) / "recording.rrd"
-        if given.web:  # which takes no order where to stand
-            _draw(recording, rrd, given.step)
+        _draw(recording, rrd, given.step)
+        for number in _ENDINGS:  # that end the viewer and remove the folder, too
+            signal.signal(number, lambda number, _: sys.exit(128 + number))
+        if given.web:
             _show_in_browser(rrd, console)
         else:
-            _draw(recording, rrd)
-            with suppress(KeyboardInterrupt), window(rrd, step=given.step) as viewer:
+            with suppress(KeyboardInterrupt), window(rrd) as viewer:
                 viewer.wait()
     return 0
 
@@ -74,7 +77,7 @@ def _show_in_browser(rrd: Path, console: Console) -> None:
         server.wait()
 
 
-def _draw(recording: Recording, path: Path, last: int | None = None) -> None:
+def _draw(recording: Recording, path: Path, last: int | None) -> None:
     progress = Console(stderr=True)
     if progress.is_terminal:
         with progress.status(f"drawing {len(recording.probes)} probes"):

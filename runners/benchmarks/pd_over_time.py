@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,13 +15,13 @@ from chsel.methods.method import Method
 from chsel.numerics.threads import threads
 from chsel.plausible.plausible_set import PlausibleSet
 from chsel.plausible.plausible_settings import plausible_settings
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import settings_mapping
-from runners.benchmarks.registrations import Scope
 from runners.benchmarks.timing import Row
 from runners.evaluation.contenders import chosen_contenders
 from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Trial
-from runners.evaluation.trial_session import load_members, make_session, open_recorded
+from runners.evaluation.trial_session import load_members, make_session, open_recorded, problems
 
 PD, TIME = "PD over time", "PD over time, time"
 """Measures: rows of the former have the median time, milliseconds, as their place."""
@@ -82,71 +80,53 @@ EFFORTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
 """Settings by effort, of each method in a preset, the default one where none is named."""
 
 
-@dataclass
-class _Found:
-    """What one effort of a method takes and gives, problem by problem."""
-
-    method: Method
-    milliseconds: list[float] = field(default_factory=list)
-    diversity: list[float] = field(default_factory=list)  # mm^2
-
-
-def pd_over_time(scope: Scope) -> Iterator[Row]:
+def pd_over_time() -> Iterator[Row]:
     """The time of a registration, and the geometric mean of its PD, on development sessions.
 
     Every method gets the problems of probed sessions, each without a result before it. Times are
     those of the processor, on one thread. All of it takes some minutes.
     """
-    found = {
-        curve: {name: _Found(_method(curve, changes)) for name, changes in efforts.items()}
+    methods = {
+        (curve, effort): _method(curve, changes)
         for curve, efforts in EFFORTS.items()
+        for effort, changes in efforts.items()
     }
+    taken: dict[tuple[str, str], list[float]] = {case: [] for case in methods}  # ms
+    diversity: dict[tuple[str, str], list[float]] = {case: [] for case in methods}  # mm^2
     with TemporaryDirectory() as folder:
         plan = _plan(Path(folder))
         for trial in _TRIALS:
-            session = _Session(plan, trial)
-            for efforts in found.values():
-                for one in efforts.values():
-                    session.register(one)
-    for curve, efforts in found.items():
-        for name, one in efforts.items():
-            taken = Row(TIME, name, curve, "ms", tuple(one.milliseconds))
-            mean = float(np.exp(np.log(np.maximum(one.diversity, _LEAST)).mean()))
-            yield taken
-            yield Row(PD, name, curve, "mm²", (mean,), taken.median)
+            make_session(plan, trial)
+            session = open_recorded(plan, trial)
+            assert session.world_from_object is not None
+            members: dict[int, PlausibleSet] = {}  # by step
+            mesh, truth = session.recorded.mesh, session.world_from_object
+            metrics = HypothesisMetrics(plan.metrics, mesh, truth)
+            for case, method in methods.items():
+                for problem in problems(plan, trial, session, method.online):
+                    milliseconds, found = _timed(method, problem, warm=bool(taken[case]))
+                    taken[case].append(milliseconds)
+                    step = problem.key.step
+                    if step not in members:
+                        members[step] = load_members(plan, trial, session, problem)
+                    measured = metrics.compute(problem, members[step], found, ranked=False)
+                    diversity[case].append(measured.get("diversity", np.inf))
+    for case, samples in taken.items():
+        curve, effort = case
+        row = Row(TIME, effort, curve, "ms", tuple(samples))
+        mean = float(np.exp(np.log(np.maximum(diversity[case], _LEAST)).mean()))
+        yield row
+        yield Row(PD, effort, curve, "mm²", (mean,), at=row.median)
 
 
-class _Session:
-    """A probed session with its plausible sets."""
-
-    def __init__(self, plan: Plan, trial: Trial) -> None:
-        trial.folder(plan).mkdir(parents=True)
-        make_session(plan, trial)
-        self._session = session = open_recorded(plan, trial)
-        self._seed, self._only = trial.seed, plan.steps_of(trial.configuration)
-        self._members = partial(load_members, plan, trial, session)
-        self._loaded: dict[int, PlausibleSet] = {}  # by step
-        assert session.world_from_object is not None
-        mesh, truth = session.recorded.mesh, session.world_from_object
-        self._metrics = HypothesisMetrics(plan.metrics, mesh, truth)
-
-    def register(self, one: _Found) -> None:
-        """Time the chosen steps, and measure what is found."""
-        online = self._session.online(one.method.online, self._seed, only=self._only)
-        for step in online.steps(self._session.perceived()):
-            if (problem := step.problem) is None:
-                continue
-            with threads(1):
-                if not one.milliseconds:
-                    one.method.register(problem)  # loads what is compiled
-                begun = time.thread_time()
-                hypotheses = one.method.register(problem)
-                one.milliseconds.append(1000.0 * (time.thread_time() - begun))
-            if step.step not in self._loaded:
-                self._loaded[step.step] = self._members(problem)
-            members = self._loaded[step.step]
-            measured = self._metrics.compute(problem, members, hypotheses, ranked=False)
-            one.diversity.append(measured.get("diversity", np.inf))
+def _timed(method: Method, problem: RegistrationProblem, *, warm: bool) -> tuple[float, Hypotheses]:
+    """Milliseconds of a registration. warm: whether the method has registered before."""
+    with threads(1):
+        if not warm:
+            method.register(problem)  # loads what is compiled
+        begun = time.thread_time()
+        found = method.register(problem)
+        return 1000.0 * (time.thread_time() - begun), found
 
 
 def _method(curve: str, changes: Mapping[str, Any]) -> Method:

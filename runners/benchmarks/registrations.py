@@ -1,32 +1,49 @@
-"""Registrations by this library, with the number of steps that the comparison prescribes."""
+"""Registrations by this library and by the published package, with equal numbers of steps."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
-from unittest.mock import patch
+from functools import partial
+
+import numpy as np
 
 from chsel.cost.cost_settings import CostSettings
-from chsel.cost.objective import Objective
-from chsel.errors import require_positive
+from chsel.cost.torch_cost import RelaxedCost
+from chsel.errors import ChselError, require_positive
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, Observer
+from chsel.problem.registration_problem import (
+    ArchiveSnapshot,
+    Hypotheses,
+    Observer,
+    RegistrationProblem,
+)
 from chsel.problem.settings import in_preset
+from runners.benchmarks.problems import PROBLEMS, drill, pose
+from runners.benchmarks.timing import Row, in_turn
+from runners.published_package.process import PublishedPackage
 
-if TYPE_CHECKING:
-    from runners.benchmarks.problems import PosedProblem
-
+WHAT = (
+    "Timed is one call, from arrays of points to poses: constructors are in it, building the "
+    "signed distance grid and what follows from it alone is not. Both packages read the same grid "
+    "and start from the same poses, one thread each, one after the other. The presets reference "
+    "and paper do as many steps as the package; default and the method anchored are measured as "
+    "they ship: they start from further poses, and stop by their own rules."
+)
+PACKAGE = "package"  # begins the names of its registrations
 PRESETS = ("reference", "paper", "default")
 EQUAL_STEPS = ("reference", "paper")
 """Presets that do as many steps as the package; all else is registered as it ships."""
 SIZES = tuple(f"anchored, {size}" for size in ("small", "medium", "adaptive"))
 OURS = (*PRESETS, *SIZES)
 """Registrations by this library: presets of CHSEL, and sizes of the method `anchored`."""
+
+
+class BenchmarkError(ChselError):
+    """Both sides would not do the same work."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +58,6 @@ class Steps:
     def __post_init__(self) -> None:
         for name in ("restarts", "adam", "search", "long_search"):
             require_positive(name, getattr(self, name))
-
-    def searching(self, *, long: bool) -> int:
-        """Iterations of the search of one registration."""
-        return self.long_search if long else self.search
 
 
 def method(name: str, steps: Steps, search: int) -> Method:
@@ -63,63 +76,86 @@ def method(name: str, steps: Steps, search: int) -> Method:
     return build_method("chsel", settings)
 
 
-@contextmanager
-def descents_counted() -> Iterator[list[int]]:
-    """Collects how many poses each call of Adam evaluates with their gradients."""
-    counts: list[int] = []
-    block = Objective.block
-
-    def counted(
-        objective: Objective, vectors: FloatArray, divisor: float, rate: float, iterations: int
-    ) -> tuple[FloatArray, FloatArray]:
-        counts.append(len(vectors) * iterations)
-        return block(objective, vectors, divisor, rate, iterations)
-
-    with patch.object(Objective, "block", counted):
-        yield counts
-
-
 def register(
-    posed: PosedProblem,
+    problem: RegistrationProblem,
     name: str,
     steps: Steps,
     search: int,
     observer: Observer | None = None,
 ) -> tuple[float, Hypotheses]:
-    """Seconds from arrays to hypotheses by one of OURS, and these; only the SDF grid is there."""
+    """Milliseconds from arrays to hypotheses by one of OURS, and these; the SDF grid is there."""
     begun = time.perf_counter()
-    problem = posed.registration_problem()
-    hypotheses = method(name, steps, search).register(problem, observer)
-    return time.perf_counter() - begun, hypotheses
+    fresh = replace(problem, points=replace(problem.points))  # which has nothing computed yet
+    found = method(name, steps, search).register(fresh, observer)
+    return 1000.0 * (time.perf_counter() - begun), found
 
 
-@dataclass(frozen=True)
-class Scope:
-    """How much is measured of this library alone."""
+def compare(
+    name: str,
+    steps: Steps,
+    repeats: int,
+    seed: int,
+    package: PublishedPackage | None,
+    *,
+    equation: bool,
+) -> Iterator[Row]:
+    """Rows of one of PROBLEMS: OURS, and in turn with them the package.
 
-    steps: Steps
-    repeats: int
-    seed: int
-    free_points: tuple[int, ...] = ()  # sizes that show how the time grows
-    hypotheses: tuple[int, ...] = ()
+    The first registration of everyone is not counted. equation: the package with the paper's own
+    free term as well, a third as often, the first one included. cost: of the best pose under the
+    paper's equation, the same measure for everyone.
+    """
+    problem = pose(PROBLEMS[name], seed)
+    search = steps.long_search if PROBLEMS[name].long else steps.search
+    found: dict[str, FloatArray] = {}  # poses (B, 4, 4) by who found them
 
-    def timed(self, posed: PosedProblem, name: str) -> tuple[float, ...]:
-        """Milliseconds of repeated registrations of a problem, after one that is not counted."""
-        self.seconds(posed, name)
-        return tuple(1000.0 * self.seconds(posed, name) for _ in range(self.repeats))
+    def ours(who: str, name: str) -> float:
+        taken, hypotheses = register(problem, name, steps, search)
+        found[who] = hypotheses.object_from_world
+        return taken
 
-    def seconds(self, posed: PosedProblem, name: str) -> float:
-        """Seconds of one registration by one of OURS."""
-        return register(posed, name, self.steps, self.steps.search)[0]
+    def theirs(who: str, cost: str) -> float:
+        assert package is not None
+        answer = package.register(
+            cost=cost,
+            restarts=steps.restarts,
+            steps=steps.adam,
+            search=search,
+            seed=seed,
+        )
+        # One gradient in an Adam step, one in an iteration of the search.
+        gradients = steps.restarts * steps.adam + search
+        require_equal("gradients of the package", answer["gradients"], gradients)
+        free_points = len(problem.points.free)
+        require_equal("free points of the package", answer["free_points"], free_points)
+        found[who] = np.array(answer["poses"])
+        return 1000.0 * float(answer["seconds"])
+
+    for preset in EQUAL_STEPS:
+        timer = StageTimer()
+        register(problem, preset, steps, search, timer)
+        counted = tuple(timer.iterations.values())
+        require_equal("iterations of ours", counted, (steps.restarts * steps.adam, search))
+    labels = {one if one in SIZES else f"ours, {one}": one for one in OURS}
+    often = {who: partial(ours, who, one) for who, one in labels.items()}
+    seldom = {}
+    if package is not None:
+        package.load(problem, drill(PROBLEMS[name].scale)[0].bounds)
+        often[PACKAGE] = partial(theirs, PACKAGE, "default")
+        if equation:
+            who = f"{PACKAGE}, Eq. 8"
+            seldom[who] = partial(theirs, who, "equation")
+    samples = in_turn(repeats, often) | in_turn(max(1, repeats // 3), seldom, first_counts=True)
+    cost = RelaxedCost.of(problem, in_preset(CostSettings(), "paper"))
+    for who, taken in samples.items():
+        least = float(cost.evaluate(found[who]).min())
+        yield Row("registration", name, who, "ms", taken, cost=least)
 
 
-def common_costs(posed: PosedProblem, poses: FloatArray) -> FloatArray:
-    """Costs (B,) of poses (B, 4, 4) under the paper's equation: the same measure for everyone."""
-    # A registration needs no torch, and a fresh process that is timed does not import it for this.
-    from chsel.cost.torch_cost import RelaxedCost
-
-    paper = in_preset(CostSettings(), "paper")
-    return RelaxedCost.of(posed.registration_problem(), paper).evaluate(poses)
+def require_equal(what: str, counted: object, expected: object) -> None:
+    """Raise BenchmarkError if one side would do less work than the other."""
+    if counted != expected:
+        raise BenchmarkError(f"{what}: {counted} counted, {expected} expected: nothing to compare")
 
 
 class StageTimer:
@@ -127,15 +163,14 @@ class StageTimer:
 
     snapshot_interval = 0
 
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.iterations: dict[str, int] = {}
-        self._clock = clock
-        self._mark = clock()
+        self._mark = time.perf_counter()
 
     def progress(self, stage: str, iteration: int, total: int) -> None:
         """The time since the last report is the stage's."""
-        now = self._clock()
+        now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
         self.iterations[stage] = iteration
         self._mark = now

@@ -1,21 +1,16 @@
-"""Repeated measurements, and the machine on which they are taken."""
+"""Repeated measurements, and how busy the machine is on which they are taken."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from chsel.numerics.threads import threads
-from replay.environment import environment
-from replay.startup import package_version
-
-_PACKAGES = ("numba", "llvmlite", "scipy")
 
 
 @dataclass(frozen=True)
@@ -27,7 +22,8 @@ class Row:
     who: str  # which registration
     unit: str
     samples: tuple[float, ...]  # in the order in which they were taken
-    at: float | None = None  # the case as a number, to plot
+    at: float | None = None  # of PD over time: milliseconds
+    cost: float | None = None  # of the best pose of a registration
 
     @property
     def median(self) -> float:
@@ -44,8 +40,7 @@ class Row:
         """The row as the report's file has it."""
         lower, upper = self.quartiles
         quartiles = {"lower_quartile": lower, "upper_quartile": upper}
-        samples = {"samples": list(self.samples)}
-        return {**vars(self), "median": self.median, **quartiles, **samples}
+        return {**asdict(self), "median": self.median, **quartiles}
 
 
 def in_turn(
@@ -62,25 +57,18 @@ def in_turn(
     return {name: tuple(values[-repeats:]) for name, values in samples.items()}
 
 
-def milliseconds(run: Callable[[], object], count: int | None = None) -> float:
-    """What a run takes, on so many threads where that is given."""
-    with nullcontext() if count is None else threads(count):
+def milliseconds(run: Callable[[], object], count: int = 1) -> float:
+    """What a run takes on so many threads."""
+    with threads(count):
         begun = time.perf_counter()
         run()
         return 1000.0 * (time.perf_counter() - begun)
 
 
-def machine() -> dict[str, Any]:
-    """Processor, cores, Python and versions."""
-    values: dict[str, Any] = {**environment(), "cores": os.cpu_count(), "cores_usable": cores()}
-    return values | {f"package {name}": package_version(name) for name in _PACKAGES}
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def cores() -> dict[str, int | None]:
+    """How many the machine has, and how many this process may use."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"cores": os.cpu_count(), "cores_usable": usable}
 
 
 def load() -> float | None:

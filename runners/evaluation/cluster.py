@@ -7,29 +7,27 @@ import logging
 import os
 import socket
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chsel.errors import SettingError, require_choice, require_positive
 from chsel.numerics.threads import require_threads
 from chsel.problem.settings import build_settings
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 _DASK = {
     "distributed.scheduler.allowed-failures": 1,  # the second worker that a task kills is the last
     "distributed.scheduler.worker-ttl": None,  # a long task may keep a worker from answering
-    "distributed.scheduler.work-stealing": False,  # no worker has a task that it does not do
-    "distributed.deploy.lost-worker-timeout": "5 minutes",  # until a worker is taken for lost
-    "distributed.admin.large-graph-warning-threshold": "1GB",  # files travel with tasks
+    "distributed.deploy.lost-worker-timeout": "5 minutes",  # for a worker to start again
 }
 _PRELOAD = "runners.evaluation.tasks"
 _LOOPBACK = "127.0.0.1"
 _LOCAL_PORT = f"{_LOOPBACK}:0"  # any free port, for this machine alone
 _CONNECT = 30.0  # s
-_PATIENCE = 60.0  # s, before a worker that is not there is given up
 
 
 @dataclass(frozen=True)
@@ -53,8 +51,8 @@ class SlurmConfig:
     queue: str | None  # the partition
     account: str | None
     interface: str | None  # of the network by which jobs reach this machine, such as ib0
-    directives: Any  # a list of further #SBATCH options
-    prologue: Any  # a list of lines of the shell before a worker starts
+    directives: tuple[str, ...]  # further #SBATCH options
+    prologue: tuple[str, ...]  # lines of the shell before a worker starts
     python: str | None  # on the nodes; None: this one
     log_directory: str | None  # of the jobs' output
     dashboard: bool
@@ -62,18 +60,6 @@ class SlurmConfig:
     def __post_init__(self) -> None:
         require_positive("jobs", self.jobs)
         require_threads("processes", self.processes)
-        for name in ("directives", "prologue"):
-            lines = getattr(self, name)
-            if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-                raise SettingError(f"{name} is {lines!r}; accepted: a list of texts")
-
-
-@dataclass(frozen=True)
-class Connection:
-    """A cluster to work on."""
-
-    client: Any  # of Dask
-    restore: Callable[[], object] = lambda: None  # starts workers in place of those that are lost
 
 
 ClusterConfig = LocalConfig | SlurmConfig
@@ -101,8 +87,8 @@ def cluster_config(values: Mapping[str, Any], workers: int | None) -> ClusterCon
 @contextmanager
 def connected(
     config: ClusterConfig, workers: int | None, say: Callable[[str], None]
-) -> Iterator[Connection]:
-    """Connect to the cluster; one that was started for it ends with the context.
+) -> Iterator[tuple[Client, int]]:
+    """A client of the cluster, which ends with the context if it was started for it, and its size.
 
     workers: of this machine, None for one a core. say: shows a line.
     """
@@ -113,21 +99,31 @@ def connected(
         if isinstance(config, LocalConfig) and config.scheduler:
             with _client_of(config.scheduler) as client:
                 say(f"workers of the Dask scheduler at {config.scheduler}")
-                yield Connection(client)
+                yield client, _checked_size(client)
             return
         if isinstance(config, SlurmConfig):
-            started, size = slurm_cluster(config), {"jobs": config.jobs}
+            size = config.jobs * config.processes
+            started = slurm_cluster(config)
         else:
-            size = {"n": workers or _cores()}
-            started = _local_cluster(size["n"], dashboard=config.dashboard)
-        with started as cluster, Client(cluster, set_as_default=False) as client:
-            restore: Callable[[], object] = partial(cluster.scale, **size)
-            restore()
-            if isinstance(config, LocalConfig):
-                restore = _LocalWorkers(cluster, client, size["n"]).restore
+            size = workers or _cores()
+            started = _local_cluster(size, dashboard=config.dashboard)
+        with started as cluster, Client(cluster) as client:
+            if isinstance(config, SlurmConfig):  # another job starts in place of one that is lost
+                cluster.adapt(minimum_jobs=config.jobs, maximum_jobs=config.jobs)
             if config.dashboard:
                 say(f"dashboard: {cluster.dashboard_link}")
-            yield Connection(client, restore)
+            yield client, size
+
+
+def _checked_size(client: Client) -> int:
+    """How many workers a running cluster has. Raises SettingError if one has several threads."""
+    threads = client.nthreads().values()
+    if max(threads, default=1) > 1:
+        raise SettingError(
+            f"a worker has {max(threads)} threads; accepted: one, as of `dask worker "
+            "--nthreads 1 --nworkers NUMBER`"
+        )
+    return max(1, len(threads))
 
 
 def slurm_cluster(config: SlurmConfig) -> Any:
@@ -169,40 +165,14 @@ def _local_cluster(workers: int, *, dashboard: bool) -> Any:
     )
 
 
-@dataclass
-class _LocalWorkers:
-    """The workers of this machine: others start in place of those that are lost.
-
-    Dask does so itself where a worker was killed, but not where it ended itself, as over a task
-    that it could not read. So those that stay away are given up: scaling down takes them first.
-    """
-
-    cluster: Any  # of Dask
-    client: Any  # of Dask
-    count: int
-    missing: int = 0
-    since: float = 0.0  # from when so many have been missing
-
-    def restore(self) -> None:
-        """Start workers in place of those that are lost."""
-        there = len(self.client.nthreads())
-        if self.count - there != self.missing:
-            self.missing, self.since = self.count - there, time.monotonic()
-        if self.missing > 0 and time.monotonic() - self.since >= _PATIENCE:
-            self.missing = 0
-            self.cluster.scale(there)  # the next call starts others, which may have the same names
-        else:
-            self.cluster.scale(self.count)
-
-
 @contextmanager
-def _client_of(address: str) -> Iterator[Any]:
+def _client_of(address: str) -> Iterator[Client]:
     from distributed import Client
     from distributed.comm import get_address_host_port
 
     try:  # Dask's client would try for long, and wait for a minute when it is given up
         socket.create_connection(get_address_host_port(address), timeout=_CONNECT).close()
-        client = Client(address, set_as_default=False, timeout=_CONNECT)
+        client = Client(address, timeout=_CONNECT)
     except (OSError, ValueError) as error:
         raise SettingError(
             f"cluster.scheduler is {address} ({' '.join(str(error).split())}); accepted: the "

@@ -19,15 +19,7 @@ from replay.environment import environment
 from replay.files import WritingError, whole_file
 from runners.evaluation.definition import definition_label
 from runners.evaluation.plan import Plan
-from runners.evaluation.table import (
-    ITERATIONS,
-    ITERATIONS_ORDER,
-    PROBES,
-    PROBES_ORDER,
-    RESULTS,
-    RESULTS_ORDER,
-    write_table,
-)
+from runners.evaluation.table import ITERATIONS, PROBES, RESULTS, write_table
 from runners.evaluation.trial_configurations import SENSORS
 
 FILE = "experiment.json"
@@ -48,8 +40,6 @@ _FIXED = (
     "plausible",
     "steered",
 )
-_BEFORE = {"plausible": True, "steered": False}
-"""What keys mean that folders from before there were any lack."""
 
 
 @contextmanager
@@ -63,11 +53,10 @@ def writing_alone(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
     lock = FileLock(folder / LOCK)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            say(f"another run is at work in {folder}; this one waits until it ends")
-            lock.acquire()
+        lock.acquire(timeout=0)
+    except Timeout:
+        say(f"another run is at work in {folder}; this one waits until it ends")
+        lock.acquire()
     except NotImplementedError:
         pass
     except OSError as error:
@@ -89,14 +78,16 @@ def collect(folder: Path) -> pa.Table:
     """
     experiment = read_experiment(folder)
     definition = definition_label(experiment["definition"])
-    if experiment.get("policies"):
-        parts = list(_parts(folder, experiment, ".parquet", ".failed.parquet"))
-        return write_table(folder, "probes", parts, PROBES, PROBES_ORDER, definition)
+
+    def written(name: str, schema: pa.Schema, *suffixes: str) -> pa.Table:
+        parts = list(_parts(folder, experiment, *suffixes))
+        return write_table(folder, name, parts, schema, definition)
+
+    if experiment["policies"]:
+        return written("probes", PROBES, ".parquet", ".failed.parquet")
     if experiment["iterations"]["every"] is not None:
-        parts = list(_parts(folder, experiment, ".iterations.parquet"))
-        write_table(folder, "iterations", parts, ITERATIONS, ITERATIONS_ORDER, definition)
-    parts = list(_parts(folder, experiment, ".parquet", ".failed.parquet"))
-    return write_table(folder, "results", parts, RESULTS, RESULTS_ORDER, definition)
+        written("iterations", ITERATIONS, ".iterations.parquet")
+    return written("results", RESULTS, ".parquet", ".failed.parquet")
 
 
 def join_experiment(
@@ -146,7 +137,7 @@ def _write(path: Path, values: Mapping[str, Any]) -> None:
 
 def _parts(folder: Path, experiment: Mapping[str, Any], *suffixes: str) -> Iterable[Path]:
     """Of every trial and label the first file with one of the suffixes."""
-    labels = [*experiment.get("policies", ())] or [*experiment["methods"], *experiment["outside"]]
+    labels = [*experiment["policies"]] or [*experiment["methods"], *experiment["outside"]]
     for configuration in experiment["configurations"]:
         for seed in experiment["seeds"]:
             trial = folder / "trials" / configuration / f"seed_{seed}"
@@ -193,16 +184,23 @@ def _command() -> str:
 
 
 def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
-    before = {**_BEFORE, **theirs}
-    differing = [text for key in _FIXED for text in _differences(key, before.get(key), ours[key])]
-    for kind in ("methods", "policies"):
-        known = theirs.get(kind) or {}
-        for label in known:
-            if label in ours[kind]:
-                differing += _differences(f"{kind}.{label}", known[label], ours[kind][label])
-    known, asked = list(theirs.get("methods") or {}), list(ours["methods"])
-    if ours["steered"] and before["steered"] and known != asked:
-        differing += _differences("methods", known, asked)
+    """Raise SettingError where what may not become more differs."""
+
+    def fixed(values: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+        found = {key: values.get(key) for key in _FIXED}
+        if ours["steered"]:
+            found["methods"] = list(values["methods"])
+        for kind in ("methods", "policies"):
+            shared = {label: one for label, one in values[kind].items() if label in others[kind]}
+            found |= {f"{kind}.{label}": one for label, one in shared.items()}
+        return dict(_flat(found))
+
+    before, now = fixed(theirs, ours), fixed(ours, theirs)
+    differing = [
+        f"{path} is {now.get(path)!r}, was {before.get(path)!r}"
+        for path in dict.fromkeys([*before, *now])
+        if now.get(path) != before.get(path)
+    ]
     if differing:
         more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise SettingError(
@@ -211,33 +209,25 @@ def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]
         )
 
 
-def _differences(path: str, theirs: Any, ours: Any) -> list[str]:
-    """Where two values differ, as "PATH is OURS, was THEIRS"."""
-    if isinstance(theirs, Mapping) and isinstance(ours, Mapping):
-        keys = dict.fromkeys([*theirs, *ours])
-        return [
-            text
-            for key in keys
-            for text in _differences(f"{path}.{key}", theirs.get(key), ours.get(key))
-        ]
-    return [] if theirs == ours else [f"{path} is {ours!r}, was {theirs!r}"]
+def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested values by their paths."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{path}{name}.")
+        else:
+            yield f"{path}{name}", value
 
 
 def _united(plan: Plan, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> dict[str, Any]:
-    both = {*theirs.get("configurations", ()), *ours["configurations"]}
-    seeds = {*theirs.get("seeds", ()), *ours["seeds"]}
-    known = [theirs.get("environment"), *theirs.get("other_environments", ())]
-    here = ours["environment"]
-    commands = [*theirs.get("commands", ()), *ours["commands"]]
+    both = {*theirs["configurations"], *ours["configurations"]}
+    known, here = [theirs["environment"], *theirs["other_environments"]], ours["environment"]
     return {
         **ours,
-        "name": theirs.get("name", ours["name"]),
+        "name": theirs["name"],
         "configurations": [name for name in plan.configurations if name in both],
-        "seeds": sorted(seeds),
-        "methods": {**theirs.get("methods", {}), **ours["methods"]},
-        "outside": {**theirs.get("outside", {}), **ours["outside"]},
-        "policies": {**theirs.get("policies", {}), **ours["policies"]},
-        "commands": list(dict.fromkeys(commands)),
+        "seeds": sorted({*theirs["seeds"], *ours["seeds"]}),
+        **{kind: {**theirs[kind], **ours[kind]} for kind in ("methods", "outside", "policies")},
+        "commands": list(dict.fromkeys([*theirs["commands"], *ours["commands"]])),
         "environment": known[0],
         "other_environments": known[1:] + [here] * (here not in known),
     }

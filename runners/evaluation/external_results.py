@@ -14,7 +14,7 @@ import numpy as np
 from chsel.errors import ChselError
 from chsel.numerics.arrays import FloatArray, frozen
 from chsel.problem.file_checks import read_npz
-from chsel.problem.poses import Poses, inverse
+from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.qd.selection import repeated
 from replay.files import file_digest
@@ -24,12 +24,10 @@ from runners.evaluation.result_rows import ResultRows
 from runners.evaluation.table import RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded, problems
 
-PRESET = "outside"
-"""What the table has for a preset."""
 REPEAT_FOLDER = "draw_{}"
 """Where further sets of the same sessions are, in the folder of the first ones."""
 SUFFIXES = (".npz", ".json")
-_TOLERANCE = 1e-5  # of the entries of R^T R - 1: transforms may have been written as text
+_TOLERANCE = 1e-5  # of rotations: transforms may have been written as text
 _KEY = re.compile(r"(step|cost|seconds)_(\d{1,10})")
 
 
@@ -56,18 +54,6 @@ class ExternalSet:
         poses = inverse(self.world_from_object)[order]
         cells = np.full(len(poses), -1, dtype=np.int64)
         return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, poses)
-
-
-@dataclass(frozen=True, eq=False)
-class ExternalResults:
-    """What a folder has about one trial, read where the folder is.
-
-    sets: by step. missing: why another step has none. digest: of the file, see `external_digest`.
-    """
-
-    sets: Mapping[int, ExternalSet]
-    missing: str
-    digest: str
 
 
 def external_folders(given: Mapping[str, Path]) -> dict[str, Path]:
@@ -97,18 +83,17 @@ def external_digest(plan: Plan, trial: Trial, label: str) -> str:
     return "none" if path is None else file_digest(path)
 
 
-def read_external(plan: Plan, trial: Trial, label: str) -> ExternalResults:
-    """The sets of a trial in the folder of a label.
+def read_external(plan: Plan, trial: Trial, label: str) -> tuple[dict[int, ExternalSet], str]:
+    """The sets of a trial in the folder of a label, by step, and why others have none.
 
     npz: arrays `step_K` (B, 4, 4), world_from_object of step K; where known `cost_K` (B,) and
     `seconds_K`. json: an object with the same names, and lists. Raises ExternalSetError for
     anything else: other names, steps that do not exist, shapes, numbers, rotations.
     """
-    folder, digest = plan.outside[label], external_digest(plan, trial, label)
+    folder = plan.outside[label]
     path = external_file(folder, trial)
     if path is None:
-        wanted = folder / trial.configuration / f"seed_{trial.seed}{SUFFIXES[0]}"
-        return ExternalResults({}, f"there is no {wanted}", digest)
+        return {}, f"there is no {folder / trial.configuration / f'seed_{trial.seed}{SUFFIXES[0]}'}"
     values = _values(path)
     steps = plan.probes_of(trial.configuration)
     for key in values:
@@ -121,28 +106,27 @@ def read_external(plan: Plan, trial: Trial, label: str) -> ExternalResults:
             )
         if f"step_{int(match[2])}" not in values:
             raise ExternalSetError(f"{path} has {key}; accepted: only with step_{int(match[2])}")
-    names = [key for key in values if key.startswith("step_")]
-    sets = {int(name[5:]): _set_of(path, int(name[5:]), values) for name in names}
-    return ExternalResults(sets, f"{path} has no set of this step", digest)
+    named = [int(key[5:]) for key in values if key.startswith("step_")]
+    return {step: _set_of(path, step, values) for step in named}, f"{path} has no set of this step"
 
 
-def external_rows(plan: Plan, trial: Trial, label: str, results: ExternalResults) -> None:
+def external_rows(plan: Plan, trial: Trial, label: str) -> None:
     """Write the part of the table about external results, of one trial."""
+    sets, missing = read_external(plan, trial, label)
+    digest = external_digest(plan, trial, label)
     session = open_recorded(plan, trial)
-    result_rows = ResultRows(plan, trial, session, label, PRESET)
+    result_rows = ResultRows(plan, trial, session, label)
     rows: list[Row] = []
     for problem in problems(plan, trial, session):
-        members, missing = result_rows.members(problem)
-        given = results.sets.get(problem.key.step)
+        given = sets.get(problem.key.step)
         if given is None:
-            row = result_rows.row(problem, None, members, results.missing)
+            row = result_rows.row(problem, None, missing)
         else:
-            row = result_rows.row(problem, given.hypotheses(), members, missing)
-            row["seconds"] = given.seconds
+            row = result_rows.row(problem, given.hypotheses()) | {"seconds": given.seconds}
             if given.cost is None:
                 row |= {"best_cost": None, "mean_cost": None}
         rows.append(row | {"problem_digest": None})  # a problem has an E_0, which is not known
-    write_part(trial.folder(plan) / f"{label}.parquet", rows, RESULTS, results.digest)
+    write_part(trial.folder(plan) / f"{label}.parquet", rows, RESULTS, digest)
 
 
 def _values(path: Path) -> Mapping[str, Any]:
@@ -163,7 +147,7 @@ def _set_of(path: Path, step: int, values: Mapping[str, Any]) -> ExternalSet:
     poses = frozen(name, values[f"step_{step}"], (None, 4, 4), error=ExternalSetError)
     if len(poses) == 0:
         raise ExternalSetError(f"{name} is empty; accepted: at least one transform")
-    _check_rigid(name, poses)
+    check_rigid(name, poses, _TOLERANCE)
     cost = values.get(f"cost_{step}")
     if cost is not None:
         cost = frozen(f"{path}: cost_{step}", cost, (len(poses),), error=ExternalSetError)
@@ -171,19 +155,3 @@ def _set_of(path: Path, step: int, values: Mapping[str, Any]) -> ExternalSet:
     if seconds is not None:
         seconds = float(frozen(f"{path}: seconds_{step}", seconds, (), error=ExternalSetError))
     return ExternalSet(poses, cost, seconds)
-
-
-def _check_rigid(name: str, poses: FloatArray) -> None:
-    """Raise ExternalSetError unless all (B, 4, 4) are rigid to what text files keep of a number."""
-    rotation = poses[:, :3, :3]
-    off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
-    off = np.maximum(off, np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1))
-    mirrored = np.linalg.det(rotation) < 0.0
-    wrong = (off > _TOLERANCE) | mirrored
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        what = "mirrors" if mirrored[row] and off[row] <= _TOLERANCE else "is not rigid"
-        raise ExternalSetError(
-            f"{name}[{row}] {what}; accepted: [R t; 0 0 0 1] with R^T R = 1 to {_TOLERANCE:g} and "
-            "det R = 1"
-        )

@@ -16,22 +16,14 @@ from chsel.problem.streams import StreamKey
 
 
 @dataclass(frozen=True)
-class MetricsConfig:
-    """How distances are measured, see DistanceSettings; quantile: of the hypotheses by cost."""
+class MetricsConfig(DistanceSettings):
+    """How distances are measured, and for which hypotheses."""
 
-    points: int = 500
-    method: str = "nearest"
-    bidirectional: bool = False
-    quantile: float = 1.0
+    quantile: float = 1.0  # of the hypotheses by their cost, the cheapest
 
     def __post_init__(self) -> None:
-        DistanceSettings(self.points, self.method, self.bidirectional)
+        super().__post_init__()
         cheapest(np.zeros(1), self.quantile)
-
-    @property
-    def distance(self) -> DistanceSettings:
-        """The part that concerns distances."""
-        return DistanceSettings(self.points, self.method, self.bidirectional)
 
 
 class HypothesisMetrics:
@@ -87,5 +79,5 @@ class HypothesisMetrics:
         if self._distance is None:
             key = StreamKey(problem.key.seed, 0)
             points = surface_points(self._mesh, self._config.points, key)
-            self._distance = SurfaceDistance(problem.sdf, self._mesh, points, self._config.distance)
+            self._distance = SurfaceDistance(problem.sdf, self._mesh, points, self._config)
         return self._distance

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -37,41 +37,36 @@ from runners.sessions.faults import CLEAN, LEVELS, level_name
 
 SESSIONS = ("simulated", "kinematic", SENSORS)
 OWN = "own"
+OUTSIDE = "outside"
+"""What the table has for a preset of hypothesis sets from elsewhere."""
 OBJECTS = {"models": "", "scans": "ycb/"}
 """Of the names of objects, by what `objects` says they are."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """All that determines the results, and where they go.
+    """All that determines the results, and where they go."""
 
-    folder: of the evaluation. session: settings, with kind. objects: "models" or "scans".
-    definition: of the plausible sets, epsilon None for that of the object. starts: OWN, where E_0
-    and E_l of a step follow from the results of each method itself (CHSEL, Alg. 2), or the method
-    from whose results they follow, so that all register the same problems. every: iterations
-    between measures of the search; None: at its end alone. recordings: whether to write
-    METHOD.mcap. outside: folders of hypothesis sets by label. logs: a folder of raw logs, for
-    sessions of sensors; None: those of the simulated robot, in the evaluation's
-    folder. truth: how the true pose of such a session is sought. policies: by label; each probes in
-    sessions of its own, registered by the only contender.
-    """
-
-    folder: Path
+    folder: Path  # of the evaluation
     preset: str
-    session: Mapping[str, Any]
-    objects: str
-    definition: Mapping[str, Any]
+    session: Mapping[str, Any]  # settings, with kind
+    objects: str  # "models" or "scans"
+    definition: Mapping[str, Any]  # of the plausible sets, epsilon None for that of the object
     metrics: MetricsConfig
     steps: str | None
+    # OWN, where E_0 and E_l of a step follow from each method's own results (CHSEL, Alg. 2), or the
+    # method from whose results they follow, so that all register the same problems.
     starts: str
-    every: int | None
-    recordings: bool
+    every: int | None  # iterations between measures of the search; None: at its end alone
+    recordings: bool  # whether to write METHOD.mcap
     assets: Path
-    contenders: Mapping[str, Contender]
-    outside: Mapping[str, Path]
+    contenders: Mapping[str, Contender]  # by label
+    outside: Mapping[str, Path]  # folders of hypothesis sets by label
+    # Of raw logs, for sessions of sensors; None: simulated ones in the evaluation's folder.
     logs: Path | None = None
-    truth: TruePoseSettings = field(default_factory=TruePoseSettings)
+    truth: TruePoseSettings = field(default_factory=TruePoseSettings)  # how it is sought in these
     plausible: bool = True  # whether to make plausible sets; without them there is no PD
+    # By label; each probes in sessions of its own, registered by the only contender.
     policies: Mapping[str, PolicyContender] = field(default_factory=dict)
 
     @property
@@ -102,19 +97,19 @@ class Plan:
         """Where CONFIGURATION/seed_K.mcap are, in sessions of sensors."""
         return self.logs if self.logs is not None else self.folder / "logs"
 
-    def moved(self, folder: Path, trial: Trial) -> Plan:
-        """The same for a worker on one trial, which has its files in `folder`.
-
-        Logs that are simulated are files of the evaluation; recorded ones and scans stay where
-        they are.
-        """
-        logs = None if self.logs is None or self.is_simulated_log(trial) else self.logs.absolute()
-        return replace(self, folder=folder, logs=logs, assets=self.assets.absolute())
-
-    def is_simulated_log(self, trial: Trial) -> bool:
-        """Whether the session of a trial comes from a log of the simulated robot."""
-        of = self.configurations[trial.configuration]
-        return self.kind == SENSORS and of.log_folder is None
+    def about(self, trial: Trial, label: str) -> dict[str, Any]:
+        """What all rows of a label in a trial share."""
+        row = {
+            "object": self.configurations[trial.configuration].object,
+            "configuration": trial.configuration,
+            "seed": trial.seed,
+            "faults": self.faults(trial),
+        }
+        if self.policies:
+            (contender,) = self.contenders.values()
+            return row | {"policy": label, "method": contender.label, "preset": contender.preset}
+        preset = self.contenders[label].preset if label in self.contenders else OUTSIDE
+        return row | {"method": label, "preset": preset, "definition": self.definition_label}
 
     def leader(self) -> Method | None:
         """The method whose problems all methods get, if these are not their own."""

@@ -40,7 +40,6 @@ class ResultRows:
         trial: Trial,
         session: RecordedSession,
         label: str,
-        preset: str,
         method: Method | None = None,
     ) -> None:
         """method: that made the hypotheses; one with `holds` tells whether its set has the truth.
@@ -49,8 +48,7 @@ class ResultRows:
         """
         assert session.world_from_object is not None
         self._plan, self._trial, self._session = plan, trial, session
-        self._label, self._preset, self._faults = label, preset, plan.faults(trial)
-        self._holds = getattr(method, "holds", None)
+        self._about, self._holds = plan.about(trial, label), getattr(method, "holds", None)
         self._clean = trial.without_faults(plan)
         self._clean_problems: dict[int, RegistrationProblem] | None = None
         if self._clean != trial and plan.plausible:
@@ -64,47 +62,32 @@ class ResultRows:
         self._symmetry = object_symmetry(mesh)
 
     def members(self, problem: RegistrationProblem) -> tuple[PlausibleSet | None, str]:
-        """The plausible set of a problem; else why there is none, as a status.
-
-        "" where none is wanted.
-        """
+        """The plausible set of a problem; else why there is none, "" where none is wanted."""
         if self._told is None:
             return None, ""
         step = problem.key.step
-        missing = self._told.failures.get(step)
         if self._clean_problems is not None and step not in self._clean_problems:
-            missing = f"without faults there is no registration at step {step}"
-        if missing is not None:
-            return None, f"no plausible set: {missing}"
+            return None, f"without faults there is no registration at step {step}"
+        if step in self._told.failures:
+            return None, self._told.failures[step]
+        of_session = self._of_session(problem)
         try:
-            of_session = self._of_session(problem)
             return load_members(self._plan, self._clean, self._session, of_session), ""
         except EvaluationError as error:
-            reason = one_line(error).replace(f"{self._plan.folder}/", "")
-            return None, f"no plausible set: {reason}"
+            return None, one_line(error).replace(f"{self._plan.folder}/", "")
 
     def row(
-        self,
-        problem: RegistrationProblem,
-        found: Hypotheses | None,
-        members: PlausibleSet | None,
-        status: str,
+        self, problem: RegistrationProblem, found: Hypotheses | None, failure: str = ""
     ) -> dict[str, Any]:
-        """The row of a step. found: None if the registration failed, for the reason in status."""
-        points = problem.points
+        """The row of a step. found: None if the registration failed. failure: the reason for it."""
+        points, (members, missing) = problem.points, self.members(problem)
         row: dict[str, Any] = {
-            "object": self._session.recorded.object,
-            "configuration": self._trial.configuration,
-            "seed": self._trial.seed,
-            "method": self._label,
-            "preset": self._preset,
-            "definition": self._plan.definition_label,
-            "faults": self._faults,
+            **self._about,
             "step": problem.key.step,
             "contacts": len(points.contacts),
             "free_points": len(points.free),
             "occupied_points": len(points.occupied),
-            "status": status or "ok",
+            "status": f"no plausible set: {missing}" if missing else "ok",
             "problem_digest": problem.digest,
         }
         if members is not None:
@@ -115,15 +98,15 @@ class ResultRows:
                 "true_cost": members.true_cost,
             }
         if found is None:
-            return row | {"status": f"failed: {status}"}
+            return row | {"status": f"failed: {failure}"}
         row |= self._numbers(problem, found)
         if members is None:
             return row
-        limit = members.true_cost + self._settings.epsilon
-        cost = EvaluationCost(self._of_session(problem), self._settings.cost)
+        of_session, limit = self._of_session(problem), members.true_cost + self._settings.epsilon
+        cost = EvaluationCost(of_session, self._settings.cost)
         below = cost.evaluate(found.object_from_world, limit=limit) < limit
         exact = {"exact_members": float(below.mean())} if len(below) else {}
-        return row | self._metrics.compute(self._of_session(problem), members, found) | exact
+        return row | self._metrics.compute(of_session, members, found) | exact
 
     def _of_session(self, problem: RegistrationProblem) -> RegistrationProblem:
         """The problem without faults, with the same random numbers for all draws."""
@@ -157,22 +140,17 @@ class ResultRows:
         }
 
     def iterations(
-        self,
-        problem: RegistrationProblem,
-        snapshots: Sequence[ArchiveSnapshot],
-        settings: Any,
-        members: PlausibleSet,
+        self, problem: RegistrationProblem, snapshots: Sequence[ArchiveSnapshot], settings: Any
     ) -> Iterator[Row]:
         """The rows of a step's search, of a method with these settings."""
+        members, _ = self.members(problem)
+        if members is None:
+            return
         for snapshot in snapshots:
             found = hypotheses_of(snapshot, problem, settings)
             metrics = self._metrics.compute(self._of_session(problem), members, found, ranked=False)
-            metrics.pop("distinct", None)
             yield {
-                "configuration": self._trial.configuration,
-                "seed": self._trial.seed,
-                "method": self._label,
-                "definition": self._plan.definition_label,
+                **self._about,
                 "step": problem.key.step,
                 "iteration": snapshot.iteration,
                 "filled": len(snapshot.cells),

@@ -20,27 +20,32 @@ def chosen_configurations(
 ) -> tuple[str, ...]:
     """Which of the existing configurations a value names, in the order of all of them.
 
-    A name, a pattern such as drill*, an object (all of its configurations, unless one has the same
-    name), "all", or a list of these. Raises SettingError if one of them names none.
+    As `chosen_names`, or an object: all of its configurations, unless one has the same name.
     """
-    listed = _listed("configurations", value)
-    chosen = {name for text in listed for name in _named(text, existing)}
-    return tuple(name for name in existing if name in chosen)
+    objects: dict[str, list[str]] = {}
+    for name, one in existing.items():
+        objects.setdefault(one.object, []).append(name)
+    return chosen_names("configurations", value, existing, objects)
 
 
-def chosen_names(setting: str, value: Any, existing: Iterable[str]) -> tuple[str, ...]:
+def chosen_names(
+    setting: str, value: Any, existing: Iterable[str], groups: Mapping[str, list[str]] | None = None
+) -> tuple[str, ...]:
     """Which of the existing names a setting has, in the order of all of them.
 
-    A name, a pattern such as noise_*, "all", or a list of these. Raises SettingError if one of them
-    names none.
+    A name, a pattern such as noise_*, "all", or a list of these. groups: names for several, here
+    of objects. Raises SettingError if one of them names none.
     """
     names, chosen = list(existing), set()
-    for text in _listed(setting, value):
-        named = [name for name in names if text == "all" or fnmatchcase(name, str(text))]
+    for text in map(str, _listed(setting, value)):
+        named = names if text == "all" else [name for name in names if name == text]
+        named = named or (groups or {}).get(text, [])
+        named = named or [name for name in names if fnmatchcase(name, text)]
         if not named:
+            accepted = "all, an object" if groups else "all"
             raise SettingError(
-                f"{setting} names {text!r}; accepted: all, a pattern such as {names[0][:3]}*, "
-                f"{', '.join(names)}"
+                f"{setting} names {text!r}; accepted: {accepted}, a pattern such as "
+                f"{names[0][:3]}*, {', '.join(names)}"
             )
         chosen.update(named)
     return tuple(name for name in names if name in chosen)
@@ -55,30 +60,15 @@ def chosen_seeds(value: Any) -> tuple[int, ...]:
 
 
 def _listed(name: str, value: Any) -> list[Any]:
-    parts = list(value) if isinstance(value, list | tuple) else [value]
-    parts = [one for part in parts for one in _split(part)]
-    if not parts or any(part is None or part == "" for part in parts):
+    parts = value if isinstance(value, list | tuple) else [value]
+    listed = [
+        one
+        for part in parts
+        for one in (map(str.strip, part.split(",")) if isinstance(part, str) else [part])
+    ]
+    if not listed or any(part is None or part == "" for part in listed):
         raise SettingError(f"{name} is {value!r}; accepted: at least one, or a list")
-    return parts
-
-
-def _split(part: Any) -> list[Any]:
-    return [text.strip() for text in part.split(",")] if isinstance(part, str) else [part]
-
-
-def _named(text: Any, existing: Mapping[str, TrialConfiguration]) -> Iterable[str]:
-    if text == "all":
-        return existing
-    if text in existing:
-        return [text]
-    matching = [name for name, one in existing.items() if one.object == text]
-    matching = matching or [name for name in existing if fnmatchcase(name, str(text))]
-    if not matching:
-        raise SettingError(
-            f"configurations names {text!r}; accepted: all, an object, a pattern such as drill*, "
-            f"{', '.join(existing)}"
-        )
-    return matching
+    return listed
 
 
 def _seeds(part: Any) -> Iterable[int]:

@@ -12,7 +12,6 @@ import pyarrow.parquet
 
 from chsel.errors import RecordingError
 from replay.files import whole_file
-from runners.sessions.faults import CLEAN
 
 Row = Mapping[str, Any]
 
@@ -94,9 +93,7 @@ their weights. poses: how many these are. spread: of the belief. promised: by ho
 action would narrow it. stop: why a session with the usual rules would end here, "" if it goes on.
 seconds: of the registration. decision_seconds: of choosing what comes next. status: "ok" or
 "failed: REASON"; what a row does not have is null."""
-RESULTS_ORDER = ("object", "configuration", "seed", "method", "step")
-ITERATIONS_ORDER = ("configuration", "seed", "method", "step", "iteration")
-PROBES_ORDER = ("object", "configuration", "seed", "policy", "step")
+_ORDER = ("object", "configuration", "seed", "policy", "method", "step", "iteration")
 
 
 def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, source: str = "") -> None:
@@ -109,63 +106,41 @@ def write_part(path: Path, rows: Sequence[Row], schema: pa.Schema, source: str =
 def read_part(path: Path, schema: pa.Schema, definition: str) -> pa.Table:
     """A part. Raises RecordingError if it is damaged, of another version or definition.
 
-    definition: label of that of the evaluation. A part from before there was a column of it has it;
-    other columns of later versions are null, and no session had faults.
+    definition: label of that of the evaluation.
     """
-    later = {DEFINITION: definition, FAULTS: CLEAN} | dict.fromkeys(("truth_held", *_TRUTH))
     try:
-        table = pa.parquet.read_table(path).replace_schema_metadata()
-        for place, column in enumerate(schema):
-            if column.name in later and column.name not in table.column_names:
-                values = pa.array([later[column.name]] * table.num_rows, column.type)
-                table = table.add_column(place, column.name, values)
-        table = table.cast(schema)
+        table = pa.parquet.read_table(path).replace_schema_metadata().cast(schema)
     except (pa.ArrowException, ValueError, OSError) as error:
         reason = " ".join(str(error).split())
         raise RecordingError(
             f"{path} cannot be read ({reason}); remove it to have it made again"
         ) from None
-    if DEFINITION not in schema.names:
-        return table
-    others = set(table[DEFINITION].to_pylist()) - {definition}
-    if others:
-        raise RecordingError(
-            f"{path} has numbers by the definition {others.pop()} of plausible sets; accepted in "
-            f"this folder: {definition}, so remove the file to have it made again"
-        )
+    if DEFINITION in schema.names:
+        others = set(table[DEFINITION].to_pylist()) - {definition}
+        if others:
+            raise RecordingError(
+                f"{path} has numbers by the definition {others.pop()} of plausible sets; accepted "
+                f"in this folder: {definition}, so remove the file to have it made again"
+            )
     return table
 
 
-def is_part(path: Path) -> bool:
-    """Whether there is a part that can be read, as far as its end tells."""
-    try:
-        pa.parquet.read_schema(path)
-    except (pa.ArrowException, ValueError, OSError):
-        return False
-    return True
-
-
-def part_source(path: Path) -> str:
-    """What was kept with a part; empty if there is no such part."""
+def part_source(path: Path) -> str | None:
+    """What was kept with a part; None if there is no part that can be read, as its end says."""
     try:
         metadata = pa.parquet.read_schema(path).metadata or {}
     except (pa.ArrowException, ValueError, OSError):
-        return ""
+        return None
     return metadata.get(b"about", b"").decode()
 
 
 def write_table(
-    folder: Path,
-    name: str,
-    parts: Sequence[Path],
-    schema: pa.Schema,
-    order: Sequence[str],
-    definition: str,
+    folder: Path, name: str, parts: Sequence[Path], schema: pa.Schema, definition: str
 ) -> pa.Table:
     """Put parts by one definition together in order, as NAME.parquet and NAME.csv."""
     tables = [read_part(path, schema, definition) for path in parts]
-    table = pa.concat_tables([schema.empty_table(), *tables])
-    table = table.sort_by([(key, "ascending") for key in order]).combine_chunks()
+    order = [(key, "ascending") for key in _ORDER if key in schema.names]
+    table = pa.concat_tables([schema.empty_table(), *tables]).sort_by(order).combine_chunks()
     with whole_file(folder / f"{name}.parquet") as beside:
         pa.parquet.write_table(table, beside)
     with whole_file(folder / f"{name}.csv") as beside:

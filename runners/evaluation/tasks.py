@@ -1,148 +1,140 @@
-"""One task of an evaluation: what a worker gets, does in a folder of its own, and gives back.
-
-No folder is shared between workers and the process that waits for them: all files of a task travel
-with it. Only raw logs of robots and the scans of objects are read where they are.
-"""
+"""The tasks of an evaluation: sessions and what is registered on them, each done by some worker."""
 
 from __future__ import annotations
 
-import errno
 import signal
-import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from itertools import islice
+from typing import TYPE_CHECKING
 
 import torch
 
+from chsel.errors import ChselError, RecordingError
 from replay.environment import environment
-from replay.files import whole_file
-from runners.evaluation.external_results import ExternalResults, external_rows
-from runners.evaluation.plan import Plan, Task
+from runners.evaluation.external_results import external_digest, external_rows
+from runners.evaluation.plan import Plan, Task, Trial
 from runners.evaluation.run_method import run_method
 from runners.evaluation.run_policy import run_policy
-from runners.evaluation.trial_session import SESSION_FILES, make_session
+from runners.evaluation.table import Row, part_source, write_part
+from runners.evaluation.trial_session import make_session, read_session
 from runners.run.session_run import one_line
 
-Files = Mapping[str, bytes]
-"""Contents by path in the folder of an evaluation."""
-LOGS = "logs/"
-_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO)
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """How a task ended."""
+class Ended:
+    """A task that is done, or has failed."""
 
-    files: Files = field(default_factory=dict)  # made by it
-    seconds: float = 0.0
-    failure: str = ""  # why there are none
-    stops: bool = False  # whether all other tasks would fail likewise, as on a full disk
-    environment: Mapping[str, str] = field(default_factory=dict)  # of the worker
+    task: Task
+    failure: str = ""
+    environment: Mapping[str, str] = field(default_factory=dict)  # of its worker
 
 
-def input_files(plan: Plan, task: Task) -> dict[str, bytes]:
-    """What a task reads: a session what there is of it already, a method finished sessions."""
-    trials = task.sessions(plan) if task.label else (task.trial,)
-    paths = [
-        path
-        for trial in trials
-        for pattern in SESSION_FILES
-        for path in trial.folder(plan).glob(pattern)
-        if not path.name.startswith(".")
-    ]
-    files = {str(path.relative_to(plan.folder)): path.read_bytes() for path in paths}
-    if not task.label and plan.is_simulated_log(task.trial):
-        folder = plan.log_folder / task.trial.configuration
-        for path in folder.glob(f"seed_{task.trial.seed}.*"):
-            files[f"{LOGS}{path.relative_to(plan.log_folder)}"] = path.read_bytes()
-    return files
+def tasks_of(plan: Plan, trials: Sequence[Trial]) -> list[Task]:
+    """All tasks of trials, seed by seed, those without a label, which others need, first."""
+    labelled = [Task(trial, label) for trial in trials for label in plan.labels]
+    sessions = [Task(session) for task in labelled for session in task.sessions(plan)]
+    return sorted(
+        {*sessions, *labelled}, key=lambda task: (task.trial.seed, bool(task.label), task)
+    )
 
 
-def store_files(plan: Plan, task: Task, files: Files) -> None:
-    """Write what a task has made, each file whole or not at all; last the one that finishes it."""
-    last = str(task.finished(plan).relative_to(plan.folder))
-    for name in sorted(files, key=lambda name: (name == last, name)):
-        path = plan.folder / name
-        if name.startswith(LOGS):
-            path = plan.log_folder / name.removeprefix(LOGS)
-        with whole_file(path) as beside:
-            beside.write_bytes(files[name])
+def is_finished(plan: Plan, task: Task) -> bool:
+    """Whether the task's last file is there and whole. External results may have changed since."""
+    if not task.label:
+        return has_session(plan, task.trial)
+    source = part_source(task.finished(plan))
+    if task.label in plan.outside:
+        return source == external_digest(plan, task.trial, task.label)
+    return source is not None
 
 
-def run_task(
-    plan: Plan,
-    task: Task,
-    files: Files,
-    external: ExternalResults | None = None,
-    *,
-    warm: set[str] | None = None,
-    scratch: str | None = None,
-) -> Outcome:
-    """Do a task in a new folder within `scratch`; a failure is an outcome, too.
+def has_session(plan: Plan, trial: Trial) -> bool:
+    """Whether `make_session` has finished with a trial."""
+    try:
+        read_session(plan, trial)
+    except (OSError, RecordingError):
+        return False
+    return True
 
-    external: what is to be ranked, in place of a method's results. warm: labels that have been at
-    work in this process before.
+
+def do_task(plan: Plan, task: Task, needed: Sequence[object] = ()) -> Mapping[str, str]:
+    """Do a task, on one thread: its files are in the plan's folder when it ends.
+
+    Gives the environment. needed: what tasks gave that must have ended before.
     """
-    known = set() if warm is None else warm
-    begun = time.perf_counter()
-    with TemporaryDirectory(dir=scratch, prefix="task-") as name:
-        folder = Path(name)
-        here = plan.moved(folder, task.trial)
-        try:
-            for path, content in files.items():
-                (folder / path).parent.mkdir(parents=True, exist_ok=True)
-                (folder / path).write_bytes(content)
-            task.trial.folder(here).mkdir(parents=True, exist_ok=True)
-            if not task.label:
-                make_session(here, task.trial)
-            elif external is not None:
-                external_rows(here, task.trial, task.label, external)
-            elif plan.policies:
-                run_policy(here, task.trial, plan.policies[task.label], known)
-            else:
-                run_method(here, task.trial, plan.contenders[task.label], known)
-            made = _made(folder, files)
-        except Exception as error:
-            reason = one_line(error).replace(name, str(plan.folder))
-            return Outcome(failure=reason, stops=_is_disk_error(error))
-    return Outcome(made, time.perf_counter() - begun, environment=_environment())
-
-
-def run_on_worker(
-    plan: Plan, task: Task, files: Files, external: ExternalResults | None
-) -> Outcome:
-    """`run_task` on a worker of Dask, on one thread, in the worker's own folder."""
-    from distributed import get_worker
-
     torch.set_num_threads(1)
-    worker: Any = get_worker()
-    warm = vars(worker).setdefault("warm_methods", set())
-    return run_task(plan, task, files, external, warm=warm, scratch=worker.local_directory)
+    task.trial.folder(plan).mkdir(parents=True, exist_ok=True)
+    if not task.label:
+        make_session(plan, task.trial)
+    elif task.label in plan.outside:
+        external_rows(plan, task.trial, task.label)
+    elif plan.policies:
+        run_policy(plan, task.trial, plan.policies[task.label])
+    else:
+        run_method(plan, task.trial, plan.contenders[task.label])
+    if task.label:
+        task.failed(plan).unlink(missing_ok=True)
+    return environment()
+
+
+def do_tasks(plan: Plan, tasks: Sequence[Task], client: Client, workers: int) -> Iterator[Ended]:
+    """Do tasks on Dask's workers, in this order; yields each when it has ended.
+
+    A failure becomes part of the table; the next call tries again. There are no more tasks under
+    way than workers, so that none ends with a worker that another one kills.
+    """
+    from distributed import wait
+
+    waiting = iter(tasks)
+    running: dict[Future, Task] = {}
+    sessions: dict[Trial, Future] = {}
+    failed: set[Trial] = set()
+    while True:
+        for task in islice(waiting, workers - len(running)):
+            needed = [sessions[trial] for trial in task.sessions(plan) if trial in sessions]
+            future = client.submit(do_task, plan, task, needed, key=None, pure=False)
+            running[future] = task
+            if not task.label:
+                sessions[task.trial] = future
+        if not running:
+            return
+        for future in wait(list(running), return_when="FIRST_COMPLETED").done:
+            task = running.pop(future)
+            failure = _failure(future)
+            if failure and not task.label:
+                failed.add(task.trial)
+            elif failure:
+                of_session = not failed.isdisjoint(task.sessions(plan))
+                failure = f"session: {failure}" if of_session else failure
+                write_part(task.failed(plan), _failure_rows(plan, task, failure), plan.schema)
+            yield Ended(task, failure, {} if failure else future.result())
+
+
+def _failure(future: Future) -> str:
+    """Why a task has no result. Raises ChselError if that says nothing about the task."""
+    from distributed import KilledWorker
+
+    if future.cancelled():
+        raise ChselError("Dask's scheduler is gone; the same command goes on with another one")
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        times = error.allowed_failures + 1
+        return f"its worker died {times} times, as of a lack of memory"
+    return "" if error is None else one_line(error)
+
+
+def _failure_rows(plan: Plan, task: Task, reason: str) -> list[Row]:
+    """A row a step, or one without a step if there is no session that has the steps."""
+    about = {**plan.about(task.trial, task.label), "status": f"failed: {reason}"}
+    if plan.policies or not has_session(plan, task.trial):
+        return [about]
+    return [{**about, "step": step} for step in read_session(plan, task.trial).steps]
 
 
 def dask_setup(worker: object) -> None:
     """Leave Ctrl-C to the process that waits; Dask calls this in every worker that preloads it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _made(folder: Path, given: Files) -> dict[str, bytes]:
-    paths = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in paths.items() if name not in given}
-
-
-def _is_disk_error(error: BaseException | None) -> bool:
-    """Whether an error, or one behind it, is that a disk is full or cannot be written."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
-            return True
-        error = error.__cause__ or error.__context__
-    return False
-
-
-@cache
-def _environment() -> Mapping[str, str]:
-    return environment()

@@ -24,18 +24,13 @@ _ACCEPTED = "accepted: a choice of object=, with any other of its keys, such as 
 
 @dataclass(frozen=True)
 class TrialConfiguration:
-    """One configuration as evaluations know it.
+    """One configuration as evaluations know it."""
 
-    object: whose it is. probes: how many it has; None: its logs tell. log_folder: of recorded
-    logs, beside which OBJECT_FILE says what the object is; None where logs are simulated. faults:
-    the level of faults in its sessions, see LEVELS; the name has it, too, unless it is CLEAN.
-    """
-
-    name: str
+    name: str  # with the level of faults, unless it is CLEAN
     object: str
-    probes: int | None = None
-    log_folder: Path | None = None
-    faults: str = CLEAN
+    probes: int | None = None  # how many; None: its logs tell
+    log_folder: Path | None = None  # of recorded logs, with OBJECT_FILE; None: they are simulated
+    faults: str = CLEAN  # the level of faults in its sessions, see LEVELS
 
     @property
     def clean_name(self) -> str:
@@ -49,16 +44,11 @@ def configurations_of(kind: str, logs: Path | None = None) -> dict[str, TrialCon
     Those of sessions of sensors are the folders in `logs`, and the simulated robot's where there
     are no others. Raises SettingError for a folder that does not exist or does not name its object.
     """
-    if kind != SENSORS:
-        return {
-            name: TrialConfiguration(name, one.object, len(one.grid))
-            for name, one in CONFIGURATIONS.items()
-        }
+    known = CABINET_CONFIGURATIONS if kind == SENSORS else CONFIGURATIONS
     simulated = {
-        name: TrialConfiguration(name, one.object, len(one.grid))
-        for name, one in CABINET_CONFIGURATIONS.items()
+        name: TrialConfiguration(name, one.object, len(one.grid)) for name, one in known.items()
     }
-    if logs is None:
+    if kind != SENSORS or logs is None:
         return simulated
     if not logs.is_dir():
         raise SettingError(

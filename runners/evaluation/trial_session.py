@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,20 +18,19 @@ from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.environment import environment
 from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
-from replay.files import WritingError
-from replay.mcap.writer import McapRecorder
+from replay.files import WritingError, whole_file
 from runners.evaluation.plan import Plan, Trial
-from runners.evaluation.sensor_logs import ensure_log
+from runners.evaluation.sensor_logs import ensure_log, guessed_pose, simulated_truth
+from runners.evaluation.step_recorder import recording_in
 from runners.evaluation.trial_configurations import SENSORS
-from runners.evaluation.true_poses import find_truth, known_at_the_end
+from runners.evaluation.true_poses import sought_pose
 from runners.objects.loader import check_size, load_object
 from runners.sessions import open_session
+from runners.sessions.problem_source import ProbedProblems
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
 METHOD = "none"
 """The method that the recording of a session alone names."""
-SESSION_FILES = ("session.mcap", "session.json", "plausible/*")
-"""Patterns of the files in the folder of a trial that are about its session."""
 TRUTH = "truth"
 """Key of the configuration under which stands how a true pose was found."""
 
@@ -51,18 +49,19 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
         "configuration": trial.configuration,
     }
     session = open_session(plan.kind, settings, model, trial.seed)
-    if plan.kind == SENSORS:
-        for warning in check_size(model, session.workspace):
-            warnings.warn(warning, stacklevel=2)
     try:
         sdf = model.grid(settings)
         truth: FloatArray | None = session.world_from_object
         events: Iterable[Event] = session.probes()
         if log is not None:
+            for warning in check_size(model, session.workspace):
+                warnings.warn(warning, stacklevel=2)
             # The true pose stands at the beginning, and is found with what is known at the end.
             events = list(events)
-            problem = known_at_the_end(trial, session, sdf, events)
-            truth, config[TRUTH] = find_truth(plan, problem, model.mesh, log)
+            found = ProbedProblems(events, session, sdf, trial.seed)
+            at_end = found.problem(max(found.steps, default=0))
+            known = guessed_pose(log), plan.truth, simulated_truth(log)
+            truth, config[TRUTH] = sought_pose(at_end, model.mesh, *known)
             config["session"]["path"] = f"{trial.configuration}/{log.name}"
         recorder.record(
             SessionStarted(
@@ -91,7 +90,6 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
         recorder.record(SessionEnded(step, "finished"))
     finally:
         session.close()
-        recorder.close()
 
 
 _ONE = OnlineSettings(hypotheses=1)
@@ -99,14 +97,10 @@ _ONE = OnlineSettings(hypotheses=1)
 
 @dataclass(frozen=True)
 class TrialSession:
-    """What session.json tells: steps with a registration, and why some have no plausible set.
-
-    seconds: of probing and of making the sets.
-    """
+    """What session.json tells: steps with a registration, and why some have no plausible set."""
 
     steps: tuple[int, ...]
     failures: Mapping[int, str]
-    seconds: Mapping[str, float]
 
 
 def make_session(plan: Plan, trial: Trial) -> None:
@@ -115,12 +109,12 @@ def make_session(plan: Plan, trial: Trial) -> None:
     Those of a session with faults are the sets of the one without.
     """
     folder, clean = trial.folder(plan), trial.without_faults(plan)
-    begun = time.perf_counter()
     if not (folder / "session.mcap").exists():
-        record_session(plan, trial, McapRecorder(folder / "session.mcap"))
-    probed = time.perf_counter()
+        with recording_in(folder / "session.mcap") as recorder:
+            record_session(plan, trial, recorder)
     session = open_recorded(plan, trial)
-    settings = plausible_settings_of(plan, session)
+    settings, truth = plausible_settings_of(plan, session), session.world_from_object
+    assert truth is not None
     steps, failures = [], {}
     before: PlausibleSet | None = None
     for problem in problems(plan, trial, session):
@@ -129,14 +123,14 @@ def make_session(plan: Plan, trial: Trial) -> None:
         if clean != trial or not plan.plausible:
             continue
         try:
-            before = _made(plan, trial, session, problem, settings, before)
+            before = _made(folder / "plausible", problem, truth, settings, before)
         except EvaluationError as error:
             failures[str(step)] = " ".join(str(error).split())
-    seconds = {"session": probed - begun, "plausible sets": time.perf_counter() - probed}
-    told = {"steps": steps, "no_plausible_set": failures, "seconds": seconds}
+    told: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
     if TRUTH in session.recorded.config:
         told[TRUTH] = session.recorded.config[TRUTH]
-    (folder / "session.json").write_text(json.dumps(told, indent=2) + "\n")
+    with whole_file(folder / "session.json") as beside:
+        beside.write_text(json.dumps(told, indent=2) + "\n")
 
 
 def read_session(plan: Plan, trial: Trial) -> TrialSession:
@@ -150,18 +144,9 @@ def read_told(path: Path) -> TrialSession:
         told = json.loads(path.read_text())
         failures = {int(step): str(text) for step, text in told["no_plausible_set"].items()}
         steps = tuple(int(step) for step in told["steps"])
-        return TrialSession(steps, failures, dict(told["seconds"]))
+        return TrialSession(steps, failures)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise RecordingError(f"{path} is damaged ({error}); remove it") from None
-
-
-def has_session(plan: Plan, trial: Trial) -> bool:
-    """Whether `make_session` has finished with a trial."""
-    try:
-        read_session(plan, trial)
-    except (OSError, RecordingError):
-        return False
-    return True
 
 
 def open_recorded(plan: Plan, trial: Trial) -> RecordedSession:
@@ -183,9 +168,14 @@ def plausible_settings_of(plan: Plan, session: RecordedSession) -> PlausibleSett
     return plan.plausible_settings(float(config["epsilon"]))
 
 
-def problems(plan: Plan, trial: Trial, session: RecordedSession) -> Iterator[RegistrationProblem]:
-    """What is known at every step with a registration; E_0 is one pose that stands for any."""
-    online = session.online(_ONE, trial.seed, only=plan.steps_of(trial.configuration))
+def problems(
+    plan: Plan, trial: Trial, session: RecordedSession, settings: OnlineSettings = _ONE
+) -> Iterator[RegistrationProblem]:
+    """What is known at every step with a registration, none of which follows from a result.
+
+    settings: of E_0, which is one pose by default, that stands for any.
+    """
+    online = session.online(settings, trial.seed, only=plan.steps_of(trial.configuration))
     steps = online.steps(session.perceived())
     return (step.problem for step in steps if step.problem is not None)
 
@@ -205,15 +195,13 @@ def load_members(
 
 
 def _made(
-    plan: Plan,
-    trial: Trial,
-    session: RecordedSession,
+    folder: Path,
     problem: RegistrationProblem,
+    truth: FloatArray,
     settings: PlausibleSettings,
     before: PlausibleSet | None,
 ) -> PlausibleSet:
-    folder, truth = trial.folder(plan) / "plausible", session.world_from_object
-    assert truth is not None
+    """The set of a step, which is made unless it is there. before: that of the step before."""
     found = load_plausible(folder, problem, settings, world_from_object=truth)
     if found is None:
         found = plausible_set(problem, truth, settings, survivors=before)

@@ -13,7 +13,6 @@ from pathlib import Path
 from chsel.errors import ChselError
 
 PUBLISHED = "0.2.1"
-_LAST_LINES = 4000
 
 
 class PackageError(ChselError):
@@ -33,30 +32,25 @@ class PackageConfig:
 
 
 def interpreter(config: PackageConfig, say: Callable[[str], None]) -> Path:
-    """The interpreter that has the package; its environment is made first if there is none."""
+    """The interpreter that has the package; its environment is made first if there is none.
+
+    The environment has torch in the version and build of ours.
+    """
     if config.python is not None:
         return Path(config.python).expanduser()
     directory = Path(config.directory).expanduser()
     finished = directory / f"chsel-{PUBLISHED}"
     python = directory / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     if not finished.exists():
-        make_environment(directory, python, config.pip, say)
+        torch = f"torch=={version('torch')}"
+        say(f"making an environment for chsel {PUBLISHED} in {directory}, once: some minutes")
+        _run("venv", [sys.executable, "-m", "venv", str(directory)])
+        install = [str(python), "-m", "pip", "install", "--quiet", *config.pip]
+        for packages in ([torch], [torch, f"chsel=={PUBLISHED}"]):
+            say(f"installing {packages[-1]}")
+            _run("pip", [*install, *packages])
         finished.touch()
     return python
-
-
-def make_environment(
-    directory: Path, python: Path, pip: tuple[str, ...], say: Callable[[str], None]
-) -> None:
-    """A virtual environment with the package, and torch in the version and build of ours."""
-    torch = f"torch=={version('torch')}"
-    say(f"making an environment for chsel {PUBLISHED} in {directory}, once: some minutes")
-    _run("venv", [sys.executable, "-m", "venv", str(directory)])
-    install = [str(python), "-m", "pip", "install", "--quiet", *pip]
-    say(f"installing {torch}")
-    _run("pip", [*install, torch])
-    say(f"installing chsel=={PUBLISHED}")
-    _run("pip", [*install, torch, f"chsel=={PUBLISHED}"])
 
 
 def _run(what: str, command: list[str]) -> None:
@@ -74,6 +68,6 @@ def _run(what: str, command: list[str]) -> None:
 
 def last_line(text: str) -> str:
     """What an error output says, in one line."""
-    lines = [line.strip() for line in text[-_LAST_LINES:].splitlines() if line.strip()]
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("ERROR:")]
     return (errors or lines or ["no message"])[-1]

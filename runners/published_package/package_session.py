@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import trimesh
 
 from chsel.errors import PoseError
-from chsel.numerics.arrays import FloatArray
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses, inverse, nearest_rigid
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import in_preset
 from chsel.problem.streams import Purpose
 from chsel.qd.selection import repeated
-from runners.published_package.problem_file import save_problem
+from replay.files import file_digest, whole_file
+from runners.evaluation.external_results import REPEAT_FOLDER
+from runners.evaluation.plan import Task, Trial
+from runners.evaluation.repeats import repeat_label, repeat_seed
 from runners.published_package.process import PublishedPackage, RefusedError
 from runners.sessions.recorded import RecordedSession, RecordedSettings
 
@@ -26,69 +30,95 @@ HOW = replace(in_preset(OnlineSettings(), "reference"), initial="so3")
 """E_0 and E_l as the package's authors make them, but first from the starts that all others get."""
 
 
-@dataclass(frozen=True, eq=False)
-class PackageSet:
-    """What the package has found."""
-
-    hypotheses: Hypotheses
-    seconds: float  # that it took, its constructor included
-    cpu_seconds: float  # of its one thread alone: fewer where others keep the processor busy
-    free_points: int  # that it knew of
-
-    @property
-    def world_from_object(self) -> FloatArray:
-        """The poses (B, 4, 4), best first."""
-        return inverse(self.hypotheses.object_from_world)
-
-
-@dataclass
+@dataclass(frozen=True)
 class PackageSession:
-    """Registers a session with the package, step by step.
+    """One draw of a trial: what registers it, and the files of what is found, in a folder of sets.
 
-    seed: of all random numbers. warm: whether it has registered before; the first of all
-    registrations runs twice, so that no time holds what is loaded only once.
+    session: the trial's recording. steps: those to register.
     """
 
     package: PublishedPackage
-    seed: int
-    warm: bool = False
+    folder: Path
+    trial: Trial
+    draw: int
+    session: Path
+    steps: tuple[int, ...]
 
-    def sets(self, path: Path, steps: Collection[int]) -> Iterator[tuple[int, PackageSet | str]]:
-        """What is found at each of the steps, or why nothing is. path: of the recording."""
-        session = RecordedSession(RecordedSettings(str(path), start_contacts=0, start_probe=0))
-        found: PackageSet | None = None
+    @property
+    def unit(self) -> Task:
+        """As progress names it."""
+        return Task(self.trial, repeat_label("package", self.draw))
+
+    @property
+    def sets(self) -> Path:
+        """The hypotheses, as runners.evaluate takes them."""
+        of_draw = self.folder / REPEAT_FOLDER.format(self.draw) if self.draw else self.folder
+        return of_draw / self.trial.configuration / f"seed_{self.trial.seed}.npz"
+
+    @property
+    def about(self) -> Path:
+        """How the sets came about, and why steps have none; written last."""
+        return self.sets.with_suffix(".about.json")
+
+    def failures(self) -> Mapping[str, str] | None:
+        """Why steps have no set; None if the sets are not there, or of another session or version.
+
+        A file that cannot be read is made again.
+        """
+        with suppress(OSError, ValueError):
+            about = json.loads(self.about.read_text())
+            if self.sets.is_file() and self._source().items() <= about.items():
+                return dict(about["failed"])
+        return None
+
+    def register(self) -> Iterator[int]:
+        """Yields each step when the package is done with it; the files are there at the end."""
+        session = RecordedSession(RecordedSettings(str(self.session), 0, 0))
+        arrays: dict[str, Any] = {}
+        about: dict[str, Any] = {"failed": {}, "cpu_seconds": {}, "free_points": {}}
 
         def register(problem: RegistrationProblem) -> Hypotheses:
-            nonlocal found
-            found = self._registered(problem, session.recorded.mesh)
-            return found.hypotheses
+            found, answer = registered(self.package, problem, session.recorded.mesh)
+            step = problem.key.step
+            arrays[f"step_{step}"] = inverse(found.object_from_world)
+            arrays[f"cost_{step}"] = found.cost
+            arrays[f"seconds_{step}"] = np.array(answer["seconds"])
+            for name in ("cpu_seconds", "free_points"):
+                about[name][str(step)] = answer[name]
+            return found
 
-        online = session.online(HOW, self.seed, only=steps)
+        online = session.online(HOW, repeat_seed(self.trial.seed, self.draw), only=self.steps)
         for step in online.steps(session.perceived(), register, (RefusedError, PoseError)):
             if step.failure is not None:
-                yield step.step, " ".join(str(step.failure).split())
-            elif step.problem is not None:
-                assert found is not None
-                yield step.step, found
+                about["failed"][str(step.step)] = " ".join(str(step.failure).split())
+            yield step.step
+        with whole_file(self.sets) as beside, beside.open("wb") as file:
+            np.savez(file, **arrays)
+        with whole_file(self.about) as beside:
+            beside.write_text(json.dumps({**self._source(), **about}, indent=2) + "\n")
 
-    def _registered(self, problem: RegistrationProblem, mesh: trimesh.Trimesh) -> PackageSet:
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "problem.npz"
-            save_problem(problem, mesh.bounds, path)
-            self.package.ask("load", problem=str(path))
-        # It draws from generators of its own, of one number that follows from ours.
-        seed = int(problem.key.stream(Purpose.EMITTER).integers(2**32))
-        if not self.warm:
-            self.package.ask("register_as_published", seed=seed)
-            self.warm = True
-        answer = self.package.ask("register_as_published", seed=seed)
-        poses = nearest_rigid("a pose of the package", np.array(answer["poses"]))
-        elites = nearest_rigid("an elite of the package", np.array(answer["elites"]))
-        cost = np.array(answer["cost"], dtype=np.float64)
-        if not np.isfinite(cost).all():
-            raise RefusedError("a cost of the package is not finite")
-        order = np.argsort(cost, kind="stable")
-        poses, cells = poses[order], np.full(len(poses), -1, dtype=np.int64)
-        found = Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites)
-        seconds, cpu = float(answer["seconds"]), float(answer["cpu_seconds"])
-        return PackageSet(found, seconds, cpu, int(answer["free_points"]))
+    def _source(self) -> dict[str, Any]:
+        return {
+            "session": file_digest(self.session),
+            "steps": list(self.steps),
+            "draw": self.draw,
+            "versions": dict(self.package.versions),
+        }
+
+
+def registered(
+    package: PublishedPackage, problem: RegistrationProblem, mesh: trimesh.Trimesh
+) -> tuple[Hypotheses, Mapping[str, Any]]:
+    """What the package finds with its own settings, best first, and its whole answer."""
+    package.load(problem, mesh.bounds)
+    # It draws from generators of its own, of one number that follows from ours.
+    seed = int(problem.key.stream(Purpose.EMITTER).integers(2**32))
+    answer = package.register(seed=seed)
+    poses = nearest_rigid("a pose of the package", np.array(answer["poses"]))
+    elites = nearest_rigid("an elite of the package", np.array(answer["elites"]))
+    cost = np.array(answer["cost"], dtype=np.float64)
+    if not np.isfinite(cost).all():
+        raise RefusedError("a cost of the package is not finite")
+    order = np.argsort(cost, kind="stable")
+    poses, cells = poses[order], np.full(len(poses), -1, dtype=np.int64)
+    return Hypotheses(poses, cost[order], repeated(Poses.of(poses)), cells, elites), answer

@@ -8,9 +8,12 @@ import subprocess
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+import numpy as np
+
+from chsel.numerics.arrays import FloatArray
+from chsel.problem.registration_problem import RegistrationProblem
 from runners.published_package.environment import PUBLISHED, PackageError, last_line
 
 _WORKER = Path(__file__).with_name("worker.py")
@@ -26,6 +29,7 @@ class PublishedPackage:
 
     def __init__(self, python: Path) -> None:
         """Raises PackageError if `python` is not an interpreter that has the package."""
+        self._warm = False
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close)
         try:
@@ -38,7 +42,6 @@ class PublishedPackage:
                 text=True,
             )
         except OSError as error:
-            self._printed.close()
             raise PackageError(
                 f"package.python {python} does not run ({error.strerror}); {_ACCEPTED}"
             ) from None
@@ -53,6 +56,37 @@ class PublishedPackage:
         if self.versions["chsel"] != PUBLISHED:
             self.close()
             raise PackageError(f"{python} has chsel {self.versions['chsel']}; {_ACCEPTED}")
+
+    def load(self, problem: RegistrationProblem, object_bounds: FloatArray) -> None:
+        """Hand a problem over; object_bounds (2, 3): of the mesh, in its frame, metres."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "problem.npz"
+            np.savez(
+                path,
+                sdf_origin=problem.sdf.origin,
+                sdf_resolution=problem.sdf.resolution,
+                sdf_values=problem.sdf.values,
+                sdf_gradients=problem.sdf.gradients,
+                object_bounds=np.asarray(object_bounds, dtype=np.float64),
+                free=problem.points.free,
+                free_spacing=problem.free_resolution,
+                known=problem.points.known,
+                known_sdf=problem.points.sdf,
+                occupied=problem.points.occupied,
+                initial_set=problem.initial_set,
+                low_cost_set=problem.low_cost_set,
+            )
+            self.ask("load", problem=str(path))
+
+    def register(self, **arguments: Any) -> dict[str, Any]:
+        """What the worker's `register` gives; the very first one runs twice.
+
+        So no time holds what is loaded only once.
+        """
+        if not self._warm:
+            self.ask("register", **arguments)
+            self._warm = True
+        return self.ask("register", **arguments)
 
     def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
         """Have the process do a task (a method of the worker's) and return its answer."""
@@ -78,22 +112,12 @@ class PublishedPackage:
 
     def close(self) -> None:
         """End the process."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        with suppress(BrokenPipeError):
-            self._process.stdin.close()
-        self._process.stdout.close()
         self._process.kill()
-        self._process.wait()
+        self._process.communicate()
         self._printed.close()
 
     def __enter__(self) -> PublishedPackage:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

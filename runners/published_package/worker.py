@@ -16,7 +16,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -83,71 +82,46 @@ class Worker:
                 GridSdf(self._data),
                 cache_path=str(Path(folder) / "sdf.pkl"),
             )
-        free, contacts = self._data["free"], self._data["contacts"]
+        free, known = self._data["free"], self._data["known"]
         occupied = self._data["occupied"]
         classes = self._chsel.SemanticsClass
-        points = np.concatenate([free, contacts, occupied])
+        points = np.concatenate([free, known, occupied])
         self._positions = torch.tensor(points, dtype=torch.float32)
-        semantics = [classes.FREE.value] * len(free) + [classes.SURFACE.value] * len(contacts)
-        if len(occupied):
-            semantics += [classes.OCCUPIED.value] * len(occupied)
+        semantics = [classes.FREE.value] * len(free) + [classes.SURFACE.value] * len(known)
+        semantics += [classes.OCCUPIED.value] * len(occupied)
         self._semantics = torch.tensor(semantics)
         self._initial_set = torch.tensor(self._data["initial_set"], dtype=torch.float32)
         return {"loaded": problem}
 
     def register(
-        self, cost: str, restarts: int, steps: int, search: int, seed: int
+        self, seed: int, cost: str = "", restarts: int = 0, steps: int = 0, search: int = 0
     ) -> dict[str, Any]:
-        """Construct and register once: seconds, poses (B, 4, 4) of object_from_world, and counts.
-
-        Runs all `restarts` x `steps` steps: the package's own test for convergence is false for
-        every cost when its threshold is not a number.
-        """
-        block = functools.partial(
-            self._descent, max_iterations=restarts, relative_rmse_thr=float("nan"), iterations=steps
-        )
-        self._chsel.sgd.volumetric_registration_sgd = block
-        counted = _counting(getattr(self._chsel, _COSTS[cost]))
-        found = self._registered(seed, {"qd_iterations": search, "cost": counted}, {})
-        return {
-            "seconds": found.seconds,
-            "poses": _matrices(found.result.RTs.R, found.result.RTs.T),
-            "cost_calls": counted.calls,
-            "cost_calls_with_gradient": counted.calls_with_gradient,
-            "poses_evaluated": counted.poses,
-            "free_points": found.free_points,
-        }
-
-    def register_as_published(self, seed: int) -> dict[str, Any]:
-        """Construct and register once, all that the problem does not say as the package has it.
+        """Construct and register once, with the package's own settings where none are given.
 
         Gives seconds, those of the processor alone, poses (B, 4, 4) of object_from_world with
-        their cost (B,), and the poses (L, 4, 4) of the archive's elites: E_l of the next
-        registration.
+        their cost (B,), the poses (L, 4, 4) of the archive's elites, E_l of the next registration,
+        and counts. cost: one of _COSTS. With `restarts` all restarts x steps are done: the
+        package's own test for convergence is false for every cost when its threshold is not a
+        number. search: iterations of CMA-MEGA.
         """
-        self._chsel.sgd.volumetric_registration_sgd = self._descent
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002  (what the package draws from)
+        descent: Any = self._descent
+        if restarts:
+            limits = {"max_iterations": restarts, "iterations": steps}
+            descent = functools.partial(descent, relative_rmse_thr=float("nan"), **limits)
+        self._chsel.sgd.volumetric_registration_sgd = descent
+        construct: dict[str, Any] = {"qd_iterations": search} if search else {}
+        counting = _counting(getattr(self._chsel, _COSTS[cost])) if cost else None
+        if counting is not None:
+            construct["cost"] = counting
         measure = self._chsel.measure.PositionMeasure(2)  # the package's own choice
-        given: dict[str, Any] = {}
+        start: dict[str, Any] = {}
         if len(self._data["low_cost_set"]):
             low_cost_set = torch.tensor(self._data["low_cost_set"], dtype=torch.float32)
             vectors = measure.get_numpy_x(low_cost_set[:, :3, :3], low_cost_set[:, :3, 3])
-            given["low_cost_transform_set"] = vectors
-        known = torch.tensor(self._data["known_sdf"], dtype=torch.float32)
-        found = self._registered(seed, {"known_sdf_values": known}, given)
-        elites = measure.get_torch_RT(np.asarray(found.elites))
-        return {
-            "seconds": found.seconds,
-            "cpu_seconds": found.cpu_seconds,
-            "poses": _matrices(found.result.RTs.R, found.result.RTs.T),
-            "cost": found.result.rmse.tolist(),
-            "elites": _matrices(*elites),
-            "free_points": found.free_points,
-        }
-
-    def _registered(self, seed: int, construct: dict[str, Any], register: dict[str, Any]) -> Any:
-        """What the package finds, with more arguments for its constructor and for register."""
-        torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002  (what the package draws from)
+            start["low_cost_transform_set"] = vectors
+        known_sdf = torch.tensor(self._data["known_sdf"], dtype=torch.float32)
         begun, cpu = time.perf_counter(), time.process_time()
         registration = self._chsel.CHSEL(
             self._sdf,
@@ -155,33 +129,34 @@ class Worker:
             self._semantics,
             resolution=self._resolution,
             free_voxels_resolution=float(self._data["free_spacing"]),
+            known_sdf_values=known_sdf,
             savedir=self._folder,
             **construct,
         )
-        result, elites = registration.register(
-            iterations=1, initial_tsf=self._initial_set, batch=len(self._initial_set), **register
+        found, elites = registration.register(
+            iterations=1, initial_tsf=self._initial_set, batch=len(self._initial_set), **start
         )
-        return SimpleNamespace(
-            seconds=time.perf_counter() - begun,
-            cpu_seconds=time.process_time() - cpu,
-            result=result,
-            elites=elites,
-            free_points=_free_points(registration.volumetric_cost.free_voxels),
-        )
+        return {
+            "seconds": time.perf_counter() - begun,
+            "cpu_seconds": time.process_time() - cpu,
+            "poses": _matrices(found.RTs.R, found.RTs.T),
+            "cost": found.rmse.tolist(),
+            "elites": _matrices(*measure.get_torch_RT(np.asarray(elites))),
+            "free_points": len(
+                registration.volumetric_cost.free_voxels.get_known_pos_and_values()[0]
+            ),
+            "gradients": None if counting is None else counting.gradients,
+        }
 
 
 def _counting(cost: Any) -> Any:
-    """The cost class, counting how often it is called and with how many poses."""
+    """The cost class, counting how often it is called for its gradient."""
 
     class Counting(cost):
-        calls = 0
-        calls_with_gradient = 0
-        poses = 0
+        gradients = 0
 
         def __call__(self, R: Any, T: Any, s: Any, other_info: Any = None) -> Any:
-            Counting.calls += 1
-            Counting.calls_with_gradient += bool(R.requires_grad)
-            Counting.poses += len(R)
+            Counting.gradients += bool(R.requires_grad)
             return super().__call__(R, T, s, other_info)
 
     return Counting
@@ -192,10 +167,6 @@ def _matrices(rotation: Any, position: Any) -> list[Any]:
     transforms = torch.eye(4, dtype=torch.float64).repeat(len(rotation), 1, 1)
     transforms[:, :3, :3], transforms[:, :3, 3] = rotation, position
     return transforms.tolist()
-
-
-def _free_points(voxels: Any) -> int:
-    return len(voxels.get_known_pos_and_values()[0])
 
 
 def main() -> None:

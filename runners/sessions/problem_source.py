@@ -97,7 +97,7 @@ def _recorded(path: Path) -> Source:
     problems: Problems = _RecordedProblems(recording)
     steps = recording.steps
     if not steps:  # nothing was registered, as where somebody else's method is to be measured
-        problems = _ProbedProblems(recording.probes, start, start.sdf, start.seed)
+        problems = ProbedProblems(recording.probes, start, start.sdf, start.seed)
         steps = problems.steps
     if not steps:
         raise RecordingError(f"recording {path} has no registration problem and no probe")
@@ -122,7 +122,7 @@ def _of_session(
     finally:
         opened.close()
     sdf = model.grid(settings)
-    problems = _ProbedProblems(events, opened, sdf, seed)
+    problems = ProbedProblems(events, opened, sdf, seed)
     described = [event.source for event in events if isinstance(event, RigDescribed)]
     return Source(
         model.name,
@@ -158,7 +158,7 @@ class _RecordedProblems:
         return self._recording.hypotheses(step) if self._recording.has_result(step) else None
 
 
-class _ProbedProblems:
+class ProbedProblems:
     """All points up to a step; where a registration starts does not matter here."""
 
     def __init__(

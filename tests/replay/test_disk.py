@@ -16,8 +16,6 @@ from chsel.problem import online_registration as online
 from replay.__main__ import main
 from replay.files import WritingError, new_file, whole_file
 from replay.mcap.writer import McapRecorder
-from replay.rerun.rerun_recorder import RerunRecorder
-from runners.benchmarks import benchmark_tables as report
 from runners.run.recording import write_in_run_folder
 from tests.runners.in_process import run
 
@@ -89,23 +87,11 @@ def test_a_recording_that_does_not_get_to_the_disk_is_an_error(
     def fail(_: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    recorders = {
-        "recording.mcap": McapRecorder(tmp_path / "recording.mcap"),
-        "recording.rrd": RerunRecorder(tmp_path / "recording.rrd"),
-    }
+    recorder = McapRecorder(tmp_path / "recording.mcap")
     monkeypatch.setattr(os, "fsync", fail)
-    for name, recorder in recorders.items():
-        recorder.record(events[0])
-        with pytest.raises(RecordingError, match=rf"{name} cannot be written.*Input/output error"):
-            recorder.close()
-
-
-def test_the_view_is_on_the_disk_when_it_is_closed(events, tmp_path, synced) -> None:
-    path = tmp_path / "recording.rrd"
-    recorder = RerunRecorder(path)
     recorder.record(events[0])
-    recorder.close()
-    assert synced.holds(path)
+    with pytest.raises(RecordingError, match=r"mcap cannot be written.*Input/output error"):
+        recorder.close()
 
 
 def test_recovered_and_accepted_recordings_are_on_the_disk(tmp_path, synced, monkeypatch) -> None:
@@ -179,12 +165,6 @@ def test_a_full_disk_under_a_file_of_a_run_is_named(
     assert sorted(os.listdir(folder)) == whole[name]
     if name == "summary.json":
         assert main(["info", str(folder / "recording.mcap")]) == 0
-
-
-def test_a_full_disk_under_a_benchmark_is_named(tmp_path, full_disk) -> None:
-    full_disk("benchmark.json")
-    with pytest.raises(WritingError, match=r"benchmark\.json cannot be written \(No space left"):
-        report.write(tmp_path / "benchmark.json", {})
 
 
 def test_a_run_folder_that_was_removed_is_not_made_again(tmp_path) -> None:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import pytest
 from hydra._internal.hydra import Hydra
 
-from runners.evaluation.external_results import read_external
+from runners.evaluation import tasks
 from runners.evaluation.plan import Plan, Task
-from runners.evaluation.tasks import input_files, run_task, store_files
+from runners.run.session_run import one_line
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ def run(program: Callable[[], None], *arguments: str, columns: int = 160) -> Don
 
 def do_task(plan: Plan, task: Task) -> str:
     """Do a task of an evaluation in this process; the reason why it failed, "" if it did not."""
-    external = read_external(plan, task.trial, task.label) if task.label in plan.outside else None
-    outcome = run_task(plan.moved(plan.folder, task.trial), task, input_files(plan, task), external)
-    store_files(plan, task, outcome.files)
-    return outcome.failure
+    try:
+        tasks.do_task(plan, task)
+    except Exception as error:
+        return one_line(error)
+    return ""

@@ -12,13 +12,17 @@ import yaml
 
 from chsel.plausible.evaluation_cost import EvaluationCost
 from chsel.plausible.plausible_settings import EvaluationCostSettings
-from chsel.plausible.symmetry import object_symmetry
+from chsel.plausible.true_pose import TruePoseSettings
 from chsel.problem.mesh import clean_mesh
-from chsel.problem.poses import apply, axis_angle, compose, inverse, roll_pitch_yaw
+from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.poses import apply, axis_angle, compose, inverse
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.streams import StreamKey
 from replay.files import file_digest
 from replay.mcap.reader import read_recording
 from runners import align, plausible, probe
-from runners.evaluation import true_poses
+from runners.evaluation.true_poses import sought_pose
 from runners.objects.loader import load_model
 from runners.sensors.pose_file import beside, read_pose
 from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
@@ -182,21 +186,17 @@ def test_what_cannot_be_searched_is_one_line(
     assert len(list(path.parent.iterdir())) == 1
 
 
-def test_roll_pitch_and_yaw_turn_about_the_axes_of_the_world_in_this_order() -> None:
-    x, y, z = np.eye(3)
-    turned = roll_pitch_yaw(np.array([np.pi / 2, 0.0, np.pi / 2])) @ np.stack([x, y, z], axis=1)
-    np.testing.assert_allclose(turned.T, [y, z, x], atol=1e-12)
-    pitched = roll_pitch_yaw(np.array([0.0, np.pi / 2, 0.0])) @ x
-    np.testing.assert_allclose(pitched, -z, atol=1e-12)
-
-
 def test_distances_between_poses_are_modulo_symmetries_at_the_centre() -> None:
     mesh = trimesh.creation.box((0.06, 0.1, 0.14))
     mesh.apply_translation([0.5, 0.0, 0.0])
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    half_turn[:3, 3] = [1.0, 0.002, 0.0]  # about the box's own axis, and 2 mm aside
-    symmetry = object_symmetry(mesh)
-    for between in (align._between, lambda *poses: true_poses._between(*poses).values()):
-        position, rotation = between(POSE @ half_turn, POSE, symmetry)
-        assert position == pytest.approx(0.002, abs=1e-9)
-        assert rotation == pytest.approx(0.0, abs=1e-6)
+    half_turn[:3, 3] = [1.0, 0.02, 0.0]  # about the box's own axis, and 2 cm aside
+    contacts = apply(POSE, trimesh.sample.sample_surface(mesh, 60, seed=0)[0])
+    workspace = Workspace.around(contacts, 0.1)
+    sdf, points = SdfGrid.from_mesh(mesh, 0.005), KnownPoints(known=contacts)
+    problem = RegistrationProblem(sdf, points, np.eye(4)[None], workspace, 0.01, StreamKey(0, 0))
+    search = TruePoseSettings(reach=0.002, spacing=0.002, rotations=1)
+    _, numbers = sought_pose(problem, mesh, POSE, search, POSE @ half_turn)
+    assert numbers["from_known"]["position"] == pytest.approx(0.02, abs=0.004)
+    assert numbers["from_known"]["rotation"] == pytest.approx(0.0, abs=0.05)
+    assert numbers["mean_distance"] < 0.002

@@ -15,9 +15,6 @@ import pytest
 from chsel.errors import RecordingError
 from replay.__main__ import main as replay_main
 from replay.mcap.reader import Recording, read_recording
-from replay.recorder import BackgroundRecorder
-from replay.rerun.rerun_recorder import RerunRecorder
-from replay.rerun.stream import RrdFile
 from runners.run.recording import RecordingConfig, open_recorder
 from tests.tools.kill_sessions import points_session, reported_probes
 
@@ -169,46 +166,3 @@ def test_two_runs_never_share_a_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"recording\.mcap cannot be written: File exists"):
         open_recorder(tmp_path, config)
     recorder.close()
-
-
-@pytest.mark.parametrize(("content", "whole"), [(b"...RRF2FOOT....", True), (b"...", False)])
-def test_pictures_without_their_end_are_an_error(
-    tmp_path: Path, content: bytes, whole: bool
-) -> None:
-    file = RrdFile(tmp_path / "recording.rrd")
-    (tmp_path / "recording.rrd").write_bytes(content)
-    if whole:
-        file.finish()
-    else:
-        with pytest.raises(RecordingError, match="cannot be written to its end"):
-            file.finish()
-
-
-def test_pictures_that_no_longer_grow_are_an_error_at_the_next_check(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    file = RrdFile(path)
-    for content in (b"...", b"......"):
-        path.write_bytes(content)
-        file.check(grown=True)
-    file.check(grown=False)  # nothing was drawn since
-    with pytest.raises(RecordingError, match="cannot be written: the disk may be full"):
-        file.check(grown=True)
-
-
-def test_pictures_that_are_gone_are_an_error_or_one_warning(
-    tmp_path: Path, recwarn: pytest.WarningsRecorder
-) -> None:
-    path = tmp_path / "recording.rrd"
-    for optional in ("", "`replay view` makes it anew"):
-        recorder = BackgroundRecorder(RerunRecorder(path), optional=optional)
-        path.unlink()
-        if optional:
-            recorder.flush()
-            recorder.flush()  # warns once
-            recorder.close()
-        else:
-            recorder.flush()
-            with pytest.raises(RecordingError, match="is not there any more"):
-                recorder.close()
-    (warning,) = recwarn
-    assert "is not there any more; `replay view` makes it anew" in str(warning.message)

@@ -12,7 +12,6 @@ from runners import evaluate
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.selection import chosen_names
-from runners.evaluation.table import RESULTS, read_part, write_part
 from runners.evaluation.trial_configurations import configurations_of, with_faults
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.figures import method_styles
@@ -62,20 +61,6 @@ def test_without_plausible_sets_there_is_no_pd_but_the_distance_from_the_truth(
     assert not TRIAL.folder(plan).exists()
     with pytest.raises(SettingError, match="plausible is True, was False"):
         join_experiment(plan_in(tmp_path / "out", steps="5"), "test", ["mustard"], [0])
-
-
-def test_parts_of_earlier_versions_have_no_faults(tmp_path: Path) -> None:
-    later = ("faults", "truth_held", "nearest_hypothesis", "nearest_position", "nearest_rotation")
-    fields = [field for field in RESULTS if field.name not in later]
-    path = tmp_path / "old.parquet"
-    write_part(
-        path,
-        [{"method": "icp", "definition": "paper"}],
-        RESULTS.empty_table().select([field.name for field in fields]).schema,
-    )
-    (found,) = read_part(path, RESULTS, "paper").to_pylist()
-    assert found["faults"] == "clean"
-    assert found["truth_held"] is found["nearest_hypothesis"] is None
 
 
 @pytest.mark.parametrize(

@@ -19,14 +19,7 @@ from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
 from runners import report
 from runners.evaluation.definition import definition_label, definition_text
-from runners.evaluation.table import (
-    ITERATIONS,
-    RESULTS,
-    RESULTS_ORDER,
-    read_part,
-    write_part,
-    write_table,
-)
+from runners.evaluation.table import ITERATIONS, RESULTS, write_part, write_table
 from runners.reporting.evaluation_folder import ReportError, open_evaluation
 from tests.chsel.plausible.scenes import WORKSPACE, ball
 from tests.runners.in_process import run
@@ -132,19 +125,13 @@ def test_rows_from_before_there_was_a_column_have_the_definition_of_their_folder
 @pytest.mark.parametrize("schema", [RESULTS, ITERATIONS], ids=["results", "iterations"])
 def test_parts_by_another_definition_go_into_no_table(tmp_path: Path, schema: pa.Schema) -> None:
     found = dict.fromkeys(schema.names) | {"method": "icp", "step": 4}
-    old = tmp_path / "old.parquet"
-    names = [name for name in schema.names if name != "definition"]
-    without = pa.schema([schema.field(name) for name in names])
-    write_part(old, [{name: found[name] for name in names}], without)
-    table = read_part(old, schema, "paper")
-    assert table.column_names == schema.names
+    one, other = tmp_path / "one.parquet", tmp_path / "other.parquet"
+    write_part(one, [found | {"definition": "paper"}], schema)
+    write_part(other, [found | {"definition": "default"}], schema)
+    with pytest.raises(RecordingError, match=r"other\.parquet has numbers by the def.* default"):
+        write_table(tmp_path, "results", [one, other], schema, "paper")
+    table = write_table(tmp_path, "results", [one], schema, "paper")
     assert table["definition"].to_pylist() == ["paper"]
-    new = tmp_path / "new.parquet"
-    write_part(new, [found | {"definition": "default"}], schema)
-    with pytest.raises(RecordingError, match=r"new\.parquet has numbers by the definition default"):
-        write_table(tmp_path, "results", [old, new], schema, RESULTS_ORDER[3:], "paper")
-    both = write_table(tmp_path, "results", [old, new], schema, RESULTS_ORDER[3:], "default")
-    assert both["definition"].to_pylist() == ["default", "default"]
 
 
 def test_a_definition_that_cannot_be_is_named() -> None:

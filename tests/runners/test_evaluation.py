@@ -7,7 +7,6 @@ import json
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,33 +16,33 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from distributed import Client
 from filelock import FileLock, Timeout
 
-from chsel.errors import ChselError, RecordingError
+from chsel.errors import ChselError, RecordingError, SettingError
 from chsel.methods.icp import Icp
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.plausible_file import read_plausible
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry, object_symmetry
-from chsel.problem.poses import axis_angle
+from chsel.problem.poses import axis_angle, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.settings import settings_mapping
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.events import Measured
 from replay.files import WritingError, whole_file
 from replay.mcap.reader import read_recording
-from runners.evaluation import run_method, scheduling
-from runners.evaluation.cluster import Connection, LocalConfig, connected
+from runners.evaluation import step_recorder, tasks
+from runners.evaluation.cluster import LocalConfig, _checked_size, connected
 from runners.evaluation.contenders import Contender, chosen_contenders
 from runners.evaluation.experiment import collect, join_experiment, writing_alone
-from runners.evaluation.external_results import ExternalSetError, read_external
+from runners.evaluation.external_results import read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
-from runners.evaluation.progress_display import Progress
-from runners.evaluation.scheduling import Scheduling, is_finished
+from runners.evaluation.result_rows import ResultRows
 from runners.evaluation.selection import chosen_configurations, chosen_seeds
-from runners.evaluation.tasks import Outcome, input_files, run_on_worker, run_task
+from runners.evaluation.tasks import do_tasks, is_finished, tasks_of
 from runners.evaluation.trial_configurations import configurations_of
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.sessions.probing_settings import ProbingSettings
@@ -147,65 +146,55 @@ def test_a_contender_has_its_preset_and_changes_by_method_label_and_entry() -> N
     assert marked.settings["cost"]["lookup"] == "nearest"
 
 
+Cluster = tuple[Client, int]
+
+
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Connection]:
+def cluster() -> Iterator[Cluster]:
     """A cluster of one worker."""
     with connected(LocalConfig("local", None, False), 1, print) as cluster:
         yield cluster
 
 
-def finished(plan: Plan, cluster: Connection) -> Progress:
-    """Do all tasks of the trial."""
-    tasks = Scheduling(plan, [TRIAL], lambda _: None)
-    tasks.run(cluster)
-    return tasks.progress
+def finished(plan: Plan, cluster: Cluster) -> dict[str, str]:
+    """Do all tasks of the trial that are not done; why each failed, by its label."""
+    missing = [task for task in tasks_of(plan, [TRIAL]) if not is_finished(plan, task)]
+    return {ended.task.label: ended.failure for ended in do_tasks(plan, missing, *cluster)}
 
 
-def _dies(plan: Plan, task: Task, files: Any, external: Any) -> Outcome:
+def _dies(plan: Plan, task: Task, *needed: Any) -> Any:
     """Kills its worker, always or once, by the label of the task."""
     mark = plan.folder / "tried"
     if task.label == "always" or (task.label == "once" and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return run_on_worker(plan, task, files, external)
+    return tasks.do_task(plan, task, *needed)
 
 
 def test_a_worker_that_dies_once_costs_nothing_and_twice_its_task_alone(
-    make_plan: MakePlan, cluster: Connection, monkeypatch: pytest.MonkeyPatch
+    make_plan: MakePlan, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scheduling, "run_on_worker", _dies)
+    monkeypatch.setattr(tasks, "do_task", _dies)
     plan = make_plan([{"name": "icp", "label": label} for label in ("always", "once", "fine")])
-    progress = finished(plan, cluster)
-    assert {task.label for task in progress.failed} == {"always"}
-    assert (progress.finished, progress.done) == (1, 2)
+    ended = finished(plan, cluster)
+    assert (ended["once"], ended["fine"]) == ("", "")
+    assert ended["always"] == "its worker died 2 times, as of a lack of memory"
     status = {row["method"]: row["status"] for row in results(plan)}
     assert status["once"] == status["fine"] == "ok"
-    assert status["always"].startswith("failed: its worker died 2 times, as of a lack of memory")
     failed = [row for row in results(plan) if row["method"] == "always"]
     assert [row["step"] for row in failed] == [4, 5]
+    assert {row["status"] for row in failed} == {f"failed: {ended['always']}"}
     assert {row["diversity"] for row in failed} == {None}
     monkeypatch.undo()
-    assert finished(plan, cluster).done == 1  # the same command tries again
+    assert finished(plan, cluster) == {"always": ""}  # the same command tries again
     assert {row["status"] for row in results(plan)} == {"ok"}
     assert not list(TRIAL.folder(plan).glob("*failed*"))
 
 
-def _raises(*_: Any) -> None:
-    raise ModuleNotFoundError("No module named 'runners'")
-
-
-def test_workers_that_cannot_run_tasks_end_the_evaluation(
-    make_plan: MakePlan, cluster: Connection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(scheduling, "run_on_worker", _raises)
-    with pytest.raises(ChselError, match=r"a worker cannot run .* No module named 'runners'"):
-        finished(make_plan(), cluster)
-
-
-def test_workers_of_several_threads_are_refused(make_plan: MakePlan) -> None:
-    client = SimpleNamespace(nthreads=lambda: {"tcp://a": 1, "tcp://b": 4}, as_current=nullcontext)
-    with pytest.raises(ChselError, match="a worker has 4 threads; accepted: one"):
-        finished(make_plan(), Connection(client))
+def test_workers_of_several_threads_are_refused() -> None:
+    client = SimpleNamespace(nthreads=lambda: {"tcp://a": 1, "tcp://b": 4})
+    with pytest.raises(SettingError, match="a worker has 4 threads; accepted: one"):
+        _checked_size(client)  # type: ignore[arg-type]
 
 
 class _FailsAtFour(Icp):
@@ -231,11 +220,12 @@ def test_a_registration_that_fails_is_a_row_and_the_session_goes_on(
 
 
 def test_a_session_that_fails_fails_its_methods_and_no_others(
-    tmp_path: Path, cluster: Connection
+    tmp_path: Path, cluster: Cluster
 ) -> None:
     plan = plan_in(tmp_path, objects="scans", assets=tmp_path / "nowhere")
     join_experiment(plan, "test", [TRIAL.configuration], [TRIAL.seed])
-    assert {task.label for task in finished(plan, cluster).failed} == {"", "icp"}
+    ended = finished(plan, cluster)
+    assert ended["icp"] == f"session: {ended['']}" != "session: "
     (row,) = results(plan)
     assert row["step"] is None
     assert row["status"].startswith("failed: session: ")
@@ -257,7 +247,7 @@ def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["session.json", "icp.parquet"])
-def test_a_damaged_file_is_made_again(make_plan: MakePlan, cluster: Connection, name: str) -> None:
+def test_a_damaged_file_is_made_again(make_plan: MakePlan, cluster: Cluster, name: str) -> None:
     plan = make_plan()
     finished(plan, cluster)
     before = results(plan)
@@ -265,57 +255,38 @@ def test_a_damaged_file_is_made_again(make_plan: MakePlan, cluster: Connection, 
     start = path.read_bytes()[:20]
     path.unlink()  # other tests share the file
     path.write_bytes(start)
-    progress = finished(plan, cluster)
-    assert (progress.finished, progress.done, progress.failed) == (1, 1, {})
+    assert list(finished(plan, cluster).values()) == [""]
     after = results(plan)
     for row in before + after:
         row.pop("seconds")
     assert after == before
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
-def test_a_disk_that_cannot_be_written_stops_everything(
-    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch, number: int
+def test_a_file_on_a_full_disk_is_named_and_not_left_half_written(
+    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(table: Any, path: Path) -> None:
         path.write_bytes(b"half")
-        raise OSError(number, os.strerror(number))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    plan, task = make_plan(), Task(TRIAL, "icp")
+    plan = make_plan(recordings=False)
     monkeypatch.setattr(pa.parquet, "write_table", full)
-    outcome = run_task(plan, task, input_files(plan, task))
-    assert outcome.stops
-    assert f"icp.parquet cannot be written ({os.strerror(number)})" in outcome.failure
-    assert str(TRIAL.folder(plan)) in outcome.failure  # not the worker's own folder
-    assert not list(TRIAL.folder(plan).glob("icp*"))
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device here")
-def test_a_full_disk_under_a_recording_stops_everything(make_plan: MakePlan) -> None:
-    plan = make_plan()
-    path = TRIAL.folder(plan) / "icp.mcap"
-    with pytest.raises(WritingError, match="No space left on device"), whole_file(path) as beside:
-        _record_on_full_disk(beside)
+    failure = do_task(plan, Task(TRIAL, "icp"))
+    path = TRIAL.folder(plan) / "icp.parquet"
+    assert failure.startswith(f"{path} cannot be written (No space left on device)")
     assert not list(TRIAL.folder(plan).glob("*icp*"))
 
 
-def _record_on_full_disk(path: Path) -> None:
-    path.symlink_to("/dev/full")
-    try:
-        path.write_bytes(bytes(100_000))
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror})") from None
-
-
-def test_what_cannot_be_recorded_is_a_failure_of_its_task_alone(
+def test_what_cannot_be_recorded_is_a_failure_of_its_task_and_leaves_no_file(
     make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(self: Any, event: Any) -> None:
         raise RecordingError("not finite")
 
     plan = make_plan()
-    monkeypatch.setattr(run_method.McapRecorder, "record", refused)
+    monkeypatch.setattr(step_recorder.McapRecorder, "record", refused)
     assert do_task(plan, Task(TRIAL, "icp")) == "not finite"
+    assert not list(TRIAL.folder(plan).glob("*icp*"))
 
 
 def _half_written(path: Path) -> None:
@@ -411,8 +382,8 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"step_3": [POSE, SCALED]}, r"step_3\[1\] is not rigid"),
-        ({"step_3": [MIRROR]}, r"step_3\[0\] mirrors"),
+        ({"step_3": [POSE, SCALED]}, r"step_3\[1\] is not a rigid transform"),
+        ({"step_3": [MIRROR]}, r"step_3\[0\] is not a rigid transform"),
         ({"step_3": [POSE[:3]]}, r"step_3 has shape \(1, 3, 4\)"),
         ({"step_3": [POSE * np.nan]}, r"step_3\[0\] is not finite"),
         ({"step_3": np.zeros((0, 4, 4))}, "step_3 is empty"),
@@ -427,7 +398,7 @@ def test_a_set_from_outside_that_is_wrong_is_told(
 ) -> None:
     (tmp_path / "mustard").mkdir()
     np.savez(tmp_path / "mustard" / "seed_0.npz", **values)
-    with pytest.raises(ExternalSetError, match=message):
+    with pytest.raises(ChselError, match=message):
         read_external(plan_in(tmp_path, outside={"mine": tmp_path}), TRIAL, "mine")
 
 
@@ -451,7 +422,7 @@ def test_searches_are_measured_from_the_same_starts(make_plan: MakePlan) -> None
     for label in plan.contenders:
         recording = read_recording(TRIAL.folder(plan) / f"{label}.mcap")
         assert {verdict.outcome for verdict in verify(recording)} == {EQUAL}
-        assert [snapshot.iteration for snapshot in recording.snapshots(4)] == [0, 20]
+        assert [snapshot.iteration for snapshot in recording.snapshots(4)] == [0, 5, 10, 15, 20]
 
 
 def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without(
@@ -488,3 +459,10 @@ def test_a_session_with_faults_is_measured_by_the_plausible_sets_of_that_without
     nearest = int(np.argmin(np.abs(position - noisy["nearest_position"])))
     assert rotation[nearest] == pytest.approx(noisy["nearest_rotation"])
     assert 0.0 < noisy["nearest_hypothesis"] < 0.1
+
+    rows = ResultRows(plan, faulty, open_recorded(plan, faulty), "icp")
+    true = inverse(truth[None])
+    exact = Hypotheses(true, np.zeros(1), np.zeros(1, dtype=bool), np.full(1, -1), true)
+    assert (
+        rows.row(recording.problem(5), exact)["exact_members"] == 1.0
+    )  # by contacts without noise

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import inverse
+from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
 from runners.evaluation.repeats import repeat_seed
@@ -23,7 +25,6 @@ from tests.runners.in_process import Done, run
 from tests.runners.test_evaluate import SMALL, table
 
 VERSIONS = {"chsel": "0.2.1", "torch": "2"}
-Problem = dict[str, np.ndarray]
 
 
 class StandIn:
@@ -31,7 +32,7 @@ class StandIn:
 
     def __init__(self, versions: dict[str, str] = VERSIONS) -> None:
         self.versions = versions
-        self.problems: list[Problem] = []
+        self.problems: list[RegistrationProblem] = []
         self.seeds: list[int] = []
         self.refused: Sequence[int] = ()
 
@@ -41,19 +42,19 @@ class StandIn:
     def __exit__(self, *_: object) -> None:
         return None
 
-    def ask(self, task: str, **arguments: Any) -> dict[str, Any]:
-        if task == "load":
-            with np.load(arguments["problem"]) as data:
-                self.problems.append(dict(data))
-            return {}
-        assert task == "register_as_published"
-        self.seeds.append(arguments["seed"])
+    def load(self, problem: RegistrationProblem, object_bounds: FloatArray) -> None:
+        assert object_bounds.shape == (2, 3)
+        self.problems.append(problem)
+
+    def register(self, seed: int) -> dict[str, Any]:
+        self.seeds.append(seed)
         if len(self.problems) in self.refused:
             raise RefusedError("RuntimeError: no  interior\npoints")
-        poses = self.problems[-1]["initial_set"].copy()
+        problem = self.problems[-1]
+        poses = problem.initial_set.copy()
         poses[:, 0, 3] += 0.01
         cost = np.linspace(1.0, 0.5, len(poses))
-        found = {"seconds": 2.0, "cpu_seconds": 1.5, "free_points": len(self.problems[-1]["free"])}
+        found = {"seconds": 2.0, "cpu_seconds": 1.5, "free_points": len(problem.points.free)}
         return {**found, "poses": poses.tolist(), "cost": cost.tolist(), "elites": poses.tolist()}
 
 
@@ -93,16 +94,16 @@ def test_each_step_starts_around_the_best_pose_of_the_one_before(
     first, second = stand_in.problems
     recorded = read_recording(folder / "trials/mustard/seed_0/icp.mcap")
     problem = recorded.problem(4)
-    np.testing.assert_array_equal(first["initial_set"], problem.initial_set)  # as others start
-    np.testing.assert_array_equal(first["free"], problem.points.free)
-    np.testing.assert_array_equal(first["contacts"], problem.points.contacts)
-    np.testing.assert_array_equal(first["sdf_values"], problem.sdf.values)
-    assert len(first["low_cost_set"]) == 0
-    moved = first["initial_set"].copy()
+    np.testing.assert_array_equal(first.initial_set, problem.initial_set)  # as others start
+    np.testing.assert_array_equal(first.points.free, problem.points.free)
+    np.testing.assert_array_equal(first.points.known, problem.points.contacts)
+    np.testing.assert_array_equal(first.sdf.values, problem.sdf.values)
+    assert len(first.low_cost_set) == 0
+    moved = first.initial_set.copy()
     moved[:, 0, 3] += 0.01
-    np.testing.assert_allclose(second["low_cost_set"], moved, atol=1e-12)
-    np.testing.assert_allclose(second["initial_set"][0], moved[-1], atol=1e-12)
-    away = inverse(second["initial_set"])[:, :3, 3] - inverse(moved[-1:])[:, :3, 3]
+    np.testing.assert_allclose(second.low_cost_set, moved, atol=1e-12)
+    np.testing.assert_allclose(second.initial_set[0], moved[-1], atol=1e-12)
+    away = inverse(second.initial_set)[:, :3, 3] - inverse(moved[-1:])[:, :3, 3]
     assert 0.02 < np.sqrt((away[1:] ** 2).mean()) < 0.1  # 5 cm along each axis
     with np.load(tmp_path / "sets/mustard/seed_0.npz") as sets:
         names = [f"{name}_{step}" for name in ("cost", "seconds", "step") for step in (4, 5)]
@@ -112,7 +113,7 @@ def test_each_step_starts_around_the_best_pose_of_the_one_before(
         assert sets["seconds_5"] == 2.0
     about = json.loads((tmp_path / "sets/mustard/seed_0.about.json").read_text())
     assert about["cpu_seconds"] == {"4": 1.5, "5": 1.5}
-    assert about["free_points"]["4"] == len(first["free"])
+    assert about["free_points"]["4"] == len(first.points.free)
 
 
 def test_draws_differ_in_their_numbers_alone_and_rank_under_labels_of_their_own(
@@ -121,10 +122,9 @@ def test_draws_differ_in_their_numbers_alone_and_rank_under_labels_of_their_own(
     sets = tmp_path / "sets"
     assert register(folder, sets, "draws=2").returncode == 0
     one, _, other, _ = stand_in.problems
-    np.testing.assert_array_equal(one["free"], other["free"])
-    assert not np.isclose(one["initial_set"][:, :3, 3], other["initial_set"][:, :3, 3]).any()
-    assert len(set(stand_in.seeds)) == 4  # two draws of two steps; the first of all runs twice
-    assert len(stand_in.seeds) == 5
+    np.testing.assert_array_equal(one.points.free, other.points.free)
+    assert not np.isclose(one.initial_set[:, :3, 3], other.initial_set[:, :3, 3]).any()
+    assert len(set(stand_in.seeds)) == len(stand_in.seeds) == 4  # two draws of two steps
     done = evaluated(folder, f"outside.package={sets}")
     assert (done.returncode, done.stderr) == (0, "")
     by = {(row["method"], row["step"]): row for row in table(folder)}
@@ -168,7 +168,7 @@ def test_a_step_that_the_package_refuses_is_told_and_the_session_goes_on(
     assert "seed 0: package: step 4: RuntimeError: no interior points" in done.stdout
     with np.load(tmp_path / "mustard/seed_0.npz") as sets:
         assert sorted(sets.files) == ["cost_5", "seconds_5", "step_5"]
-    assert len(stand_in.problems[1]["low_cost_set"]) == 0  # there is no step before
+    assert len(stand_in.problems[1].low_cost_set) == 0  # there is no step before
 
 
 def test_a_process_that_ends_stops_all_and_leaves_what_is_finished(
@@ -179,7 +179,7 @@ def test_a_process_that_ends_stops_all_and_leaves_what_is_finished(
     def die(*_: object, **__: object) -> None:
         raise PackageError("its process ended: Killed")
 
-    monkeypatch.setattr(stand_in, "ask", die)
+    monkeypatch.setattr(stand_in, "register", die)
     done = register(folder, tmp_path, "draws=2")
     assert (done.returncode, done.stderr) == (2, "error: its process ended: Killed\n")
     assert [path.name for path in tmp_path.rglob("*.npz")] == ["seed_0.npz"]
@@ -260,7 +260,7 @@ def test_the_worker_hands_over_all_points_and_leaves_the_rest_to_the_package(
         sdf_gradients=np.zeros((2, 2, 2, 3)),
         object_bounds=np.zeros((2, 3)),
         free=np.full((2, 3), 1.0),
-        contacts=np.full((1, 3), 2.0),
+        known=np.full((1, 3), 2.0),
         occupied=np.full((1, 3), 3.0),
         known_sdf=np.array([0.005]),
         free_spacing=0.025,
@@ -268,7 +268,7 @@ def test_the_worker_hands_over_all_points_and_leaves_the_rest_to_the_package(
         low_cost_set=low,
     )
     worker.load(str(tmp_path / "problem.npz"))
-    answer = worker.register_as_published(seed=7)
+    answer = worker.register(seed=7)
     assert worker._chsel.sgd.volumetric_registration_sgd is published_descent
     assert asked["points"][:, 0].tolist() == [1.0, 1.0, 2.0, 3.0]
     assert asked["semantics"] == [1, 1, 0, 2]

@@ -44,7 +44,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     session = open_recorded(plan, TRIAL)
     truth = session.world_from_object
     assert truth is not None
-    rows = ResultRows(plan, TRIAL, session, "made_up", "default")
+    rows = ResultRows(plan, TRIAL, session, "made_up")
     problem = list(problems(plan, TRIAL, session))[-1]
     members, _ = rows.members(problem)
     assert members is not None
@@ -70,11 +70,11 @@ def test_errors_are_those_of_the_best_hypothesis(scene: Scene) -> None:
     shifts = np.array([[0.012, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.0, 0.1]])
     turns = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.3, 0.0, 0.0]])
     shifted = hypotheses(moved(scene.truth, shifts, turns))
-    row = scene.rows.row(scene.problem, shifted, scene.members, "")
+    row = scene.rows.row(scene.problem, shifted)
     assert row["position_error"] == pytest.approx(0.012)
     assert row["rotation_error"] == pytest.approx(0.0, abs=1e-6)
     turned = hypotheses(moved(scene.truth, shifts[::-1], turns[::-1]))
-    row = scene.rows.row(scene.problem, turned, scene.members, "")
+    row = scene.rows.row(scene.problem, turned)
     assert row["rotation_error"] == pytest.approx(0.3)
     assert (row["best_cost"], row["mean_cost"]) == (0.0, 1.0)
     assert (row["hypotheses"], row["distinct"]) == (3, 3)
@@ -82,7 +82,7 @@ def test_errors_are_those_of_the_best_hypothesis(scene: Scene) -> None:
 
 def test_points_are_counted_by_their_class(scene: Scene) -> None:
     points = scene.problem.points
-    row = scene.rows.row(scene.problem, None, scene.members, "no reason")
+    row = scene.rows.row(scene.problem, None, "no reason")
     assert row["status"] == "failed: no reason"
     assert row["free_points"] == len(points.free) > 1000
     assert row["contacts"] == len(points.contacts) == len(points.known) > 0
@@ -101,9 +101,8 @@ def test_exact_members_are_those_within_one_epsilon_of_the_true_cost(scene: Scen
     far = poses[above > 5.0 * EPSILON][:4]
     assert (len(inside), len(near), len(far)) == (3, 5, 4)
     found = hypotheses(np.concatenate([inside, near, far]))
-    row = scene.rows.row(scene.problem, found, scene.members, "")
+    row = scene.rows.row(scene.problem, found)
     assert row["exact_members"] == pytest.approx(3.0 / 12.0)
-    assert scene.rows.row(scene.problem, found, None, "none")["status"] == "none"
 
 
 def test_all_steps_of_a_session_are_measured_by_the_same_points_on_the_surface(

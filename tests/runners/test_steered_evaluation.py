@@ -21,7 +21,7 @@ from runners import evaluate, probe
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
 from runners.evaluation.policy_contenders import chosen_policies
-from runners.evaluation.probe_rows import spread_of
+from runners.evaluation.run_policy import spread_of, usual_stop
 from tests.runners.in_process import do_task, run
 from tests.runners.made_up_evaluations import tables_of
 from tests.runners.test_evaluate import stamps
@@ -115,6 +115,21 @@ def check_decision(row: dict[str, Any], recording: Any) -> None:
     best = after.decision.expected_spread[np.isfinite(after.decision.score)].min()
     assert row["promised"] == row["spread"] - best
     assert row["decision_seconds"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("spread", "promised", "stop"),
+    [
+        (0.004, 0.05, "spread"),
+        (0.1, 0.0001, "gain"),
+        (0.1, 0.05, ""),
+        (0.1, None, ""),
+    ],
+)
+def test_the_usual_rules_stop_at_a_narrow_belief_or_where_little_is_promised(
+    spread: float, promised: float | None, stop: str
+) -> None:
+    assert usual_stop(spread, promised) == stop
 
 
 def test_sessions_are_those_of_runners_probe(folder: Path, tmp_path: Path) -> None:

@@ -62,13 +62,8 @@ def views_of_the_last_layout(path: Path) -> set[str]:
     return {name for row in rows for name in row.get("ViewBlueprint:display_name") or ()}
 
 
-def in_layout(path: Path, name: str) -> Any:
-    """The one value of a component that the last layout has once."""
-    ((value,),) = [row[name] for row in last_layout(path) if row.get(name)]
-    return value
-
-
 def opens_at(path: Path) -> tuple[str, PlayState]:
-    """The timeline that the viewer shows first, and whether it rests at its first moment."""
-    timeline = in_layout(path, "TimePanelBlueprint:timeline")
-    return timeline, PlayState(in_layout(path, "TimePanelBlueprint:play_state"))
+    """The timeline that the viewer shows first, and whether it follows what comes."""
+    panel = {name: value for row in last_layout(path) for name, value in row.items() if value}
+    (timeline,), (state,) = (panel[f"TimePanelBlueprint:{n}"] for n in ("timeline", "play_state"))
+    return timeline, PlayState(state)

@@ -28,7 +28,7 @@ def pixel_rows(
         raise UnusableMessage(f"encoding {encoding!r} is no depth; accepted: {kinds}")
     kind = np.dtype(_KINDS[encoding]).newbyteorder(">" if big_endian else "<")
     row = width * kind.itemsize
-    if step < row or step * height != len(data) or not data:
+    if not 0 < row <= step or height < 1 or step * height != len(data):
         raise UnusableMessage(
             f"an image of {width} x {height} in rows of {step} bytes cannot have {len(data)} bytes"
         )

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from mcap.records import Schema
-from mcap_ros2.decoder import DecoderFactory
 
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log import message_fields as fields
@@ -34,6 +33,8 @@ def ros2_decoder(name: str, definition: str | None = None) -> Decode | None:
     definition: of the schema in the file, by which messages are decoded; by default that of ROS 2.
     Raises UnusableMessage for one that is not understood.
     """
+    from mcap_ros2.decoder import DecoderFactory  # of the extra "sensors"
+
     short = short_name(name)
     contents = _CONTENTS.get(short)
     if contents is None:

@@ -16,7 +16,7 @@ from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.colors import UNAVAILABLE, ScoreScale
+from replay.colors import UNAVAILABLE
 from replay.events import ActionsOffered, Decided, Event, Probe, SessionEnded, SessionStarted
 from replay.rerun.rerun_recorder import RerunRecorder
 from tests.tools.rrd_rows import Row, at_probe, read, shown_at, views_of_the_last_layout
@@ -24,16 +24,16 @@ from tests.tools.rrd_rows import Row, at_probe, read, shown_at, views_of_the_las
 MESH = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
 SDF = SdfGrid.from_mesh(MESH, 0.05)
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-DOWN = np.diag([1.0, -1.0, -1.0])
+ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # its last column
 ACTIONS = Actions(
     compose(
-        np.stack([np.eye(3), np.eye(3), DOWN]),
+        np.stack([np.eye(3), np.eye(3), ALONG_X]),
         np.array([[0.0, 0.0, -0.6], [0.1, 0.0, -0.6], [0.0, 0.2, 0.7]]),
     ),
     np.array([0.5, 0.02, 0.4]),
 )
 HAND = HandShape.of(trimesh.creation.box(extents=(0.02, 0.04, 0.1)))
-ENTITIES = ("/scene/actions", "/score_legend", "/decision")
+ENTITIES = ("/scene/actions", "/decision")
 
 
 def decided(step: int, chosen: int, score: list[float], stop: str = "") -> Decided:
@@ -119,7 +119,7 @@ def test_every_action_is_an_arrow_along_its_way_no_longer_than_it(
     )
     vectors = np.array(shown["Arrows3D:vectors"])
     lengths = np.linalg.norm(vectors, axis=1)
-    np.testing.assert_allclose(vectors / lengths[:, None], [[0, 0, 1], [0, 0, 1], [0, 0, -1]])
+    np.testing.assert_allclose(vectors / lengths[:, None], [[0, 0, 1], [0, 0, 1], [1, 0, 0]])
     assert lengths[1] == pytest.approx(0.02, rel=1e-6)
     assert lengths[0] == pytest.approx(lengths[2])
     assert 0.02 < lengths[0] < 0.2
@@ -173,11 +173,11 @@ def curve(rows: dict[str, list[Row]], name: str) -> dict[int, float]:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("spread/after", {-1: 100.0, 0: 50.0, 1: 100.0 / 3.0}),
+        ("spread/spread", {-1: 100.0, 0: 50.0, 1: 100.0 / 3.0}),
         ("spread/expected", {0: 30.0, 1: 25.0}),  # of the chosen action, at its own probe
-        ("hit/forecast", {0: 0.75, 1: 0.25}),
+        ("hit/forecast_chance", {0: 0.75, 1: 0.25}),
         ("hit/outcome", {0: 1.0, 1: 0.0}),
-        ("surprise/outcome", {0: 0.5, 1: 1.0}),
+        ("surprise/surprise", {0: 0.5, 1: 1.0}),
     ],
 )
 def test_what_happened_stands_beside_its_forecast(
@@ -192,17 +192,6 @@ def test_the_hand_of_the_actions_is_drawn_where_the_probe_is_deepest(
     shown = shown_at(rows["/scene/hand"], 0)
     assert len(shown["Mesh3D:triangle_indices"]) == len(HAND.faces)
     np.testing.assert_allclose(shown["InstancePoses3D:translations"], [[0.0, 0.0, -0.3]], rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("step", "texts"),
-    [(-1, ["1", "3", "3 actions"]), (0, ["7", "7", "1 action"]), (1, ["stop: actions"])],
-)
-def test_the_legend_says_what_scores_there_are(
-    rows: dict[str, list[Row]], step: int, texts: list[str]
-) -> None:
-    labels = shown_at(rows["/score_legend/score"], step)["Points2D:labels"]
-    assert sorted(labels) == sorted([*texts, "score"])
 
 
 def test_the_log_says_what_was_decided(rows: dict[str, list[Row]]) -> None:
@@ -226,23 +215,7 @@ def test_only_steered_sessions_have_views_of_decisions(tmp_path: Path, recording
     assert not any(at_probe(found, -1) for found in read(plain).values())
     more = views_of_the_last_layout(recording) - views_of_the_last_layout(plain)
     assert more == {
-        "Scores",
         "Spread and its forecast [mm]",
-        "Hit: chance, and outcome as dots",
+        "Hit: chance and outcome",
         "Surprise [nats]",
     }
-
-
-@pytest.mark.parametrize(
-    ("score", "fractions"),
-    [
-        ([-1e308, 1e308, 0.0], [0.0, 1.0, 0.5]),  # whose difference is not finite
-        ([1e-300, 0.0], [1.0, 0.0]),
-        ([2.0, 2.0], [1.0, 1.0]),
-    ],
-)
-def test_scores_of_any_size_have_a_place_on_the_scale(
-    score: list[float], fractions: list[float]
-) -> None:
-    scores = np.array(score)
-    assert ScoreScale.of(np.append(scores, -np.inf)).fraction(scores).tolist() == fractions

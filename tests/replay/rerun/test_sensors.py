@@ -12,7 +12,7 @@ import trimesh
 
 from chsel.problem.poses import compose
 from replay.events import Event, Probe, RigDescribed, SensorImage
-from replay.rerun.meshes import deepest
+from replay.rerun.scene import deepest
 from replay.rerun.sensors import display_size, pixel_classes
 from tests.replay.rerun.test_recorder import probe, registration, started, write
 from tests.tools.rrd_rows import Row, at_probe, read, until_probe, views_of_the_last_layout
@@ -100,10 +100,6 @@ def test_pictures_tell_which_pixels_count(rows: dict[str, list[Row]]) -> None:
     np.testing.assert_array_equal(classes == 0, depth(0).mask)
     assert classes[0, 0] == 2  # no measurement
     assert classes[0, 1] == 1
-    caption = at_probe(rows["/sensors/camera/caption"], 0)[-1]["Points2D:labels"]
-    assert caption[0].startswith("probe 0: 79.2 % used; 0.06 to ")
-    felt = at_probe(rows["/sensors/pad_1/caption"], 1)[-1]["Points2D:labels"]
-    assert felt == ["probe 1: 46.7 % in contact; 0 to 10 mm"]
 
 
 def test_deformations_have_one_range_of_millimetres(rows: dict[str, list[Row]]) -> None:
@@ -129,27 +125,7 @@ def test_each_image_has_its_moment_and_a_probe_shows_the_largest_contact(
 
 
 def test_a_pad_that_tells_nothing_of_a_probe_shows_nothing(rows: dict[str, list[Row]]) -> None:
-    for name in ("values", "pixels", "caption"):
-        last = at_probe(rows[f"/sensors/pad_1/{name}"], 2)
-        assert [values for values in last if "Clear:is_recursive" in values]
-
-
-def test_the_first_registration_shows_the_images_of_its_probe(tmp_path: Path) -> None:
-    events: list[Event] = [started(), RigDescribed(-1, "cabinet", "0a1b", HAND)]
-    events += [touch(0, 9), depth(0), probe(0), depth(1), touch(1, 7), touch(1, 4), probe(1)]
-    rows = read(write(tmp_path / "a.rrd", [*events, *registration(1)]))
-
-    def first(entity: str) -> dict[str, Any]:
-        return [values for times, values in rows[entity] if times.get("registration") == 1][-1]
-
-    felt = pixels(first("/sensors/pad_1/pixels"), "SegmentationImage", np.uint8, (3, 5))
-    assert (felt == 0).sum() == 7
-    seen = first("/scene/cameras/camera/depth")
-    np.testing.assert_array_equal(pixels(seen, "DepthImage", np.uint16, (4, 6)), depth(1).values)
-    assert first("/sensors/camera/caption")["Points2D:labels"][0].startswith("probe 1: ")
-    hand = np.array(first("/scene/hand")["InstancePoses3D:translations"], np.float32)
-    path = probe(1).gripper_path
-    np.testing.assert_array_equal(hand, path[deepest(path), :3, 3].astype(np.float32)[None])
+    assert at_probe(rows["/sensors/pad_1"], 2) == [{"Clear:is_recursive": [True]}]
 
 
 def test_sensors_have_views_beside_all_others(recording: Path, tmp_path: Path) -> None:

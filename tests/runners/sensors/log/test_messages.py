@@ -25,6 +25,7 @@ from runners.sensors.log.messages import (
     CloudMessage,
     Content,
     Decode,
+    Decoded,
     ImageMessage,
     JointsMessage,
     MarkerMessage,
@@ -257,12 +258,15 @@ def test_messages_of_other_bytes_are_well_formed_or_faults(
     decode, data = sent[which]
     start = 4 + int(place * len(data) - 4) // 4 * 4  # where numbers of ROS 2 begin
     rest = b"" if other is None else other + data[start + len(other) :]
-    contents: list[object] = []
+    found: list[Decoded] = []
     with suppress(UnusableMessage):
-        contents += [content for _, content in decode(data[:start] + rest)]
-    for content in contents:
+        found += decode(data[:start] + rest)
+    for stamp, content in found:
+        assert stamp is None or 0 < stamp < 2**63
         for name, value in vars(content).items():
-            if "_from_" in name:
+            if isinstance(content, ImageMessage) and name == "values":
+                assert value.size > 0
+            elif "_from_" in name:
                 check_rigid(name, value[None])
             elif isinstance(content, JointsMessage):
                 assert np.isfinite(list(value.values())).all()
