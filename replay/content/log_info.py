@@ -74,8 +74,11 @@ class LogInfo:
 
 def is_other_programs(path: str | Path) -> bool:
     """Whether a file is a robot's: a ROS 1 bag, or MCAP, by its header not a recording of ours."""
+    path = Path(path).expanduser()
+    if not path.is_file():  # a FIFO would be waited for
+        return False
     try:
-        with Path(path).expanduser().open("rb") as file:
+        with path.open("rb") as file:
             if file.read(len(ROS1_BAG)) == ROS1_BAG:
                 return True
             file.seek(0)

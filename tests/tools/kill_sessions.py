@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import shutil
 import signal
 import sys
@@ -99,7 +100,7 @@ def points_session(folder: Path, probes: int = PROBES) -> tuple[str, ...]:
 def reported_probes(output: str) -> int:
     """How many whole lines of a session's output are about a probe that is done."""
     lines = output.splitlines(keepends=True)
-    return sum(line.startswith("probe ") and line.endswith("\n") for line in lines)
+    return sum(re.fullmatch(r"probe +\d+ .*\n", line) is not None for line in lines)
 
 
 def kill_many(count: int, seed: int, tell: Callable[[int], None] = lambda _: None) -> Figures:
