@@ -185,6 +185,7 @@ class Display:
             )
         errors = ["mm", "°", "mm", "°"] if truth else []
         table = plain_table(title, numbers=["probe", "contacts", "best cost", *errors, "time"])
+        table.pad_edge = True  # only lines about a probe begin with "probe"
         table.add_column("verdict", no_wrap=True)
         for row in rows:
             cells = [str(row["step"]), str(row["contacts"]), f"{row['best_cost']:.4g}"]
@@ -266,6 +267,7 @@ def _sensor_table(report: Report) -> Table:
     columns = {name: cells for name, cells in columns.items() if any(cells)}
     title = "sensors; left out: invalid, edge in % of pixels, others in pixels or points"
     table = plain_table(title, texts=["probe", "sensor"], numbers=list(columns))
+    table.pad_edge = True
     for index, (step, sensor, _) in enumerate(rows):
         table.add_row(step, sensor, *(cells[index] for cells in columns.values()))
     return table

@@ -28,7 +28,6 @@ NAMES = (
     "(a)",
     "a\\'b",
     "a#b",
-    "[/bold]",
 )
 SHORT = (
     "recording=mcap",
