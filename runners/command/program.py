@@ -116,6 +116,9 @@ def _exit_on_error(run: Callable[[], None], config_name: str, show_traceback: bo
     except BrokenPipeError:  # the reader of the output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    except ModuleNotFoundError as error:  # caught, as Hydra would print a line of its own
+        sys.excepthook(type(error), error, error.__traceback__)
+        sys.exit(1)
     except _USER_ERRORS as error:
         if show_traceback:
             raise
