@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING
 
-import torch
-
 from chsel.errors import ChselError, RecordingError
+from chsel.numerics.threads import threads
 from replay.environment import environment
 from runners.evaluation.external_results import external_digest, external_rows
 from runners.evaluation.plan import Plan, Task, Trial
@@ -66,16 +65,16 @@ def do_task(plan: Plan, task: Task, needed: Sequence[object] = ()) -> Mapping[st
 
     Gives the environment. needed: what tasks gave that must have ended before.
     """
-    torch.set_num_threads(1)
     task.trial.folder(plan).mkdir(parents=True, exist_ok=True)
-    if not task.label:
-        make_session(plan, task.trial)
-    elif task.label in plan.outside:
-        external_rows(plan, task.trial, task.label)
-    elif plan.policies:
-        run_policy(plan, task.trial, plan.policies[task.label])
-    else:
-        run_method(plan, task.trial, plan.contenders[task.label])
+    with threads(1):
+        if not task.label:
+            make_session(plan, task.trial)
+        elif task.label in plan.outside:
+            external_rows(plan, task.trial, task.label)
+        elif plan.policies:
+            run_policy(plan, task.trial, plan.policies[task.label])
+        else:
+            run_method(plan, task.trial, plan.contenders[task.label])
     if task.label:
         task.failed(plan).unlink(missing_ok=True)
     return environment()
