@@ -107,9 +107,8 @@ def main(config: DictConfig) -> None:
         pose, numbers = sought_pose(problem, source.mesh, guess, search, truth)
     guessed = {"cost": numbers["guess_cost"], **fit(problem, guess, search)}
     print_table(Console(), _table(_title(source, problem), {"guess": guessed, "found": numbers}))
-    console.print(
-        f"found at {pose[:3, 3].round(4).tolist()} m, {_apart(numbers['from_guess'])} away"
-    )
+    position = ", ".join(f"{value:.4f}" for value in pose[:3, 3])
+    console.print(f"moved from the guess by {_apart(numbers['from_guess'])}, to ({position}) m")
     if truth is not None:
         apart = _apart(numbers["from_known"])
         console.print(f"from the true pose that the recording has: {apart}")
