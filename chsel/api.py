@@ -107,11 +107,10 @@ def _warn(points_warnings: list[PointsWarning]) -> None:
 
 def _known_points(surface: Any, free: Any, occupied: Any, known: Any, sdf: Any) -> KnownPoints:
     """All classes together; None stands for no points."""
+    classes = {"surface": surface, "free": free, "occupied": occupied, "known": known}
     surface, free, occupied, known = (
         frozen(name, np.zeros((0, 3)) if value is None else value, (None, 3))
-        for name, value in zip(
-            ("surface", "free", "occupied", "known"), (surface, free, occupied, known), strict=True
-        )
+        for name, value in classes.items()
     )
     sdf = frozen("known_sdf", np.zeros(0) if sdf is None else sdf, (None,))
     if len(known) != len(sdf):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -88,13 +88,11 @@ class CompiledCost:
     def costs(self, poses: Poses) -> FloatArray:
         """Costs (B,) of poses."""
         costs = np.empty(len(poses))
-
-        def run(first: int, last: int, work: Any) -> None:
-            costs_of_poses(self.model, poses.numbers, costs, first, last, work)
-
-        spread(
-            run, len(poses), lambda: work_of(self.model), least=_POSES_PER_THREAD, multiple=LANES
+        run, work = (
+            partial(costs_of_poses, self.model, poses.numbers, costs),
+            partial(work_of, self.model),
         )
+        spread(run, len(poses), work, least=_POSES_PER_THREAD, multiple=LANES)
         return costs
 
 

@@ -16,6 +16,8 @@ from chsel.problem.settings import CheckedSettings, Presets, not_negative, one_o
 
 FREE_TERMS = ("direct", "interior")
 GRADIENTS = ("defined", "exact")
+FEW_INTERIOR_POINTS = 25  # fewer are worth a warning
+_MAX_NODES = 10_000_000  # of the lattice over the SDF grid
 
 
 @dataclass(frozen=True)
@@ -82,10 +84,6 @@ def uncertain_depth(sdf: SdfGrid, depth: float) -> float:
     So free points still matter to a thin object.
     """
     return min(depth, 0.5 * max(-float(sdf.values.min()), 0.0))
-
-
-FEW_INTERIOR_POINTS = 25  # fewer are worth a warning
-_MAX_NODES = 10_000_000  # of the lattice over the SDF grid
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from chsel.numerics.near_points import (
     NearPoints,
     PointTree,
     gather,
-    is_kept,
     near_points_for,
     select,
     to_cells,
@@ -117,7 +116,6 @@ def _gather_within(free, pose, near, n, to_cell, slack, rounding):
         points.number[n] = 0
     else:
         gather(free.tree, free.cells, to_cell, reach, points, n)
-        near.slack[n] = near.slack[n] if is_kept(points, n) else -1.0
 
 
 @leaf

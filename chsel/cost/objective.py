@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -144,11 +144,8 @@ class Objective:
     def costs_and_gradients(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Costs (B,) and the defined gradients (B, d) at vectors (B, d)."""
         costs, gradients = np.empty(len(vectors)), np.empty(vectors.shape)
-
-        def run(first: int, last: int, work: Any) -> None:
-            space = self.space_arrays
-            costs_and_gradients(self.model, space, vectors, costs, gradients, first, last, work)
-
+        space = self.space_arrays
+        run = partial(costs_and_gradients, self.model, space, vectors, costs, gradients)
         spread(run, len(vectors), self.work, multiple=LANES)
         return costs, gradients
 
@@ -179,9 +176,6 @@ class Objective:
     ) -> tuple[FloatArray, FloatArray]:
         moved, costs = vectors.copy(), np.empty(len(vectors))
         adam = iterations, float(rate), float(divisor), ends_on_poses
-
-        def run(first: int, last: int, work: Any) -> None:
-            descend(self.model, self.space_arrays, moved, costs, *adam, first, last, work)
-
+        run = partial(descend, self.model, self.space_arrays, moved, costs, *adam)
         spread(run, len(vectors), self.work, multiple=LANES)
         return moved, costs

@@ -132,20 +132,18 @@ class _Scratch(NamedTuple):
     matched: FloatArray  # (3, N), and where
     form: FloatArray  # (4, 4), a quadratic form of quaternions
     work: FloatArray  # (4, 4)
-    values: FloatArray  # (4,), its eigenvalues
     vectors: FloatArray  # (4, 4), its eigenvectors, in columns
-    last_values: FloatArray  # (4,), the same of the form of the rotation so far
-    last_vectors: FloatArray  # (4, 4)
+    last_vectors: FloatArray  # (4, 4), the same of the form of the rotation so far
+    values: FloatArray  # (4,), its eigenvalues
+    last_values: FloatArray  # (4,)
 
 
 def _scratch(sets: _PointSets) -> _Scratch:
     count = sets.contacts.shape[1]
-    points, matched, squares = np.empty((3, count)), np.empty((3, count)), np.empty(count)
-    form, work, vectors, last_vectors = np.empty((4, 4, 4))
-    values, last_values = np.empty((2, 4))
+    points, matched = np.empty((2, 3, count))
     nearest = np.empty(count, dtype=np.int64)
     return _Scratch(
-        points, squares, nearest, matched, form, work, values, vectors, last_values, last_vectors
+        points, np.empty(count), nearest, matched, *np.empty((4, 4, 4)), *np.empty((2, 4))
     )
 
 

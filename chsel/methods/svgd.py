@@ -27,6 +27,9 @@ from chsel.qd.selection import ranked_hypotheses
 
 _LEAST = 1e-8  # of 2 h^2, which keeps gamma finite
 _MOST_REMEMBERED = 40_000_000  # points around all particles, 16 bytes each
+MOST_ITERATIONS = 1_000_000
+MOST_PARTICLES = 10_000  # numbers are kept for every pair
+_BLOCK = 50  # iterations between two calls of the observer
 
 
 class Particles(NamedTuple):
@@ -173,11 +176,6 @@ def _median(values: Any) -> Any:
     for n in range(1, middle):
         below = max(below, values[n])
     return 0.5 * (below + values[middle])
-
-
-MOST_ITERATIONS = 1_000_000
-MOST_PARTICLES = 10_000  # numbers are kept for every pair
-_BLOCK = 50  # iterations between two calls of the observer
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 CELL = 0.002  # metres: side of the cells of the front
 _LARGEST = 2000  # cells, either way: a hand of 4 m
+MOST_ACTIONS = 20_000  # that are compared in one decision
+STOPS = ("", "spread", "gain", "actions", "budget")
+"""Why no further probe is made: the set is small, no action promises to make it smaller, there is
+none left that can be taken, or as many were made as were allowed. "" if one is made."""
 
 
 class HandFront(NamedTuple):
@@ -110,9 +114,6 @@ def raise_front(front: Any, vertices: Any, faces: Any) -> None:
                 r = 1.0 - p - q
                 if p >= 0.0 and q >= 0.0 and r >= 0.0:
                     heights[i, j] = max(heights[i, j], p * a[2] + q * b[2] + r * c[2])
-
-
-MOST_ACTIONS = 20_000  # that are compared in one decision
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,11 +212,6 @@ class DecisionProblem:
         numbers = np.array([*self.workspace.lower, *self.workspace.upper, self.free_resolution])
         key = np.array([self.key.seed, self.key.step], dtype=np.uint64)
         return digest(text, numbers, self.available, key)
-
-
-STOPS = ("", "spread", "gain", "actions", "budget")
-"""Why no further probe is made: the set is small, no action promises to make it smaller, there is
-none left that can be taken, or as many were made as were allowed. "" if one is made."""
 
 
 @dataclass(frozen=True, eq=False)

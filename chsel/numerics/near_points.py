@@ -29,7 +29,6 @@ _UNIT = 2.0**-20  # 16 roundings of 32-bit numbers: more than are on the way to 
 _UNIT_64 = 1e-12  # more than all roundings of 64-bit numbers in a rigid motion
 _COARSEST = 0.25  # cells: if rounding moves a point further, 32 bits are not enough
 _MOST_LIMIT = 1e6  # of squared distances, in cells
-LONGEST = 16_000  # points, of lists that are kept
 
 
 class PointTree(NamedTuple):
@@ -173,42 +172,30 @@ def _fill_blocks(points, tree):
 class NearPoints(NamedTuple):
     """Scratch for P lists of the packets of points that are near a set of cells."""
 
-    x: Any  # (P C + S,) of spheres around packets, as in PointTree.blocks; float32
+    x: Any  # (P C + 8,) of spheres around packets, C for each list, as in PointTree.blocks; float32
     y: Any
     z: Any
     radius: Any
-    kept: Any  # (P C + S,) which packets they are, ascending, int32
-    own: int  # C, the places of each list
-    begin: IntArray  # (P,) where each list begins: in its C places, or in the S for a longer one
+    kept: Any  # (P C + 8,) which packets they are, ascending, int32
     number: IntArray  # (P,) how many packets each has
-    rows: Any  # (4, S') nodes, or points, that are looked at: x, y, z, radius; float32
-    nodes: Any  # (S',) nodes or packets, int32
-    cells: Any  # (S',) where they lie, int32
-    limits: Any  # (S',) which of CellSet.steps is near enough, int32
-    hits: Any  # (S',) points of a list that may lie in the set, int32
+    rows: Any  # (4, S) nodes, or points, that are looked at: x, y, z, radius; float32
+    nodes: Any  # (S,) nodes or packets, int32
+    cells: Any  # (S,) where they lie, int32
+    limits: Any  # (S,) which of CellSet.steps is near enough, int32
+    hits: Any  # (S,) points of a list that may lie in the set, int32
 
 
 def near_points_for(tree: PointTree, lists: int) -> NearPoints:
-    """Scratch for so many lists of the points of a tree.
-
-    Each has little room, as it takes longer to get much memory than to use a little of it.
-    """
+    """Scratch for so many lists of the points of a tree."""
     packets = tree.packets
-    own = min(packets, LONGEST // LANES)
-    room = lists * own + packets + LANES  # vectors reach beyond the last list
+    room = lists * packets + LANES  # vectors reach beyond the last list
     x, y, z, radius = (np.empty(room, dtype=np.float32) for _ in range(4))
     kept = np.empty(room, dtype=np.int32)
-    begin, number = (scratch(lists, dtype=np.int64) for _ in range(2))
+    number = scratch(lists, dtype=np.int64)
     most = LANES * (packets + 1)
     rows = np.empty((4, most), dtype=np.float32)
     nodes, cells, limits, hits = (np.empty(most, dtype=np.int32) for _ in range(4))
-    return NearPoints(x, y, z, radius, kept, own, begin, number, rows, nodes, cells, limits, hits)
-
-
-@leaf
-def is_kept(near, n):
-    """Whether the n-th list stays while others are filled: a long one lies where others may."""
-    return near.begin[n] < len(near.number) * near.own
+    return NearPoints(x, y, z, radius, kept, number, rows, nodes, cells, limits, hits)
 
 
 @leaf
@@ -241,7 +228,7 @@ def to_cells(tree, box, move):
 def gather(tree, cells, to_cell, slack, near, n):
     """Fill the n-th list with the packets that have points within `slack` metres of the set.
 
-    to_cell: as to_cells makes it; slack includes its rounding. See is_kept.
+    to_cell: as to_cells makes it; slack includes its rounding.
     """
     x, y, z, radius = near.rows[0], near.rows[1], near.rows[2], near.rows[3]
     nodes, count, none = near.nodes, tree.roots, np.uint64(0)
@@ -251,15 +238,15 @@ def gather(tree, cells, to_cell, slack, near, n):
         count = _expand(tree, nodes, count, near)
         _locate_spheres(x, y, z, radius, none, count, to_cell, cells.box, slack, near)
         count = _keep(nodes, none, count, cells.steps, near)
-    begin = n * near.own if count <= near.own else len(near.number) * near.own
+    begin = np.uint64(n * tree.packets)
     for at in range(np.uint64(count)):
-        packet, to = nodes[at], np.uint64(begin) + at
+        packet, to = nodes[at], begin + at
         place = np.uint64(tree.places[np.uint64(packet)])
         near.kept[to] = packet
         near.x[to], near.y[to] = tree.blocks[place], tree.blocks[place + _ROW]
         near.z[to] = tree.blocks[place + np.uint64(2) * _ROW]
         near.radius[to] = tree.blocks[place + np.uint64(3) * _ROW]
-    near.begin[n], near.number[n] = begin, count
+    near.number[n] = count
 
 
 @leaf
@@ -346,7 +333,7 @@ def select(tree, cells, to_cell, rounding, near, n):
     rounding: by how many metres it may move a point.
     """
     steps, where, nodes, hits = cells.steps, near.cells, near.nodes, near.hits
-    begin, count = np.uint64(near.begin[n]), near.number[n]
+    begin, count = np.uint64(n * tree.packets), near.number[n]
     _locate_spheres(
         near.x, near.y, near.z, near.radius, begin, count, to_cell, cells.box, rounding, near
     )

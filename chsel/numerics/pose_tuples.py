@@ -46,11 +46,6 @@ def decode(space, x):
     """The pose of a search vector."""
     if space.planar:
         return _planar(space, x)
-    return _spatial(x)
-
-
-@leaf
-def _spatial(x):
     p, q, r, u, v, w = _gram_schmidt(x)[:6]
     return p, q, r, u, v, w, q * w - r * v, r * u - p * w, p * v - q * u, x[6], x[7], x[8]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,11 +102,8 @@ class EvaluationCost:
         """Costs (B,) of transforms (B, 4, 4); infinite for those not below `limit`."""
         poses = Poses.of(object_from_world)
         costs = np.empty(len(poses))
-
-        def run(first: int, last: int, scratch: EvaluationScratch) -> None:
-            costs_below(self.model, poses.numbers, limit, costs, first, last, scratch)
-
-        spread(run, len(poses), lambda: scratch_for(self.model), least=_POSES_PER_THREAD)
+        run = partial(costs_below, self.model, poses.numbers, limit, costs)
+        spread(run, len(poses), partial(scratch_for, self.model), least=_POSES_PER_THREAD)
         return costs
 
     def at(self, world_from_object: FloatArray) -> float:

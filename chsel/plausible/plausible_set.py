@@ -44,6 +44,28 @@ from chsel.problem.subset import farthest_points
 from chsel.problem.surface import surface_points
 
 _PER_MODE = 4  # members that a mode gets, where there are few modes
+_SHRINK = 0.5  # of the steps of local members
+_ROUNDS, _MOST_ROUNDS = 8, 64  # the latter where the former find fewer than wanted
+_DRAWN = 4000  # poses a round
+_ENOUGH = 20  # times as many as wanted, to choose from
+_POSITION, _ANGLE = 0.01, 0.1  # standard deviations at first, metres and radians
+_LEAST_SCALE = _SHRINK ** (_ROUNDS - 1)
+_FEW = 0.02  # members among those drawn, of which a later round makes steps shorter
+_MODE_STREAM = 200
+_PENALTY = 0.001  # metres that a violated free point adds to the mean of the known ones
+_FIRST_ROTATIONS = 60  # that are scanned for poses to climb from; then twice as many, and so on
+_CANDIDATES = 10_000  # among which those to climb from are chosen
+_RATES = (0.01, 0.004, 0.0015)  # of Adam: in a block of iterations each
+_ITERATIONS = 40
+_SCALE = 20.0  # of the violations in it
+_CLIMB_ROUNDS, _CLIMB_DRAWN = 16, 8  # of random steps, and poses a round for each that climbs
+_CLIMB_POSITION, _CLIMB_ANGLE = 0.003, 0.03  # standard deviations at first, metres and radians
+_CLIMB_SHRINK = 0.7
+_GIVEN_UP = 0.2  # of those still climbing, after every round
+_SURFACE_POINTS = 50
+FORMAT = 1
+MOST_BYTES = 4 * 2**30  # of a file, unpacked: 30 million members
+_UNREADABLE = (ChselError, ValueError, TypeError, KeyError, OverflowError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,28 +210,6 @@ def _filled(members: PlausibleSet, cost: EvaluationCost, limit: float) -> Plausi
     return members.with_members(*local_members(cost, around, limit, wanted, seed=members.seed))
 
 
-_SHRINK = 0.5  # of the steps of local members
-_ROUNDS, _MOST_ROUNDS = 8, 64  # the latter where the former find fewer than wanted
-_DRAWN = 4000  # poses a round
-_ENOUGH = 20  # times as many as wanted, to choose from
-_POSITION, _ANGLE = 0.01, 0.1  # standard deviations at first, metres and radians
-_LEAST_SCALE = _SHRINK ** (_ROUNDS - 1)
-_FEW = 0.02  # members among those drawn, of which a later round makes steps shorter
-
-_MODE_STREAM = 200
-_PENALTY = 0.001  # metres that a violated free point adds to the mean of the known ones
-_FIRST_ROTATIONS = 60  # that are scanned for poses to climb from; then twice as many, and so on
-_CANDIDATES = 10_000  # among which those to climb from are chosen
-_RATES = (0.01, 0.004, 0.0015)  # of Adam: in a block of iterations each
-_ITERATIONS = 40
-_SCALE = 20.0  # of the violations in it
-_CLIMB_ROUNDS, _CLIMB_DRAWN = 16, 8  # of random steps, and poses a round for each that climbs
-_CLIMB_POSITION, _CLIMB_ANGLE = 0.003, 0.03  # standard deviations at first, metres and radians
-_CLIMB_SHRINK = 0.7
-_GIVEN_UP = 0.2  # of those still climbing, after every round
-_SURFACE_POINTS = 50
-
-
 def random_subset(count: int, most: int, stream: np.random.Generator) -> IntArray:
     """At most so many of the numbers below `count`, drawn at random, ascending."""
     if count <= most:
@@ -281,6 +281,8 @@ def modes_between(
 ) -> tuple[FloatArray, FloatArray]:
     """Up to `most` poses (M, 4, 4) that cost less than the limit, and their costs.
 
+    Between the poses of the grid, a mode that is a few millimetres thick fits many times. But
+    around it poses nearly are members: the grid is scanned for those, and they climb from there.
     Each far from members (P, 4, 4), the true pose first, and from the other ones, the farthest
     first. No position is farther outside of the grid's than the separation. All poses are
     world_from_object.
@@ -402,11 +404,6 @@ def _far_from(
         from_it = distance.between(inverse(poses[farthest : farthest + 1]), poses)[0]
         nearest = np.minimum(nearest, from_it)
     return np.array(chosen, dtype=np.int64)
-
-
-FORMAT = 1
-MOST_BYTES = 4 * 2**30  # of a file, unpacked: 30 million members
-_UNREADABLE = (ChselError, ValueError, TypeError, KeyError, OverflowError)
 
 
 def plausible_path(folder: Path, problem: RegistrationProblem, settings: PlausibleSettings) -> Path:

@@ -54,6 +54,8 @@ _MOST_INFORMATIVE = 256  # known points that are put in order
 _ROUNDING = 1e-9  # share of a sum that is more than rounding changes
 _LEAST_OUTWARD = 1e-9  # of a gradient along the normal of a face, so that rounding is no matter
 _LANES = 32  # positions that are looked at together
+_FIRST_LOOK = 4000  # poses that show which costs are worth looking for
+_STREAM = 100  # of the plausible rotations' streams, and those after it
 
 
 def plausible_stream(seed: int, index: int = 0) -> np.random.Generator:
@@ -307,10 +309,6 @@ def _add_bounds(scan: Scan, buffer: ScanBuffer, start: int, m: int) -> None:
         total[i] += max(outside if beyond[i] > 0.0 else inside, 0.0)
 
 
-_FIRST_LOOK = 4000  # poses that show which costs are worth looking for
-_STREAM = 100  # of the plausible rotations' streams, and those after it
-
-
 @dataclass(frozen=True)
 class TruePoseSettings(CheckedSettings):
     """The poses to look at around the guess.
@@ -350,6 +348,7 @@ def find_true_pose(
     """The pose of least evaluation cost near a guess, world_from_object (4, 4).
 
     problem: that of the last step, when most is known. The least of all poses looked at, exactly.
+    So the authors made T* of real data from a pose set by hand; plausible sets are around it.
     """
     settings = settings or TruePoseSettings()
     guess = frozen("guess", guess, (4, 4), error=PoseError)

@@ -6,7 +6,7 @@ They are searched on the surface: first for axes of revolution, then for a finit
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,6 +43,7 @@ _COARSE = 0.05  # of the diameter: coarse errors of rotations within 9 degrees o
 _MOST_CANDIDATES, _MOST_ALIGNED = 400, 50
 _SAME = np.deg2rad(10.0)  # between two approximations of one element
 _IMPROVEMENTS = 5
+_FOUND: dict[str, ObjectSymmetry] = {}  # by digests of meshes
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +80,12 @@ def object_symmetry(mesh: trimesh.Trimesh) -> ObjectSymmetry:
     """The symmetries of a mesh, within the tolerance of `RotatedSurface`.
 
     The centre is the surface's centroid, which every symmetry maps to itself, and which open meshes
-    have, too. A pure function of vertices and faces; the last few results are kept.
+    have, too. A pure function of vertices and faces; results are kept.
     """
-    return _symmetry(_MeshByDigest(mesh_digest(mesh), mesh))
+    key = mesh_digest(mesh)
+    if key not in _FOUND:
+        _FOUND[key] = _symmetry(RotatedSurface(mesh))
+    return _FOUND[key]
 
 
 def grid_symmetry(sdf: SdfGrid) -> ObjectSymmetry:
@@ -89,17 +93,7 @@ def grid_symmetry(sdf: SdfGrid) -> ObjectSymmetry:
     return ObjectSymmetry(object_centre(sdf) if has_surface(sdf) else sdf.bounds.mean(axis=0))
 
 
-@dataclass(frozen=True)
-class _MeshByDigest:
-    """A mesh, equal to all of the same content."""
-
-    digest: str
-    mesh: trimesh.Trimesh = field(compare=False)
-
-
-@lru_cache(maxsize=8)
-def _symmetry(key: _MeshByDigest) -> ObjectSymmetry:
-    surface = RotatedSurface(key.mesh)
+def _symmetry(surface: RotatedSurface) -> ObjectSymmetry:
     if surface.radius == 0.0:
         return ObjectSymmetry(surface.centre)
     axes = _axes_of_revolution(surface)

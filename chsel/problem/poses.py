@@ -78,11 +78,6 @@ class Poses:
         """The 9-D vectors (B, 9): the first two rows of R, then t (CHSEL, Sec. IV-B)."""
         return np.concatenate([self.numbers[:, :6], self.translations], axis=1)
 
-    @cached_property
-    def quaternions(self) -> FloatArray:
-        """Unit quaternions (B, 4) of R, as x y z w."""
-        return quaternions(self.rotations)
-
 
 def stacked(object_from_world: Any) -> FloatArray:
     """Transforms (B, 4, 4) as an array, finite or not. Raises PoseError for another shape."""

@@ -236,12 +236,11 @@ class GridArchive:
     def add(
         self, solutions: FloatArray, objectives: FloatArray, measures: FloatArray
     ) -> tuple[IntArray, FloatArray]:
-        """Offer solutions (B, d) with objectives (B,) and measures (B, k).
+        """Offer solutions (B, d) with objectives (B,) and measures (B, k); status and value (B,).
 
-        Status (B,): 2 for a cell that was empty, 1 for a better objective, 0 for neither, all
-        against the archive before this batch. Value (B,): the objective where the cell was empty,
-        else its gain over the cell's. Of a batch, each cell keeps the highest, the first on a
-        tie. A solution of which any number is not finite is refused: status 0, value -inf.
+        Against the archive before: 2 and the objective for an empty cell, 1 for a higher objective
+        and 0 for a lower one, and the gain. A cell keeps the highest, the first of equals. A
+        solution of which any number is not finite is refused: 0 and -inf.
         """
         batch = batch_of(len(solutions), self.cells.solutions.shape[1], self.measure.count)
         batch.vectors[:], batch.objectives[:], batch.measures[:] = solutions, objectives, measures

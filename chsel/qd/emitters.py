@@ -40,7 +40,7 @@ from chsel.qd.measures import measure_gradients_of, measures_of
 SEARCHES = "cma_mega", "cma_me"  # Fontaine and Nikolaidis, 2021; Fontaine et al., 2020
 MOST_ITERATIONS = 1_000_000
 _TRACED = 10  # iterations between two traces
-_MOST_DRAWN = 4_000_000  # normal draws held at once, 8 bytes each
+_MOST_NORMALS = 4_000_000  # normal numbers held at once, 8 bytes each
 _EPSILON = 1e-8  # keeps the normalisation of a zero gradient finite
 
 
@@ -70,7 +70,7 @@ class Landscape(NamedTuple):
     work: Any  # scratch
 
 
-class SearchDraws(NamedTuple):
+class RandomNumbers(NamedTuple):
     """Random numbers of some iterations."""
 
     normals: FloatArray  # (iterations, L, n), standard normal, for the strategy
@@ -108,7 +108,7 @@ class MeSearch(NamedTuple):
 
 
 @compiled
-def mega_iterations(landscape, archive, search, draws, first, last):
+def mega_iterations(landscape, archive, search, random, first, last):
     """Iterations of CMA-MEGA (Fontaine and Nikolaidis, 2021) from `first` to before `last`."""
     model, space, measure, work = landscape
     theta, measures, gradient = search.theta, search.measures, search.gradient
@@ -124,14 +124,14 @@ def mega_iterations(landscape, archive, search, draws, first, last):
         _normalise(gradient, -1.0, directions[0])
         for i in range(len(measures)):
             _normalise(measure_gradients[i], 1.0, directions[i + 1])
-        ask(strategy, draws.normals[iteration], coefficients)
+        ask(strategy, random.normals[iteration], coefficients)
         _branch(theta, directions, coefficients, branches.vectors)
         _evaluate(landscape, branches)
         insert(archive, branches)
         parents = rank(branches.status, branches.value, branches.order)
         tell(strategy, coefficients, branches.order, parents)
         if parents == 0 or stopped(strategy, branches.order, branches.status, branches.value):
-            _move_to_elite(archive, draws.elites[iteration], theta)
+            _move_to_elite(archive, random.elites[iteration], theta)
             _forget(search.adam)
             reset(strategy)
             strategy.mean[:] = 0.0
@@ -140,17 +140,17 @@ def mega_iterations(landscape, archive, search, draws, first, last):
 
 
 @compiled
-def me_iterations(landscape, archive, search, draws, first, last):
+def me_iterations(landscape, archive, search, random, first, last):
     """Iterations of CMA-ME (Fontaine et al., 2020) from `first` to before `last`."""
     samples, strategy = search.samples, search.strategy
     for iteration in range(first, last):
-        ask(strategy, draws.normals[iteration], samples.vectors)
+        ask(strategy, random.normals[iteration], samples.vectors)
         _evaluate(landscape, samples)
         insert(archive, samples)
         parents = rank(samples.status, samples.value, samples.order)
         tell(strategy, samples.vectors, samples.order, parents)
         if parents == 0 or stopped(strategy, samples.order, samples.status, samples.value):
-            _move_to_elite(archive, draws.elites[iteration], strategy.mean)
+            _move_to_elite(archive, random.elites[iteration], strategy.mean)
             reset(strategy)
 
 
@@ -283,7 +283,7 @@ def fill_archive(
     stream = key.stream(Purpose.EMITTER, refinement)
     elites = key.stream(Purpose.RESTART, refinement).random(total)
     # A multiple of 10, so that no pair of normal numbers is split.
-    block = 10 * max(1, min(100, _MOST_DRAWN // (10 * batch * dimension)))
+    block = 10 * max(1, min(100, _MOST_NORMALS // (10 * batch * dimension)))
     is_watched = type(observer) is not NullObserver
     interval = observer.snapshot_interval or _TRACED
     if is_watched:
@@ -291,11 +291,11 @@ def fill_archive(
         observer.snapshot(archive.snapshot(0, refinement))
     for begin in range(0, total, block):
         end = min(begin + block, total)
-        draws = SearchDraws(normals(stream, (end - begin, batch, dimension)), elites[begin:end])
+        random = RandomNumbers(normals(stream, (end - begin, batch, dimension)), elites[begin:end])
         between = range(begin + 1, end if is_watched else begin)
         stops = [n for n in between if n % _TRACED == 0 or n % interval == 0]
         for first, last in pairwise([begin, *stops, end]):
-            run(landscape, archive.cells, search, draws, first - begin, last - begin)
+            run(landscape, archive.cells, search, random, first - begin, last - begin)
             if is_watched and (last % _TRACED == 0 or last == total):
                 observer.trace(name, last, archive.solutions, archive.costs)
                 observer.progress(name, last, total)

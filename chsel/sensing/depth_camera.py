@@ -16,6 +16,9 @@ from chsel.errors import PointsError, SettingError, require_at_most, require_pos
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 
 MOST_PIXELS = 100_000  # on a side
+_STEEPEST = 4.0  # tangent of the angle between a surface's normal and the ray: 76 degrees
+_SPACINGS = 4.0  # random points on a surface are one region up to so many typical distances
+_MOST_ASKED = 2000  # points whose nearest neighbours give the typical distance
 
 
 @dataclass(frozen=True)
@@ -128,11 +131,6 @@ def _least_around(image: FloatArray, reach: int) -> FloatArray:
         least = np.minimum(least[:, step:], least[:, :-step])
         side += step
     return least
-
-
-_STEEPEST = 4.0  # tangent of the angle between a surface's normal and the ray: 76 degrees
-_SPACINGS = 4.0  # random points on a surface are one region up to so many typical distances
-_MOST_ASKED = 2000  # points whose nearest neighbours give the typical distance
 
 
 @dataclass(frozen=True, eq=False)

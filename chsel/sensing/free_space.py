@@ -39,6 +39,10 @@ _POINTS_PER_THREAD = 100_000
 _STAY = np.eye(4)[None]
 _FARTHEST = 2.0**52  # voxels from the first: beyond, neighbours are the same number
 _SHORTEST = 1e-100  # voxels: shorter moves along an axis count as none
+MOST_NODES = 2_000_000
+MOST_POSES = 1_000_000
+_DEEPEST_ON_SURFACE = 1e-9  # m: a node on the surface is not inside, however it is rounded
+_ROUNDING = 1e-9  # steps: a move of one step is not two
 
 
 class MarkedVoxels(NamedTuple):
@@ -373,12 +377,6 @@ def _crossings(voxel, last, d):
     face = float(voxel + 1 if last > voxel else voxel)
     inverse = 1.0 / d if abs(d) >= _SHORTEST else 0.0
     return step, face, abs(last - voxel), inverse
-
-
-MOST_NODES = 2_000_000
-MOST_POSES = 1_000_000
-_DEEPEST_ON_SURFACE = 1e-9  # m: a node on the surface is not inside, however it is rounded
-_ROUNDING = 1e-9  # steps: a move of one step is not two
 
 
 def interior_lattice(

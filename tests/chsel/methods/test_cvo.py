@@ -1,34 +1,176 @@
+"""CVO and its fields, beside sums over all pairs of points, as its equations have them."""
+
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 import pytest
 import trimesh
 
-from chsel import KnownPoints, RegistrationProblem, Workspace
+from chsel import KnownPoints, RegistrationProblem, SdfGrid, Workspace
+from chsel.errors import SettingError
 from chsel.methods import cvo, preset_settings
-from chsel.methods.cvo import Ascent, Cvo, CvoSettings, Product, climb, climbers_at, values_of
+from chsel.methods.cvo import (
+    Ascent,
+    Cvo,
+    CvoSettings,
+    Kernel,
+    Product,
+    class_field,
+    climb,
+    climbers_at,
+    cloud_norm,
+    flow_at,
+    full_cubes,
+    values_of,
+)
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
+from chsel.numerics.pose_tuples import pose_at
 from chsel.numerics.threads import threads
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
-from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse
+from chsel.problem.poses import Poses, apply, axis_angle, compose, inverse, rotation_vector
 from chsel.problem.streams import StreamKey
-from tests.chsel.methods.dense_cvo import (
-    KERNEL,
-    MESH,
-    SDF,
-    DenseClouds,
-    along,
-    flows,
-    nearby,
-    product_of,
-    scene,
-)
 from tests.chsel.methods.scene import Watcher
+
+SIGMA, S_SIGMA, S_ELL = 0.1, 0.8, 0.1
+FREE, SURFACE = np.array([0.9, 0.1]), np.array([0.1, 0.9])
+C = D = 7.0
+KERNEL = Kernel(0.1, 0.0064)
+MESH = trimesh.creation.box([0.12, 0.08, 0.06])
+SDF = SdfGrid.from_mesh(MESH, 0.01, padding=0.03)
+
+
+def scene(count: int = 60) -> KnownPoints:
+    """Free points and 20 contacts around the box."""
+    stream = np.random.default_rng(1)
+    free = stream.uniform(-0.25, 0.25, (count, 3))
+    return KnownPoints(free=free, known=stream.uniform(-0.06, 0.06, (20, 3)))
+
+
+def product_of(points: KnownPoints, kernel: Kernel, sdf: SdfGrid = SDF) -> Product:
+    """The inner product by fields, with a surface band of a voxel."""
+    band = sdf.resolution
+    free = class_field(sdf, kernel, band, "free")
+    surface = class_field(sdf, kernel, band, "surface")
+    nothing = free.term(np.zeros((0, 3)), 1.0)
+    return Product(free.term(points.free, 1.0), nothing, surface.term(points.contacts, 1.0))
+
+
+def labels(free: int, surface: int) -> FloatArray:
+    """Of so many free points, then surface points (N, 2)."""
+    return np.concatenate([np.tile(FREE, (free, 1)), np.tile(SURFACE, (surface, 1))])
+
+
+@dataclass(frozen=True, eq=False)
+class DenseClouds:
+    """x (N, 3) of the world with labels (N, 2), z (M, 3) of the object with labels (M, 2)."""
+
+    x: FloatArray
+    x_labels: FloatArray
+    z: FloatArray
+    z_labels: FloatArray
+    ell: float = 0.1
+
+    @classmethod
+    def of(
+        cls,
+        sdf: SdfGrid,
+        points: KnownPoints,
+        band: float,
+        *,
+        ell: float = 0.1,
+    ) -> DenseClouds:
+        nodes = sdf.origin + np.argwhere(sdf.values > -np.inf) * sdf.resolution
+        values = sdf.values.reshape(-1)
+        free, surface = nodes[values > band], nodes[np.abs(values) <= band]
+        x = np.concatenate([points.free, points.contacts])
+        x_labels = labels(len(points.free), len(points.contacts))
+        z = np.concatenate([free, surface])
+        return cls(x, x_labels, z, labels(len(free), len(surface)), ell)
+
+    def kernel(self, object_from_world: FloatArray) -> FloatArray:
+        """a_ij (N, M) = k(x_i, y_j) s(l_i, m_j)."""
+        moved = apply(object_from_world, self.x)
+        apart = ((moved[:, None] - self.z) ** 2).sum(-1)
+        labels_apart = ((self.x_labels[:, None] - self.z_labels) ** 2).sum(-1)
+        a = SIGMA**2 * np.exp(-apart / (2 * self.ell**2))
+        a *= S_SIGMA**2 * np.exp(-labels_apart / (2 * S_ELL**2))
+        return a
+
+    def product(self, object_from_world: FloatArray) -> float:
+        """F(X)."""
+        return float(self.kernel(object_from_world).sum())
+
+    def flow(self, object_from_world: FloatArray) -> FloatArray:
+        """(omega, u) (6,), not normalised, as sums over pairs in the world."""
+        a, y = self.kernel(object_from_world), self.y(object_from_world)
+        omega = np.einsum("nm,nmk->k", a, np.cross(self.x[:, None], y[None])) / C
+        u = np.einsum("nm,nmk->k", a, y[None] - self.x[:, None]) / D
+        return np.concatenate([omega, u])
+
+    def y(self, object_from_world: FloatArray) -> FloatArray:
+        """The object's cloud in the world (M, 3)."""
+        return apply(np.linalg.inv(object_from_world), self.z)
+
+    def quartic(self, object_from_world: FloatArray, xi: FloatArray) -> FloatArray:
+        """B, C, D, E: F(G Exp(tau xi)) = F + B tau + C tau^2 + D tau^3 + E tau^4 + ..."""
+        a, y, q = self.kernel(object_from_world), self.y(object_from_world), 0.5 / self.ell**2
+        apart = self.x[:, None] - y
+        first = np.cross(xi[:3], y) + xi[3:]
+        second = np.cross(xi[:3], first)
+        third = np.cross(xi[:3], second)
+        fourth = np.cross(xi[:3], third)
+
+        def dot(p: FloatArray, q: FloatArray) -> FloatArray:
+            return (p * q).sum(-1)
+
+        beta = -2 * q * dot(first, apart)
+        gamma = -q * (dot(first, first) - dot(second, apart))
+        delta = -q * (dot(third, apart) / 3 - dot(first, second))
+        epsilon = -q * (dot(second, second) / 4 + dot(first, third) / 3 - dot(fourth, apart) / 12)
+        return np.array(
+            [
+                (a * beta).sum(),
+                (a * (gamma + beta**2 / 2)).sum(),
+                (a * (delta + beta * gamma + beta**3 / 6)).sum(),
+                (
+                    a * (epsilon + beta * delta + beta**2 * gamma / 2 + gamma**2 / 2 + beta**4 / 24)
+                ).sum(),
+            ]
+        )
+
+
+def along(object_from_world: FloatArray, xi: FloatArray, tau: float) -> FloatArray:
+    """G Exp(tau xi), the exponential by its series."""
+    twist = np.zeros((4, 4))
+    twist[:3, :3] = np.cross(np.eye(3), tau * xi[:3])
+    twist[:3, 3] = tau * xi[3:]
+    total, term = np.eye(4), np.eye(4)
+    for n in range(1, 25):
+        term = term @ twist / n
+        total = total + term
+    return object_from_world @ total
+
+
+def nearby(count: int, seed: int, reach: float = 0.08) -> FloatArray:
+    """Transforms (count, 4, 4) around the identity."""
+    stream = np.random.default_rng(seed)
+    turns = rotation_vector(stream.normal(0.0, 0.6, (count, 3)))
+    return compose(turns, stream.uniform(-reach, reach, (count, 3)))
+
+
+@numba.njit(error_model="numpy")
+def flows(product, poses, out):  # type: ignore[no-untyped-def]
+    """Fill out (B, 7) with F, sum x_i x h_i and sum h_i, h = R^T grad f, at poses (B, 12)."""
+    for n in range(len(poses)):
+        flow = flow_at(product, pose_at(poses, n), (0.0, 0.0, 0.0))
+        for i in range(7):
+            out[n, i] = flow[i]
+
 
 WORKSPACE = Workspace((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
 ASCENT = Ascent(1e-4, 0.8, (0.0, 0.0, 0.0), 7.0, 7.0, -1.0)
@@ -68,18 +210,6 @@ def test_a_step_is_the_exponential_of_the_flow(tau: float) -> None:
         found = np.array(moved_along(tuple(Poses.of(start[None]).numbers[0]), tuple(xi), tau))
         expected = along(start, xi, tau)
         np.testing.assert_allclose(found, Poses.of(expected[None]).numbers[0], rtol=0, atol=1e-15)
-
-
-def test_the_expansion_along_the_flow_is_that_of_the_sum_over_all_pairs() -> None:
-    dense = DenseClouds.of(SDF, scene(30), 0.01)
-    for start in nearby(3, 4):
-        xi = dense.flow(start)
-        xi = xi / np.sqrt((xi**2).sum())
-        quartic = dense.quartic(start, xi)
-        taus = np.linspace(-0.04, 0.04, 17)
-        values = [dense.product(along(start, xi, tau)) for tau in taus]
-        fit = np.polynomial.Polynomial.fit(taus, values, 8).convert().coef[1:5]
-        np.testing.assert_allclose(quartic, fit, rtol=1e-4)
 
 
 def test_the_flow_is_the_way_uphill_and_its_slope_that_of_the_inner_product() -> None:
@@ -294,3 +424,127 @@ def test_balanced_contacts_weigh_as_much_as_free_points() -> None:
     )
     plain = Cvo(QUICK).register(problem(points, starts))
     assert np.abs(plain.object_from_world - balanced.object_from_world).max() > 1e-3
+
+
+def values(product: Product, transforms: FloatArray) -> FloatArray:
+    return values_of(product, Poses.of(transforms).numbers)
+
+
+def flow(product: Product, transforms: FloatArray) -> FloatArray:
+    """Sums (B, 6) over x_i x h_i and h_i."""
+    out = np.full((len(transforms), 7), np.nan)
+    flows(product, Poses.of(transforms).numbers, out)
+    np.testing.assert_allclose(out[:, 0], values(product, transforms), rtol=1e-12)
+    return out[:, 1:]
+
+
+def test_a_field_gives_what_the_sum_over_all_pairs_gives() -> None:
+    points, transforms = scene(), nearby(6, 0)
+    dense = DenseClouds.of(SDF, points, SDF.resolution)
+    product = product_of(points, KERNEL)
+    expected = np.array([dense.product(transform) for transform in transforms])
+    most = dense.product(np.eye(4))
+    np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
+    # The dense flow is of a, that of the field of grad f = sum a (z - p) / ell^2.
+    wanted = np.array([7.0 * dense.flow(transform) for transform in transforms])
+    found = flow(product, transforms) * KERNEL.ell**2
+    sizes = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(found / sizes, wanted / sizes, rtol=0, atol=0.01)
+
+
+def test_at_the_nodes_a_field_is_the_sum_but_for_its_truncation() -> None:
+    nodes = SDF.origin + np.array([[0, 0, 0], [8, 7, 5], [3, 11, 2]]) * SDF.resolution
+    points = KnownPoints(free=nodes, known=nodes)
+    dense = DenseClouds.of(SDF, points, SDF.resolution)
+    expected = dense.product(np.eye(4))
+    assert values(product_of(points, KERNEL), np.eye(4)[None])[0] == pytest.approx(expected, 1e-6)
+
+
+def test_a_coarser_field_stands_for_a_fine_grid_all_the_same() -> None:
+    fine = SdfGrid.from_mesh(trimesh.creation.box([0.06, 0.04, 0.03]), 0.004, padding=0.02)
+    points, transforms = scene(60), nearby(4, 5)
+    dense = DenseClouds.of(fine, points, fine.resolution)
+    product = product_of(points, KERNEL, fine)
+    assert product.free.box.inverse == pytest.approx(1.0 / 0.008)
+    expected = np.array([dense.product(transform) for transform in transforms])
+    most = dense.product(np.eye(4))
+    np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
+
+
+def test_a_field_is_made_once_for_a_grid() -> None:
+    sdf = SdfGrid(SDF.origin, SDF.resolution, SDF.values, SDF.gradients)
+    assert class_field(sdf, KERNEL, 0.01, "free") is class_field(sdf, KERNEL, 0.01, "free")
+    assert class_field(sdf, KERNEL, 0.01, "free") is not class_field(sdf, KERNEL, 0.02, "free")
+    assert class_field(sdf, KERNEL, 0.01, "free") is not class_field(sdf, KERNEL, 0.01, "surface")
+
+
+def test_a_field_too_large_for_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cvo, "MOST_NODES", 1000)
+    with pytest.raises(SettingError, match="a smaller ell"):
+        class_field(SDF, Kernel(0.02, 1.0), 0.0123, "surface")
+    with pytest.raises(SettingError, match="a smaller ell"):
+        class_field(SDF, Kernel(1e6, 1.0), 0.0123, "surface")
+
+
+def pair_sum(points: FloatArray) -> float:
+    total = 0.0
+    for point in points:
+        apart = np.minimum(np.abs(points - point), 1e3)
+        total += np.exp(-(apart**2).sum(axis=1) / (2 * KERNEL.ell**2)).sum()
+    return KERNEL.amplitude * float(total)
+
+
+@pytest.mark.parametrize("count", [50, 2100])
+def test_the_norm_of_a_cloud_is_the_sum_over_its_pairs(count: int) -> None:
+    points = np.random.default_rng(0).uniform(-0.2, 0.3, (count, 3))
+    expected = pair_sum(points)
+    tolerance = 1e-12 if count == 50 else 0.002
+    assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(expected, tolerance)
+
+
+def test_the_norm_of_lattice_points_is_that_of_a_field_at_its_nodes() -> None:
+    lattice = np.indices((14, 15, 16)).reshape(3, -1).T
+    points = (lattice * 0.0228)[np.random.default_rng(0).random(len(lattice)) < 0.9] + 0.1234
+    found = cloud_norm(points, KERNEL, 0.0228)
+    assert found == pytest.approx(pair_sum(points), 1e-3)
+
+
+def test_points_all_over_the_world_are_summed_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (2100, 3))
+    for scale in (1.0, 1e300):
+        points[0] = scale * 1e6
+        assert cloud_norm(points, KERNEL, 0.01) == pytest.approx(pair_sum(points), 1e-9)
+    monkeypatch.setattr(cvo, "_MANY", 2050)
+    with pytest.raises(SettingError, match="2100 points of one class are far apart"):
+        cloud_norm(points, KERNEL, 0.01)
+
+
+@pytest.mark.parametrize("spacing", [0.01, 0.0228])
+def test_a_cube_of_points_is_as_good_as_its_points(spacing: float) -> None:
+    lattice = (np.indices((20, 20, 20)).reshape(3, -1).T - 10.0) * spacing
+    points = lattice[~(np.abs(lattice) < 4.5 * spacing).all(axis=1)]
+    alone, centres, wide = full_cubes(points, KERNEL, spacing)
+    side = 5 if spacing == 0.01 else 2
+    assert len(alone) + side**3 * len(centres) == len(points)
+    assert len(alone) < 0.6 * len(points)
+    field = class_field(SDF, KERNEL, 0.01, "free")
+    nothing = field.term(np.zeros((0, 3)), 1.0)
+    all_alone = Product(field.term(points, 1.0), nothing, nothing)
+    cubes = class_field(SDF, wide, 0.01, "free").term(centres, 1.0)
+    with_cubes = Product(field.term(alone, 1.0), cubes, nothing)
+    transforms = nearby(5, 2)
+    expected, wanted = values(all_alone, transforms), flow(all_alone, transforms)
+    np.testing.assert_allclose(values(with_cubes, transforms), expected, rtol=1e-3)
+    size = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(flow(with_cubes, transforms) / size, wanted / size, atol=0.005)
+
+
+def test_cubes_are_made_of_full_lattices_alone() -> None:
+    off = np.random.default_rng(0).uniform(-0.2, 0.2, (3000, 3))
+    for points in (off, off[:5], np.zeros((0, 3))):
+        alone, centres, _ = full_cubes(points, KERNEL, 0.01)
+        np.testing.assert_array_equal(alone, points)
+        assert len(centres) == 0
+    twice = np.tile(np.indices((20, 20, 4)).reshape(3, -1).T * 0.02, (2, 1))
+    alone, centres, _ = full_cubes(twice, KERNEL, 0.02)
+    assert len(alone) + 2**3 * len(centres) == len(twice)

@@ -107,8 +107,7 @@ def found_in(tree: PointTree, cells: CellSet, slack: float) -> tuple[IntArray, I
     near = near_points_for(tree, 1)
     rounding, packets, count = fill_hits(tree, cells, STAY, slack, near)
     assert 0.0 <= rounding < 1e-4
-    begin = near.begin[0]
-    firsts = tree.first[near.kept[begin : begin + packets]]
+    firsts = tree.first[near.kept[:packets]]
     gathered = (firsts[:, None] + np.arange(LANES)).reshape(-1)
     return gathered[gathered < len(tree.order)], near.hits[:count].astype(np.int64)
 

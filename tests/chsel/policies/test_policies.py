@@ -78,9 +78,9 @@ def test_the_nearest_way_is_to_the_mean_and_ends_where_the_action_ends() -> None
 def test_the_nearest_way_is_to_the_centre_of_an_object_whose_origin_is_beside_it() -> None:
     """The ball's centre is 5 cm from its origin; turned and moved, it is at the world's origin."""
     quarter = axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5 * np.pi))
-    pose = inverse(compose(quarter, np.array([0.05, 0.0, 0.0])))
+    pose = inverse(compose(quarter, np.array([0.0, -0.05, 0.0])))
     problem = ball_problem(pose[None], along_x([(0.0, 0.0), (0.06, 0.0)]))
-    sdf = replace(problem.sdf, origin=np.add(problem.sdf.origin, [0.0, 0.05, 0.0]))
+    sdf = replace(problem.sdf, origin=np.add(problem.sdf.origin, [0.05, 0.0, 0.0]))
     decision = build_policy("nearest_mean").decide(replace(problem, sdf=sdf))
     assert decision.score == pytest.approx([0.0, -0.06], abs=3e-3)
 

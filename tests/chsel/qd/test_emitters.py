@@ -138,9 +138,9 @@ class Stepper:
 
     def step(self, kind: int) -> None:
         landscape = emitters.Landscape(Landscape(kind), 0, MEASURE.code, 0)
-        draws = emitters.SearchDraws(self._normals, self.elites)
+        random = emitters.RandomNumbers(self._normals, self.elites)
         span = self.iteration, self.iteration + 1
-        self._loop(landscape, self.archive.cells, self.search, draws, *span)
+        self._loop(landscape, self.archive.cells, self.search, random, *span)
         self.iteration += 1
 
 
@@ -169,7 +169,7 @@ def test_iterations_between_calls_and_draws_change_no_byte(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_once = {bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 1, 7, 25)}
-    monkeypatch.setattr(emitters, "_MOST_DRAWN", 1)  # ten iterations at a time
+    monkeypatch.setattr(emitters, "_MOST_NORMALS", 1)  # ten iterations at a time
     assert at_once == {bytes_of(found(name, QUADRATIC, interval)) for interval in (0, 7)}
     assert len(at_once) == 1
 

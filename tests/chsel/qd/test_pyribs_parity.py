@@ -205,9 +205,3 @@ def test_coverage_and_qd_score_are_within_one_deviation_of_pyribs(name: str) -> 
     ):
         print(name, np.mean(mine), np.std(mine), np.mean(other), np.std(other))
         assert abs(np.mean(mine) - np.mean(other)) <= max(np.std(mine), np.std(other))
-
-
-def test_cma_mega_fills_the_archive_of_a_quadratic_and_finds_its_optimum() -> None:
-    archive = search("cma_mega", 0, sigma0=0.1)
-    assert archive.snapshot(0, 0).coverage > 0.6
-    assert archive.costs.min() < 0.05

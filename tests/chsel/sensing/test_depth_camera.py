@@ -1,4 +1,4 @@
-"""The pinhole camera, by hand; pixels that count, and edges where depth jumps."""
+"""Cameras, reliable pixels, and regions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from chsel.errors import PointsError, SettingError
-from chsel.sensing.depth_camera import PinholeCamera, occlusion_edges, valid_pixels
+from chsel.sensing.depth_camera import (
+    PinholeCamera,
+    depth_regions,
+    main_regions,
+    occlusion_edges,
+    point_regions,
+    small_regions,
+    speckle_free,
+    valid_pixels,
+)
 
 CAMERA = PinholeCamera(4, 3, 2.0, 4.0, 1.0, 1.5)
 
@@ -103,3 +112,120 @@ def test_edges_are_those_of_the_filters_of_scipy(shape: tuple[int, int], reach: 
     expected = valid & (jumps > limit)
     assert 0 < expected.sum() < valid.sum()
     np.testing.assert_array_equal(occlusion_edges(depth, valid, limit, reach=reach), expected)
+
+
+TELE = PinholeCamera(60, 40, 600.0, 600.0, 29.5, 19.5)
+
+
+def regions(depth: np.ndarray, jump: float = 0.01, camera: PinholeCamera = TELE) -> np.ndarray:
+    return depth_regions(depth, depth > 0.0, camera, jump)
+
+
+def test_regions_end_where_depth_jumps_and_the_threshold_grows_with_depth() -> None:
+    depth = np.full((40, 60), 0.6)
+    depth[:, 30:] += 0.015  # 2.5 % at 0.6 m; 1 % and the slant explain 1.67 %
+    found = regions(depth)
+    assert np.unique(found[:, :30]).tolist() == [1]
+    assert np.unique(found[:, 30:]).tolist() == [2]
+    depth = np.full((40, 60), 3.0)
+    depth[:, 30:] += 0.045  # 1.5 % at 3 m
+    assert regions(depth).max() == 1
+    assert regions(depth, jump=0.005).max() == 2
+    assert regions(depth, jump=0.005, camera=PinholeCamera(60, 40, 300, 300, 29.5, 19.5)).max() == 1
+
+
+def test_a_steeply_inclined_surface_is_one_region() -> None:
+    slope = np.tan(np.radians(75.0))
+    depth = 0.6 / (1.0 - slope * TELE.columns)[None].repeat(40, axis=0)
+    assert np.abs(np.diff(depth, axis=1)).max() > 0.0035
+    assert regions(depth, jump=0.001).max() == 1
+
+
+def test_pixels_that_do_not_count_are_in_no_region_and_connect_none() -> None:
+    depth = np.full((40, 60), 0.6)
+    depth[20], depth[5, 5] = 0.0, np.nan
+    found = depth_regions(depth, np.isfinite(depth) & (depth > 0.0), TELE, 0.01)
+    assert found[5, 5] == 0
+    assert (found[20] == 0).all()
+    assert (found[19, 0], found[21, 0], found.max()) == (1, 2, 2)
+    depth[20, 7] = 0.6  # a bridge
+    assert regions(np.nan_to_num(depth)).max() == 1
+    diagonal = np.eye(3) * 0.5
+    assert regions(diagonal, camera=PinholeCamera(3, 3, 9.0, 9.0, 1.0, 1.0)).max() == 3
+
+
+def test_an_image_without_a_pixel_that_counts_has_no_region() -> None:
+    assert regions(np.zeros((1, 1)), camera=PinholeCamera(1, 1, 9.0, 9.0, 0.0, 0.0)).max() == 0
+    assert not small_regions(regions(np.zeros((40, 60))), 100).any()
+
+
+def test_small_regions_are_those_of_fewer_pixels() -> None:
+    depth = np.full((40, 60), 0.6)
+    depth[10:13, 10:13] = 0.9
+    for least, count in ((9, 0), (10, 9), (0, 0), (10**6, 40 * 60)):
+        assert int(small_regions(regions(depth), least).sum()) == count
+
+
+@pytest.mark.parametrize("side", [1, 5, 9])
+def test_rays_of_small_regions_end_at_the_least_depth_around(side: int) -> None:
+    depth = np.full((40, 60), 0.6)
+    depth[10 : 10 + side, 20 : 20 + side] = 0.9
+    ends, small = speckle_free(depth, depth > 0.0, regions(depth), 100)
+    assert small == side**2
+    np.testing.assert_array_equal(ends, np.full((40, 60), 0.6))
+    nearer = depth.copy()
+    nearer[30, 30] = 0.4  # ends at itself
+    ends, small = speckle_free(nearer, depth > 0.0, regions(nearer), 100)
+    assert (small, ends[30, 30], ends[30, 31]) == (side**2 + 1, 0.4, 0.6)
+    assert speckle_free(depth, depth > 0.0, regions(depth), 0)[1] == 0
+
+
+def surface(count: int, size: float, centre: tuple[float, float, float]) -> np.ndarray:
+    """Random points on a square (count, 3)."""
+    plane = np.random.default_rng(count).uniform(-0.5, 0.5, (count, 2)) * size
+    return np.pad(plane, ((0, 0), (0, 1))) + centre
+
+
+def test_points_are_one_region_up_to_the_gap_and_others_beyond() -> None:
+    one, other = surface(2000, 0.1, (0, 0, 0)), surface(300, 0.03, (0.2, 0, 0))
+    found = point_regions(np.concatenate([one, other]), 0.02)
+    assert (np.unique(found[:2000]).tolist(), np.unique(found[2000:]).tolist()) == ([1], [2])
+    near = other - [0.2 - 0.05 - 0.015 - 0.015, 0.0, 0.0]  # 15 mm aside of the first
+    assert point_regions(np.concatenate([one, near]), 0.02).max() == 1
+
+
+def test_sparse_points_are_one_region_whatever_the_gap() -> None:
+    sparse = surface(400, 1.0, (0, 0, 0))  # about 25 mm apart
+    assert np.bincount(point_regions(sparse, 0.001))[1:].max() > 390
+    touches = np.array([[0.0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]])
+    assert point_regions(touches, 0.02).tolist() == [1, 1, 1]
+    assert point_regions(np.concatenate([touches, [[5.0, 0, 0]]]), 0.02).max() == 2
+    assert point_regions(np.zeros((0, 3)), 0.02).tolist() == []
+    assert point_regions(np.zeros((5, 3)), 0.02).tolist() == [1] * 5
+
+
+@pytest.mark.parametrize(
+    ("sizes", "centres", "kept", "small", "far"),
+    [
+        ([100, 4], [0.0, 0.0], [True, False], 4, 0),
+        ([100, 5], [0.0, 0.0], [True, True], 0, 0),
+        ([40, 100], [0.0, 0.31], [False, True], 0, 40),
+        ([40, 100], [0.0, 0.29], [True, True], 0, 0),
+        ([1, 1, 1], [0.0, 0.1, 0.2], [True] * 3, 0, 0),
+    ],
+)
+def test_the_largest_region_is_kept_and_large_ones_within_the_objects_diameter(
+    sizes: list[int], centres: list[float], kept: list[bool], small: int, far: int
+) -> None:
+    regions = np.repeat(np.arange(len(sizes)) + 1, sizes)
+    points = np.zeros((len(regions), 3))
+    points[:, 2] = np.repeat(centres, sizes)
+    found = main_regions(regions, part=0.05, points=points, diameter=0.3)
+    np.testing.assert_array_equal(found.kept, np.repeat(kept, sizes))
+    assert (found.small, found.far) == (small, far)
+    assert main_regions(regions, part=0.0).kept.all()
+
+
+def test_no_measurement_is_no_region() -> None:
+    found = main_regions(np.zeros(0, dtype=np.int64), part=0.05)
+    assert (len(found.kept), found.small, found.far) == (0, 0, 0)
