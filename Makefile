@@ -41,7 +41,7 @@ $(VENV)/constraints.txt: constraints.txt | $(VENV)/bin/python
 		then sed '/^torch==/d' constraints.txt; else cat constraints.txt; fi > $@
 
 $(VENV)/.installed: pyproject.toml $(VENV)/constraints.txt
-	$(INSTALL) --editable .
+	$(INSTALL) --editable ".[all]"
 	@touch $@
 
 $(VENV)/.installed-test: $(VENV)/.installed

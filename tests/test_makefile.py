@@ -26,7 +26,7 @@ def made(folder: Path, *words: str) -> str:
 
 OPTIONS = "--index-url=URL --no-deps"
 INSTALL = f".venv/bin/python -m pip install --quiet {OPTIONS} --constraint .venv/constraints.txt"
-STEPS = [f"{INSTALL} --editable .", f'{INSTALL} --editable ".[test]"']
+STEPS = [f'{INSTALL} --editable ".[{extra}]"' for extra in ("all", "test")]
 
 
 @pytest.mark.parametrize("goal", ["probe", "test"])

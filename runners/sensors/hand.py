@@ -123,7 +123,7 @@ class _Linkage:
         except ImportError:
             raise self._error(
                 "needs the package yourdfpy; install it where the project is: "
-                "pip install -e '.[urdf]'"
+                "pip install -e '.[sensors]'"
             ) from None
         content = path.read_bytes()
         if b"<xacro:" in content:
