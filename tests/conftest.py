@@ -13,14 +13,8 @@ from hypothesis import settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LONGEST = (  # minutes each; files that start first end before others are done
-    "tests/docs/test_architecture.py",
     "tests/determinism/test_matrix.py",
-    "tests/docs/test_writing_a_method.py",
-    "tests/runners/test_broken_disk.py",
     "tests/runners/test_benchmark.py",
-    "tests/determinism/test_machine_code.py",
-    "tests/replay/test_kill.py",
-    "tests/replay/test_planted_changes.py",
     "tests/runners/test_evaluate.py",
 )
 settings.register_profile("random", deadline=None)  # --hypothesis-profile=random: other examples

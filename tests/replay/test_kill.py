@@ -18,6 +18,7 @@ from replay.__main__ import main
 from replay.mcap.reader import read_recording
 from tests.tools.kill_sessions import PROBES, points_session, reported_probes
 
+pytestmark = pytest.mark.slow
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 SEEDS = (1, 2)  # one for each of two processes
 KILLS = 30  # in each; thousands by hand, see kill_sessions

@@ -18,6 +18,7 @@ from replay.mcap.reader import Recording, read_recording
 from runners.run.recording import RecordingConfig, open_recorder
 from tests.tools.kill_sessions import points_session, reported_probes
 
+pytestmark = pytest.mark.slow
 PROBES = 6
 TIMEOUT = 120
 

@@ -24,6 +24,7 @@ from chsel.errors import SettingError
 from runners.evaluation.cluster import LocalConfig, SlurmConfig, connected, slurm_cluster
 from tests.runners.test_evaluate import METHODS, evaluated
 
+pytestmark = pytest.mark.slow
 REPOSITORY = Path(__file__).resolve().parents[2]
 SBATCH = """#!/usr/bin/env bash
 cp "${*: -1}" "$(dirname "$0")/job"

@@ -15,6 +15,7 @@ import yaml
 from replay.mcap.reader import read_recording
 from replay.registration import recorded_method
 
+pytestmark = pytest.mark.slow
 PLUGINS = {
     "joblib": "hydra_joblib_launcher",
     "submitit_local": "hydra_submitit_launcher",
