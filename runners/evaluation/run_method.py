@@ -18,7 +18,6 @@ from replay.events import (
 )
 from replay.files import file_digest
 from replay.mcap.writer import McapRecorder
-from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender
 from runners.evaluation.plan import OWN, Plan, Trial
 from runners.evaluation.repeats import repeat_seed
@@ -41,7 +40,7 @@ def run_method(plan: Plan, trial: Trial, contender: Contender, warm: set[str]) -
     method, leader = contender.method(), plan.leader()
     rows: list[Row] = []
     iterations: list[Row] = []
-    recorder: Recorder = NullRecorder()
+    recorder: Recorder = Recorder()
     if plan.recordings:
         recorder = McapRecorder(folder / f"{contender.label}.mcap")
     recorder.record(_started(plan, trial, contender, session))

@@ -9,7 +9,6 @@ from chsel.plausible.symmetry import object_symmetry
 from chsel.rehearsal import warm_up, warm_up_policy
 from replay.events import Logged, Recorder, SessionEnded
 from replay.mcap.writer import McapRecorder
-from replay.recorder import NullRecorder
 from runners.evaluation.contenders import Contender
 from runners.evaluation.plan import Plan, Trial
 from runners.evaluation.policy_contenders import PolicyContender
@@ -35,7 +34,7 @@ def run_policy(plan: Plan, trial: Trial, contender: PolicyContender, warm: set[s
         warm.add(contender.label)
         warm_up(registering.method())
         warm_up_policy(contender.policy())
-    recorder: Recorder = NullRecorder()
+    recorder: Recorder = Recorder()
     if plan.recordings:
         recorder = McapRecorder(folder / f"{contender.label}.mcap")
     config = _config(plan, trial, registering, contender)

@@ -12,8 +12,8 @@ import pytest
 from chsel.cost.cost_settings import CostSettings
 from chsel.methods import OURS, build_method, preset_settings
 from chsel.problem.settings import settings_mapping
+from replay.comparing.choices import recorded_method
 from replay.mcap.reader import read_recording
-from replay.registration import recorded_method
 from replay.settings_migration import LEFT_OUT, completed
 
 REPLAYS = Path(__file__).resolve().parents[1] / "replays"
@@ -95,7 +95,7 @@ def test_settings_that_no_longer_exist_are_dropped_where_they_were() -> None:
 def test_stored_recordings_mean_what_they_meant(name: str) -> None:
     recording = read_recording(REPLAYS / f"{name}.mcap")
     config = recording.start.config["method"]
-    settings = recorded_method(recording).method.settings
+    settings = recorded_method(recording).settings
     left_out = set()
     for path, group in groups(settings):
         given = value_at(config, path[:-1]) if path else config

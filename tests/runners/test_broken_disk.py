@@ -15,7 +15,7 @@ import pytest
 from chsel.errors import RecordingError
 from replay.__main__ import main as replay_main
 from replay.mcap.reader import Recording, read_recording
-from replay.recorder import BackgroundRecorder
+from replay.recorder import Recorders
 from replay.rerun.rerun_recorder import RerunRecorder
 from replay.rerun.stream import RrdFile
 from runners.run.recording import RecordingConfig, open_recorder
@@ -200,7 +200,7 @@ def test_pictures_that_are_gone_are_an_error_or_one_warning(
 ) -> None:
     path = tmp_path / "recording.rrd"
     for optional in ("", "`replay view` makes it anew"):
-        recorder = BackgroundRecorder(RerunRecorder(path), optional=optional)
+        recorder = Recorders([], RerunRecorder(path), optional=optional)
         path.unlink()
         if optional:
             recorder.flush()

@@ -18,13 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from chsel.errors import ChselError, RecordingError
-from replay.comparing.policies import recorded_policy
+from replay.comparing.choices import recorded_method, recorded_policy
 from replay.comparing.recording_diff import recording_diff
 from replay.comparing.verification import DIFFERS, EQUAL, Verdict, verify
 from replay.content.recording_info import recording_info
 from replay.events import Event, HypothesesFound, ProblemPosed, SessionStarted
 from replay.mcap.reader import Recording, read_recording
-from replay.registration import recorded_method
 from tests.replay.conftest import same_bits
 from tests.tools.fuzzing import Tally, WrongOutcome, run_cases
 from tests.tools.mutations import LAYERS, Random, file_of, meaning, split
@@ -146,7 +145,7 @@ def ask(path: Path, whole: Path, outcome: str) -> None:
     except RecordingError as error:
         _check_message(error, path)
     else:
-        if found.is_equal and outcome not in ("the same", "refused"):
+        if not found.differences and outcome not in ("the same", "refused"):
             raise WrongOutcome("diff finds no difference to the original, but reading does")
 
 
@@ -156,14 +155,14 @@ def _check_verdict(
     """Whether registering or deciding anew, apart from `verify`, says the same."""
     step = verdict.step
     if verdict.is_decision:
-        decided, policy = recording.decision(step), recorded_policy(recording).policy
+        decided, policy = recording.decision(step), recorded_policy(recording).build()
         if verdict.outcome == EQUAL and policy.decide(decided.problem).digest != (
             decided.decision.digest
         ):
             raise WrongOutcome(f'the decision of step {step} is "equal", but today has other bits')
         return
     if verdict.outcome == EQUAL:
-        method = recorded_method(recording).method
+        method = recorded_method(recording).build()
         if method.register(recording.problem(step)).digest != recording.hypotheses(step).digest:
             raise WrongOutcome(f'step {step} is "equal", but a registration gives other bits')
     here, there = _of_step(events, step), _of_step(original.events, step)

@@ -43,7 +43,7 @@ from replay.events import (
     Timed,
     Traced,
 )
-from replay.recorder import BackgroundRecorder
+from replay.recorder import Recorders
 from replay.rerun import viewer as rerun_viewer
 from replay.rerun.hypotheses import LEVELS, MOST
 from replay.rerun.rerun_recorder import RerunRecorder
@@ -593,7 +593,7 @@ def test_without_a_viewer_the_live_view_is_a_warning(
 def test_a_thread_in_the_background_draws_the_same(
     tmp_path: Path, rows: dict[str, list[Row]]
 ) -> None:
-    recorder = BackgroundRecorder(RerunRecorder(tmp_path / "a.rrd"))
+    recorder = Recorders([], RerunRecorder(tmp_path / "a.rrd"))
     for event in session():
         recorder.record(event)
     recorder.close()
