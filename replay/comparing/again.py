@@ -39,7 +39,7 @@ class Again:
     """A registration or decision as it was recorded, and today's."""
 
     name: str  # of the method or policy
-    recorded: list[Event]  # ProblemPosed and what follows from it, or one Decided
+    recorded: Sequence[Event]  # ProblemPosed and what follows from it, or one Decided
     # The same kinds; none where a recorded registration has no result.
     today: list[Event] = field(default_factory=list)
     failure: str = ""  # what ended it today
@@ -131,7 +131,7 @@ class _SessionAgain:
             self._result, self._result_known = None, True
         self._surprise = self._steering.surprise
 
-    def registered(self, group: list[Event]) -> Iterator[Event | Again]:
+    def registered(self, group: Sequence[Event]) -> Iterator[Event | Again]:
         """A registration again, and what was logged meanwhile."""
         if not group:
             return
@@ -176,7 +176,7 @@ class _SessionAgain:
             yield Again(self._policy.name, [decided], today, failure)
         self._before = again if anew else decided
 
-    def _register(self, posed: ProblemPosed, recorded: list[Event]) -> Again:
+    def _register(self, posed: ProblemPosed, recorded: Sequence[Event]) -> Again:
         start, step, recorder = self._recording.start, posed.step, ListRecorder()
         try:
             problem = posed.problem if self._lost else self._online.pose(step)

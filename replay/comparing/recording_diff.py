@@ -59,7 +59,7 @@ def recording_diff(first: Path, second: Path, ignored: Sequence[str] = ()) -> Re
     "environment" or "config.seed". Raises RecordingError if a file cannot be read.
     """
     recordings = [read_recording(path) for path in (first, second)]
-    found = RecordingDiff(filecmp.cmp(*(each.path for each in recordings), shallow=False))
+    found = RecordingDiff(filecmp.cmp(recordings[0].path, recordings[1].path, shallow=False))
     if found.same_bytes:
         return found
     steps = (_steps(recording, side) for side, recording in enumerate(recordings))
@@ -71,8 +71,8 @@ def recording_diff(first: Path, second: Path, ignored: Sequence[str] = ()) -> Re
         for place in dict.fromkeys([*events[0], *events[1]]):
             if place.topic.strip("/") not in {word.strip("/") for word in ignored}:
                 found.counts[place.topic] += 1
-                pair = (of.get(place) for of in events)
-                found.differences += _differences(place, *pair, ignored)
+                one, other = (of.get(place) for of in events)
+                found.differences += _differences(place, one, other, ignored)
     return found
 
 

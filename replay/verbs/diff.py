@@ -41,8 +41,8 @@ def run(given: argparse.Namespace) -> int:
         return 0
     console.print(f"first difference: {found.differences[0]}")
     console.print(_table(found), "")
-    equal = len(set(found.counts) - {item.place.topic for item in found.differences})
-    console.print(f"{equal} of {len(found.counts)} topics are equal")
+    same = len(set(found.counts) - {item.place.topic for item in found.differences})
+    console.print(f"{same} of {len(found.counts)} topics are equal")
     of_start = [item for item in found.differences[1:] if item.place.topic == "/session"]
     for item in found.differences if given.all else of_start:
         console.print(str(item))
