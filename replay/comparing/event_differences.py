@@ -8,9 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 
-from chsel.next_probe.decision_problem import HandShape
 from replay.comparing.differences import differences
 from replay.events import (
     Decided,
@@ -158,7 +156,7 @@ def is_close(recorded: float, other: float | None, name: str) -> bool:
 
 def _parts(value: Any) -> Iterator[tuple[str, Any]]:
     """The fields of a value that has some."""
-    if isinstance(value, trimesh.Trimesh | HandShape):
+    if hasattr(value, "vertices"):  # a mesh or hand, which have more than these
         yield "vertices", np.asarray(value.vertices)
         yield "faces", np.asarray(value.faces)
     elif is_dataclass(value):

@@ -224,7 +224,9 @@ def _decision_table(rows: pd.DataFrame) -> Table:
             cells = [f"{row['chosen']:.0f}", start, along]
             cells += [_shown_number(row[name]) for name in ("score", "hit_chance")]
             cells.append(_shown_number(row["expected_spread_m"], 1e3))
-        table.add_row(str(row["step"]), row["label"].removeprefix("recorded: "), *cells)
+        name = row["label"].removeprefix("recorded: ")
+        style = "" if name == row["label"] else "dim"
+        table.add_row(str(row["step"]), name, *cells, style=style)
     return table
 
 
