@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -235,14 +235,10 @@ Event = (
 
 
 class Recorder:
-    """Writes events down; each kind of recorder does more in some of these methods."""
+    """Writes nothing down; each kind of recorder does more in some of these methods."""
 
     def record(self, event: Event) -> None:
         """Take one event; events of one session come in the order in which things happen."""
-
-    def record_later(self, make: Callable[[], Event]) -> None:
-        """Take the event that `make` returns, which is called where and when it is recorded."""
-        self.record(make())
 
     def flush(self) -> None:
         """Make sure that all events so far survive the end of the process."""

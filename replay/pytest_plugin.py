@@ -66,9 +66,8 @@ class StoredReplay(pytest.File):
         A file that cannot be used has one that fails.
         """
         from chsel.errors import ChselError
-        from replay.comparing.policies import recorded_policy
+        from replay.comparing.choices import recorded_method, recorded_policy
         from replay.mcap.reader import read_recording
-        from replay.registration import recorded_method
 
         try:
             recording = read_recording(self.path)

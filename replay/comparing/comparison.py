@@ -2,39 +2,86 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
-from chsel.errors import ChselError
+from chsel.errors import ChselError, RecordingError
+from chsel.methods.method import Method
 from chsel.plausible.pose_metrics import closest_pose, pose_errors
-from chsel.problem.registration_problem import Hypotheses
+from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import PRESETS, in_preset
-from replay.comparing.contenders import Contender, recorded_or_none
+from chsel.rehearsal import warm_up
+from replay.comparing.choices import Choice, is_recorded, recorded_method
 from replay.comparing.plausible import PlausibleSets
-from replay.events import ProblemPosed, SessionStarted
+from replay.environment import environment
+from replay.events import ProblemPosed, Recorder, SessionEnded, SessionStarted
+from replay.files import file_digest, new_file
 from replay.mcap.reader import Recording
-from replay.recorder import NullRecorder
-from replay.registration import recorded_symmetry, register_recorded
+from replay.mcap.writer import McapRecorder
+from replay.registration import (
+    Registered,
+    recorded_symmetry,
+    register_recorded,
+    snapshot_interval,
+    symmetry_for_errors,
+)
+
+
+class Column(NamedTuple):
+    """A number of a comparison."""
+
+    csv_name: str  # with its unit
+    title: str  # of a plot, with the unit shown
+    heading: str = ""  # of a table, lines by "\\n"; "" to leave it out
+    times: float = 1.0  # what turns the number into the unit shown
+
+
+_DEGREES = math.degrees(1.0)
+COLUMNS: Mapping[str, Column] = {
+    "best_cost": Column("best_cost", "best cost", "best\ncost"),
+    "median_cost": Column("median_cost", "median cost", "median\ncost"),
+    "hypotheses": Column("hypotheses", "hypotheses"),
+    "distinct": Column("distinct", "distinct hypotheses", "dis-\ntinct"),
+    "best_position_error": Column(
+        "best_position_error_m", "position error of the best, mm", "best\nmm", 1e3
+    ),
+    "best_rotation_error": Column(
+        "best_rotation_error_rad", "rotation error of the best, °", "best\n°", _DEGREES
+    ),
+    "closest_position_error": Column(
+        "closest_position_error_m", "position error of the closest, mm", "near\nmm", 1e3
+    ),
+    "closest_rotation_error": Column(
+        "closest_rotation_error_rad", "rotation error of the closest, °", "near\n°", _DEGREES
+    ),
+    "coverage": Column("coverage_mm2", "coverage, mm²", "cover-\nage"),
+    "plausibility": Column("plausibility_mm2", "plausibility, mm²", "plausi-\nbility"),
+    "diversity": Column("diversity_mm2", "plausible diversity, mm²", "PD\nmm²"),
+    "seconds": Column("seconds_s", "time, ms", "ms", 1e3),
+}
+"""All numbers by the names that `Outcome.numbers` has, in the order in which they are shown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one method, or the recording, has for one step.
-
-    numbers: by the names of `replay.comparing.columns`; empty without hypotheses. failure: why
-    there are none. as_recorded: whether all bits of the hypotheses are the recorded ones; None if
-    there is no recorded result, or the method has other settings than the recorded one.
-    """
+    """What one method, or the recording, has for one step."""
 
     step: int
     label: str
     hypotheses: Hypotheses | None
-    numbers: Mapping[str, float] = field(default_factory=dict)
-    failure: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)  # none without hypotheses
+    failure: str = ""  # why there are none
+    # Whether the hypotheses have the recorded bits; None if there is no recorded result, or the
+    # method has other settings than the recorded one.
     as_recorded: bool | None = None
 
 
@@ -48,15 +95,17 @@ class CommonCost:
 
 def common_cost(recording: Recording) -> CommonCost:
     """The cost of the recorded method; that of the default preset if the recording has none."""
-    recorded = recorded_or_none(recording)
-    settings = getattr(recorded.method.settings, "cost", None) if recorded else None
+    try:
+        method = recorded_method(recording)
+    except RecordingError:
+        return CommonCost(CostSettings(), "preset default")
+    settings = getattr(method.settings, "cost", None)
     if not isinstance(settings, CostSettings):
         return CommonCost(CostSettings(), "preset default")
-    assert recorded is not None
     for preset in PRESETS:
         if settings == in_preset(CostSettings(), preset):
             return CommonCost(settings, f"preset {preset}, as recorded")
-    return CommonCost(settings, f"{recorded.name}'s, as recorded")
+    return CommonCost(settings, f"{method.name}'s, as recorded")
 
 
 def recorded_label(recording: Recording) -> str:
@@ -66,25 +115,89 @@ def recorded_label(recording: Recording) -> str:
 
 def compared(
     recording: Recording,
-    methods: Sequence[Contender],
+    methods: Sequence[Choice[Method]],
     steps: Sequence[int],
     cost: CommonCost,
     plausible: PlausibleSets | None = None,
+    *,
+    out: Path | None = None,
+    interval: int | None = None,
 ) -> Iterator[Outcome]:
     """Outcomes step by step: the recorded one, then one of each method in turn.
 
-    plausible: the sets that hypotheses are also measured by. A registration that fails is an
-    outcome, too. Before its first step a method registers once uncounted, so that no time holds
-    the compiling of kernels.
+    plausible: the sets that hypotheses are also measured by. out: where to record the registration
+    of one method and one step, with all that its problem follows from. interval: iterations between
+    snapshots of the archive, 0 for the first and last alone; None: as recorded. A registration that
+    fails is an outcome, too; with `out` its error is raised, and no file is left.
     """
-    start, warm = recording.start, False
+    built = {choice.label: choice.build() for choice in methods}
+    for method in built.values():
+        warm_up(method)  # so that no time holds the compiling of kernels
     for posed in _problems(recording, steps):
-        recorded = recording.hypotheses(posed.step) if recording.has_result(posed.step) else None
-        judge = CompiledCost.of(posed.problem, cost.settings)
-        yield _recorded(recording, posed, recorded, judge, plausible)
-        for method in methods:
-            yield _again(start, posed, method, recorded, judge, plausible, warm=warm)
-        warm = True
+        step, judge = posed.step, CompiledCost.of(posed.problem, cost.settings)
+        sets = (judge, recording.start, posed.problem, plausible)
+        recorded = recording.hypotheses(step) if recording.has_result(step) else None
+        numbers = {} if recorded is None else _all_numbers(recorded, *sets)
+        failure = "" if recorded is not None else "no result was recorded"
+        yield Outcome(step, recorded_label(recording), recorded, numbers, failure)
+        for choice in methods:
+            try:
+                with _recorder(recording, step, choice, out) as recorder:
+                    registered = _register(
+                        recording, posed, built[choice.label], recorder, interval
+                    )
+                found = registered.hypotheses
+                numbers = _all_numbers(found, *sets) | {"seconds": registered.total_seconds}
+            except Exception as error:  # the others go on
+                if out is not None:
+                    raise
+                known = isinstance(error, ChselError)
+                failure = str(error) if known else f"{type(error).__name__}: {error}"
+                yield Outcome(step, choice.label, None, failure=failure)
+                continue
+            same = None
+            if recorded is not None and is_recorded(recording, choice):
+                same = _digests(found) == _digests(recorded)
+            yield Outcome(step, choice.label, found, numbers, as_recorded=same)
+
+
+def frame(
+    outcomes: Sequence[Outcome],
+    methods: Sequence[Choice[Method]],
+    cost: CommonCost,
+    definition: str,
+) -> pd.DataFrame:
+    """A row for each step and method; names of columns end in their unit.
+
+    step, label, method, changes (to the settings, with "; " between), cost (by which all are
+    judged), definition (of the plausible sets, empty where a row has no PD), then the numbers with
+    all digits, empty where there are none, then bits_as_recorded (yes, no, or empty where the
+    method is not the recorded one) and failure.
+    """
+    by_label = {choice.label: choice for choice in methods}
+    rows = []
+    for outcome in outcomes:
+        choice, numbers = by_label.get(outcome.label), outcome.numbers
+        rows.append(
+            {
+                "step": outcome.step,
+                "label": outcome.label,
+                "method": choice.name if choice else outcome.label.split(": ", 1)[-1],
+                "changes": "; ".join(choice.changes) if choice else "",
+                "cost": cost.name,
+                "definition": definition if "diversity" in numbers else "",
+                **{column.csv_name: numbers.get(name) for name, column in COLUMNS.items()},
+                "bits_as_recorded": {True: "yes", False: "no", None: ""}[outcome.as_recorded],
+                "failure": outcome.failure,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def write_csv(rows: pd.DataFrame, path: Path) -> None:
+    """Write a new CSV file."""
+    with new_file(path) as beside:
+        rows.to_csv(beside, index=False)
 
 
 def numbers_under(
@@ -113,13 +226,15 @@ def numbers_under(
     return numbers
 
 
-def medians(outcomes: Sequence[Outcome]) -> dict[str, float]:
-    """The median of every number over those outcomes that have it."""
-    names = dict.fromkeys(name for outcome in outcomes for name in outcome.numbers)
-    return {
-        name: float(np.median([o.numbers[name] for o in outcomes if name in o.numbers]))
-        for name in names
-    }
+def _all_numbers(
+    found: Hypotheses,
+    judge: CompiledCost,
+    start: SessionStarted,
+    problem: RegistrationProblem,
+    plausible: PlausibleSets | None,
+) -> dict[str, float]:
+    about = numbers_under(judge, found, start)
+    return about if plausible is None else about | plausible.numbers(problem, found)
 
 
 def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPosed]:
@@ -131,50 +246,54 @@ def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPos
             yield event
 
 
-def _recorded(
+def _register(
     recording: Recording,
     posed: ProblemPosed,
-    found: Hypotheses | None,
-    judge: CompiledCost,
-    plausible: PlausibleSets | None,
-) -> Outcome:
-    label = recorded_label(recording)
-    if found is None:
-        return Outcome(posed.step, label, None, failure="no result was recorded")
-    numbers = numbers_under(judge, found, recording.start)
-    if plausible is not None:
-        numbers |= plausible.numbers(posed.problem, found)
-    return Outcome(posed.step, label, found, numbers)
+    method: Method,
+    recorder: Recorder,
+    interval: int | None,
+) -> Registered:
+    start = recording.start
+    if interval is None:
+        interval = snapshot_interval(recording.snapshots(posed.step))
+    given = (start.world_from_object, symmetry_for_errors(start))
+    return register_recorded(posed, method, recorder, *given, snapshot_interval=interval)
 
 
-def _again(
-    start: SessionStarted,
-    posed: ProblemPosed,
-    method: Contender,
-    recorded: Hypotheses | None,
-    judge: CompiledCost,
-    plausible: PlausibleSets | None,
-    *,
-    warm: bool,
-) -> Outcome:
-    """Run a method; whatever goes wrong in it is its own failure, and the others go on."""
-    try:
-        if not warm:
-            register_recorded(posed, method.named.method, NullRecorder(), None, None)
-        registered = register_recorded(posed, method.named.method, NullRecorder(), None, None)
-        found = registered.hypotheses
-        numbers = numbers_under(judge, found, start) | {"seconds": registered.total_seconds}
-        if plausible is not None:
-            numbers |= plausible.numbers(posed.problem, found)
-    except Exception as error:
-        known = isinstance(error, ChselError)
-        failure = str(error) if known else f"{type(error).__name__}: {error}"
-        return Outcome(posed.step, method.label, None, failure=failure)
-    same = None
-    if method.as_recorded and recorded is not None:
-        same = found.digest == recorded.digest and _archive(found) == _archive(recorded)
-    return Outcome(posed.step, method.label, found, numbers, as_recorded=same)
+@contextmanager
+def _recorder(
+    recording: Recording, step: int, choice: Choice[Method], out: Path | None
+) -> Iterator[Recorder]:
+    """What records a registration: in a new file with the probes before it, or nothing."""
+    if out is None:
+        yield Recorder()
+        return
+    facts: dict[str, Any] = {"step": step, "method": recording.start.method, "hypotheses": None}
+    if recording.has_result(step):
+        facts["hypotheses"] = recording.hypotheses(step).digest
+    config = {**recording.start.config, "method": choice.config, "source": facts}
+    config.pop("policy", None)  # no decision is part of it
+    if choice.preset:
+        config["preset"] = {"name": choice.preset}
+    start = replace(
+        recording.start,
+        method=choice.name,
+        config=config,
+        environment=environment(),
+        source=file_digest(recording.path),
+    )
+    with new_file(out) as beside:
+        recorder = McapRecorder(beside)
+        try:
+            recorder.record(start)
+            for probe in recording.probes:
+                if probe.step <= step:
+                    recorder.record(probe)
+            yield recorder
+            recorder.record(SessionEnded(step, "finished"))
+        finally:
+            recorder.close()
 
 
-def _archive(hypotheses: Hypotheses) -> str | None:
-    return None if hypotheses.archive is None else hypotheses.archive.digest
+def _digests(found: Hypotheses) -> tuple[str, str | None]:
+    return found.digest, None if found.archive is None else found.archive.digest

@@ -1,60 +1,46 @@
-"""How two recordings differ: message by message, each number to the bit."""
+"""How two recordings differ: event by event, each number to the bit."""
 
 from __future__ import annotations
 
 import filecmp
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from heapq import merge
+from itertools import groupby
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple
 
 from replay.comparing.differences import Difference, differences
-from replay.comparing.message_content import Content, attachment_content, message_content
-from replay.comparing.message_pairs import (
-    BEFORE_ALL_STEPS,
-    MALFORMED,
-    ComparedRecording,
-    Ignored,
-    Key,
-    MessagePair,
-    message_pairs,
-)
-from replay.mcap.file import StoredMessage
-from replay.mcap.schemas import RECORDS
+from replay.comparing.event_differences import Content, content, event_name
+from replay.mcap.reader import Recording, read_recording
 
 BOTH, FIRST, SECOND = "both", "first", "second"
-Stored = TypeVar("Stored", bytes, StoredMessage)
+
+
+class Place(NamedTuple):
+    """What two events have in common to be compared."""
+
+    topic: str
+    step: int
+    about: str  # see `event_name`
+    number: int  # counts events with the same rest
+
+    def __str__(self) -> str:
+        parts = [self.topic, "start" if self.step < 0 else f"step {self.step}"]
+        parts += [self.about] if self.about else []
+        return ", ".join([*parts, f"number {self.number + 1}"] if self.number else parts)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MessageDifference(Difference):
-    """A field that differs between two messages, or a message that one recording alone has."""
+class EventDifference(Difference):
+    """A field that differs between two events, or an event that one recording alone has."""
 
-    key: Key
-    having: str = BOTH  # which of the recordings have the message: "both", "first" or "second"
+    place: Place
+    having: str = BOTH  # which of the recordings have the event: "both", "first" or "second"
 
     def __str__(self) -> str:
-        return f"{self.key}: {self.text}"
-
-
-@dataclass
-class TopicDiff:
-    """What differs on one topic, or in one attachment."""
-
-    count: int = 0  # of messages in either recording
-    differing: int = 0  # of those in both
-    only_first: int = 0  # without a counterpart
-    only_second: int = 0
-    steps: set[int] = field(default_factory=set)  # in which something differs
-    fields: Counter[str] = field(default_factory=Counter)  # in how many messages each differs
-    largest_ulps: int | None = None  # None without numbers
-
-    @property
-    def is_equal(self) -> bool:
-        """Whether nothing differs."""
-        return not (self.differing or self.only_first or self.only_second)
+        return f"{self.place}: {self.text}"
 
 
 @dataclass
@@ -62,96 +48,55 @@ class RecordingDiff:
     """All that differs between two recordings."""
 
     same_bytes: bool  # whether the files are equal
-    topics: dict[str, TopicDiff] = field(default_factory=dict)  # every topic and attachment met
-    # In the order of the first recording, all or as many as were to be kept.
-    differences: list[MessageDifference] = field(default_factory=list)
-
-    @property
-    def is_equal(self) -> bool:
-        """Whether the recordings say the same."""
-        return all(topic.is_equal for topic in self.topics.values())
+    counts: Counter[str] = field(default_factory=Counter)  # events on each topic in either
+    differences: list[EventDifference] = field(default_factory=list)
 
 
-def recording_diff(
-    first: Path, second: Path, *, ignored: Ignored | None = None, keep: int | None = None
-) -> RecordingDiff:
-    """Compare two recordings, each read twice and never held as a whole.
+def recording_diff(first: Path, second: Path, ignored: Sequence[str] = ()) -> RecordingDiff:
+    """Compare two recordings, step by step.
 
-    What is drawn for viewers alone (`SCENE`) is left out: it follows from the rest.
-
-    keep: how many differences to keep beside those of the session's start; None: all. Raises
-    RecordingError if a file cannot be read, or one of its checksums is wrong.
+    ignored: topics, such as "/timed", and fields with what is nested in them, such as
+    "environment" or "config.seed". Raises RecordingError if a file cannot be read.
     """
-    ignored = ignored or Ignored()
-    one, other = ComparedRecording(first, ignored), ComparedRecording(second, ignored)
-    found = RecordingDiff(filecmp.cmp(one.path, other.path, shallow=False))
+    recordings = [read_recording(path) for path in (first, second)]
+    found = RecordingDiff(filecmp.cmp(recordings[0].path, recordings[1].path, shallow=False))
     if found.same_bytes:
         return found
-    for name in dict.fromkeys([*one.attachments, *other.attachments]):
-        key = Key(name, BEFORE_ALL_STEPS, "", 0)
-        pair = (one.attachments.get(name), other.attachments.get(name))
-        _take(found, key, _compared(key, *pair, partial(attachment_content, name), ignored), keep)
-    for paired in message_pairs(one, other):
-        _take(found, paired.key, _compared_messages(paired, ignored), keep)
+    steps = (_steps(recording, side) for side, recording in enumerate(recordings))
+    together = merge(*steps, key=lambda part: part[:2])
+    for _, sides in groupby(together, lambda part: part[0]):
+        events: list[dict[Place, Content]] = [{}, {}]
+        for _, side, contents in sides:
+            events[side] = contents
+        for place in dict.fromkeys([*events[0], *events[1]]):
+            if place.topic.strip("/") not in {word.strip("/") for word in ignored}:
+                found.counts[place.topic] += 1
+                one, other = (of.get(place) for of in events)
+                found.differences += _differences(place, one, other, ignored)
     return found
 
 
-def _take(
-    found: RecordingDiff, key: Key, differences: Sequence[MessageDifference], keep: int | None
-) -> None:
-    """Count a message or attachment and its differences."""
-    topic = found.topics.setdefault(key.topic, TopicDiff())
-    topic.count += 1
-    if not differences:
-        return
-    having = differences[0].having
-    topic.differing += having == BOTH
-    topic.only_first += having == FIRST
-    topic.only_second += having == SECOND
-    topic.steps.add(key.step)
-    topic.fields.update(item.field for item in differences if item.field)
-    ulps = [item.ulps for item in differences if item.ulps is not None]
-    topic.largest_ulps = max([*ulps, topic.largest_ulps or 0]) if ulps else topic.largest_ulps
-    for item in differences:
-        if keep is None or len(found.differences) < keep or key.topic == "/session":
-            found.differences.append(item)
+def _steps(recording: Recording, side: int) -> Iterator[tuple[int, int, dict[Place, Content]]]:
+    """What the events of each step say, by their places."""
+    for step, events in groupby(recording.events(), lambda event: event.step):
+        contents: dict[Place, Content] = {}
+        numbers: Counter[tuple[str, int, str]] = Counter()
+        for event in events:
+            name = event_name(event)
+            contents[Place(*name, numbers[name])] = content(event)
+            numbers[name] += 1
+        yield step, side, contents
 
 
-def _compared_messages(pair: MessagePair, ignored: Ignored) -> list[MessageDifference]:
-    key, first, second, moved = pair
-    order = "order: it stands later in the second recording"
-    found = [MessageDifference(key=key, field="order", text=order)] if moved else []
-    same = first is not None and second is not None and first.data == second.data
-    if same and key.topic in RECORDS:  # else its time stamp may differ from its log time
-        return found
-    return found + _compared(key, first, second, message_content, ignored)
-
-
-def _compared(
-    key: Key,
-    first: Stored | None,
-    second: Stored | None,
-    read: Callable[[Stored], Content],
-    ignored: Ignored,
-) -> list[MessageDifference]:
-    """What differs between two messages or attachments, or which of them there is alone."""
+def _differences(
+    place: Place, first: Content | None, second: Content | None, ignored: Sequence[str]
+) -> list[EventDifference]:
     if first is None or second is None:
-        having = FIRST if second is None else SECOND
+        having = SECOND if first is None else FIRST
         text = f"only in the {having} recording"
-        return [MessageDifference(key=key, having=having, field="", text=text)]
-    if first is second or first == second:
-        return []
+        return [EventDifference(place=place, having=having, field="", text=text)]
     return [
-        MessageDifference(key=key, **vars(found))
-        for found in differences(_content(read, first), _content(read, second))
-        if not ignored.field(found.field)
+        EventDifference(place=place, **vars(item))
+        for item in differences(first, second)
+        if not any(f"{item.field}.".startswith((f"{word}.", f"{word}[")) for word in ignored)
     ]
-
-
-def _content(read: Callable[[Stored], Content], stored: Stored) -> Content:
-    """The content; of what is malformed, the mere bytes and why it is."""
-    try:
-        return read(stored)
-    except MALFORMED as error:
-        data = stored if isinstance(stored, bytes) else stored.data
-        return {"malformed": str(error), "bytes": data}

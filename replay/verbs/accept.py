@@ -12,13 +12,8 @@ from pathlib import Path
 from rich.table import Table
 
 from chsel.errors import RecordingError
-from replay.comparing.acceptance import (
-    ResultChange,
-    decision_changes,
-    result_changes,
-    write_accepted,
-)
-from replay.comparing.verification import EQUAL, recordings_in
+from replay.comparing.acceptance import ResultChange, write_accepted
+from replay.comparing.verification import DIFFERS, recordings_in
 from replay.console import Console, plain_table
 from replay.files import sync_folder
 from replay.mcap.reader import read_recording
@@ -40,25 +35,19 @@ def run(given: argparse.Namespace) -> int:
 
 def _accept(path: Path, *, ask: bool) -> int:
     console = Console(soft_wrap=True)
-    recording = read_recording(path)
     new = path.with_name(f"{path.name}.{os.getpid()}.new")
     try:
-        accepted = write_accepted(recording, new)
-        changes = result_changes(recording, accepted)
-        decisions = decision_changes(recording, accepted)
-        differing = [change for change in changes if change.verdict.outcome != EQUAL]
-        others = [verdict for verdict in decisions if verdict.outcome != EQUAL]
-        if not differing and not others:
+        changes = write_accepted(read_recording(path), new)
+        differing = [change for change in changes if change.verdict.outcome == DIFFERS]
+        if not differing:
             console.print(f"{path}: all {len(changes)} results are as recorded, nothing to change")
             return 0
-        for verdict in [*(change.verdict for change in differing), *others]:
-            for line in verdict.report().split("\n"):
+        for change in differing:
+            for line in change.verdict.report().split("\n"):
                 console.print(line)
         counts = f"{len(differing)} of {len(changes)} results"
-        if decisions:
-            counts += f" and {len(others)} of {len(decisions)} decisions"
-        title = f"{path}: {counts} change"
-        console.print(_table(title, differing) if differing else title)
+        registrations = [change for change in differing if not change.verdict.is_decision]
+        console.print(_table(f"{path}: {counts} change", registrations))
         if ask and console.input("record these results as the expected ones? [y/N] ") != "y":
             console.print(f"{path}: left as it was")
             return 1
@@ -71,27 +60,17 @@ def _accept(path: Path, *, ask: bool) -> int:
 
 
 def _table(title: str, changes: Sequence[ResultChange]) -> Table:
-    """A row for each result that changes."""
-    rows = [
-        {
-            "step": str(change.verdict.step),
-            "up to": f"{change.verdict.largest_ulps:.3g} ulp",
-            "best pose moves": _distance(*change.moved),
-            **{name: _pair(shown, change) for name, shown in _NUMBERS.items()},
-        }
-        for change in changes
-    ]
-    names = [name for name in rows[0] if any(row[name] for row in rows)]
-    table = plain_table(title, texts=names)
-    for row in rows:
-        table.add_row(*(row[name] for name in names))
+    """A row for each registration whose result changes."""
+    table = plain_table(title, texts=["step", "up to", "best pose moves", *_NUMBERS])
+    for change in changes:
+        pairs = [(shown(change.recorded), shown(change.new)) for shown in _NUMBERS.values()]
+        table.add_row(
+            str(change.verdict.step),
+            f"{change.verdict.largest_ulps:.3g} ulp",
+            _distance(*change.moved),
+            *(old if old == new else f"{old} -> {new}" for old, new in pairs),
+        )
     return table
-
-
-def _pair(shown: Callable[[Mapping[str, float]], str], change: ResultChange) -> str:
-    """A number of the recorded result and of the new one; empty where neither has it."""
-    recorded, new = (shown(numbers) for numbers in (change.recorded, change.new))
-    return recorded if recorded == new else f"{recorded or '-'} -> {new or '-'}"
 
 
 def _distance(position: float, rotation: float) -> str:
@@ -99,16 +78,19 @@ def _distance(position: float, rotation: float) -> str:
     return f"{1000.0 * position:.2f} mm {math.degrees(rotation):.2f}°"
 
 
+def _number(name: str, form: str) -> Callable[[Mapping[str, float]], str]:
+    return lambda numbers: f"{numbers[name]:{form}}" if name in numbers else "-"
+
+
 def _error(numbers: Mapping[str, float]) -> str:
-    if "best_position_error" not in numbers:
-        return ""
-    return _distance(numbers["best_position_error"], numbers["best_rotation_error"])
+    names = ("best_position_error", "best_rotation_error")
+    return _distance(*(numbers[name] for name in names)) if names[0] in numbers else "-"
 
 
-_NUMBERS: dict[str, Callable[[Mapping[str, float]], str]] = {
-    "best cost": lambda numbers: f"{numbers['best_cost']:.5g}",
-    "distinct": lambda numbers: f"{numbers['distinct_hypotheses']:.0f}",
+_NUMBERS = {
+    "best cost": _number("best_cost", ".5g"),
+    "distinct": _number("distinct_hypotheses", ".0f"),
     "error of the best": _error,
-    "PD, mm²": lambda numbers: f"{numbers['diversity']:.4g}" if "diversity" in numbers else "",
+    "PD, mm²": _number("diversity", ".4g"),
 }
 """Columns of the table, with what they show of a result."""

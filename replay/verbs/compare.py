@@ -1,70 +1,57 @@
 """Run several methods on exactly the same recorded problems, and judge all by one cost.
 
 A problem is as it was recorded: its low-cost set E_l follows from what the recorded method found
-before, so no method goes on from results of its own. Status 1 if a registration failed. With
---policies, what policies decide after recorded steps of a steered session.
+before, so no method goes on from results of its own. With --policies, what policies decide after
+recorded steps of a steered session. Status 1 if one fails, or one with the recorded settings has
+other bits.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from itertools import groupby
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 from rich.progress import BarColumn, MofNCompleteColumn
 from rich.table import Table
 
 from chsel.errors import RecordingError, SettingError
+from chsel.methods.method import Method
 from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.plausible_settings import DEFINITIONS
 from chsel.problem.registration_problem import Hypotheses
 from replay.arguments import STEPS_HELP, chosen_steps, path_argument
-from replay.comparing.columns import PLAUSIBLE, Column, columns_in_table
+from replay.comparing.choices import LABELS_HELP, METHOD, POLICY, Choice, chosen
 from replay.comparing.comparison import (
+    COLUMNS,
+    Column,
     Outcome,
     common_cost,
     compared,
-    medians,
+    frame,
     recorded_label,
+    write_csv,
 )
-from replay.comparing.contenders import METHODS_HELP, Contender, contenders
-from replay.comparing.csv_file import write_csv
 from replay.comparing.plausible import PlausibleSets
-from replay.comparing.policy_choices import (
-    POLICIES_HELP,
-    choice_table,
-    decision_problem,
-    median_table,
-    policy_choices,
-    policy_contenders,
-    write_choices,
-)
+from replay.comparing.policy_decisions import policy_decisions, require_steered
 from replay.console import Console, Progress, TextColumn, plain_table
 from replay.files import require_folder, require_new
 from replay.mcap.reader import Recording, read_recording
 
 _FEW_STEPS = 3
+_PLAUSIBLE = ("coverage", "plausibility", "diversity")  # which have tables of their own
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The file, its steps, the methods with their settings, and what to save."""
     parser.add_argument("file", type=path_argument, metavar="FILE", help="a recording")
     which = parser.add_mutually_exclusive_group(required=True)
-    which.add_argument(
-        "--policies",
-        nargs="+",
-        metavar="POLICY",
-        help=f"{POLICIES_HELP}; after them KEY=VALUE for all policies that have the setting, or "
-        "POLICY:KEY=VALUE for one",
-    )
-    which.add_argument(
-        "--methods",
-        nargs="+",
-        metavar="METHOD",
-        help=f"{METHODS_HELP}; after them KEY=VALUE for all methods that have the setting, or "
-        "METHOD:KEY=VALUE for one",
-    )
+    for option, kind in (("--methods", "METHOD"), ("--policies", "POLICY")):
+        text = f"{LABELS_HELP}; after them KEY=VALUE for all that have the setting, or "
+        text += f"{kind}:KEY=VALUE for one"
+        which.add_argument(option, nargs="+", metavar=kind, help=text)
     parser.add_argument("--steps", metavar="STEPS", help=STEPS_HELP)
     parser.add_argument("--each", action="store_true", help="show every step, not medians alone")
     parser.add_argument(
@@ -80,191 +67,206 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"which of them: {', '.join(DEFINITIONS)}",
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads, 1 by default")
+    parser.add_argument(
+        "-o", "--out", type=path_argument, help="record one method on one step: a new recording"
+    )
+    parser.set_defaults(snapshot_interval=None)  # as recorded, but for `step`
     parser.add_argument("--save-csv", type=path_argument, metavar="OUT", help="all numbers")
     parser.add_argument("--save-plot", type=path_argument, metavar="OUT", help="a png, svg or pdf")
     parser.add_argument("--save-rerun", type=path_argument, metavar="OUT", help="a Rerun recording")
 
 
 def run(given: argparse.Namespace) -> int:
-    """Print a table of medians, of all steps if wanted; 1 if a registration failed."""
+    """Print a table of medians, of all steps if wanted."""
     outputs = _checked_outputs(given)
     require_threads("--threads", given.threads)
     recording = read_recording(given.file)
-    if given.policies:
-        return _compare_policies(given, recording)
+    with threads(given.threads):
+        compare = _compare_policies if given.policies else _compare_methods
+        status = compare(given, recording)
+    for path in outputs:
+        Console().print(f"written: {path}", soft_wrap=True)
+    return status
+
+
+def _compare_methods(given: argparse.Namespace, recording: Recording) -> int:
     if not recording.steps:
         raise RecordingError(f"recording {given.file} has no registration problem to compare on")
     steps = chosen_steps(given.steps, recording.steps)
-    labels = [word for word in given.methods if "=" not in word]
-    changes = [word for word in given.methods if "=" in word]
-    methods = contenders(recording, labels, changes)
+    methods = chosen(recording, METHOD, given.methods)
+    if given.out is not None and (len(steps), len(methods)) != (1, 1):
+        raise SettingError("--out records one registration; accepted: with one method and one step")
     sets = PlausibleSets(recording, given.plausible, given.definition)
-    with threads(given.threads):
-        outcomes = _outcomes(recording, methods, steps, sets)
-    console = Console()
     cost = common_cost(recording)
-    columns = columns_in_table({name for outcome in outcomes for name in outcome.numbers})
-    for title, found in (
-        (f"costs of all by {cost.name}", [c for c in columns if c.name not in PLAUSIBLE]),
-        (
-            f"plausible sets by definition {given.definition}",
-            [c for c in columns if c.name in PLAUSIBLE],
-        ),
-    ):
-        if found:
-            each = given.each or len(steps) <= _FEW_STEPS
-            _print_tables(console, title, found, outcomes, each=each)
-    console.print(_legend(columns, given.threads))
-    for method in methods:
-        if method.changes:
-            console.print(f"{method.label} with {', '.join(method.changes)}", soft_wrap=True)
-        _print_bits(console, method, [o for o in outcomes if o.label == method.label])
-    failed = [outcome for outcome in outcomes if outcome.failure]
-    for outcome in failed:
-        what = f"step {outcome.step}, {outcome.label}: {outcome.failure}"
-        console.print(what, soft_wrap=True)
+    once = {"out": given.out, "interval": given.snapshot_interval}
+    found = compared(recording, methods, steps, cost, sets, **once)
+    outcomes = list(_shown(found, methods, steps))
+    rows, console = frame(outcomes, methods, cost, given.definition), Console()
+    columns = {n: c for n, c in COLUMNS.items() if c.heading and rows[c.csv_name].notna().any()}
+    others = [column for name, column in columns.items() if name not in _PLAUSIBLE]
+    each = given.each or len(steps) <= _FEW_STEPS
+    _print_tables(console, f"costs of all by {cost.name}", others, rows, each=each)
+    plausible = [columns[name] for name in _PLAUSIBLE if name in columns]
+    if plausible:
+        what = f"plausible sets by definition {given.definition}"
+        _print_tables(console, what, plausible, rows, each=each)
+    console.print(
+        "problems as recorded, with their E_0 and E_l; errors to the true pose modulo the "
+        "object's symmetries, at its centre: of the best by cost, and of the nearest; ms: of one "
+        f"registration by {given.threads} thread{'s' if given.threads > 1 else ''}"
+    )
+    other_bits = [_print_bits(console, choice, outcomes) for choice in methods]
+    _print_rest(console, methods, rows)
     if given.save_csv is not None:
-        write_csv(given.save_csv, outcomes, methods, cost, given.definition)
+        write_csv(rows, given.save_csv)
     if given.save_plot is not None:
         from replay.comparing.plot import write_plot
 
         start = recording.start
         title = f"{start.object}, {start.session} session, seed {start.seed}, costs of all by "
-        write_plot(given.save_plot, outcomes, title + cost.name)
+        write_plot(given.save_plot, rows, [*columns.values()], title + cost.name)
     if given.save_rerun is not None:
         from replay.rerun.comparison_view import save_comparison
 
         save_comparison(given.save_rerun, recording, _results(recording, outcomes))
-    for path in outputs:
-        console.print(f"written: {path}", soft_wrap=True)
-    return int(any(outcome.label != recorded_label(recording) for outcome in failed))
+    ours = [o.failure for o in outcomes if o.label != recorded_label(recording)]
+    return int(any(ours) or any(other_bits))
 
 
 def _compare_policies(given: argparse.Namespace, recording: Recording) -> int:
-    """Print what policies decide, each step or in medians; 1 if one cannot."""
-    if any((given.plausible, given.save_plot, given.save_rerun)):
+    if any((given.plausible, given.out, given.save_plot, given.save_rerun)):
         raise SettingError("--policies writes tables alone; accepted: with --save-csv")
-    if recording.offered is None:
-        decision_problem(recording, 0)  # says so
-    existing = sorted({*recording.decision_steps, *recording.steps})
-    steps = chosen_steps(given.steps, existing)
-    labels = [word for word in given.policies if "=" not in word]
-    changes = [word for word in given.policies if "=" in word]
-    policies = policy_contenders(recording, labels, changes)
-    with threads(given.threads):
-        choices = list(policy_choices(recording, policies, steps))
-    console, offered = Console(), recording.offered
-    assert offered is not None
+    require_steered(recording)
+    steps = chosen_steps(given.steps, recording.decision_steps)
+    policies = chosen(recording, POLICY, given.policies)
+    rows, console = pd.DataFrame(policy_decisions(recording, policies, steps)), Console()
     if given.each or len(steps) <= _FEW_STEPS:
-        console.print(choice_table(offered.actions, choices, "each step, problems as recorded"))
+        console.print(_decision_table(rows))
     if len(steps) > 1:
-        console.print(median_table(choices))
-    for policy in policies:
-        if policy.changes:
-            console.print(f"{policy.label} with {', '.join(policy.changes)}", soft_wrap=True)
-    failed = [choice for choice in choices if choice.failure]
-    for choice in failed:
-        console.print(f"step {choice.step}, {choice.label}: {choice.failure}", soft_wrap=True)
+        console.print(_decision_medians(rows))
+    _print_rest(console, policies, rows)
     if given.save_csv is not None:
-        write_choices(given.save_csv, offered.actions, choices, policies)
-        console.print(f"written: {given.save_csv}", soft_wrap=True)
-    return int(bool(failed))
+        write_csv(rows, given.save_csv)
+    return int(rows["failure"].any())
 
 
 def _checked_outputs(given: argparse.Namespace) -> list[Path]:
     """The files to write. Raises before any work what would make it end in nothing."""
-    paths = [path for path in (given.save_csv, given.save_plot, given.save_rerun) if path]
-    for path in paths:
+    paths = (given.out, given.save_csv, given.save_plot, given.save_rerun)
+    outputs = [path for path in paths if path is not None]
+    for path in outputs:
         require_new(path)
         require_folder(path)
-        if paths.count(path) > 1:
+        if outputs.count(path) > 1:
             raise RecordingError(f"{path} is named twice; accepted: a file for each")
     if given.save_plot is not None:
         from replay.comparing.plot import require_picture
 
         require_picture(given.save_plot)
-    return paths
+    return outputs
 
 
-def _outcomes(
-    recording: Recording,
-    methods: Sequence[Contender],
-    steps: Sequence[int],
-    plausible: PlausibleSets,
-) -> list[Outcome]:
+def _shown(
+    outcomes: Iterator[Outcome], methods: Sequence[Choice[Method]], steps: Sequence[int]
+) -> Iterator[Outcome]:
+    """The outcomes, with a bar while they come."""
     waiting = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    outcomes = []
     with Progress(
         *columns, console=waiting, transient=True, disable=not waiting.is_terminal
     ) as progress:
         task = progress.add_task("registering", total=len(steps) * (len(methods) + 1))
-        for outcome in compared(recording, methods, steps, common_cost(recording), plausible):
-            outcomes.append(outcome)
+        for outcome in outcomes:
             progress.update(task, advance=1, description=f"step {outcome.step}")
-    return outcomes
+            yield outcome
 
 
 def _print_tables(
-    console: Console,
-    what: str,
-    columns: Sequence[Column],
-    outcomes: Sequence[Outcome],
-    *,
-    each: bool,
+    console: Console, what: str, columns: Sequence[Column], rows: pd.DataFrame, *, each: bool
 ) -> None:
     """A row for each step and method if wanted, and the medians over several steps."""
-    steps = list(dict.fromkeys(outcome.step for outcome in outcomes))
-    headings = [column.heading for column in columns]
+    headings, count = [column.heading for column in columns], rows["step"].nunique()
     if each:
         table = plain_table(f"each step, {what}", texts=["step", "method"], numbers=headings)
-        for step, of_step in groupby(outcomes, lambda outcome: outcome.step):
-            for outcome in of_step:
-                _add(table, [str(step), outcome.label], columns, outcome)
-            table.add_section()
+        for _, row in rows.iterrows():
+            _add(table, [str(row["step"]), row["label"]], columns, row)
         console.print(table, "")
-    if len(steps) > 1:
-        some_failed = any(outcome.failure for outcome in outcomes)
-        texts = ["method", "steps"] if some_failed else ["method"]
-        title = f"medians over {len(steps)} steps, {what}"
-        table = plain_table(title, texts=texts, numbers=headings)
-        for label in dict.fromkeys(outcome.label for outcome in outcomes):
-            found = [o for o in outcomes if o.label == label and not o.failure]
-            cells = [label, str(len(found))][: len(texts)]
-            _add(table, cells, columns, Outcome(0, label, None, medians(found)))
+    if count > 1:
+        title = f"medians over {count} steps, {what}"
+        table = plain_table(title, texts=["method", "steps"], numbers=headings)
+        for label, of_label in rows.groupby("label", sort=False):
+            medians = of_label.median(numeric_only=True)
+            _add(table, [label, str((of_label["failure"] == "").sum())], columns, medians)
         console.print(table, "")
 
 
-def _add(table: Table, texts: list[str], columns: Sequence[Column], outcome: Outcome) -> None:
-    cells = [column.shown(outcome.numbers.get(column.name)) for column in columns]
-    if outcome.failure:
+def _add(table: Table, texts: list[str], columns: Sequence[Column], row: pd.Series) -> None:
+    cells = [_shown_number(row.get(column.csv_name), column.times) for column in columns]
+    if row.get("failure"):
         cells[0] = "failed"
-    style = "dim" if outcome.label.startswith("recorded:") else ""
-    table.add_row(*texts, *cells, style=style)
+    table.add_row(*texts, *cells, style="dim" if "recorded: " in "".join(texts) else "")
 
 
-def _legend(columns: Sequence[Column], count: int) -> str:
-    """What the numbers of a table are about."""
-    text = "problems as recorded, with their E_0 and E_l; "
-    if any(column.name.endswith("_error") for column in columns):
-        text += "mm, °: to the true pose, modulo the object's symmetries, at its centre, "
-        text += "of the best hypothesis by cost and of the nearest; "
-    return text + f"ms: of one registration by {count} thread{'s' if count > 1 else ''}"
+def _shown_number(value: float | None, times: float = 1.0) -> str:
+    return "-" if value is None or pd.isna(value) else f"{times * value:.3g}"
 
 
-def _print_bits(console: Console, method: Contender, outcomes: Sequence[Outcome]) -> None:
-    """Whether a method with the recorded settings gives what was recorded."""
-    known = [outcome for outcome in outcomes if outcome.as_recorded is not None]
+def _decision_table(rows: pd.DataFrame) -> Table:
+    """A row for each step and policy: the action with start and direction, and its forecasts."""
+    numbers = ("action", "start, mm", "along", "score", "hit\nchance", "then\nmm")
+    title = "each step, problems as recorded; then: spread of the belief, expected after the action"
+    table = plain_table(title, texts=["step", "policy"], numbers=numbers)
+    for _, row in rows.iterrows():
+        cells = ["failed" if row["failure"] else f"stop: {row['stop']}"]
+        if row["chosen"] >= 0:
+            start = " ".join(f"{1e3 * row[name]:.0f}" for name in ("x_m", "y_m", "z_m"))
+            along = " ".join(f"{row[name]:.2f}" for name in ("dx", "dy", "dz"))
+            cells = [f"{row['chosen']:.0f}", start, along]
+            cells += [_shown_number(row[name]) for name in ("score", "hit_chance")]
+            cells.append(_shown_number(row["expected_spread_m"], 1e3))
+        name = row["label"].removeprefix("recorded: ")
+        style = "" if name == row["label"] else "dim"
+        table.add_row(str(row["step"]), name, *cells, style=style)
+    return table
+
+
+def _decision_medians(rows: pd.DataFrame) -> Table:
+    """A row for each policy, over all steps."""
+    numbers = ("steps", "as\nrecorded", "stops", "hit\nchance", "then\nmm")
+    table = plain_table("medians of the chosen actions", texts=["policy"], numbers=numbers)
+    for label, own in rows.groupby("label", sort=False):
+        same = own["as_recorded"].dropna()
+        table.add_row(
+            str(label),
+            str((own["failure"] == "").sum()),
+            f"{int(same.sum())} of {len(same)}" if len(same) else "",
+            str((own["chosen"] < 0).sum()),
+            _shown_number(own["hit_chance"].median()),
+            _shown_number(own["expected_spread_m"].median(), 1e3),
+        )
+    return table
+
+
+def _print_bits(console: Console, choice: Choice[Method], outcomes: Sequence[Outcome]) -> list[str]:
+    """Say whether a method with the recorded settings gives what was recorded; steps if not."""
+    known = [o for o in outcomes if o.label == choice.label and o.as_recorded is not None]
     other = [str(outcome.step) for outcome in known if not outcome.as_recorded]
-    if not known:
-        return
-    text = f"{method.label} has the recorded settings: "
-    if other:
-        text += f"{len(other)} of {len(known)} results are not those recorded, at step "
-        text += f"{', '.join(other)} (verify shows where)"
-    else:
-        text += f"its {len(known)} results are those recorded, to the bit"
-    console.print(text, soft_wrap=True)
+    if known:
+        text = f"its {len(known)} results are those recorded, to the bit"
+        if other:
+            text = f"{len(other)} of {len(known)} results are not those recorded, at step "
+            text += f"{', '.join(other)} (verify shows where)"
+        console.print(f"{choice.label} has the recorded settings: {text}", soft_wrap=True)
+    return other
+
+
+def _print_rest(console: Console, choices: Sequence[Choice[Any]], rows: pd.DataFrame) -> None:
+    """The changes of settings, and what failed."""
+    for choice in choices:
+        if choice.changes:
+            console.print(f"{choice.label} with {', '.join(choice.changes)}", soft_wrap=True)
+    for _, row in rows[rows["failure"] != ""].iterrows():
+        console.print(f"step {row['step']}, {row['label']}: {row['failure']}", soft_wrap=True)
 
 
 def _results(recording: Recording, outcomes: Sequence[Outcome]) -> dict[str, dict[int, Hypotheses]]:

@@ -28,7 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--step", type=int, action="append", metavar="K", help="this step alone; may be repeated"
     )
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="processes, a file in each"
+    )
 
 
 def run(given: argparse.Namespace) -> int:
@@ -36,42 +38,36 @@ def run(given: argparse.Namespace) -> int:
     require_threads("--jobs", given.jobs)
     console = Console(soft_wrap=True)
     paths = recordings_in(given.files)
-    begun, status, equal, total = time.perf_counter(), 0, 0, 0
+    begun, files = time.perf_counter(), []
     # One console for both, so that results are printed above the bar.
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("verifying", total=len(paths) if len(paths) > 1 else None)
         for file in verified_files(paths, given.step, jobs=given.jobs):
             progress.advance(task)
             _print(console, file)
-            status = max(status, file.status)
-            equal += file.equal
-            total += len(file.registrations)
+            files.append(file)
     if len(paths) > 1:
-        rate = total / (time.perf_counter() - begun)
-        console.print(
-            f"{len(paths)} recordings: {equal} of {total} steps equal, {rate:.0f} steps/s"
-        )
-    return status
+        outcomes = [v.outcome for file in files for v in file.compared(decisions=False)]
+        equal = f"{outcomes.count(EQUAL)} of {len(outcomes)} steps equal"
+        rate = len(outcomes) / (time.perf_counter() - begun)
+        console.print(f"{len(paths)} recordings: {equal}, {rate:.0f} steps/s")
+    return max(file.status for file in files)
 
 
 def _print(console: Console, file: FileVerdict) -> None:
     if file.unusable:
         print_error(file.unusable)
         return
-    registrations = file.registrations
-    compared = [verdict for verdict in registrations if verdict.outcome != NO_RESULT]
-    methods = ", ".join(sorted({verdict.method for verdict in registrations})) or "no method"
-    line = f"{file.path}: {file.equal} of {len(compared)} steps equal ({methods}), "
-    if file.decisions:
-        equal = sum(verdict.outcome == EQUAL for verdict in file.decisions)
-        line += f"{equal} of {len(file.decisions)} decisions equal ({file.decisions[0].method}), "
-    line += f"{file.seconds:.1f} s"
-    without = len(registrations) - len(compared)
-    if without:
-        line += f", {without} without a result"
-    if file.digest:
-        line += f", digest {file.digest}"
-    console.print(line)
+    parts = []
+    for decisions, kind in ((False, "steps"), (True, "decisions")):
+        found = file.compared(decisions=decisions)
+        if found:
+            equal = sum(verdict.outcome == EQUAL for verdict in found)
+            parts.append(f"{equal} of {len(found)} {kind} equal ({found[0].name})")
+    without = sum(verdict.outcome == NO_RESULT for verdict in file.verdicts)
+    parts += [f"{file.seconds:.1f} s", f"{without} without a result" if without else ""]
+    parts += [f"digest {file.digest}" if file.digest else ""]
+    console.print(f"{file.path}: {', '.join(filter(None, parts))}")
     for verdict in file.verdicts:
         if verdict.outcome == DIFFERS:
             for line in verdict.report().split("\n"):

@@ -11,7 +11,7 @@ from chsel.errors import SettingError, require_choice, require_instance
 from chsel.methods import METHODS, build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.problem.settings import build_settings, changed_settings, settings_mapping
-from replay.comparing.contenders import METHODS_HELP
+from replay.comparing.choices import LABELS_HELP
 from runners.evaluation.repeats import repeat_label, require_repeats
 
 _LABEL = re.compile(r"(?P<name>\w+)(@(?P<preset>\w+))?(#(?P<mark>[\w+-]+))?")
@@ -69,7 +69,7 @@ def chosen_contenders(
     labels = [entry.label or entry.name for entry in entries]
     for label in labels:
         if labels.count(label) > 1:
-            raise SettingError(f"methods has {label} twice; accepted: {METHODS_HELP}")
+            raise SettingError(f"methods has {label} twice; accepted: {LABELS_HELP}")
         require_label(label)
     for key in settings:
         require_choice("settings of a method", key, dict.fromkeys([*METHODS, *labels]))
@@ -115,7 +115,7 @@ def _listed(methods: Any) -> Sequence[Any]:
     if isinstance(methods, Mapping):
         return [methods]
     if not isinstance(methods, list | tuple):
-        raise SettingError(f"methods is {methods!r}; accepted: all, or a list of {METHODS_HELP}")
+        raise SettingError(f"methods is {methods!r}; accepted: all, or a list of {LABELS_HELP}")
     return methods
 
 
@@ -124,7 +124,7 @@ def _entry(value: Any) -> _Entry:
         return build_settings(_Entry, value, "methods")
     match = _LABEL.fullmatch(str(value))
     if match is None:
-        raise SettingError(f"methods has {value!r}; accepted: {METHODS_HELP}")
+        raise SettingError(f"methods has {value!r}; accepted: {LABELS_HELP}")
     return _Entry(match["name"], str(value), match["preset"])
 
 

@@ -12,7 +12,7 @@ from chsel.errors import RecordingError, require_positive
 from replay.events import Recorder
 from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
-from replay.recorder import BackgroundRecorder, DeferredRecorder, TeeRecorder
+from replay.recorder import Recorders
 
 IN_RUN_FOLDER = "a logs=DIR that can be written"
 """What is accepted where a file of a run cannot be written."""
@@ -63,21 +63,16 @@ def write_in_run_folder(path: Path, text: str) -> None:
 def open_recorder(folder: Path, config: RecordingConfig) -> Recorder:
     """A recorder to all files that `config` asks for.
 
-    A registration has the processor for itself: events are recorded after a step. The run waits for
-    the MCAP file, the full record, which a thread would not write sooner, as threads of Python take
-    turns. It does not wait for the pictures, which a thread draws from then on, while the next
-    probe is taken; those of a live view at once. Beside that file, pictures that cannot be written
-    are a warning.
+    The run waits for the MCAP file, the full record, and not for the pictures; beside that file,
+    pictures that cannot be written are a warning.
     """
-    recorders: list[Recorder] = []
-    if config.mcap:
-        recorders.append(DeferredRecorder(McapRecorder(folder / "recording.mcap")))
+    files = [McapRecorder(folder / "recording.mcap")] if config.mcap else []
+    pictures: Recorder | None = None
     if config.rerun or config.live:
         os.environ.setdefault("RUST_LOG", _LOG_FILTER)  # read once, when Rerun is imported
         from replay.rerun.rerun_recorder import RerunRecorder
 
         path = folder / "recording.rrd" if config.rerun else None
-        optional = "`replay view` makes it anew" if config.mcap else ""
-        pictures = BackgroundRecorder(RerunRecorder(path, live=config.live), optional=optional)
-        recorders.append(pictures if config.live else DeferredRecorder(pictures))
-    return TeeRecorder(recorders)
+        pictures = RerunRecorder(path, live=config.live)
+    optional = "`replay view` makes it anew" if config.mcap else ""
+    return Recorders(files, pictures, live=config.live, optional=optional)

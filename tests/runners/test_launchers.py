@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from replay.comparing.choices import recorded_method
 from replay.mcap.reader import read_recording
-from replay.registration import recorded_method
 
 pytestmark = pytest.mark.slow
 PLUGINS = {
@@ -92,7 +92,7 @@ def test_every_job_of_a_sweep_records_its_session(launcher: str, tmp_path: Path)
     recordings = [read_recording(path) for path in tmp_path.rglob("recording.mcap")]
     assert sorted(recording.start.seed for recording in recordings) == [0, 1]
     for recording in recordings:
-        here = recorded_method(recording).method.register(recording.problem(4))
+        here = recorded_method(recording).build().register(recording.problem(4))
         assert here.digest == recording.hypotheses(4).digest
 
 

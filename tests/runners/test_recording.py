@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,8 @@ from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.events import Event, SnapshotTaken, Traced
-from replay.recorder import NullRecorder
+from replay.events import Event, Recorder, SnapshotTaken, Traced
+from replay.recorder import ListRecorder
 from replay.registration import StepObserver
 from runners.run.recording import RecordingConfig, make_run_folder, open_recorder
 
@@ -42,7 +41,7 @@ def test_a_folder_that_can_not_be_made_is_one_clear_error(tmp_path: Path) -> Non
         make_run_folder(tmp_path / "file", "drill")
 
 
-class Keeping(NullRecorder):
+class Keeping(Recorder):
     """Keeps events, and the digests of their arrays at the moment they came."""
 
     def __init__(self) -> None:
@@ -83,15 +82,13 @@ def test_what_is_handed_over_is_never_changed() -> None:
 
 @pytest.mark.parametrize("count", [4, 5])
 def test_a_trace_is_of_the_moment_at_which_it_was_handed_over(count: int) -> None:
-    made: list[Callable[[], Event]] = []
-    recorder = NullRecorder()
-    recorder.record_later = made.append  # type: ignore[method-assign]
+    recorder = ListRecorder()
     random = np.random.default_rng(count)
     vectors, cost = random.normal(size=(count, 9)), random.uniform(size=count)
     expected = digest(vectors, cost), cost.min(), np.median(cost), cost.max()
     StepObserver(recorder, 0, 5, lambda *_: None).trace("descent", 10, vectors, cost)
     vectors[:], cost[:] = 0.0, 0.0
-    assert [make() for make in made] == [Traced(0, "descent", 10, *expected)]
+    assert recorder.events == [Traced(0, "descent", 10, *expected)]
 
 
 def test_without_files_nothing_runs_in_the_background(tmp_path: Path) -> None:
