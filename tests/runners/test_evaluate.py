@@ -265,11 +265,12 @@ def test_an_interrupted_run_goes_on_and_a_killed_one_leaves_nobody_at_work(tmp_p
 
     def started() -> subprocess.Popen[str]:
         """The command, at work on the method; in a process group of its own, as in a shell."""
+        before = set(glob("trials/*/*/.chsel.mcap.*", root_dir=tmp_path))
         process = subprocess.Popen(
             command, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True
         )
         latest = time.monotonic() + 300.0
-        while not glob("trials/*/*/.chsel.mcap.*", root_dir=tmp_path):
+        while not set(glob("trials/*/*/.chsel.mcap.*", root_dir=tmp_path)) - before:
             assert process.poll() is None
             assert time.monotonic() < latest
             time.sleep(0.1)

@@ -167,7 +167,7 @@ def test_without_yourdfpy_boxes_work_and_a_urdf_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
     assert HandModel(HandRig(frame="hand", boxes=(BoxRig((0.1, 0.1, 0.1)),))).solids() is not None
-    with pytest.raises(SettingError, match=r"pip install -e '\.\[urdf\]'"):
+    with pytest.raises(SettingError, match=r"pip install -e '\.\[sensors\]'"):
         HandModel(hand(urdf(tmp_path)))
     with pytest.raises(SettingError, match=r"hand.urdf nofile.urdf does not exist"):
         HandModel(HandRig(frame="hand", urdf="nofile.urdf"))

@@ -22,7 +22,11 @@ from runners.sessions.recorded import RecordedSession, RecordedSettings
 from runners.sessions.recorded_actions import RecordedActions
 
 REPLAYS = Path(__file__).resolve().parents[2] / "replays"
-GRIDS = [("mustard_anchored", "mustard"), ("spam_can_chsel", "can"), ("drill_svgd", "drill")]
+GRIDS = [
+    ("mustard_medial_constraint", "mustard"),
+    ("spam_can_gradient_descent", "can"),
+    ("mustard_medial_constraint_cma_me", "mustard"),
+]
 
 
 def opened(name: str) -> tuple[RecordedSession, list[Probe]]:
