@@ -144,7 +144,7 @@ def test_true_poses_that_were_sought_have_a_table_of_their_own(tmp_path: Path) -
         truth["violations"] = index
         truth["from_guess"] = {"position": 0.002 * index, "rotation": 0.034906585 * index}
         if name == names[0]:
-            truth["from_simulated"] = {"position": 0.003 + 0.002 * index, "rotation": 0.01745329}
+            truth["from_known"] = {"position": 0.003 + 0.002 * index, "rotation": 0.01745329}
         folder = tmp_path / "trials" / name / f"seed_{seed}"
         folder.mkdir(parents=True)
         (folder / "session.json").write_text(json.dumps({"truth": truth}))
