@@ -228,7 +228,7 @@ def _true_poses(folder: Path) -> list[str]:
         rotations = degrees(1.0) * known["rotation_error"]
         lines.append(
             f"from the simulated truth of {len(known)}, modulo symmetries: {positions.mean():.1f} "
-            f"mm in the mean, {positions.max():.1f} mm at worst; {rotations.mean():.1f} and "
+            f"mm on average, {positions.max():.1f} mm at worst; {rotations.mean():.1f} and "
             f"{rotations.max():.1f} degrees"
         )
     return lines

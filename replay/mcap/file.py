@@ -197,7 +197,7 @@ class McapFile:
         """Whether a file ends as a finished one; RecordingError unless it begins as one of MCAP."""
         file.seek(0)
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise RecordingError(f"recording {self.path} is no MCAP file; {ACCEPTED}")
+            raise RecordingError(f"recording {self.path} is not an MCAP file; {ACCEPTED}")
         file.seek(max(size - len(MCAP0_MAGIC), len(MCAP0_MAGIC)))
         return file.read() == MCAP0_MAGIC
 

@@ -68,7 +68,7 @@ class RawFile:
                 if start == ROS1_BAG or (path.suffix == ".bag" and start != MCAP0_MAGIC):
                     raise SessionError(f"log {path} is a ROS 1 bag; {ACCEPTED}: {_CONVERT}")
                 if start != MCAP0_MAGIC:
-                    raise SessionError(f"log {path} is no MCAP file; {ACCEPTED}")
+                    raise SessionError(f"log {path} is not an MCAP file; {ACCEPTED}")
                 self.size = file.seek(0, 2)
                 self.is_indexed = self._read_index(file)
         except OSError as error:

@@ -139,7 +139,7 @@ def test_json_is_standard_and_a_list_of_several(events, write, tmp_path, capsys)
     shown = capsys.readouterr()
     several = strict_json(shown.out)
     assert several[0]["message_bytes"]["/probe"] > 0
-    assert "is no MCAP file; accepted: " in several[1]["error"]
+    assert "is not an MCAP file; accepted: " in several[1]["error"]
     assert shown.err.startswith("error: recording")
     assert shown.err.count("\n") == 1
 

@@ -40,7 +40,7 @@ def decoder(
             raise
         except Exception as error:
             reason = one_line(f"{type(error).__name__}: {error}")[:200]
-            raise UnusableMessage(f"a message is no valid {name} ({reason})") from None
+            raise UnusableMessage(f"a message is not a valid {name} ({reason})") from None
 
     return decode
 

@@ -176,7 +176,7 @@ def test_reading_a_damaged_log(
     assert log.messages is not None
     file = answer(path, lambda: RawFile(path))
     if isinstance(file, str):
-        assert "is no MCAP file" in file
+        assert "is not an MCAP file" in file
         return
     messages = Counter(file.messages(None, faults.append))
     assert messages <= log.messages

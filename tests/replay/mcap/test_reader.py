@@ -225,8 +225,8 @@ def test_rewriting_alone_is_no_damage(events, write, assert_same):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "is no MCAP file; accepted: a recording.mcap that this project wrote"),
-        (b"ply\nformat ascii 1.0\n", "is no MCAP file"),
+        (b"", "is not an MCAP file; accepted: a recording.mcap that this project wrote"),
+        (b"ply\nformat ascii 1.0\n", "is not an MCAP file"),
         (MCAP0_MAGIC, "is unfinished"),
         (MCAP0_MAGIC * 2, "is damaged after byte"),
     ],

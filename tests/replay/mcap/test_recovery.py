@@ -263,9 +263,9 @@ def test_losses_are_told_in_the_recording_where_they_are(
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "is no MCAP file"),
+        (b"", "is not an MCAP file"),
         (MCAP0_MAGIC, "nothing can be recovered"),
-        (b"solid cube\n" * 500, "is no MCAP file"),
+        (b"solid cube\n" * 500, "is not an MCAP file"),
         (None, "does not exist; accepted: a recording.mcap"),
     ],
 )

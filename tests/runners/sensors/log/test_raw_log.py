@@ -117,7 +117,7 @@ def test_a_topic_that_is_not_there_is_an_error_that_lists_the_others(tmp_path: P
 @pytest.mark.parametrize("content", [b"", b"SQLite format 3\0", b"\x89MCAP1\r\n"])
 def test_what_is_no_log_is_an_error(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "log.mcap").write_bytes(content)
-    with pytest.raises(SessionError, match=r"log\.mcap is no MCAP file"):
+    with pytest.raises(SessionError, match=r"log\.mcap is not an MCAP file"):
         RawLog(tmp_path / "log.mcap")
     with pytest.raises(SessionError, match=r"other\.mcap does not exist"):
         RawLog(tmp_path / "other.mcap")
