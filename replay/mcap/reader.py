@@ -23,7 +23,6 @@ from replay.events import (
     SessionEnded,
     SessionStarted,
     SnapshotTaken,
-    Timed,
 )
 from replay.files import file_digest
 from replay.mcap.encoding import decode
@@ -135,11 +134,6 @@ class Recording:
     def digest(self) -> str:
         """The digest of its file, which names the recording."""
         return file_digest(self.path)
-
-    @cached_property
-    def has_timings(self) -> bool:
-        """Whether wall-clock times were recorded."""
-        return any(isinstance(entry, Timed) for entry in self._entries)
 
     def snapshots(self, step: int) -> list[ArchiveSnapshot]:
         """The archive over the registration of a step; empty if the method keeps none."""

@@ -22,7 +22,8 @@ def connect(instead: str) -> Any:
             from pybullet_utils.bullet_client import BulletClient
         except ImportError:
             raise SessionError(
-                f"PyBullet is not installed (it has wheels for Python 3.11 only); {instead}"
+                "PyBullet is not installed (pip install -e '.[sim]' where the project is; it has "
+                f"wheels for Python 3.11 only); {instead}"
             ) from None
         return BulletClient(pybullet.DIRECT)
 
