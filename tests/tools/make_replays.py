@@ -4,7 +4,7 @@ Existing files stay as they are, as the bits that later code must give; to accep
 `python -m replay accept`. Needs PyBullet for simulated sessions.
 
 `points_default_METHOD` has the settings of preset `default` without any change: when the preset
-changes, it is made again. The others keep older settings, and many an older format.
+changes, it is made again. The others keep older settings, and some are cut to two registrations.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def cases() -> dict[str, list[str]]:
         for index, (method, brief) in enumerate(_BASELINES.items()):
             if f"{name}_{method}" in _LARGE:
                 continue
-            start = 25 if name == "drill" else 10
+            start = 10
             if method in _MEDIAL and name != "clamp":  # one step, for its size
                 start = 15 if name == "mustard" else 11
             found[f"{name}_{method}"] = [
