@@ -46,10 +46,27 @@ def representative_poses(sdf: SdfGrid, poses: Poses, count: int) -> IntArray:
 
     Fewer than `count` if all others have the same descriptors as chosen ones.
     """
-    size = len(poses)
-    chosen = np.zeros(min(count, size), dtype=np.int64)
-    descriptors = np.ascontiguousarray(surface_descriptors(sdf, poses).T)
-    located = locate_facilities(descriptors, chosen, np.empty((2, size)), np.empty((size, size)))
+    first = np.zeros(min(1, len(poses)), dtype=np.int64)
+    return facilities(squared_distances(sdf, poses), first, count, np.zeros(len(poses)))
+
+
+def squared_distances(sdf: SdfGrid, poses: Poses) -> FloatArray:
+    """Squared distances (B, B) of poses from each other by their descriptors (B, 64)."""
+    apart = np.empty((len(poses), len(poses)))
+    fill_apart(np.ascontiguousarray(surface_descriptors(sdf, poses).T), apart)
+    return apart
+
+
+def facilities(costs: FloatArray, given: IntArray, count: int, prices: FloatArray) -> IntArray:
+    """At most `count` of B facilities for C clients, chosen greedily: the given ones come first.
+
+    costs (C, B), not negative, of serving each client from each facility. Every other one chosen
+    makes the sum of what all clients cost, each from the cheapest facility so far, and of its own
+    price (B,), the least. One from which its own client costs nothing more is not chosen.
+    """
+    chosen = np.zeros(min(count, len(prices)), dtype=np.int64)
+    chosen[: len(given)] = given
+    located = locate_facilities(costs, prices, len(given), chosen, np.empty((2, len(prices))))
     return chosen[:located]
 
 
@@ -132,21 +149,19 @@ def _squared_distance(one: Any, other: Any) -> Any:
 
 
 @compiled
-def locate_facilities(points: Any, chosen: Any, rows: Any, apart: Any) -> Any:
-    """Greedily choose points (d, C) so that the sum of squared distances to them is least.
+def locate_facilities(apart: Any, prices: Any, given: Any, chosen: Any, rows: Any) -> Any:
+    """Fill `chosen` (B,) after those given; apart (C, C) is `costs` of `facilities`.
 
-    The first point, then always the one that lowers the sum the most. chosen (B,): indices to
-    fill. rows (2, C), apart (C, C): scratch. Returns the number of chosen points, less than B if
-    all others equal chosen ones.
+    rows (2, C): scratch. Returns the number of chosen ones, less than B if all others are served
+    for nothing.
     """
-    count = points.shape[1]
+    count = len(prices)
     nearest, totals = rows[0], rows[1]
-    _fill_apart(points, apart)
     for i in range(count):
         nearest[i] = np.inf
     for n in range(len(chosen)):
-        if n > 0:
-            _fill_totals(nearest, apart, totals)
+        if n >= given:
+            _fill_totals(nearest, apart, prices, totals)
             best, least = -1, np.inf
             for i in range(count):
                 if nearest[i] != 0.0 and totals[i] < least:
@@ -154,14 +169,13 @@ def locate_facilities(points: Any, chosen: Any, rows: Any, apart: Any) -> Any:
             if best < 0:  # every other point equals a chosen one
                 return n
             chosen[n] = best
-        row = apart[chosen[n]]
         for j in range(count):
-            nearest[j] = min(nearest[j], row[j])
+            nearest[j] = min(nearest[j], apart[j, chosen[n]])
     return len(chosen)
 
 
-@inner
-def _fill_apart(points: Any, apart: Any) -> None:
+@compiled
+def fill_apart(points: Any, apart: Any) -> None:
     """Squared distances of points (d, C) from each other; four dimensions in a pass."""
     dimension, count = points.shape
     for i in range(count):
@@ -184,12 +198,12 @@ def _fill_apart(points: Any, apart: Any) -> None:
 
 
 @inner
-def _fill_totals(nearest: Any, apart: Any, totals: Any) -> None:
-    """What the sum of squared distances becomes with each point (C,); four rows in a pass."""
+def _fill_totals(nearest: Any, apart: Any, prices: Any, totals: Any) -> None:
+    """What the sum of costs and of its price becomes with each (C,); four rows in a pass."""
     count = len(totals)
     fours = count // 4 * 4
     for i in range(count):
-        totals[i] = 0.0
+        totals[i] = prices[i]
     for j in range(0, fours, 4):
         p, q, r, s = apart[j], apart[j + 1], apart[j + 2], apart[j + 3]
         a, b, c, d = nearest[j], nearest[j + 1], nearest[j + 2], nearest[j + 3]

@@ -15,8 +15,8 @@ from chsel.methods.anchored.modes import distinct, has_new_mode, near_symmetries
 from chsel.methods.anchored.walking import Chains, stride_of, walked
 from chsel.methods.method import ConfiguredMethod
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.elementary import exps
 from chsel.problem.noise import NoiseModel, noise_model
+from chsel.problem.outline import in_order
 from chsel.problem.poses import Poses, compose, product, rotated
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -26,7 +26,12 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.search_space import origin_bounds, search_space
 from chsel.problem.streams import Purpose
-from chsel.problem.subset import evenly_spaced, farthest_poses
+from chsel.problem.subset import (
+    evenly_spaced,
+    facilities,
+    farthest_poses,
+    squared_distances,
+)
 from chsel.problem.surface import object_centre
 from chsel.qd.archive import Evaluated
 from chsel.qd.measures import measure_named
@@ -34,7 +39,6 @@ from chsel.qd.selection import (
     measure_range,
     ranked,
     repeated,
-    representatives,
     sized_archive,
 )
 
@@ -42,9 +46,11 @@ _MOST_ROUNDS = 12
 # While minima are sought, contacts and free voxels draw from far.
 _FAR = NoiseModel((0.015,) * 8, (0.125,) * 8, softness=0.01, wrong=50.0)
 _KEPT = 6  # states of a chain
-_MODES = 6  # whose best poses are always among the hypotheses
 _LIKELY = 6.3  # nats above the best: 95 % of a normal distribution in six dimensions
-_POOL = 400  # candidates that the others represent
+_MODES = 3  # whose best poses are always among the hypotheses
+_LIKELY_MODE = 3.0  # nats of those above the best
+_POOL = 400  # candidates that hypotheses are chosen from
+_REACH = 1.0  # nats from the true pose to others that are as plausible
 _MOST_BASINS = 60  # that results are compared with
 _MOST_KNOWN = 64  # points that poses are rated by, as more of them tell hardly more
 _LEAST_LEFT = 3  # contacts that poses are sampled on if one is left out
@@ -258,21 +264,36 @@ class Search:
         return replace(found, candidates=poses.matrices)
 
     def _representative(self, candidates: RatedPoses, count: int) -> IntArray:
-        """Indices of candidates: the best of the likeliest modes, and those near to all others.
+        """Indices of candidates: the best of the likeliest modes, and those that cover the rest.
 
-        Of the others, likelier ones count as many times as they are likelier.
+        Each candidate may be the true pose, all alike, as they were drawn from the likelihood; then
+        those are plausible that are at most _REACH less likely. The others are chosen one after
+        another so that the expected plausible diversity (Sec. V of the paper) is the least: how far
+        plausible poses are from the nearest hypothesis, and hypotheses from the plausible poses.
         """
         sdf, energies = self._problem.sdf, candidates.energies
-        likely = int((energies <= energies.min() + _LIKELY).sum())  # the lowest come first
+        likely = int((energies <= energies.min() + _LIKELY_MODE).sum())  # the lowest come first
         modes = distinct(sdf, candidates.poses[:likely], min(_MODES, count))
-        until = np.cumsum(exps(energies.min() - energies))
-        share = (np.arange(_POOL) + 0.5) / _POOL
-        drawn = np.searchsorted(until, until[-1] * share)
-        others = drawn[representatives(sdf, candidates.poses[drawn], count - len(modes))]
-        every, first = np.unique(np.concatenate([modes, others]), return_index=True)
-        return every[np.argsort(first, kind="stable")]
+        pool = np.union1d(modes, evenly_spaced(len(energies), _POOL))
+        apart = squared_distances(sdf, candidates.poses[pool])
+        energies = energies[pool]
+        plausible = np.searchsorted(energies, energies + _REACH, side="right")
+        weights = coverage_weights(plausible)
+        to_set = np.minimum.accumulate(apart, axis=1)[:, plausible - 1]
+        prices = in_order(to_set) / (len(pool) * count)
+        given = np.searchsorted(pool, modes)
+        return pool[facilities(weights[:, None] * apart, given, count, prices)]
 
     def _show(self, stage: str, candidates: RatedPoses) -> None:
         vectors = self._space.encode(candidates.poses)
         self._observer.trace(stage, 0, vectors.copy(), candidates.energies.copy())
         self._observer.progress(stage, 1, 1)
+
+
+def coverage_weights(plausible: IntArray) -> FloatArray:
+    """The chance (C,) of each candidate to be drawn from the plausible set of a random true pose.
+
+    plausible (C,), rising: of each true pose, how many of the likeliest are plausible.
+    """
+    shares = np.bincount(plausible - 1, 1.0 / plausible, len(plausible))
+    return np.cumsum(shares[::-1])[::-1] / len(plausible)

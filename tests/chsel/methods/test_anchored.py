@@ -14,6 +14,7 @@ from chsel.methods import build_method, trust_by
 from chsel.methods.anchor_sampling import AnchorSampler
 from chsel.methods.anchored.anchored import Anchored, Search
 from chsel.methods.anchored.anchored_settings import AnchoredSettings, Effort
+from chsel.methods.anchored.modes import distinct
 from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.noise import LATER, WRONG, noise_model
@@ -29,6 +30,7 @@ from chsel.problem.registration_problem import (
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.search_space import PlaneSettings, search_space
 from chsel.problem.streams import StreamKey
+from chsel.problem.subset import surface_descriptors
 from chsel.problem.trust import trust_in
 from tests.chsel.methods.scene import GRID, ODD, POINTS, SIDE, TRUTH, Watcher, known_points, posed
 from tests.chsel.samples import hypotheses_at, plain_energies
@@ -50,6 +52,7 @@ FEW = replace(POINTS, known=POINTS.known[:2], known_sdf=None)
 INEXACT = replace(  # by 2 mm
     POINTS, known=POINTS.known + np.random.default_rng(1).normal(0.0, 0.002, POINTS.known.shape)
 )
+INEXACT_FEW = replace(INEXACT, known=INEXACT.known[:3], known_sdf=None)
 
 
 def anchored(effort: Effort = EFFORT, **changes: Any) -> Anchored:
@@ -333,3 +336,30 @@ def test_a_point_far_away_costs_no_more_than_any_that_is_off() -> None:
     method = anchored()
     known = np.concatenate([[[1000.0, 0.0, 0.0]], POINTS.known])
     assert_found(registered(method, posed(method, KnownPoints(free=POINTS.free, known=known))))
+
+
+def test_hypotheses_are_chosen_for_the_least_expected_plausible_diversity() -> None:
+    count = 6
+    problem = posed(anchored(), INEXACT_FEW, initial_set=np.tile(inverse(TRUTH), (count, 1, 1)))
+    search = Search(problem, AnchoredSettings(effort=EFFORT), NullObserver())
+    every = search.spread(search.minima())
+    candidates = every.chosen(np.arange(40) * len(every.energies) // 40)
+    energies = candidates.energies
+    descriptors = surface_descriptors(problem.sdf, candidates.poses)
+    apart = ((descriptors[:, None] - descriptors) ** 2).sum(axis=2)
+
+    def expected_diversity(chosen: list[int]) -> float:
+        """Of hypotheses, over all candidates that may be the true pose."""
+        total = 0.0
+        for truth in energies:
+            between = apart[np.ix_(energies <= truth + 1.0, chosen)]
+            total += between.min(axis=1).mean() + between.min(axis=0).sum() / count
+        return total
+
+    likely = candidates.poses[: int((energies <= energies[0] + 3.0).sum())]
+    chosen = distinct(problem.sdf, likely, 3).tolist()
+    while len(chosen) < count:
+        others = [i for i in range(len(energies)) if i not in chosen]
+        chosen.append(min(others, key=lambda i: expected_diversity([*chosen, i])))
+    found = search.hypotheses(candidates).object_from_world
+    np.testing.assert_allclose(found, candidates.poses.matrices[sorted(chosen)], atol=1e-9)
