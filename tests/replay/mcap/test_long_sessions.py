@@ -16,12 +16,12 @@ import pytest
 from chsel.problem import points as points_module
 from chsel.problem.online_registration import OnlineRegistration, OnlineSettings, Start
 from chsel.problem.points import GrowingPoints, KnownPoints
-from replay.content.recording_info import recording_info
 from replay.events import Event, Logged, Probe, SessionEnded, SessionStarted
 from replay.mcap.reader import Recording, read_recording
 from replay.mcap.recovery import recover
 from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
+from replay.verbs.info import recording_info
 from runners.run.recording import RecordingConfig
 from runners.run.session_run import SessionRun
 from runners.sessions.point_files import PointClass
