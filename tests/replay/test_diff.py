@@ -13,8 +13,8 @@ import trimesh
 
 from chsel.problem.sdf_grid import SdfGrid
 from replay.__main__ import main
-from replay.comparing.recording_diff import FIRST, SECOND, recording_diff
 from replay.events import HypothesesFound, Logged, Measured, Probe, SensorImage, Traced
+from replay.verbs.diff import FIRST, SECOND, recording_diff
 from tests.replay.conftest import with_decisions
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from replay.__main__ import main
-from replay.comparing.event_differences import is_close
+from replay.comparing.differences import is_close
 from replay.comparing.verification import DIFFERS, EQUAL, verify
 from replay.events import Event, Measured
 from replay.files import file_digest

@@ -18,9 +18,9 @@ from chsel.policies import build_policy
 from chsel.problem.poses import axis_angle, compose
 from replay.__main__ import main
 from replay.comparing.choices import POLICY, chosen
-from replay.comparing.policy_decisions import policy_decisions
 from replay.events import Decided, Event
 from replay.mcap.reader import Recording, read_recording
+from replay.verbs.compare import policy_decisions
 from tests.tools.small_recordings import STEERED, registered_session, steered_session
 
 Write = Callable[[list[Event]], Path]

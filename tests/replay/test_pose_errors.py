@@ -15,11 +15,11 @@ from chsel.problem.poses import axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.comparing.acceptance import best_pose_moves
 from replay.comparing.comparison import numbers_under
 from replay.events import Measured, ProblemPosed, SessionStarted
 from replay.recorder import ListRecorder
 from replay.registration import register_recorded, symmetry_for_errors
+from replay.verbs.accept import best_pose_moves
 
 CENTRE = np.array([0.3, -0.2, 0.25])
 TRUTH = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.8)), np.array([0.1, 0.0, -0.3]))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from replay.__main__ import main
-from replay.comparing.acceptance import write_accepted
 from replay.events import RigDescribed, SensorImage
 from replay.mcap.reader import read_recording
+from replay.verbs.accept import write_accepted
 from tests.replay.conftest import same_bits
 from tests.tools.small_recordings import robot_session, write_recording
 

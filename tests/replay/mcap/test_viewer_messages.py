@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 import replay
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import compose, inverse, rotation_matrices
-from replay.comparing.recording_diff import recording_diff
 from replay.events import Event, HypothesesFound, Probe, SessionStarted
 from replay.mcap.foxglove_messages import FOXGLOVE, POINT_CLASSES, SCENE, VIEWS
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import MESSAGES, RECORDS, STEP_TIME
 from replay.mcap.viewer_messages import CumulativePoints, poses_in_world, simple_mesh
 from replay.mcap.writer import McapRecorder
+from replay.verbs.diff import recording_diff
 
 _ADD = McapRecorder._add
 LAYOUT = Path(replay.__file__).parent / "foxglove_layout.json"

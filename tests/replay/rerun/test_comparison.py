@@ -21,7 +21,7 @@ from replay.comparing.comparison import common_cost, numbers_under
 from replay.events import Event
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.comparison_view import ranked, save_comparison
-from replay.rerun.hypotheses import LEVELS
+from replay.rerun.scene import LEVELS
 from tests.tools.rrd_rows import Row, opens_at, read, shown_at
 
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box

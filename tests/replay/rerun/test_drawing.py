@@ -7,8 +7,7 @@ import pytest
 import trimesh
 
 from replay.colors import CostScale, cost_colors, number
-from replay.rerun.hypotheses import LEVELS, cost_levels
-from replay.rerun.scene import coarsened
+from replay.rerun.scene import LEVELS, coarsened, cost_levels
 
 
 def test_places_on_the_scale_are_logarithmic() -> None:

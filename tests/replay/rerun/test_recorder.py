@@ -42,8 +42,8 @@ from replay.events import (
     Traced,
 )
 from replay.rerun import viewer as rerun_viewer
-from replay.rerun.hypotheses import LEVELS, MOST
 from replay.rerun.rerun_recorder import RerunRecorder
+from replay.rerun.scene import LEVELS, MOST
 from replay.rerun.text import verdict_markdown
 from tests.tools.rrd_rows import (
     Row,
