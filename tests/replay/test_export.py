@@ -16,7 +16,7 @@ from chsel.errors import RecordingError, SettingError
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import inverse
 from replay.__main__ import main
-from replay.events import HypothesesFound, Probe, SensorImage, SnapshotTaken
+from replay.events import HypothesesFound, SensorImage, SnapshotTaken
 from replay.mcap.reader import read_recording
 from replay.verbs.export import EXPORTS, exported_archive, write_export
 from runners.sessions.points import PointsSession, PointsSettings
@@ -199,15 +199,6 @@ def test_images_are_the_recorded_ones(sensor_events, write, tmp_path):
             assert same_bits(found[f"{folder}/{name}"], getattr(seen, name))
         assert int(row["counting"]) == seen.mask.sum()
         assert float(row["cx"]) == seen.intrinsics[2]
-
-
-def test_points_stand_in_the_order_of_the_probes(any_events, write, tmp_path):
-    recording = read_recording(write(any_events))
-    found = arrays(exported(recording, tmp_path, "points", "npz"))
-    events = [any_events[0].initial_points]
-    events += [e.new_points for e in any_events if isinstance(e, Probe)]
-    for name in ("free", "occupied", "known"):
-        assert same_bits(found[name], np.concatenate([getattr(new, name) for new in events]))
 
 
 def test_the_file_is_named_after_the_recording(recording, tmp_path, monkeypatch, capsys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
@@ -152,7 +151,7 @@ def test_a_log_without_messages_has_no_times(tmp_path, capsys):
         ("x.bag", b"#ROSBAG V2.0\n", "`rosbags-convert --src LOG.bag"),
     ],
 )
-def test_what_is_no_log_is_an_error_of_one_line(tmp_path: Path, capsys, name, data, message):
+def test_what_is_no_log_is_an_error_of_one_line(tmp_path, capsys, name, data, message):
     path = tmp_path / name
     if data is not None:
         path.write_bytes(data)
