@@ -125,13 +125,11 @@ def compared(
     plausible: PlausibleSets | None = None,
     *,
     out: Path | None = None,
-    interval: int | None = None,
 ) -> Iterator[Outcome]:
     """Outcomes step by step: the recorded one, then one of each method in turn.
 
     plausible: the sets that hypotheses are also measured by. out: where to record the registration
-    of one method and one step, with all that its problem follows from. interval: iterations between
-    snapshots of the archive, 0 for the first and last alone; None: as recorded. A registration that
+    of one method and one step, with all that its problem follows from. A registration that
     fails is an outcome, too; with `out` its error is raised, and no file is left.
     """
     built = {choice.label: choice.build() for choice in methods}
@@ -147,9 +145,7 @@ def compared(
         for choice in methods:
             try:
                 with _recorder(recording, step, choice, out) as recorder:
-                    registered = _register(
-                        recording, posed, built[choice.label], recorder, interval
-                    )
+                    registered = _register(recording, posed, built[choice.label], recorder)
                 found = registered.hypotheses
                 numbers = _all_numbers(found, *sets) | {"seconds": registered.total_seconds}
             except Exception as error:  # the others go on
@@ -251,17 +247,17 @@ def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPos
 
 
 def _register(
-    recording: Recording,
-    posed: ProblemPosed,
-    method: Method,
-    recorder: Recorder,
-    interval: int | None,
+    recording: Recording, posed: ProblemPosed, method: Method, recorder: Recorder
 ) -> Registered:
     start = recording.start
-    if interval is None:
-        interval = snapshot_interval(recording.snapshots(posed.step))
-    given = (start.world_from_object, symmetry_for_errors(start))
-    return register_recorded(posed, method, recorder, *given, snapshot_interval=interval)
+    return register_recorded(
+        posed,
+        method,
+        recorder,
+        start.world_from_object,
+        symmetry_for_errors(start),
+        snapshot_interval=snapshot_interval(recording.snapshots(posed.step)),
+    )
 
 
 @contextmanager

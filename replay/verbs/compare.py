@@ -75,7 +75,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", type=path_argument, help="record one method on one step: a new recording"
     )
-    parser.set_defaults(snapshot_interval=None)  # as recorded, but for `step`
     parser.add_argument("--save-csv", type=path_argument, metavar="OUT", help="all numbers")
     parser.add_argument("--save-plot", type=path_argument, metavar="OUT", help="a png, svg or pdf")
     parser.add_argument("--save-rerun", type=path_argument, metavar="OUT", help="a Rerun recording")
@@ -103,8 +102,7 @@ def _compare_methods(given: argparse.Namespace, recording: Recording) -> int:
         raise SettingError("--out records one registration; accepted: with one method and one step")
     sets = PlausibleSets(recording, given.plausible, given.definition)
     cost = common_cost(recording)
-    once = {"out": given.out, "interval": given.snapshot_interval}
-    found = compared(recording, methods, steps, cost, sets, **once)
+    found = compared(recording, methods, steps, cost, sets, out=given.out)
     outcomes = list(_shown(found, methods, steps))
     rows, console = frame(outcomes, methods, cost, given.definition), Console()
     columns = {n: c for n, c in COLUMNS.items() if c.heading and rows[c.csv_name].notna().any()}

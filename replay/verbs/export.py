@@ -119,8 +119,8 @@ def exported_points(recording: Recording, steps: str | None) -> Exported:
     return Exported(arrays.items(), pd.concat(tables))
 
 
-def exported_archive(recording: Recording, steps: str | None, *, last: bool = False) -> Exported:
-    """The archive over each registration, or as it is at the end.
+def exported_archive(recording: Recording, steps: str | None) -> Exported:
+    """The archive over each registration; the last snapshot of a step is that of its result.
 
     npz: `steps` (S,); for snapshot I of step K, `step_K/snapshot_I/` with `iteration`,
     `refinement`, `measure_names` (k,), `shape` (k,), `lower` (k,), `upper` (k,), `cells` (C,),
@@ -131,7 +131,7 @@ def exported_archive(recording: Recording, steps: str | None, *, last: bool = Fa
     arrays: dict[str, Any] = {"steps": np.array(chosen, dtype=np.int64)}
     tables = []
     for step in chosen:
-        for index, archive in enumerate(taken[step][-1:] if last else taken[step]):
+        for index, archive in enumerate(taken[step]):
             folder = f"step_{step}/snapshot_{index}"
             arrays |= {f"{folder}/{name}": getattr(archive, name) for name in _OF_ARCHIVES}
             columns = {
@@ -268,21 +268,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a new file; else RECORDING_WHAT.FORMAT in this folder",
     )
     parser.add_argument("--steps", metavar="A..B", help=STEPS_HELP)
-    parser.add_argument(
-        "--last", action="store_true", help="of the archives, the last of each step"
-    )
 
 
 def run(given: argparse.Namespace) -> int:
     """Write the file and say where it is."""
     file_format = _format(given.format, given.out)
-    if given.last and given.what != "archive":
-        raise SettingError(f"--last does not go with {given.what}; accepted: --what archive")
     recording = read_recording(given.file)
-    if given.last:
-        exported = exported_archive(recording, given.steps, last=True)
-    else:
-        exported = EXPORTS[given.what](recording, given.steps)
+    exported = EXPORTS[given.what](recording, given.steps)
     path = given.out or Path(f"{recording.path.stem}_{given.what}.{file_format}")
     write_export(exported, path, file_format)
     console = Console(soft_wrap=True)

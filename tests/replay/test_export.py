@@ -139,9 +139,6 @@ def test_archives_are_the_recorded_ones(recording, events, tmp_path):
     assert same_bits(flat, np.concatenate([archive.solutions for archive in taken]))
     pairs = [[float(row["measure_0"]), float(row["measure_1"])] for row in rows]
     assert same_bits(pairs, np.concatenate([archive.measures for archive in taken]))
-    last = arrays(exported(recording, tmp_path, "archive", "npz", "--last"))
-    assert same_bits(last["step_2/snapshot_0/cells"], recording.hypotheses(2).archive.cells)
-    assert not any("snapshot_1" in name for name in last)
 
 
 def test_an_archive_that_is_no_snapshot_is_exported_too(make_events, write):
@@ -239,7 +236,6 @@ def test_nothing_is_left_of_a_file_that_cannot_be_finished(recording, tmp_path, 
 def test_what_does_not_fit_is_named(recording, tmp_path, capsys):
     words = ["export", str(recording.path), "--what"]
     for more, message in {
-        ("points", "--last"): "--last does not go with points; accepted: --what archive",
         ("points", "--format", "csv", "-o", "a.npz"): "--format is csv and a.npz ends in npz",
         ("points", "-o", "a.xlsx"): "a.xlsx ends in .xlsx; accepted: .npz, .csv, .json",
         ("points", "--format", "csv", "-o", "a"): "a ends in no suffix; accepted: .npz, .csv",

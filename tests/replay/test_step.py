@@ -121,7 +121,6 @@ def test_nothing_is_overwritten(recording, step, capsys):
         (("--step", "1", "--method", "a", "b"), "--method names a and b; accepted: one, then"),
         (("--step", "1", "--method", "chselle"), "chselle"),
         (("--step", "1", "--method", "emitter.iteration=4"), "iteration does not exist"),
-        (("--step", "1", "--snapshot-interval", "-1"), "--snapshot-interval is -1; accepted: 0"),
     ],
 )
 def test_what_does_not_exist_is_named(step, capsys, words, message):
