@@ -248,12 +248,14 @@ def _fact_table(facts: Mapping[str, str | None]) -> Table:
 def _facts(info: Mapping[str, Any]) -> dict[str, str]:
     """Names and what they are, but for the steps."""
     preset = f", preset {info['preset']}" if info["preset"] else ""
-    counts = f"probes {len(info['steps'])}, registrations {info['registrations']}"
+    steps = f"probes {len(info['steps'])}, registrations {info['registrations']}"
     files = ", ".join(f"{name} {decimal(size)}" for name, size in info["attachments"].items())
-    messages = (
-        f"{info['messages'][topic]} {topic} ({decimal(size)})"
-        for topic, size in info["message_bytes"].most_common()
-    )
+    counts, sizes = Counter[str](), Counter[str]()  # of topics such as /all_points/free/0 together
+    for topic, size in info["message_bytes"].items():
+        name = "/".join(topic.split("/")[:2])
+        counts[name] += info["messages"][topic]
+        sizes[name] += size
+    messages = (f"{counts[name]} {name} ({decimal(size)})" for name, size in sizes.most_common())
     versions = (f"{k.removeprefix('package ')} {v}" for k, v in info["environment"].items())
     damage, path = info["integrity"]["damage"], Path(info["path"])
     integrity = "finished; all checksums and digests are right"
@@ -261,7 +263,7 @@ def _facts(info: Mapping[str, Any]) -> dict[str, str]:
         integrity = f"{damage}; what is whole was read, and {recover_hint(path)}"
     return {
         "object": info["object"],
-        "session": f"{info['session']}, runner {info['runner']}; {counts}",
+        "session": f"{info['session']}, runner {info['runner']}; {steps}",
         "method": f"{info['method']}{preset}, seed {info['seed']}",
         "policy": _policy(info),
         "source": f"recording {info['source']}" if info["source"] else "",
