@@ -36,11 +36,10 @@ MAY_IMPORT = {
     },
     "replay": {
         "mcap": set(),
-        "content": {"mcap"},
         "registration": {"mcap"},
         "comparing": {"mcap", "registration"},
         "rerun": {"mcap", "comparing"},
-        "verbs": {"mcap", "content", "registration", "comparing", "rerun"},
+        "verbs": {"mcap", "registration", "comparing", "rerun"},
     },
     "runners": {
         "objects": set(),

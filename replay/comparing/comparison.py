@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,14 +15,17 @@ import pandas as pd
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.cost.cost_settings import CostSettings
-from chsel.errors import ChselError, RecordingError
+from chsel.errors import ChselError, RecordingError, require_choice
 from chsel.methods.method import Method
-from chsel.plausible.pose_metrics import closest_pose, pose_errors
+from chsel.plausible.plausible_set import PlausibleSet, read_plausible
+from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
+from chsel.plausible.pose_metrics import closest_pose, plausible_diversity, pose_errors
+from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.settings import PRESETS, in_preset
+from chsel.problem.streams import StreamKey
 from chsel.rehearsal import warm_up
 from replay.comparing.choices import Choice, is_recorded, recorded_method
-from replay.comparing.plausible import PlausibleSets
 from replay.environment import environment
 from replay.events import ProblemPosed, Recorder, SessionEnded, SessionStarted
 from replay.files import file_digest, new_file
@@ -121,13 +125,11 @@ def compared(
     plausible: PlausibleSets | None = None,
     *,
     out: Path | None = None,
-    interval: int | None = None,
 ) -> Iterator[Outcome]:
     """Outcomes step by step: the recorded one, then one of each method in turn.
 
     plausible: the sets that hypotheses are also measured by. out: where to record the registration
-    of one method and one step, with all that its problem follows from. interval: iterations between
-    snapshots of the archive, 0 for the first and last alone; None: as recorded. A registration that
+    of one method and one step, with all that its problem follows from. A registration that
     fails is an outcome, too; with `out` its error is raised, and no file is left.
     """
     built = {choice.label: choice.build() for choice in methods}
@@ -143,9 +145,7 @@ def compared(
         for choice in methods:
             try:
                 with _recorder(recording, step, choice, out) as recorder:
-                    registered = _register(
-                        recording, posed, built[choice.label], recorder, interval
-                    )
+                    registered = _register(recording, posed, built[choice.label], recorder)
                 found = registered.hypotheses
                 numbers = _all_numbers(found, *sets) | {"seconds": registered.total_seconds}
             except Exception as error:  # the others go on
@@ -247,17 +247,17 @@ def _problems(recording: Recording, steps: Sequence[int]) -> Iterator[ProblemPos
 
 
 def _register(
-    recording: Recording,
-    posed: ProblemPosed,
-    method: Method,
-    recorder: Recorder,
-    interval: int | None,
+    recording: Recording, posed: ProblemPosed, method: Method, recorder: Recorder
 ) -> Registered:
     start = recording.start
-    if interval is None:
-        interval = snapshot_interval(recording.snapshots(posed.step))
-    given = (start.world_from_object, symmetry_for_errors(start))
-    return register_recorded(posed, method, recorder, *given, snapshot_interval=interval)
+    return register_recorded(
+        posed,
+        method,
+        recorder,
+        start.world_from_object,
+        symmetry_for_errors(start),
+        snapshot_interval=snapshot_interval(recording.snapshots(posed.step)),
+    )
 
 
 @contextmanager
@@ -297,3 +297,52 @@ def _recorder(
 
 def _digests(found: Hypotheses) -> tuple[str, str | None]:
     return found.digest, None if found.archive is None else found.archive.digest
+
+
+class PlausibleSets:
+    """The sets of a recording's steps by one definition, as `runners.plausible` keeps them.
+
+    folder: by default `plausible` beside the recording. Raises RecordingError for a folder that
+    does not exist, unless it is the default, and SettingError for an unknown definition.
+    """
+
+    def __init__(
+        self, recording: Recording, folder: Path | None = None, definition: str = "default"
+    ) -> None:
+        require_choice("definition", definition, DEFINITIONS)
+        if folder is not None and not folder.is_dir():
+            raise RecordingError(f"{folder} is not a folder; accepted: one with plausible sets")
+        self._folder = folder or recording.path.parent / "plausible"
+        self._definition = definition
+        self._start = recording.start
+
+    @cached_property
+    def _distance(self) -> SurfaceDistance:
+        start = self._start
+        points = surface_points(start.mesh, DistanceSettings().points, StreamKey(start.seed, 0))
+        return SurfaceDistance(start.sdf, start.mesh, points)
+
+    def numbers(self, problem: RegistrationProblem, hypotheses: Hypotheses) -> dict[str, float]:
+        """Coverage, plausibility and PD in mm^2 (CHSEL, Sec. V); none without a set of the problem.
+
+        Raises EvaluationError for a set that is damaged.
+        """
+        members = self._members(problem)
+        if members is None or len(hypotheses.object_from_world) == 0:
+            return {}
+        poses = hypotheses.object_from_world
+        found = plausible_diversity(self._distance.between(poses, members.world_from_object))
+        return {
+            "coverage": found.coverage,
+            "plausibility": found.plausibility,
+            "diversity": found.diversity,
+        }
+
+    def _members(self, problem: RegistrationProblem) -> PlausibleSet | None:
+        """The set of these points and this object by the definition, whatever its eps."""
+        for path in sorted(self._folder.glob(f"{problem.points.digest}_*.npz")):
+            found = read_plausible(path)
+            usual = plausible_settings(self._definition, found.settings.epsilon)
+            if found.settings == usual and found.sdf_digest == problem.sdf.digest:
+                return found
+        return None

@@ -13,7 +13,7 @@ from pathlib import Path
 from chsel.errors import ChselError, RecordingError
 from chsel.numerics.threads import threads
 from replay.comparing.again import Again, made_again, result_in
-from replay.comparing.event_differences import result_differences
+from replay.comparing.differences import result_differences
 from replay.environment import environment_differences
 from replay.mcap.reader import Recording, read_recording
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +28,7 @@ from replay.files import file_digest
 from replay.mcap.encoding import decode
 from replay.mcap.event_messages import ImagePlace, RecordedDecision, RecordedProblem, image_from
 from replay.mcap.event_reader import Entry, EventReader
-from replay.mcap.file import DamagedRecordingError, McapFile, StoredMessage
+from replay.mcap.file import DamagedRecordingError, McapFile
 from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
 from replay.mcap.schemas import RECORDS, STEP_TIME
 from replay.mcap.texts import one_line
@@ -199,25 +199,17 @@ class Recording:
             )
 
 
-def read_recording(
-    path: str | Path,
-    *,
-    partial: bool = False,
-    watch: Callable[[StoredMessage], None] | None = None,
-) -> Recording:
+def read_recording(path: str | Path, *, partial: bool = False) -> Recording:
     """Read a recording, every checksum and digest checked.
 
     With `partial`, an unfinished or damaged file gives all events before the first damage, which
-    `Recording.damage` names. `watch` is given every message, as it is met. Raises RecordingError
-    if the file does not exist, is no recording of this project, is of another format, or is
-    unfinished or damaged.
+    `Recording.damage` names. Raises RecordingError if the file does not exist, is no recording of
+    this project, is of another format, or is unfinished or damaged.
     """
     path = Path(path).expanduser()
     file = McapFile(path, TOPIC_SCHEMAS, partial=partial)
     reader, entries = EventReader(file.attachments), list[Entry]()
     for message in file.messages():
-        if watch is not None:
-            watch(message)
         with _blaming(path):
             entry = reader.take(message)
         if entry is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from replay.mcap.texts import check_name
 from replay.mcap.validation import (
     Check,
     ascending_costs,
@@ -29,7 +30,6 @@ from replay.mcap.validation import (
     rigid,
     sensor_name,
     session_end,
-    short_name,
     short_names,
     stop_reason,
     voxel_side,
@@ -67,10 +67,10 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
     "Text": {"name": "string", "value": "string"},
     "Session": {
         "format_version": "uint32",
-        "runner": ("string", short_name),
-        "object": ("string", short_name),
-        "session": ("string", short_name),
-        "method": ("string", short_name),
+        "runner": ("string", check_name),
+        "object": ("string", check_name),
+        "session": ("string", check_name),
+        "method": ("string", check_name),
         "seed": "uint64",
         "config": "string",  # JSON
         "workspace": "f8[2,3]",
@@ -79,7 +79,7 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
         "environment": ("Text*", short_names, plain_texts),
         "mesh_digest": "string",
         "sdf_digest": "string",
-        "source": ("string", short_name),
+        "source": ("string", check_name),
     },
     "Probe": {
         "step": "sint32",
@@ -127,9 +127,9 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
     },
     "Trace": {
         "step": "sint32",
-        "stage": ("string", short_name),
+        "stage": ("string", check_name),
         "iteration": "uint32",
-        "digest": ("string", short_name),
+        "digest": ("string", check_name),
         "lowest_cost": "double",
         "median_cost": "double",
         "highest_cost": "double",
@@ -150,8 +150,8 @@ MESSAGES: Mapping[str, Mapping[str, str | tuple[str | Check, ...]]] = {
     "SessionEnded": {"step": "sint32", "outcome": ("string", session_end)},
     "Rig": {
         "step": "sint32",
-        "name": ("string", short_name),
-        "source": ("string", short_name),  # digest of the raw log
+        "name": ("string", check_name),
+        "source": ("string", check_name),  # digest of the raw log
         "hand_vertices": "f8[V,3]?",
         "hand_faces": "i4[F,3]?",
     },

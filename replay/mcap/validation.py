@@ -48,11 +48,6 @@ def between(low: float, high: float, unit: str) -> Check:
     return check
 
 
-def short_name(field: str, value: str) -> None:
-    """A text on one line, of bounded length, without control characters."""
-    check_name(field, value)
-
-
 def short_names(field: str, value: tuple[str, ...] | Mapping[str, Any]) -> None:
     """Such texts, or a mapping with such names."""
     for item in value:

@@ -6,7 +6,7 @@ messages say, rounded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -62,8 +62,6 @@ _ARROW = 0.01  # metres: width of the arrow of the next probe
 _MOST_FACES = 400
 _FINEST, _COARSEST = 40, 4  # cells along the longest side of a mesh's bounds
 _BLOCKS = 8  # that one level of all points holds before they move to the next
-_ENTITIES = SceneUpdate.ENTITIES_FIELD_NUMBER
-_TRIANGLES = SceneEntity.TRIANGLES_FIELD_NUMBER
 _POINT = np.dtype([("position", "<f4", 3), ("color", "u1", 4)])
 
 
@@ -119,10 +117,7 @@ class SceneMessages:
         step = -(-len(self._vertices) // _SURFACE_POINTS)
         self._surface = self._vertices[::step]  # (S, 3)
         points = [Point3(x=x, y=y, z=z) for x, y, z in self._vertices.tolist()]
-        # Parts of the bytes of its triangles, in the order of the fields: pose, points, color,
-        # indices. A message for each hypothesis repeats them, which takes protobuf far longer.
-        self._points = serialized(TriangleListPrimitive(points=points))
-        self._indices = serialized(TriangleListPrimitive(indices=faces.ravel().tolist()))
+        self._mesh = TriangleListPrimitive(points=points, indices=faces.ravel().tolist())
 
     def object_mesh(self, time: int) -> bytes:
         """The object where the frame "object" is."""
@@ -157,14 +152,12 @@ class SceneMessages:
     ) -> bytes:
         """The object at poses (B, 4, 4), each in a color: red, green, blue to 255, opacity to 1."""
         entity = SceneEntity(timestamp=stamp(time), id=name, frame_id=frame, frame_locked=True)
-        parts = [serialized(entity)]
         for pose, (r, g, b, a) in zip(_poses(poses), colors, strict=True):
-            color = Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=a)
-            placed = serialized(TriangleListPrimitive(pose=pose))
-            colored = serialized(TriangleListPrimitive(color=color))
-            triangles = (placed, self._points, colored, self._indices)
-            parts += (_length_prefix(_TRIANGLES, triangles), *triangles)
-        return b"".join((_length_prefix(_ENTITIES, parts), *parts))
+            triangles = entity.triangles.add(
+                pose=pose, color=Color(r=r / 255.0, g=g / 255.0, b=b / 255.0, a=a)
+            )
+            triangles.MergeFrom(self._mesh)
+        return serialized(SceneUpdate(entities=[entity]))
 
 
 class CumulativePoints:
@@ -258,17 +251,6 @@ def colored_cloud(points: FloatArray, color: ColorArray, time: int, frame: str =
 def empty_cloud(time: int) -> bytes:
     """A cloud of no points."""
     return colored_cloud(np.zeros((0, 3)), np.zeros(3, np.uint8), time)
-
-
-def _length_prefix(field: int, parts: Sequence[bytes]) -> bytes:
-    """What stands before a message in a field, given its number and all bytes of the message."""
-    prefix = bytearray()
-    for value in (field << 3 | 2, sum(map(len, parts))):  # 2: bytes with their length
-        while value > 0x7F:
-            prefix.append(value & 0x7F | 0x80)
-            value >>= 7
-        prefix.append(value)
-    return bytes(prefix)
 
 
 def _poses(poses: FloatArray) -> list[Pose]:

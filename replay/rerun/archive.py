@@ -8,8 +8,7 @@ import rerun as rr
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses
 from replay.colors import EMPTY_CELL, TEXT, ColorArray, CostScale, cost_colors, number
-from replay.rerun.hypotheses import shown_hypotheses
-from replay.rerun.scene import on_screen
+from replay.rerun.scene import on_screen, shown_hypotheses
 
 _FLATTEST = 4  # a map wider or higher than this has its shorter side stretched
 _MARK = (255, 255, 255)

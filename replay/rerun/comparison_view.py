@@ -22,8 +22,7 @@ from replay.comparing.comparison import CommonCost, common_cost, numbers_under
 from replay.events import Probe, ProblemPosed
 from replay.mcap.reader import Recording
 from replay.rerun.curves import DEGREES, MILLIMETRES, style_curve
-from replay.rerun.hypotheses import HypothesisMeshes, shown_hypotheses
-from replay.rerun.scene import Scene, coarsened
+from replay.rerun.scene import HypothesisMeshes, Scene, coarsened, shown_hypotheses
 from replay.rerun.stream import PROBE, new_file_stream
 from replay.rerun.text import costs_markdown, literal
 from replay.rerun.views import at_last_probe, curves_view, scene_view

@@ -19,8 +19,7 @@ from replay.mcap.schemas import NUMBERS
 from replay.rerun.archive import ArchiveMap
 from replay.rerun.curves import Curves
 from replay.rerun.decisions import Decisions
-from replay.rerun.hypotheses import HypothesisMeshes
-from replay.rerun.scene import Scene, coarsened
+from replay.rerun.scene import HypothesisMeshes, Scene, coarsened
 from replay.rerun.sensors import SensorImages
 from replay.rerun.stream import Clock, flush, new_stream
 from replay.rerun.text import COLORS, costs_markdown, session_markdown, verdict_markdown

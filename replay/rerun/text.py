@@ -13,7 +13,7 @@ from chsel.problem.noise import FREEDOMS
 from chsel.problem.registration_problem import VERDICTS, Hypotheses, Trust
 from replay.colors import CostScale, number
 from replay.events import SessionStarted
-from replay.rerun.hypotheses import shown_hypotheses
+from replay.rerun.scene import shown_hypotheses
 
 COLORS = """
 | in the scene | colour |

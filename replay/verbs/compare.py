@@ -9,6 +9,7 @@ other bits.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,12 @@ import pandas as pd
 from rich.progress import BarColumn, MofNCompleteColumn
 from rich.table import Table
 
-from chsel.errors import RecordingError, SettingError
+from chsel.errors import ChselError, RecordingError, SettingError
 from chsel.methods.method import Method
+from chsel.next_probe.decision_problem import Actions, Decision
 from chsel.numerics.threads import require_threads, threads
 from chsel.plausible.plausible_settings import DEFINITIONS
+from chsel.policies.policy import Policy
 from chsel.problem.registration_problem import Hypotheses
 from replay.arguments import STEPS_HELP, chosen_steps, path_argument
 from replay.comparing.choices import LABELS_HELP, METHOD, POLICY, Choice, chosen
@@ -28,18 +31,20 @@ from replay.comparing.comparison import (
     COLUMNS,
     Column,
     Outcome,
+    PlausibleSets,
     common_cost,
     compared,
     frame,
     recorded_label,
     write_csv,
 )
-from replay.comparing.plausible import PlausibleSets
-from replay.comparing.policy_decisions import policy_decisions, require_steered
 from replay.console import Console, Progress, TextColumn, plain_table
-from replay.files import require_folder, require_new
+from replay.files import new_file, require_folder, require_new
 from replay.mcap.reader import Recording, read_recording
 
+_POSE = ("x_m", "y_m", "z_m", "dx", "dy", "dz")
+_OF_ACTIONS = ("score", "hit_chance", "blocked_chance", "expected_spread")
+_PICTURES = (".png", ".svg", ".pdf")
 _FEW_STEPS = 3
 _PLAUSIBLE = ("coverage", "plausibility", "diversity")  # which have tables of their own
 
@@ -70,7 +75,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--out", type=path_argument, help="record one method on one step: a new recording"
     )
-    parser.set_defaults(snapshot_interval=None)  # as recorded, but for `step`
     parser.add_argument("--save-csv", type=path_argument, metavar="OUT", help="all numbers")
     parser.add_argument("--save-plot", type=path_argument, metavar="OUT", help="a png, svg or pdf")
     parser.add_argument("--save-rerun", type=path_argument, metavar="OUT", help="a Rerun recording")
@@ -98,8 +102,7 @@ def _compare_methods(given: argparse.Namespace, recording: Recording) -> int:
         raise SettingError("--out records one registration; accepted: with one method and one step")
     sets = PlausibleSets(recording, given.plausible, given.definition)
     cost = common_cost(recording)
-    once = {"out": given.out, "interval": given.snapshot_interval}
-    found = compared(recording, methods, steps, cost, sets, **once)
+    found = compared(recording, methods, steps, cost, sets, out=given.out)
     outcomes = list(_shown(found, methods, steps))
     rows, console = frame(outcomes, methods, cost, given.definition), Console()
     columns = {n: c for n, c in COLUMNS.items() if c.heading and rows[c.csv_name].notna().any()}
@@ -120,11 +123,9 @@ def _compare_methods(given: argparse.Namespace, recording: Recording) -> int:
     if given.save_csv is not None:
         write_csv(rows, given.save_csv)
     if given.save_plot is not None:
-        from replay.comparing.plot import write_plot
-
         start = recording.start
         title = f"{start.object}, {start.session} session, seed {start.seed}, costs of all by "
-        write_plot(given.save_plot, rows, [*columns.values()], title + cost.name)
+        write_plot(given.save_plot, rows, list(columns.values()), title + cost.name)
     if given.save_rerun is not None:
         from replay.rerun.comparison_view import save_comparison
 
@@ -160,9 +161,13 @@ def _checked_outputs(given: argparse.Namespace) -> list[Path]:
         if outputs.count(path) > 1:
             raise RecordingError(f"{path} is named twice; accepted: a file for each")
     if given.save_plot is not None:
-        from replay.comparing.plot import require_picture
+        import matplotlib  # noqa: F401, as it is an extra
 
-        require_picture(given.save_plot)
+        if given.save_plot.suffix.lower() not in _PICTURES:
+            accepted = f"*{', *'.join(_PICTURES)}"
+            raise SettingError(
+                f"{given.save_plot} is not the name of a picture; accepted: {accepted}"
+            )
     return outputs
 
 
@@ -280,3 +285,82 @@ def _results(recording: Recording, outcomes: Sequence[Outcome]) -> dict[str, dic
     if again:
         results.pop(recorded_label(recording), None)
     return results
+
+
+def write_plot(path: Path, rows: pd.DataFrame, columns: Sequence[Column], title: str) -> None:
+    """Write a new picture with a panel for every column over the steps, a line for each method.
+
+    What failed, and costs that are infinite, are gaps.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    height = math.ceil(len(columns) / 4)
+    figure = Figure(figsize=(13, 1.1 + 3.0 * height), layout="constrained")
+    for place, column in enumerate(columns):
+        axes = figure.add_subplot(height, min(4, len(columns)), place + 1)
+        values = rows.pivot(index="step", columns="label", values=column.csv_name) * column.times
+        values = values[rows["label"].unique()]
+        for number, label in enumerate(values):
+            line = ":" if number == 0 else "-"  # the recorded one
+            axes.plot(values[label], line, marker="os^DvPX"[number % 7], alpha=0.8, label=label)
+        axes.set_title(column.title, fontsize=10)
+        axes.set_xlabel("step")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        positive = values.min().min() > 0.0
+        axes.set_yscale("log" if positive and "cost" in column.title else "linear")
+        axes.grid(color="#dddddd", linewidth=0.6)
+    if columns:
+        lines, labels = axes.get_legend_handles_labels()
+        figure.legend(lines, labels, loc="outside lower center", ncols=min(len(labels), 5))
+    figure.suptitle(title, fontsize=11, parse_math=False)
+    with new_file(path) as beside:
+        figure.savefig(beside, format=path.suffix.lower()[1:], dpi=120)
+
+
+def policy_decisions(
+    recording: Recording, policies: Sequence[Choice[Policy]], steps: Sequence[int]
+) -> Iterator[dict[str, Any]]:
+    """A row of a table for each step and policy, the recorded decision first; with their units.
+
+    step, label, failure, changes (to the settings, with "; " between), chosen (action), stop,
+    spread_m, then of the chosen action, where there is one, start (x_m to z_m), direction (dx to
+    dz) and forecasts, and as_recorded, whether it is the recorded one.
+    """
+    built = [(choice, choice.build()) for choice in policies]
+    group = recording.start.config.get("policy")
+    name = group.get("name") if isinstance(group, dict) else None
+    for step in steps:
+        decided = recording.decision(step)
+        actions, recorded = decided.problem.actions, decided.decision
+        first = {"step": step, "label": f"recorded: {name}", "failure": "", "changes": ""}
+        yield first | _cells(actions, recorded) | {"as_recorded": None}
+        for choice, policy in built:
+            row = first | {"label": choice.label, "changes": "; ".join(choice.changes)}
+            try:
+                decision = policy.decide(decided.problem)
+            except ChselError as error:
+                yield row | {"failure": str(error)}
+            else:
+                same = decision.chosen == recorded.chosen
+                yield row | _cells(actions, decision) | {"as_recorded": same}
+
+
+def require_steered(recording: Recording) -> None:
+    """Raise RecordingError unless a recording has decisions."""
+    if not recording.decision_steps:
+        raise RecordingError(
+            f"recording {recording.path} has no actions to choose from; accepted: a recording of "
+            "a steered session"
+        )
+
+
+def _cells(actions: Actions, decision: Decision) -> dict[str, Any]:
+    chosen = decision.chosen
+    row = {"chosen": chosen, "stop": decision.stop, "spread_m": decision.spread}
+    if chosen >= 0:
+        pose = actions.world_from_hand[chosen]
+        row |= dict(zip(_POSE, [*pose[:3, 3], *pose[:3, 2]], strict=True))
+        values = {name: float(getattr(decision, name)[chosen]) for name in _OF_ACTIONS}
+        row |= values | {"expected_spread_m": values.pop("expected_spread")}
+    return row

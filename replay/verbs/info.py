@@ -10,106 +10,231 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
+from mcap.records import Header
+from mcap.stream_reader import StreamReader
 from rich.filesize import decimal
 from rich.table import Table
 
 from chsel.errors import RecordingError, SessionError
+from chsel.problem.mesh import mesh_digest
+from chsel.problem.points import GrowingPoints
 from replay.console import Console, plain_table, print_error
-from replay.content.log_info import LogInfo, is_other_programs, log_info
-from replay.content.recording_info import RecordingInfo, recording_info
+from replay.events import Decided, Probe
+from replay.mcap.file import MALFORMED, McapFile, recover_hint
+from replay.mcap.foxglove_messages import TOPIC_SCHEMAS
+from replay.mcap.log_file import ROS1_BAG, Channel, RawFile
+from replay.mcap.reader import Recording, read_recording
+from replay.mcap.schemas import FORMAT_VERSION, PROFILE
 
-_IN_FULL = 3  # files; of more, each is a line
-_EITHER_END = 5  # steps that are shown of many
+_POINTS = ("free", "occupied", "known", "contacts")
+_SECOND = 10**9
+_LONGEST_HEADER = 4096  # bytes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, how much, and as what."""
+    """Files, and as what."""
     parser.add_argument("files", nargs="+", metavar="FILE", help="recordings, or any MCAP files")
-    parser.add_argument("--steps", action="store_true", help="show all steps")
     parser.add_argument("--json", action="store_true", help="print all as one JSON document")
 
 
 def run(given: argparse.Namespace) -> int:
     """Print what is in the files; a list in JSON if there are several."""
-    infos: list[RecordingInfo | LogInfo] = []
-    documents: list[dict[str, Any]] = []
-    status = 0
+    console, documents, status = Console(), [], 0
     for file in given.files:
         try:
             info = log_info(file) if is_other_programs(file) else recording_info(file)
         except (RecordingError, SessionError) as error:
             print_error(str(error))
-            documents.append({"path": file, "error": str(error)})
-            status = 2
-            continue
-        infos.append(info)
-        documents.append(info.plain())
-        status = max(status, int(info.damage is not None))
+            info, status = {"path": file, "error": str(error)}, 2
+        else:
+            status = max(status, int(not info["integrity"]["whole"]))
+            if not given.json:
+                console.print(info["path"], style="bold", soft_wrap=True)
+                for table in _log_tables(info) if "log" in info else _recording_tables(info):
+                    console.print(table)
+        documents.append(info)
     if given.json:
         document = documents if len(documents) > 1 else documents[0]
         sys.stdout.write(json.dumps(document, indent=2, allow_nan=False) + "\n")
-    else:
-        _show(Console(), infos, brief=len(given.files) > _IN_FULL, all_=given.steps)
     return status
 
 
-def _show(
-    console: Console, infos: Sequence[RecordingInfo | LogInfo], *, brief: bool, all_: bool
-) -> None:
-    for info in infos:
-        if brief:
-            console.print(_overview(info), soft_wrap=True)
-            continue
-        console.print(str(info.path), style="bold", soft_wrap=True)
-        if isinstance(info, LogInfo):
-            console.print(_fact_table(_log_facts(info)))
-            console.print(_topic_table(info))
-            continue
-        console.print(_fact_table(_facts(info)))
-        if info.steps:
-            console.print(_step_table(info.steps, all_=all_))
+def recording_info(path: str | Path) -> dict[str, Any]:
+    """What is in a recording, every checksum and digest compared, as JSON has it.
 
-
-def _overview(info: RecordingInfo | LogInfo) -> str:
-    """One line about a file."""
-    if isinstance(info, LogInfo):
-        facts = [f"{len(info.topics)} topics, {info.count} messages", f"{info.seconds:.3f} s"]
-        facts += [decimal(info.size), info.damage or "whole"]
-        return f"{info.path}: log of another program, {', '.join(facts)}"
-    session = info.session
-    facts = [
-        f"{session['object']}, {session['session']}, {session['method']}",
-        f"{len(info.steps)} probes, {info.registrations} registrations",
-        decimal(info.size),
-        "whole" if info.damage is None else info.damage,
-    ]
-    return f"{info.path}: {', '.join(facts)}"
-
-
-def _log_facts(info: LogInfo) -> dict[str, str]:
+    Of a damaged one, all is read that is whole. Raises RecordingError if nothing can be read.
+    """
+    path = Path(path).expanduser()
+    recording = read_recording(path, partial=True)
+    start, damage, decision = recording.start, recording.damage, None
+    try:
+        for event in recording.events():  # which compares the digests of all problems
+            if isinstance(event, Probe):
+                decision = None
+            elif isinstance(event, Decided):
+                decision = event.decision
+    except RecordingError as error:
+        damage = damage or str(error).removeprefix(f"recording {path}: ")
+    messages, sizes = Counter[str](), Counter[str]()
+    for message in McapFile(path, TOPIC_SCHEMAS, partial=True).messages():
+        messages[message.topic] += 1
+        sizes[message.topic] += len(message.data)
+    rows, policy = step_rows(recording), _name(start.config, "policy")
+    stopped: dict[str, Any] = {"stop": None, "spread": None}
+    if decision is not None:
+        stopped = {"stop": decision.stop, "spread": decision.spread}
+    rig = recording.rig
     return {
-        "kind": "log of another program; not a recording of a session",
-        "time": f"{info.span}, {info.seconds:.3f} s" if info.count else "",
-        "messages": f"{info.count} on {len(info.topics)} topics",
-        "size": decimal(info.size),
-        "integrity": info.damage or "",
+        "path": str(path),
+        "bytes": path.stat().st_size,
+        "runner": start.runner,
+        "object": start.object,
+        "session": start.session,
+        "method": start.method,
+        "seed": start.seed,
+        "source": start.source,
+        "free_resolution": start.free_resolution,
+        "preset": _name(start.config, "preset"),
+        "format_version": FORMAT_VERSION,
+        "workspace": start.workspace.bounds.tolist(),
+        "true_pose": start.world_from_object is not None,
+        "sdf_digest": start.sdf.digest,
+        "mesh_digest": mesh_digest(start.mesh),
+        "environment": dict(start.environment),
+        "config": start.config,
+        "rig": None if rig is None else {"name": rig.name, "source": rig.source},
+        "policy": None if policy is None else {"name": policy, **stopped},
+        "outcome": None if recording.ended is None else recording.ended.outcome,
+        "registrations": sum(row["hypotheses"] is not None for row in rows),
+        "integrity": {"whole": damage is None, "damage": damage},
+        "digest": recording.digest,
+        "steps": rows,
+        "attachments": dict(recording.attachments),
+        "messages": messages,
+        "message_bytes": sizes,
     }
 
 
-def _topic_table(info: LogInfo) -> Table:
-    table = plain_table("", texts=("topic", "type"), numbers=("messages", "Hz"))
-    for channel, count in info.topics:
-        rate = info.rate(count)
-        usual = channel.encoding in ("cdr", "protobuf")
-        kind = channel.schema if usual else f"{channel.schema} ({channel.encoding})".strip()
-        table.add_row(channel.topic, kind, str(count), "" if rate is None else f"{rate:.4g}")
-    return table
+def step_rows(recording: Recording) -> list[dict[str, Any]]:
+    """A row for each probe: all points known with it, and what the registration after it gave.
+
+    hypotheses, distinct and best_cost are None without a result.
+    """
+    points, rows = GrowingPoints(recording.start.initial_points), []
+    for probe in recording.probes:
+        points.add(probe.new_points)
+        row = {"step": probe.step, **{name: getattr(points, name) for name in _POINTS}}
+        row |= {"posed": probe.step in recording.steps}
+        row |= dict.fromkeys(("hypotheses", "distinct", "best_cost"))
+        if recording.has_result(probe.step):
+            found = recording.hypotheses(probe.step)
+            row |= {"hypotheses": len(found.cost), "distinct": found.distinct}
+            if len(found.cost) and math.isfinite(found.cost[0]):
+                row["best_cost"] = float(found.cost[0])
+        rows.append(row)
+    return rows
 
 
-def _fact_table(facts: Mapping[str, str]) -> Table:
+def is_other_programs(path: str | Path) -> bool:
+    """Whether a file is a robot's: a ROS 1 bag, or MCAP, by its header not a recording of ours."""
+    path = Path(path).expanduser()
+    if not path.is_file():  # a FIFO would be waited for
+        return False
+    try:
+        with path.open("rb") as file:
+            if file.read(len(ROS1_BAG)) == ROS1_BAG:
+                return True
+            file.seek(0)
+            header = next(StreamReader(file, record_size_limit=_LONGEST_HEADER).records, None)
+    except (*MALFORMED, OSError):
+        return False
+    return isinstance(header, Header) and header.profile != PROFILE
+
+
+def log_info(path: str | Path) -> dict[str, Any]:
+    """What is in an MCAP file of any program, by its summary; without one, everything is read.
+
+    begin and end: first and last log time, nanoseconds, 0 without messages; rate: messages a
+    second over that span. Raises SessionError for a file that cannot be read, or is not MCAP.
+    """
+    file, faults = RawFile(Path(path).expanduser()), list[str]()
+    counts: Counter[Channel] = Counter()
+    times = file.times
+    if not file.is_indexed:
+        for message in file.messages(None, faults.append):
+            counts[message.channel] += 1
+            first, last = times or (message.log_time, message.log_time)
+            times = min(first, message.log_time), max(last, message.log_time)
+    for number, channel in file.channels.items():
+        counts[channel] += file.counts.get(number, 0)
+    begin, end = times or (0, 0)
+    damage = f"unfinished or damaged: {faults[0]}; what is whole was counted" if faults else None
+    return {
+        "path": str(file.path),
+        "bytes": file.size,
+        "log": True,
+        "begin": begin,
+        "end": end,
+        "integrity": {"whole": damage is None, "damage": damage},
+        "topics": [
+            {
+                "topic": channel.topic,
+                "type": channel.schema,
+                "encoding": channel.encoding,
+                "count": count,
+                "rate": _SECOND * count / (end - begin) if end > begin else None,
+            }
+            for channel, count in sorted(counts.items(), key=lambda c: (c[0].topic, c[0].schema))
+        ],
+    }
+
+
+def _name(config: Mapping[str, Any], group: str) -> str | None:
+    """What a configuration has chosen of a group."""
+    chosen = config.get(group)
+    return str(chosen.get("name", "")) if isinstance(chosen, Mapping) else None
+
+
+def _log_tables(info: Mapping[str, Any]) -> tuple[Table, Table]:
+    begin, end = (datetime.fromtimestamp(info[t] / _SECOND, UTC) for t in ("begin", "end"))
+    count = sum(topic["count"] for topic in info["topics"])
+    span = f"{begin:%Y-%m-%d %H:%M:%S} to {end:%Y-%m-%d %H:%M:%S} UTC"
+    facts = {
+        "kind": "log of another program; not a recording of a session",
+        "time": f"{span}, {(info['end'] - info['begin']) / _SECOND:.3f} s" if count else "",
+        "messages": f"{count} on {len(info['topics'])} topics",
+        "size": decimal(info["bytes"]),
+        "integrity": info["integrity"]["damage"],
+    }
+    table = plain_table("", texts=("topic", "type", "encoding"), numbers=("messages", "Hz"))
+    for topic in info["topics"]:
+        rate = "" if topic["rate"] is None else f"{topic['rate']:.4g}"
+        names = (topic["topic"], topic["type"], topic["encoding"])
+        table.add_row(*names, str(topic["count"]), rate)
+    return _fact_table(facts), table
+
+
+def _recording_tables(info: Mapping[str, Any]) -> tuple[Table, Table]:
+    title = "known points after each probe, and what registering gave"
+    names = ("step", *_POINTS, "hypotheses", "distinct", "best cost")
+    table = plain_table(title, numbers=names)
+    for row in info["steps"]:
+        points = [str(row[name]) for name in ("step", *_POINTS)]
+        without = "no result" if row["posed"] else ""
+        cost = "" if row["best_cost"] is None else f"{row['best_cost']:.4g}"
+        counts = [row["hypotheses"], row["distinct"]]
+        result = [without, "", ""] if counts[0] is None else [*map(str, counts), cost]
+        table.add_row(*points, *result)
+    return _fact_table(_facts(info)), table
+
+
+def _fact_table(facts: Mapping[str, str | None]) -> Table:
     """Names and what they are, without those of which nothing is known."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
@@ -120,83 +245,47 @@ def _fact_table(facts: Mapping[str, str]) -> Table:
     return table
 
 
-def _facts(info: RecordingInfo) -> dict[str, str]:
+def _facts(info: Mapping[str, Any]) -> dict[str, str]:
     """Names and what they are, but for the steps."""
-    session = info.session
-    preset = f", preset {session['preset']}" if session["preset"] else ""
-    counts = f"probes {len(info.steps)}, registrations {info.registrations}"
-    files = ", ".join(f"{name} {decimal(size)}" for name, size in info.attachments.items())
+    preset = f", preset {info['preset']}" if info["preset"] else ""
+    steps = f"probes {len(info['steps'])}, registrations {info['registrations']}"
+    files = ", ".join(f"{name} {decimal(size)}" for name, size in info["attachments"].items())
+    counts, sizes = Counter[str](), Counter[str]()  # of topics such as /all_points/free/0 together
+    for topic, size in info["message_bytes"].items():
+        name = "/".join(topic.split("/")[:2])
+        counts[name] += info["messages"][topic]
+        sizes[name] += size
+    messages = (f"{counts[name]} {name} ({decimal(size)})" for name, size in sizes.most_common())
+    versions = (f"{k.removeprefix('package ')} {v}" for k, v in info["environment"].items())
+    damage, path = info["integrity"]["damage"], Path(info["path"])
+    integrity = "finished; all checksums and digests are right"
+    if damage is not None:
+        integrity = f"{damage}; what is whole was read, and {recover_hint(path)}"
     return {
-        "object": session["object"],
-        "session": f"{session['session']}, runner {session['runner']}; {counts}",
-        "method": f"{session['method']}{preset}, seed {session['seed']}",
+        "object": info["object"],
+        "session": f"{info['session']}, runner {info['runner']}; {steps}",
+        "method": f"{info['method']}{preset}, seed {info['seed']}",
         "policy": _policy(info),
-        "source": f"recording {session['source']}" if session["source"] else "",
-        "rig": "" if info.rig is None else f"{info.rig['name']}, raw log {info.rig['source']}",
-        "true pose": "known" if session["true_pose"] else "unknown",
-        "outcome": info.outcome or "unknown: the session did not end",
-        "size": f"{decimal(info.size)}, of that, uncompressed: {files}",
-        "messages": _messages(info),
-        "environment": _environment(session["environment"]),
-        "format": f"version {session['format_version']}",
-        "digest": info.digest,
-        "integrity": info.integrity,
+        "source": f"recording {info['source']}" if info["source"] else "",
+        "rig": "{name}, raw log {source}".format(**info["rig"]) if info["rig"] else "",
+        "true pose": "known" if info["true_pose"] else "unknown",
+        "outcome": info["outcome"] or "unknown: the session did not end",
+        "size": f"{decimal(info['bytes'])}, of that, uncompressed: {files}",
+        "messages": ", ".join(messages),
+        "environment": ", ".join(versions),
+        "format": f"version {info['format_version']}",
+        "digest": info["digest"],
+        "integrity": integrity,
     }
 
 
-def _policy(info: RecordingInfo) -> str:
+def _policy(info: Mapping[str, Any]) -> str:
     """The policy of a steered session, and how it stopped; empty if there is none."""
-    if info.policy is None:
+    if info["policy"] is None:
         return ""
-    stop, spread = info.policy["stop"], info.policy["spread"]
-    text = f"{info.policy['name']}, decisions {info.messages.get('/decision', 0)}, "
+    stop, spread = info["policy"]["stop"], info["policy"]["spread"]
+    text = f"{info['policy']['name']}, decisions {info['messages']['/decision']}, "
     if spread is None:
         return f"{text}none after the last probe"
     ended = f"stopped by {stop}" if stop else "not stopped"
     return f"{text}{ended}, spread of the poses {1000.0 * spread:.1f} mm"
-
-
-def _messages(info: RecordingInfo) -> str:
-    """How many on each topic, with their bytes, the most first."""
-    counts, sizes = _grouped(info.messages), _grouped(info.message_bytes)
-    return ", ".join(
-        f"{counts[topic]} {topic} ({decimal(size)})"
-        for topic, size in sorted(sizes.items(), key=lambda item: -item[1])
-    )
-
-
-def _grouped(numbers: Mapping[str, int]) -> dict[str, int]:
-    """Sums over the topics that are parts of one cloud."""
-    sums: dict[str, int] = {}
-    for topic, number in numbers.items():
-        name = "/all_points" if topic.startswith("/all_points/") else topic
-        sums[name] = sums.get(name, 0) + number
-    return sums
-
-
-def _environment(environment: Mapping[str, str]) -> str:
-    return ", ".join(f"{k.removeprefix('package ')} {v}" for k, v in environment.items())
-
-
-def _step_table(steps: Sequence[Mapping[str, Any]], *, all_: bool) -> Table:
-    """A row for each probe, or for the first and last of many."""
-    names = ("step", "free", "occupied", "known", "contacts", "hypotheses", "distinct", "best cost")
-    title = "known points after each probe, and what registering gave"
-    table = plain_table(title, numbers=names)
-    many = not all_ and len(steps) > 2 * _EITHER_END + 2
-    for index, step in enumerate(steps):
-        if many and index == _EITHER_END:
-            table.add_row("...", *[""] * (len(names) - 1))
-        if not many or not _EITHER_END <= index < len(steps) - _EITHER_END:
-            table.add_row(*_cells(step))
-    if many:
-        table.caption = f"{len(steps) - 2 * _EITHER_END} more steps (--steps shows all)"
-    return table
-
-
-def _cells(step: Mapping[str, Any]) -> list[str]:
-    points = [str(step[name]) for name in ("step", "free", "occupied", "known", "contacts")]
-    if step["hypotheses"] < 0:
-        return [*points, "no result" if step["posed"] else "", "", ""]
-    cost = "" if math.isnan(step["best_cost"]) else f"{step['best_cost']:.4g}"
-    return [*points, str(step["hypotheses"]), str(step["distinct"]), cost]

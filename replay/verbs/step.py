@@ -47,12 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a new file; else RECORDING_stepK_METHOD.mcap in this folder",
     )
     parser.add_argument(
-        "--snapshot-interval",
-        type=int,
-        metavar="N",
-        help="iterations between snapshots of the archive, 0 for first and last; else as recorded",
-    )
-    parser.add_argument(
         "--save-rerun", type=path_argument, metavar="RRD", help="also both results side by side"
     )
 
@@ -63,14 +57,11 @@ def run(given: argparse.Namespace) -> int:
     compare.add_arguments(parser)
     asked = parser.parse_args(["", "--methods", "", "--each"])
     asked.file, asked.steps, asked.save_rerun = given.file, str(given.step), given.save_rerun
-    interval = given.snapshot_interval
     if given.policy:
-        if given.method or interval is not None:
+        if given.method:
             raise SettingError("--policy registers nothing; accepted: with FILE and --step")
         asked.methods, asked.policies, asked.out = None, _policies(given.policy), given.out
         return compare.run(asked)
-    if interval is not None and interval < 0:
-        raise SettingError(f"--snapshot-interval is {interval}; accepted: 0 or more")
     names = [word for word in given.method if "=" not in word]
     if len(names) > 1:
         raise SettingError(f"--method names {' and '.join(names)}; accepted: one, then KEY=VALUE")
@@ -79,7 +70,7 @@ def run(given: argparse.Namespace) -> int:
     changes = [word for word in given.method if "=" in word and word not in presets]
     default = f"{given.file.stem}_step{given.step}_{label.partition('@')[0]}.mcap"
     label += "".join(f"@{word.removeprefix('preset=')}" for word in presets[:1])
-    asked.methods, asked.snapshot_interval = [label, *changes], interval
+    asked.methods = [label, *changes]
     asked.out = given.out or Path(default)
     return compare.run(asked)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -270,27 +269,27 @@ def _archive(random: np.random.Generator, iteration: int, elites: int) -> Archiv
 
 
 @pytest.fixture
-def events() -> list[Event]:
+def events():
     return example_events()
 
 
 @pytest.fixture
-def make_events() -> Callable[..., list[Event]]:
+def make_events():
     return example_events
 
 
 @pytest.fixture
-def sensor_events() -> list[Event]:
+def sensor_events():
     return with_sensors(example_events())
 
 
 @pytest.fixture
-def steered_events() -> list[Event]:
+def steered_events():
     return with_decisions(example_events())
 
 
 @pytest.fixture(params=["full", "bare", "start alone", "sensors", "steered", "steered sensors"])
-def any_events(request: pytest.FixtureRequest) -> list[Event]:
+def any_events(request):
     if request.param == "bare":
         return bare_events()
     if request.param == "steered":
@@ -303,7 +302,7 @@ def any_events(request: pytest.FixtureRequest) -> list[Event]:
 
 
 @pytest.fixture
-def assert_same() -> Callable[[Any, Any], None]:
+def assert_same():
     """Asserts that two lists of events are equal to the bit."""
 
     def check(read: Any, written: Any) -> None:
@@ -316,7 +315,7 @@ def assert_same() -> Callable[[Any, Any], None]:
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Callable[[list[Event]], Path]:
+def write(tmp_path):
     """Records events to a new file."""
     from replay.mcap.writer import McapRecorder
 

@@ -8,13 +8,12 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
 import trimesh
 
 from chsel.problem.sdf_grid import SdfGrid
 from replay.__main__ import main
-from replay.comparing.recording_diff import FIRST, SECOND, recording_diff
-from replay.events import HypothesesFound, Logged, Measured, Probe, SensorImage, Traced
+from replay.events import HypothesesFound, Measured, Probe, SensorImage, Traced
+from replay.verbs.diff import FIRST, SECOND, recording_diff
 from tests.replay.conftest import with_decisions
 
 
@@ -54,12 +53,6 @@ def test_a_bit_of_one_cost_is_found(events, write, capsys):
     assert found.ulps == 2
 
 
-def test_a_trace_is_named_by_its_stage(events, write):
-    first, second = write(events), write(changed(events, Traced, 0, digest="0" * 32))
-    (text,) = texts(first, second)
-    assert text.startswith("/trace, step 1, descent iteration 100: digest: ")
-
-
 def test_settings_and_environment_differ_by_key(events, write, capsys):
     start = events[0]
     config = {"object": {"name": "电钻", "scale": 2.5}, "flags": [True, None, -1.0], "new": {}}
@@ -96,14 +89,6 @@ def test_an_event_too_many_shifts_nothing(events, write):
             f"/trace, step 1, descent iteration 50: only in the {having} recording"
         )
         assert found.having == having
-
-
-def test_a_shorter_session_lacks_its_last_events(make_events, write):
-    first, second = write(make_events(steps=3)), write(make_events(steps=2))
-    found = recording_diff(first, second).differences
-    lonely = [item for item in found if item.having == FIRST]
-    assert {item.place.step for item in lonely} == {2}
-    assert {"/probe", "/problem", "/hypotheses"} <= {item.place.topic for item in lonely}
 
 
 def test_signed_zeros_differ_and_equal_nan_do_not(events, write):
@@ -151,26 +136,6 @@ def test_mesh_grid_and_points_are_compared_by_number(events, write):
     assert texts(first, second, "mesh", "sdf", "/probe") == []
 
 
-def test_log_lines_are_compared_by_text(events, write):
-    first, second = write(events), write(changed(events, Logged, 0, text="other"))
-    assert texts(first, second) == ["/log, start: text: ready — los geht's -> other"]
-
-
-def test_files_that_cannot_be_used_are_named(events, write, tmp_path, capsys):
-    path = write(events)
-    whole = path.read_bytes()
-    cut, flipped = tmp_path / "cut.mcap", tmp_path / "flipped.mcap"
-    cut.write_bytes(whole[:-9])
-    middle = len(whole) // 2
-    flipped.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
-    for bad, message in ((cut, "is unfinished"), (flipped, "damaged"), (tmp_path / "no", "exist")):
-        for pair in ((path, bad), (bad, path)):
-            assert main(["diff", *map(str, pair)]) == 2
-            error = capsys.readouterr().err
-            assert str(bad) in error
-            assert message in error
-
-
 def test_a_pixel_is_met(sensor_events, write):
     events = with_decisions(sensor_events)
     image = next(event for event in events if isinstance(event, SensorImage))
@@ -179,10 +144,3 @@ def test_a_pixel_is_met(sensor_events, write):
     first, second = write(events), write(changed(events, SensorImage, 0, values=values))
     (text,) = texts(first, second)
     assert text == "/sensor_image, step 0, camera: values: 1 of 35 entries, the first at 17"
-
-
-@pytest.mark.parametrize("ignored", ["measured", "/measured"])
-def test_topics_can_be_left_out(events, write, ignored):
-    first, second = write(events), write(changed(events, Measured, 0, values={"a": 1.0}))
-    assert texts(first, second) != []
-    assert texts(first, second, ignored) == []

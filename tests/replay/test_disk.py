@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
-from collections.abc import Callable
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from chsel.errors import RecordingError
 from chsel.problem import online_registration as online
 from replay.__main__ import main
 from replay.files import WritingError, new_file, whole_file
+from replay.mcap.reader import read_recording
 from replay.mcap.writer import McapRecorder
-from runners.run.recording import write_in_run_folder
-from tests.runners.in_process import run
+from tests.tools.kill_sessions import PROBES, points_session, reported_probes
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STORED = REPOSITORY / "tests" / "replays" / "spam_can_icp.mcap"
@@ -38,7 +44,7 @@ class Synced:
 
 
 @pytest.fixture
-def synced(monkeypatch: pytest.MonkeyPatch) -> Synced:
+def synced(monkeypatch):
     """Follows os.fsync."""
     found = Synced()
 
@@ -53,24 +59,7 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> Synced:
     return found
 
 
-@pytest.fixture
-def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Makes files with a text in their names fail as on a full disk: the error names none."""
-
-    def fill(part: str) -> None:
-        write_text = Path.write_text
-
-        def fail(path: Path, *more: object, **named: object) -> int:
-            if part in path.name:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            return write_text(path, *more, **named)  # type: ignore[arg-type]
-
-        monkeypatch.setattr(Path, "write_text", fail)
-
-    return fill
-
-
-def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, synced) -> None:
+def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, synced):
     path = tmp_path / "recording.mcap"
     recorder = McapRecorder(path)
     for event in events:
@@ -81,9 +70,7 @@ def test_a_recording_is_on_the_disk_when_it_is_closed(events, tmp_path, synced) 
     assert synced.holds(path)
 
 
-def test_a_recording_that_does_not_get_to_the_disk_is_an_error(
-    events, tmp_path, monkeypatch
-) -> None:
+def test_a_recording_that_does_not_get_to_the_disk_is_an_error(events, tmp_path, monkeypatch):
     def fail(_: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
@@ -94,7 +81,7 @@ def test_a_recording_that_does_not_get_to_the_disk_is_an_error(
         recorder.close()
 
 
-def test_recovered_and_accepted_recordings_are_on_the_disk(tmp_path, synced, monkeypatch) -> None:
+def test_recovered_and_accepted_recordings_are_on_the_disk(tmp_path, synced, monkeypatch):
     out = tmp_path / "out.mcap"
     assert main(["recover", str(STORED), "-o", str(out)]) == 0
     assert synced.holds(out)
@@ -112,7 +99,7 @@ def test_recovered_and_accepted_recordings_are_on_the_disk(tmp_path, synced, mon
 
 
 @pytest.mark.parametrize("make", [whole_file, new_file])
-def test_new_files_are_on_the_disk_and_a_full_one_is_named(make, tmp_path, synced) -> None:
+def test_new_files_are_on_the_disk_and_a_full_one_is_named(make, tmp_path, synced):
     path = tmp_path / "out.txt"
     with make(path) as beside:
         beside.write_text("text")
@@ -126,48 +113,73 @@ def test_new_files_are_on_the_disk_and_a_full_one_is_named(make, tmp_path, synce
     assert sorted(os.listdir(tmp_path)) == ["out.txt"]
 
 
-def test_a_full_disk_under_a_recovery_names_the_file_that_was_asked_for(
-    tmp_path, capsys, monkeypatch
-) -> None:
-    def fail(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", fail)
-    out = tmp_path / "out.mcap"
-    assert main(["recover", str(STORED), "-o", str(out)]) == 2
-    error = f"error: {out} cannot be written: No space left on device\n"
-    assert capsys.readouterr().err == error
-    assert os.listdir(tmp_path) == []
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
+SEEDS = (1, 2)  # one for each of two processes
+KILLS = 30  # in each; thousands by hand, see kill_sessions
 
 
-def test_an_error_about_another_file_stays_what_it_is(tmp_path) -> None:
-    with pytest.raises(FileNotFoundError, match="other"), new_file(tmp_path / "out"):
-        (tmp_path / "other").read_text()
+@pytest.mark.slow
+def test_every_reported_probe_survives_kills_at_random_moments():
+    """In processes of their own: a fork needs one without the threads of other tests."""
+    command = [sys.executable, "-m", "tests.tools.kill_sessions", "--count", str(KILLS), "--seed"]
+    running = [
+        subprocess.Popen(
+            [*command, str(seed)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=ENVIRONMENT,
+            cwd=Path(__file__).resolve().parents[2],
+        )
+        for seed in SEEDS
+    ]
+    for process in running:
+        output, errors = process.communicate(timeout=300)
+        assert process.returncode == 0, errors
+        figures = re.match(
+            r"(\d+) kills, (\d+) before .*, (\d+) after .*; (\d+) probes reported, (\d+) recovered",
+            output,
+        )
+        assert figures is not None, output
+        kills, without, ended, reported, recovered = map(int, figures.groups())
+        assert kills == KILLS
+        assert without + ended < 0.7 * kills  # most kills came in between
+        assert kills < reported <= recovered
 
 
-@pytest.mark.parametrize("name", ["summary.json", "config.yaml"])
-def test_a_full_disk_under_a_file_of_a_run_is_named(
-    name: str, tmp_path, full_disk, make_events, write
-) -> None:
-    from runners.probe import main as probe
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    overrides = points_session(tmp_path_factory.mktemp("points"))
+    return (*overrides, "method=chsel", "method.descent.restarts=2", "method.descent.iterations=20")
 
-    source = write(make_events(steps=2, seed=1))
-    full_disk(name)
-    more = ("method=icp", "method.iterations=2", "recording=mcap", f"logs={tmp_path / 'logs'}")
-    done = run(probe, "session=recorded", f"session.path={source}", *more)
-    assert done.returncode == 2, done.stderr
-    (folder,) = (tmp_path / "logs" / "probe").iterdir()
-    assert done.stderr == (
-        f"error: {folder / name} cannot be written (No space left on device); "
-        "accepted: a logs=DIR that can be written\n"
+
+@pytest.mark.slow
+@pytest.mark.parametrize("probes", [1, 3, 5])
+def test_a_killed_command_leaves_both_files_readable(session, tmp_path, capsys, probes):
+    command = [sys.executable, "-u", "-m", "runners.probe", *session, f"logs={tmp_path}"]
+    slow = ["method.emitter.iterations=2000", "recording=both"]  # so that the kill is not too late
+    process = subprocess.Popen(
+        [*command, *slow], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
     )
-    whole = {"summary.json": ["config.yaml", "recording.mcap"], "config.yaml": []}
-    assert sorted(os.listdir(folder)) == whole[name]
-    if name == "summary.json":
-        assert main(["info", str(folder / "recording.mcap")]) == 0
-
-
-def test_a_run_folder_that_was_removed_is_not_made_again(tmp_path) -> None:
-    with pytest.raises(WritingError, match=r"summary\.json cannot be written: its folder was"):
-        write_in_run_folder(tmp_path / "gone" / "summary.json", "")
-    assert not (tmp_path / "gone").exists()
+    assert process.stdout is not None
+    output = ""
+    for line in process.stdout:
+        output += line
+        if reported_probes(output) == probes:
+            time.sleep(np.random.default_rng(probes).uniform(0.0, 0.05))
+            process.send_signal(signal.SIGKILL)
+            break
+    output += process.stdout.read()
+    assert process.wait(timeout=60) == -signal.SIGKILL
+    reported = reported_probes(output)
+    assert probes <= reported <= PROBES
+    (path,) = tmp_path.rglob("recording.mcap")
+    assert main(["recover", str(path), "-o", str(tmp_path / "recovered.mcap")]) == 0
+    recovered = read_recording(tmp_path / "recovered.mcap")
+    assert f"kept: {len(recovered.probes)} probes" in capsys.readouterr().out
+    assert [probe.step for probe in recovered.probes][:reported] == list(range(reported))
+    for step in range(reported):
+        assert recovered.problem(step).points.count > 0
+        assert recovered.hypotheses(step).object_from_world.shape == (30, 4, 4)
+    chunks = RrdReader(path.with_suffix(".rrd")).stream().to_chunks()
+    assert any("hypotheses" in chunk.entity_path for chunk in chunks)

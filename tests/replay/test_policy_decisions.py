@@ -5,35 +5,31 @@ from __future__ import annotations
 import csv
 import dataclasses
 import re
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from chsel.errors import SettingError
 from chsel.next_probe.decision_problem import Actions
 from chsel.policies import build_policy
 from chsel.problem.poses import axis_angle, compose
 from replay.__main__ import main
 from replay.comparing.choices import POLICY, chosen
-from replay.comparing.policy_decisions import policy_decisions
-from replay.events import Decided, Event
+from replay.events import Decided
 from replay.mcap.reader import Recording, read_recording
-from tests.tools.small_recordings import STEERED, registered_session, steered_session
+from replay.verbs.compare import policy_decisions
+from tests.tools.small_recordings import STEERED, steered_session
 
-Write = Callable[[list[Event]], Path]
 OTHERS = ("voxel_entropy", "nearest_mean", "grid")
 
 
 @pytest.fixture(scope="module")
-def steered() -> list[Event]:
+def steered():
     return steered_session()
 
 
 @pytest.fixture
-def path(steered: list[Event], write: Write) -> Path:
+def path(steered, write):
     return write(steered)
 
 
@@ -41,7 +37,7 @@ def rows_of(recording: Recording, step: int, *words: str) -> list[dict[str, Any]
     return list(policy_decisions(recording, chosen(recording, POLICY, words), [step]))
 
 
-def test_others_decide_on_the_recorded_problem(path: Path) -> None:
+def test_others_decide_on_the_recorded_problem(path):
     recording = read_recording(path)
     for step in (-1, 1):
         recorded, *rows = rows_of(recording, step, *OTHERS, "stop.spread=0.0", "stop.gain=0.0")
@@ -57,7 +53,7 @@ def test_others_decide_on_the_recorded_problem(path: Path) -> None:
             assert row["as_recorded"] is (action == recorded["chosen"])
 
 
-def test_the_recorded_policy_has_its_recorded_settings(path: Path) -> None:
+def test_the_recorded_policy_has_its_recorded_settings(path):
     words = ("information", "information#2", "information#2:noise=0.5")
     recorded, again, wide = rows_of(read_recording(path), 0, *words)
     assert again["as_recorded"]
@@ -67,9 +63,7 @@ def test_the_recorded_policy_has_its_recorded_settings(path: Path) -> None:
     assert wide["changes"] == "noise=0.5"
 
 
-def test_start_and_direction_are_the_hands_place_and_its_z_axis(
-    steered: list[Event],
-) -> None:
+def test_start_and_direction_are_the_hands_place_and_its_z_axis(steered):
     """Seen with hands that are turned about an axis of no symmetry."""
     turn = axis_angle(np.array([0.36, 0.48, 0.8]), np.array(2.1))
     decided = next(event for event in steered if isinstance(event, Decided))
@@ -77,7 +71,7 @@ def test_start_and_direction_are_the_hands_place_and_its_z_axis(
     turned = Actions(compose(turn, [0.0, 0.1, 0.2]) @ old.world_from_hand, old.length)
     problem = dataclasses.replace(decided.problem, actions=turned)
     decided = dataclasses.replace(decided, problem=problem)
-    (row,) = policy_decisions(_Recorded(decided), [], [-1])  # type: ignore[arg-type]
+    (row,) = policy_decisions(_Recorded(decided), [], [-1])
     pose = decided.problem.actions.world_from_hand[decided.decision.chosen]
     forward = pose @ [0.0, 0.0, 1.0, 0.0]
     assert [row[name] for name in ("dx", "dy", "dz")] == pytest.approx(forward[:3], abs=1e-15)
@@ -96,7 +90,7 @@ class _Recorded:
         return self.decided
 
 
-def test_step_shows_a_row_for_each_policy(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_step_shows_a_row_for_each_policy(path, capsys):
     words = ["--policy", "information", "policy.noise=0.5", "--policy", "information"]
     assert main(["step", str(path), "--step", "1", *words]) == 0
     shown = capsys.readouterr().out
@@ -106,9 +100,7 @@ def test_step_shows_a_row_for_each_policy(path: Path, capsys: pytest.CaptureFixt
     assert "information with policy.noise=0.5" in shown
 
 
-def test_compare_counts_agreement_and_writes_a_table(
-    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_compare_counts_agreement_and_writes_a_table(path, tmp_path, capsys):
     out = tmp_path / "decisions.csv"
     words = ["--policies", "information", "grid", "--save-csv", str(out)]
     assert main(["compare", str(path), *words]) == 0
@@ -140,27 +132,8 @@ def test_compare_counts_agreement_and_writes_a_table(
         (["compare", "--policies", "grid", "--steps", "9"], "there is no step 9"),
     ],
 )
-def test_what_cannot_be_is_one_line(
-    path: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_is_one_line(path, words, message, capsys):
     assert main([words[0], str(path), *words[1:]]) == 2
     shown = capsys.readouterr().err
     assert message in shown
     assert shown.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "words", [["step", "--step", "1", "--policy", "grid"], ["compare", "--policies", "grid"]]
-)
-def test_a_session_that_was_not_steered_has_no_actions(
-    write: Write, words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write(registered_session("gradient_descent"))
-    assert main([words[0], str(path), *words[1:]]) == 2
-    message = "has no actions to choose from; accepted: a recording of a steered session\n"
-    assert capsys.readouterr().err.endswith(message)
-
-
-def test_a_policy_has_to_be_named(path: Path) -> None:
-    with pytest.raises(SettingError, match="no policy is named; accepted: grid"):
-        chosen(read_recording(path), POLICY, ["noise=0.1"])

@@ -15,11 +15,11 @@ from chsel.problem.poses import axis_angle, compose, inverse
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.comparing.acceptance import best_pose_moves
 from replay.comparing.comparison import numbers_under
 from replay.events import Measured, ProblemPosed, SessionStarted
 from replay.recorder import ListRecorder
 from replay.registration import register_recorded, symmetry_for_errors
+from replay.verbs.accept import best_pose_moves
 
 CENTRE = np.array([0.3, -0.2, 0.25])
 TRUTH = compose(axis_angle(np.array([0.6, 0.0, 0.8]), np.array(0.8)), np.array([0.1, 0.0, -0.3]))
@@ -59,7 +59,7 @@ class Fixed:
 
 
 @pytest.fixture(scope="module")
-def start() -> SessionStarted:
+def start():
     mesh = box()
     return SessionStarted(
         runner="probe",
@@ -84,7 +84,7 @@ def problem_of(start: SessionStarted) -> RegistrationProblem:
     )
 
 
-def test_recorded_errors(start: SessionStarted) -> None:
+def test_recorded_errors(start):
     recorder, method = ListRecorder(), Fixed(found(turned(180.0, 0.03), turned(10.0)))
     posed = ProblemPosed(1, problem_of(start))
     registered = register_recorded(posed, method, recorder, TRUTH, symmetry_for_errors(start))
@@ -96,7 +96,7 @@ def test_recorded_errors(start: SessionStarted) -> None:
     assert measured.values["closest_rotation_error"] == pytest.approx(np.deg2rad(10.0), abs=1e-6)
 
 
-def test_compared_errors(start: SessionStarted) -> None:
+def test_compared_errors(start):
     class ByOrder:
         def evaluate(self, poses: np.ndarray) -> np.ndarray:
             return np.arange(float(len(poses)))
@@ -106,7 +106,7 @@ def test_compared_errors(start: SessionStarted) -> None:
     assert numbers["best_rotation_error"] == pytest.approx(np.deg2rad(10.0), abs=1e-6)
 
 
-def test_how_far_the_best_pose_moves(start: SessionStarted) -> None:
+def test_how_far_the_best_pose_moves(start):
     symmetry = object_symmetry(start.mesh)
     pair = found(turned(180.0)), found(turned(20.0, 0.004))
     position, rotation = best_pose_moves(*pair, symmetry)
@@ -116,6 +116,6 @@ def test_how_far_the_best_pose_moves(start: SessionStarted) -> None:
     assert np.isnan(best_pose_moves(found(), pair[0], symmetry)).all()
 
 
-def test_without_a_true_pose_no_symmetry_is_sought(start: SessionStarted) -> None:
+def test_without_a_true_pose_no_symmetry_is_sought(start):
     assert symmetry_for_errors(start) is object_symmetry(start.mesh)
     assert symmetry_for_errors(replace(start, world_from_object=None)) is None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numba
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from chsel.problem.settings import settings_mapping
-from replay.events import Event, HypothesesFound
+from replay.events import HypothesesFound
 from replay.mcap.reader import read_recording
 from tests.tools.small_recordings import measured_again
 
@@ -23,7 +22,7 @@ DESCENT = REPLAYS / "cracker_box_gradient_descent.mcap"
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _numba_as_a_whole() -> None:
+def _numba_as_a_whole():
     """Modules that are first imported within a test of pytester are forgotten after it.
 
     What numba imports when it first compiles cannot be imported twice.
@@ -37,7 +36,7 @@ def abs_of(number: float) -> float:
 
 
 @pytest.fixture
-def stored(tmp_path: Path) -> Path:
+def stored(tmp_path):
     """A folder with one whole recording."""
     folder = tmp_path / "stored"
     folder.mkdir()
@@ -45,31 +44,25 @@ def stored(tmp_path: Path) -> Path:
     return folder
 
 
-def test_an_item_for_each_step_of_each_file(pytester: pytest.Pytester, stored: Path) -> None:
+def test_an_item_for_each_step_of_each_file(pytester, stored):
     pytester.makepyfile("def test_of_the_user(): pass")
     result = pytester.runpytest_inprocess("--replays", str(stored), ".", "-v")
     result.assert_outcomes(passed=5)
     result.stdout.fnmatch_lines(["*box.mcap::step 8, gradient_descent PASSED*"])
 
 
-def test_without_the_option_recordings_are_no_tests(
-    pytester: pytest.Pytester, stored: Path
-) -> None:
+def test_without_the_option_recordings_are_no_tests(pytester, stored):
     assert pytester.runpytest_inprocess(str(stored)).ret == pytest.ExitCode.NO_TESTS_COLLECTED
 
 
-def test_folders_of_the_configuration_are_collected(
-    pytester: pytest.Pytester, stored: Path
-) -> None:
+def test_folders_of_the_configuration_are_collected(pytester, stored):
     shutil.copytree(stored, pytester.path / "kept")
     pytester.makeini("[pytest]\nreplays = kept\n")
     pytester.runpytest_inprocess().assert_outcomes(passed=4)
     pytester.runpytest_inprocess("-k", "step and 9").assert_outcomes(passed=1, deselected=3)
 
 
-def test_a_failing_item_says_what_verify_says(
-    pytester: pytest.Pytester, stored: Path, write: Callable[[list[Event]], Path]
-) -> None:
+def test_a_failing_item_says_what_verify_says(pytester, stored, write):
     events = list(read_recording(DESCENT).events())
     at = [i for i, event in enumerate(events) if isinstance(event, HypothesesFound)][2]
     event = events[at]
@@ -89,7 +82,7 @@ def test_a_failing_item_says_what_verify_says(
     )
 
 
-def test_a_broken_file_fails_and_the_others_run(pytester: pytest.Pytester, stored: Path) -> None:
+def test_a_broken_file_fails_and_the_others_run(pytester, stored):
     (stored / "cut.mcap").write_bytes(DESCENT.read_bytes()[:-100])
     (stored / "empty.mcap").touch()
     result = pytester.runpytest_inprocess("--replays", str(stored))
@@ -97,13 +90,13 @@ def test_a_broken_file_fails_and_the_others_run(pytester: pytest.Pytester, store
     result.stdout.fnmatch_lines(["recording *cut.mcap is unfinished*"])
 
 
-def test_a_folder_that_does_not_exist_is_one_clear_line(pytester: pytest.Pytester) -> None:
+def test_a_folder_that_does_not_exist_is_one_clear_line(pytester):
     result = pytester.runpytest_inprocess("--replays", "nowhere")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["ERROR: --replays nowhere does not exist*"])
 
 
-def test_every_object_and_method_has_stored_replays_of_a_modest_size() -> None:
+def test_every_object_and_method_has_stored_replays_of_a_modest_size():
     from chsel.methods import METHODS
     from runners.objects.loader import MODELS
 
@@ -121,7 +114,7 @@ def test_every_object_and_method_has_stored_replays_of_a_modest_size() -> None:
     assert {"simulated", "points"} <= {start.session for start in starts}
 
 
-def test_a_stored_replay_of_every_method_has_todays_default_settings() -> None:
+def test_a_stored_replay_of_every_method_has_todays_default_settings():
     from chsel.methods import METHODS, preset_settings
 
     stored = [read_recording(file).start.config["method"] for file in REPLAYS.glob("*.mcap")]

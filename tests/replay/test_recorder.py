@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from chsel.errors import RecordingError
-from replay.events import Measured, Probe
+from replay.events import Measured
 from replay.mcap.reader import read_recording
-from replay.mcap.writer import McapRecorder
 from replay.recorder import Recorders
 
 
@@ -61,17 +60,6 @@ def test_files_and_pictures_get_everything_in_order_at_a_flush():
     assert file.calls == pictures.calls == [1, 2, "flush", 3, "close"]
     assert file.threads == {threading.current_thread()}
     assert threading.current_thread() not in pictures.threads
-
-
-def test_many_events_and_those_of_a_live_view_do_not_wait_for_a_flush():
-    live, many = Gate(), Gate()
-    recorder = Recorders([live], live=True)
-    recorder.record("now")
-    assert live.calls == ["now"]
-    recorder = Recorders([many])
-    for event in range(200):
-        recorder.record(event)
-    assert len(many.calls) > 100
 
 
 def test_who_records_faster_than_the_pictures_are_drawn_has_to_wait():
@@ -129,23 +117,6 @@ def test_pictures_that_are_optional_end_with_a_warning(recwarn):
     assert [str(warning.message) for warning in recwarn] == ["no bad; it can be made anew"]
 
 
-def test_equal_events_give_the_bytes_of_a_recorder_alone_and_the_thread_ends(
-    tmp_path, events, write
-):
-    before = threading.active_count()
-    paths = [tmp_path / name for name in ("file.mcap", "pictures.mcap")]
-    recorder = Recorders([McapRecorder(paths[0])], McapRecorder(paths[1]))
-    for event in events:
-        recorder.record(event)
-    recorder.close()
-    assert threading.active_count() == before
-    alone = write(events).read_bytes()
-    assert [path.read_bytes() for path in paths] == [alone, alone]
-    recorder.close()
-    recorder.flush()
-    assert paths[0].read_bytes() == alone
-
-
 _SCRIPT = """
 import runpy, sys
 from replay.events import Recorder
@@ -173,14 +144,3 @@ def test_all_that_was_flushed_survives_sigkill(tmp_path, events, assert_same):
     assert done.returncode == -signal.SIGKILL, done.stderr
     last = next(i for i, event in enumerate(events) if isinstance(event, Measured))
     assert_same(read_recording(path, partial=True).events(), events[: last + 1])
-
-
-def test_a_run_that_dies_ends_and_leaves_what_was_flushed(tmp_path, events):
-    path = tmp_path / "died.mcap"
-    done = run_script("raise ValueError('died')", path)
-    assert done.returncode == 1
-    assert "ValueError: died" in done.stderr
-    recording = read_recording(path, partial=True)
-    assert recording.steps == (1,)
-    probes = [event for event in events if isinstance(event, Probe)]
-    assert [probe.step for probe in recording.probes] == [probe.step for probe in probes[:2]]

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from chsel.errors import RecordingError, SettingError
-from chsel.problem.registration_problem import Hypotheses
+from chsel.errors import RecordingError
 from replay.__main__ import main
-from replay.comparing import comparison
 from replay.comparing.choices import METHOD, chosen
 from replay.comparing.verification import EQUAL, verify
 from replay.environment import environment
@@ -28,12 +24,12 @@ def written(events: list[Event], path: Path) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def session() -> list[Event]:
+def session():
     return registered_session("chsel")
 
 
 @pytest.fixture
-def recording(session, tmp_path) -> Recording:
+def recording(session, tmp_path):
     return written(session, tmp_path / "session.mcap")
 
 
@@ -97,41 +93,6 @@ def test_another_method_with_other_settings_is_recorded_as_such(recording, step,
     assert [verdict.outcome for verdict in verify(again)] == [EQUAL]
 
 
-def test_settings_of_the_recorded_method_can_change_alone(recording, step):
-    assert step("--step", "1", "--method", "emitter.iterations=4", "--snapshot-interval", "0") == 0
-    again = read_recording("session_step1_chsel.mcap")
-    expected = recording.start.config["method"]
-    assert again.start.config["method"] == {
-        **expected,
-        "emitter": {**expected["emitter"], "iterations": 4},
-    }
-    assert [archive.iteration for archive in again.snapshots(1)] == [0, 4]
-
-
-def test_a_step_again_can_be_taken_again(recording, step):
-    assert step("--step", "1", "-o", "once.mcap") == 0
-    assert step("--step", "1", "-o", "twice.mcap") == 0
-    assert Path("once.mcap").read_bytes() == Path("twice.mcap").read_bytes()
-    assert main(["step", "once.mcap", "--step", "1", "-o", "of_it.mcap"]) == 0
-    of_it = read_recording("of_it.mcap")
-    once = hashlib.blake2b(Path("once.mcap").read_bytes(), digest_size=16).hexdigest()
-    assert of_it.start.source == once
-    assert of_it.hypotheses(1).digest == recording.hypotheses(1).digest
-
-
-def test_a_result_that_is_not_the_recorded_one_is_told(session, tmp_path, capsys):
-    events = list(session)
-    index = max(i for i, event in enumerate(events) if isinstance(event, HypothesesFound))
-    found: Hypotheses = events[index].hypotheses
-    cost = np.nextafter(found.cost, np.inf)
-    events[index] = HypothesesFound(1, dataclasses.replace(found, cost=cost))
-    path = written(events, tmp_path / "changed.mcap").path
-    assert main(["step", str(path), "--step", "1", "-o", str(tmp_path / "a.mcap")]) == 1
-    assert "1 of 1 results are not those recorded, at step 1" in capsys.readouterr().out
-    more = ["--method", "emitter.iterations=4"]
-    assert main(["step", str(path), "--step", "1", "-o", str(tmp_path / "b.mcap"), *more]) == 0
-
-
 def test_a_problem_without_a_result_can_be_registered(session, tmp_path, capsys):
     events = [e for e in session if not (isinstance(e, HypothesesFound) and e.step == 1)]
     path = written(events, tmp_path / "lacking.mcap").path
@@ -153,16 +114,6 @@ def test_nothing_is_overwritten(recording, step, capsys):
     assert [file.name for file in Path().iterdir()] == ["mine.mcap"]
 
 
-def test_nothing_is_left_of_a_registration_that_fails(recording, step, monkeypatch, capsys):
-    def failing(*_, **__):
-        raise SettingError("the object is too small")
-
-    monkeypatch.setattr(comparison, "register_recorded", failing)
-    assert step("--step", "1") == 2
-    assert capsys.readouterr().err == "error: the object is too small\n"
-    assert not list(Path().iterdir())
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -170,7 +121,6 @@ def test_nothing_is_left_of_a_registration_that_fails(recording, step, monkeypat
         (("--step", "1", "--method", "a", "b"), "--method names a and b; accepted: one, then"),
         (("--step", "1", "--method", "chselle"), "chselle"),
         (("--step", "1", "--method", "emitter.iteration=4"), "iteration does not exist"),
-        (("--step", "1", "--snapshot-interval", "-1"), "--snapshot-interval is -1; accepted: 0"),
     ],
 )
 def test_what_does_not_exist_is_named(step, capsys, words, message):
@@ -179,11 +129,6 @@ def test_what_does_not_exist_is_named(step, capsys, words, message):
     assert message in said
     assert said.count("\n") == 1
     assert not list(Path().iterdir())
-
-
-def test_it_can_be_drawn_too(step):
-    assert step("--step", "1", "--save-rerun", "view.rrd") == 0
-    assert Path("view.rrd").read_bytes()[:3] == b"RRF"
 
 
 def test_a_digest_names_a_file_as_b2sum_does(tmp_path):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import signal
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +15,10 @@ import pytest
 import trimesh
 from rerun.blueprint.components import PlayState
 
-from chsel.errors import RecordingError
 from replay import __main__
-from replay.events import Event, SessionStarted
 from replay.mcap.reader import read_recording
 from replay.rerun import viewer as rerun_viewer
-from replay.rerun.rerun_recorder import RerunRecorder, draw_recording
+from replay.rerun.rerun_recorder import draw_recording
 from tests.tools.rrd_rows import opens_at, read, views_of_the_last_layout
 
 QUICK = ("recording=both", "recording.snapshot_interval=5")
@@ -38,11 +34,10 @@ KINEMATIC = (
 )
 SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 ENVIRONMENT = {name: value for name, value in os.environ.items() if name not in SCREENS}
-Write = Callable[[list[Event]], Path]
 
 
 @pytest.fixture(scope="module", params=["kinematic", "gradient_descent"])
-def run_folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(request, tmp_path_factory):
     """Both recordings of a small session: of probes, or of points with times and no true pose."""
     folder = tmp_path_factory.mktemp(request.param)
     timed_descent = ("method=gradient_descent", "recording.timings=true")
@@ -70,7 +65,7 @@ def points(folder: Path) -> tuple[str, ...]:
     return ("session=points", f"session.path={folder / 'can.npz'}", *object_choice)
 
 
-def test_it_is_equal_to_the_one_that_the_run_wrote(run_folder: Path, tmp_path: Path) -> None:
+def test_it_is_equal_to_the_one_that_the_run_wrote(run_folder, tmp_path):
     recording = read_recording(run_folder / "recording.mcap")
     draw_recording(recording, tmp_path / "again.rrd")
     written, again = run_folder / "recording.rrd", tmp_path / "again.rrd"
@@ -80,25 +75,7 @@ def test_it_is_equal_to_the_one_that_the_run_wrote(run_folder: Path, tmp_path: P
     assert len(rows["/scene/hypotheses/best"]) > len(recording.steps)
 
 
-def test_what_an_mcap_file_does_not_keep_is_not_drawn(
-    events: list[Event], tmp_path: Path, write: Write
-) -> None:
-    start = events[0]
-    assert isinstance(start, SessionStarted)
-    upward = np.tile([0.0, 0.0, 1.0], (len(start.mesh.vertices), 1))
-    mesh = trimesh.Trimesh(start.mesh.vertices, start.mesh.faces, vertex_normals=upward)
-    shared = [1, 2]
-    start = dataclasses.replace(start, mesh=mesh, config={"a": shared, "b": shared})
-    recorder = RerunRecorder(tmp_path / "a.rrd")
-    recorder.record(start)
-    recorder.close()
-    draw_recording(read_recording(write([start])), tmp_path / "b.rrd")
-    np.testing.assert_equal(read(tmp_path / "b.rrd"), read(tmp_path / "a.rrd"))
-
-
-def test_save_writes_a_new_file_and_opens_nothing(
-    events: list[Event], tmp_path: Path, write: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_save_writes_a_new_file_and_opens_nothing(events, tmp_path, write, capsys):
     file, saved = write(events), tmp_path / "saved.rrd"
     assert __main__.main(["view", str(file), "--save", str(saved)]) == 0
     assert capsys.readouterr().out.strip() == str(saved)
@@ -110,9 +87,7 @@ def test_save_writes_a_new_file_and_opens_nothing(
     assert saved.read_bytes() == before
 
 
-def test_nothing_after_the_step_asked_for_is_saved(
-    events: list[Event], tmp_path: Path, write: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_after_the_step_asked_for_is_saved(events, tmp_path, write, capsys):
     file, saved = str(write(events)), tmp_path / "saved.rrd"
     assert __main__.main(["view", file, "--save", str(saved), "--step", "7"]) == 2
     assert "has no probe 7; accepted: 0 to 2" in capsys.readouterr().err
@@ -123,40 +98,8 @@ def test_nothing_after_the_step_asked_for_is_saved(
     assert opens_at(saved) == ("probe", PlayState.Following)  # at that probe, the last
 
 
-def test_what_is_whole_of_an_unfinished_file_is_drawn_with_a_warning(
-    events: list[Event], tmp_path: Path, write: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file, saved = write(events), tmp_path / "saved.rrd"
-    file.write_bytes(file.read_bytes()[:-1])
-    assert __main__.main(["view", str(file), "--save", str(saved)]) == 0
-    assert "is unfinished; what is whole of it is shown" in capsys.readouterr().err
-    whole = read_recording(file, partial=True)
-    assert len(list(whole.events())) == len(events)
-    assert "/scene/hypotheses/best" in read(saved)
-
-
-def test_nothing_is_left_of_a_file_that_cannot_be_drawn(
-    events: list[Event], tmp_path: Path, write: Write, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = read_recording(write(events))
-
-    def some_events() -> Iterator[Event]:
-        yield events[0]
-        raise RecordingError("the problem of step 1 is not the recorded one")
-
-    monkeypatch.setattr(recording, "events", some_events)
-    with pytest.raises(RecordingError, match="is not the recorded one"):
-        draw_recording(recording, tmp_path / "a.rrd")
-    assert not (tmp_path / "a.rrd").exists()
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a screen")
-def test_without_a_screen_the_other_ways_are_named(
-    events: list[Event],
-    write: Write,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_without_a_screen_the_other_ways_are_named(events, write, monkeypatch, capsys):
     for name in SCREENS:
         monkeypatch.delenv(name, raising=False)
     assert __main__.main(["view", str(write(events))]) == 2
@@ -165,13 +108,7 @@ def test_without_a_screen_the_other_ways_are_named(
     assert "accepted: --save OUT.rrd, or --web" in error
 
 
-def test_a_viewer_that_does_not_start_says_why(
-    events: list[Event],
-    tmp_path: Path,
-    write: Write,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_viewer_that_does_not_start_says_why(events, tmp_path, write, monkeypatch, capsys):
     program = tmp_path / "viewer"
     program.write_text("#!/bin/sh\necho no graphics today\nexit 1\n")
     program.chmod(0o700)
@@ -186,8 +123,8 @@ def test_a_viewer_that_does_not_start_says_why(
 @pytest.mark.skipif(os.name == "nt", reason="there are no such signals on Windows")
 @pytest.mark.parametrize(("ending", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_the_web_viewer_is_served_here_alone_and_ends_with_the_command(
-    events: list[Event], tmp_path: Path, write: Write, ending: signal.Signals, status: int
-) -> None:
+    events, tmp_path, write, ending, status
+):
     folder = tmp_path / "temporary"
     folder.mkdir()
     command = [sys.executable, "-m", "replay", "view", str(write(events)), "--web"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,12 +10,11 @@ import numpy as np
 import pytest
 import trimesh
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from chsel.errors import RecordingError
-from replay.events import HypothesesFound, Probe, ProblemPosed, SnapshotTaken
+from replay.events import ProblemPosed
 from replay.mcap.encoding import decode, encode, message_class
 from replay.mcap.reader import read_recording
 from replay.mcap.schemas import FORMAT_VERSION, RECORDS
@@ -87,18 +85,6 @@ def test_problems_are_rebuilt_from_the_file_alone(events, write):
     assert len(recording.problem(2).low_cost_set) == 12
 
 
-def test_probes_hypotheses_and_snapshots_are_found_by_step(events, write):
-    recording = read_recording(write(events))
-    assert [probe.step for probe in recording.probes] == [0, 1, 2]
-    written = [e for e in events if isinstance(e, HypothesesFound)][-1]
-    assert recording.hypotheses(2).digest == written.hypotheses.digest
-    assert recording.hypotheses(2).archive.digest == written.hypotheses.archive.digest
-    taken = [e.archive.digest for e in events if isinstance(e, SnapshotTaken) and e.step == 2]
-    assert [snapshot.digest for snapshot in recording.snapshots(2)] == taken
-    assert recording.snapshots(0) == []
-    assert recording.ended.outcome == "finished"
-
-
 def test_steps_without_a_registration_are_named(events, write):
     path = write(events)
     recording = read_recording(path)
@@ -106,12 +92,6 @@ def test_steps_without_a_registration_are_named(events, write):
         recording.problem(0)
     with pytest.raises(RecordingError, match="no result of step 7; accepted: 1, 2"):
         recording.hypotheses(7)
-
-
-def test_arrays_read_back_cannot_be_changed(events, write):
-    found = read_recording(write(events)).hypotheses(1)
-    with pytest.raises(ValueError, match="read-only"):
-        found.cost[0] = 0.0
 
 
 def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
@@ -175,18 +155,6 @@ def test_plain_mcap_and_protobuf_rebuild_a_problem(events, write):
     assert mesh.faces.tolist() == events[0].mesh.faces.tolist()
 
 
-def test_the_record_that_holds_the_checksum_of_the_data_cannot_be_hidden(events, write):
-    path = write(events)
-    whole = bytearray(path.read_bytes())
-    (summary_start,) = struct.unpack_from("<Q", whole, len(whole) - 8 - 20)
-    data_end = summary_start - 13  # opcode, length, checksum
-    assert whole[data_end] == Opcode.DATA_END
-    whole[data_end] = 200  # a record of no known kind, which readers skip
-    path.write_bytes(whole)
-    with pytest.raises(RecordingError, match="the end of its data is missing"):
-        read_recording(path)
-
-
 def test_a_flipped_bit_in_a_chunk_is_named_and_what_is_before_it_kept(events, write, assert_same):
     path = write(events)
     whole = bytearray(path.read_bytes())
@@ -217,11 +185,6 @@ def test_an_event_cut_from_its_points_is_left_out(events, write, assert_same):
     assert_same(read_recording(cut, partial=True).events(), events[:2])
 
 
-def test_rewriting_alone_is_no_damage(events, write, assert_same):
-    copy = rewritten(write(events), lambda name, data: data)
-    assert_same(read_recording(copy).events(), events)
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -238,13 +201,6 @@ def test_other_files_are_refused(tmp_path, content, message):
         read_recording(path)
 
 
-def test_missing_files_and_folders_are_named(tmp_path):
-    with pytest.raises(RecordingError, match=r"nowhere\.mcap does not exist; accepted: "):
-        read_recording(tmp_path / "nowhere.mcap")
-    with pytest.raises(RecordingError, match="is a folder; accepted: "):
-        read_recording(tmp_path)
-
-
 def test_recordings_of_other_programs_are_refused(tmp_path):
     path = tmp_path / "other.mcap"
     with path.open("wb") as file:
@@ -255,19 +211,8 @@ def test_recordings_of_other_programs_are_refused(tmp_path):
         read_recording(path)
 
 
-def test_topics_nobody_wrote_on_may_be_missing(make_events, write, assert_same):
-    events = make_events(steps=1)
-    lacking = rewritten(write(events), lambda name, data: data, topics=("/trace", "/timed"))
-    assert_same(read_recording(lacking).events(), events)
-
-
 def drop(*names: str) -> Change:
     return lambda name, data: None if name in names else data
-
-
-def test_an_empty_recording_has_no_session(write):
-    with pytest.raises(RecordingError, match="has no session in it"):
-        read_recording(write([]))
 
 
 def test_another_format_version_is_named_before_all_else(events, write):
@@ -281,12 +226,6 @@ def test_another_format_version_is_named_before_all_else(events, write):
 
     with pytest.raises(RecordingError, match="it is of format 2; accepted: 1"):
         read_recording(rewritten(write(events), newer))
-
-
-@pytest.mark.parametrize("name", ["mesh.ply", "sdf_grid"])
-def test_a_missing_attachment_is_named(events, write, name):
-    with pytest.raises(RecordingError, match=f"lacks the attachment {name}"):
-        read_recording(rewritten(write(events), drop(name)))
 
 
 @pytest.mark.parametrize("name", ["mesh.ply", "sdf_grid"])
@@ -311,6 +250,14 @@ def test_a_changed_attachment_has_another_digest(events, write, name):
         (edited("/session", config="[1]"), "its configuration is not a mapping"),
         (edited("/session", config="{"), "Expecting property name"),
         (edited("/session", workspace=np.ones((2, 3))), "every lower bound below"),
+        (edited("/session", object="\x1b[2J"), r"object holds the character '\\x1b' at 0"),
+        (edited("/session", free_resolution=1e-12), "free_resolution is 1e-12; accepted"),
+        (edited("/session", world_from_object=np.eye(4) * 3.0), "is not a rigid transform"),
+        (edited("/probe", outcome="gone"), "accepted: contact, free, points"),
+        (edited("/probe", step=1), "has a time of step 0, not its own"),
+        (edited("/trace", lowest_cost=1e12), "accepted: lowest, median, highest"),
+        (edited("/problem", sdf_digest="0"), "the SDF grid of the problem of step 1"),
+        (edited("/session_ended", outcome="fine"), "accepted: finished, interrupted, failed"),
         (drop("/points/occupied"), "occupied points of step 0 are missing"),
         (drop("/probe"), "/points/free is out of place"),
         (drop("/session", "/points/free", "/known_points"), "a message on /log is out of place"),
@@ -342,13 +289,6 @@ def test_a_problem_that_is_not_the_recorded_one_is_refused(events, write, change
         list(recording.events())
 
 
-def test_a_problem_of_other_points_than_recorded_is_refused(events, write):
-    change = edited("/problem", points_digest="a\nb")
-    recording = read_recording(rewritten(write(events), change))
-    with pytest.raises(RecordingError, match=r"all points of step 1 has digest .* not a b as rec"):
-        recording.problem(1)
-
-
 def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):
     """Measured values are in no digest; that they are all there follows from their numbering."""
     path = write(events)
@@ -364,11 +304,3 @@ def test_a_lost_message_is_noticed_though_all_checksums_hold(events, write):
     twice.write_bytes(whole[:end] + whole[start:])
     with pytest.raises(RecordingError, match=r"message \d+ is missing, \d+ follows"):
         read_recording(twice)
-
-
-def test_probes_are_whole(events, write):
-    probe = read_recording(write(events)).probes[2]
-    written = [e for e in events if isinstance(e, Probe)][2]
-    assert probe.gripper_path.tobytes() == written.gripper_path.tobytes()
-    assert probe.contacts.shape == (2, 3)
-    assert (probe.contact_normals == -probe.contacts).all()

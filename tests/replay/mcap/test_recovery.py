@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
 import struct
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import MCAP0_MAGIC
 
-from chsel.errors import RecordingError
+from chsel.errors import RecordingError, SessionError
 from chsel.problem.defaults import object_grid
 from replay.__main__ import main
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
@@ -28,13 +33,14 @@ from replay.events import (
     SessionStarted,
     SnapshotTaken,
 )
+from replay.mcap.log_file import RawFile, RawMessage
 from replay.mcap.reader import read_recording
 from replay.mcap.recovery import Recovered, recover, tells_loss
 from replay.mcap.writer import McapRecorder
-from tests.tools.small_recordings import registered_session
-
-Same = Callable[[object, object], None]
-Damage = Callable[[bytes, int, int], bytes]
+from replay.verbs.info import log_info, recording_info
+from tests.replay.conftest import example_events, same_bits
+from tests.runners.sensors.small_logs import ros2_sent, write_ros2
+from tests.tools.small_recordings import registered_session, write_recording
 
 
 def recorded(path: Path, events: list[Event], *flush_before: type[Event]) -> bytes:
@@ -95,11 +101,8 @@ def wrong_length(data: bytes, start: int, _: int) -> bytes:
 
 
 def test_a_whole_recording_is_copied_and_nothing_is_lost(
-    tmp_path: Path,
-    sensor_events: list[Event],
-    assert_same: Same,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    tmp_path, sensor_events, assert_same, capsys
+):
     path, out = tmp_path / "whole.mcap", tmp_path / "out.mcap"
     recorded(path, sensor_events)
     assert main(["recover", str(path), "-o", str(out)]) == 0
@@ -111,9 +114,7 @@ def test_a_whole_recording_is_copied_and_nothing_is_lost(
 
 
 @pytest.mark.parametrize("damage", [flipped, wrong_length])
-def test_of_a_damaged_chunk_all_other_probes_come_back(
-    tmp_path: Path, make_events: Callable[..., list[Event]], assert_same: Same, damage: Damage
-) -> None:
+def test_of_a_damaged_chunk_all_other_probes_come_back(tmp_path, make_events, assert_same, damage):
     many = make_events(steps=6, free=400)
     data = recorded(tmp_path / "whole.mcap", many)
     chunks = chunks_of(data, "/probe")
@@ -136,9 +137,7 @@ def test_of_a_damaged_chunk_all_other_probes_come_back(
         assert_same([e for e in events if isinstance(e, Measured)], numbers)
 
 
-def test_an_unfinished_recording_gets_an_end_that_says_so(
-    tmp_path: Path, events: list[Event], assert_same: Same, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unfinished_recording_gets_an_end_that_says_so(tmp_path, events, assert_same, capsys):
     data = recorded(tmp_path / "whole.mcap", events)
     path, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
     for extra in (0, 40):
@@ -156,39 +155,7 @@ def test_an_unfinished_recording_gets_an_end_that_says_so(
         assert kept[-1].outcome == "recovered: how the session ended is not known"
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda data: data[:-30],
-        lambda data: data[:-20] + bytes([data[-20] ^ 1]) + data[-19:],
-        lambda data: data + b"garbage" * 1000,
-    ],
-    ids=["no footer", "summary", "garbage"],
-)
-def test_damage_behind_the_session_loses_nothing(
-    tmp_path: Path, events: list[Event], assert_same: Same, change: Callable[[bytes], bytes]
-) -> None:
-    kept, _ = recovered(tmp_path, change(recorded(tmp_path / "whole.mcap", events)))
-    assert_same(without_marks(kept), events)
-
-
-def test_chunks_of_another_session_do_not_fit(
-    tmp_path: Path, make_events: Callable[..., list[Event]], assert_same: Same
-) -> None:
-    """Two sessions with as many messages, spliced: the points are not those of its problems."""
-    one, other = make_events(steps=6, seed=1), make_events(steps=6, seed=2)
-    first = recorded(tmp_path / "one.mcap", one)
-    second = recorded(tmp_path / "other.mcap", other)
-    spliced = (
-        first[: chunks_of(first, "/probe")[2][0]] + second[chunks_of(second, "/probe")[2][0] :]
-    )
-    kept, found = recovered(tmp_path, spliced)
-    assert found.damage is not None
-    results = [event for event in kept if isinstance(event, HypothesesFound | ProblemPosed)]
-    assert_same(results, [e for e in one if isinstance(e, HypothesesFound | ProblemPosed)][:2])
-
-
-def test_a_result_is_never_given_an_older_archive(tmp_path: Path, events: list[Event]) -> None:
+def test_a_result_is_never_given_an_older_archive(tmp_path, events):
     """Where a result says that its archive is the last snapshot, and that one is lost."""
     data = recorded(tmp_path / "whole.mcap", events, HypothesesFound, SnapshotTaken)
     kept, found = recovered(tmp_path, flipped(data, *chunks_of(data, "/archive")[-1]))
@@ -198,8 +165,8 @@ def test_a_result_is_never_given_an_older_archive(tmp_path: Path, events: list[E
 
 
 def test_images_and_decisions_without_what_they_need_are_lost(
-    tmp_path: Path, sensor_events: list[Event], steered_events: list[Event]
-) -> None:
+    tmp_path, sensor_events, steered_events
+):
     for events, topic, names in (
         (sensor_events, "/rig", "/sensor_image"),
         (steered_events, "/actions", "/decision"),
@@ -212,7 +179,7 @@ def test_images_and_decisions_without_what_they_need_are_lost(
         assert found.results == [1, 2]
 
 
-def test_verify_does_not_judge_by_what_is_lost(tmp_path: Path) -> None:
+def test_verify_does_not_judge_by_what_is_lost(tmp_path):
     """Step 0 keeps its problem alone, so that the sets of step 1 do not follow from it."""
     written = registered_session("chsel")
     data = recorded(tmp_path / "whole.mcap", written, HypothesesFound, ProblemPosed)
@@ -225,9 +192,7 @@ def test_verify_does_not_judge_by_what_is_lost(tmp_path: Path) -> None:
     assert outcomes == [NO_RESULT, EQUAL][: len(found.problems)]
 
 
-def test_a_damaged_grid_is_made_again_from_the_mesh(
-    tmp_path: Path, events: list[Event], assert_same: Same, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_grid_is_made_again_from_the_mesh(tmp_path, events, assert_same, capsys):
     start = events[0]
     assert isinstance(start, SessionStarted)
     config = {"session": {"object_resolution": 0.02, "object_padding": 0.03}}
@@ -247,44 +212,7 @@ def test_a_damaged_grid_is_made_again_from_the_mesh(
     assert "attachment mesh.ply has digest" in error
 
 
-def test_losses_are_told_in_the_recording_where_they_are(
-    tmp_path: Path, make_events: Callable[..., list[Event]]
-) -> None:
-    many = make_events(steps=6, free=400)
-    data = recorded(tmp_path / "whole.mcap", many)
-    start, end = chunks_of(data, "/probe")[2]
-    kept, found = recovered(tmp_path, flipped(data, start, end))
-    first = next(index for index, event in enumerate(kept) if tells_loss(event))
-    reason = found.lost[f"bytes {start} to {end}"]
-    expected = Logged(1, "warning", f"recovered: lost: bytes {start} to {end}: {reason}")
-    assert kept[first] == expected
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "is not an MCAP file"),
-        (MCAP0_MAGIC, "nothing can be recovered"),
-        (b"solid cube\n" * 500, "is not an MCAP file"),
-        (None, "does not exist; accepted: a recording.mcap"),
-    ],
-)
-def test_other_files_are_refused(
-    tmp_path: Path, content: bytes | None, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "other"
-    if content is not None:
-        path.write_bytes(content)
-    assert main(["recover", str(path), "-o", str(tmp_path / "out.mcap")]) == 2
-    errors = capsys.readouterr().err
-    assert errors.count("\n") == 1
-    assert message in errors
-    assert [file.name for file in tmp_path.iterdir()] == (["other"] if content is not None else [])
-
-
-def test_no_file_is_ever_overwritten(
-    tmp_path: Path, events: list[Event], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_file_is_ever_overwritten(tmp_path, events, capsys):
     path = tmp_path / "whole.mcap"
     data = recorded(path, events)
     other, link = tmp_path / "other.mcap", tmp_path / "link.mcap"
@@ -300,19 +228,156 @@ def test_no_file_is_ever_overwritten(
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_a_file_that_appears_meanwhile_is_not_overwritten(
-    tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, out = tmp_path / "whole.mcap", tmp_path / "out.mcap"
-    recorded(path, events)
-    close = McapRecorder.close
+T = TypeVar("T")
+PAGE = 4096
+examples = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.data_too_large],
+)
 
-    def close_late(recorder: McapRecorder) -> None:
-        close(recorder)
-        out.write_bytes(b"precious")
 
-    monkeypatch.setattr(McapRecorder, "close", close_late)
-    with pytest.raises(RecordingError, match="exists; accepted: the name of a new file"):
-        recover(path, out)
-    assert out.read_bytes() == b"precious"
-    assert len(list(tmp_path.iterdir())) == 2
+@dataclass(repr=False)
+class Original:
+    """A file that is whole: its bytes, those of its chunks, and what it says."""
+
+    data: bytes
+    chunks: list[bytes]
+    events: Sequence[Event] = ()
+    messages: Counter[RawMessage] | None = None
+
+
+@st.composite
+def damages(draw: st.DrawFn) -> Callable[[bytes], bytes]:
+    """Up to three damages: bits flipped, bytes zeroed, removed or put in, or all cut off."""
+    kinds = st.sampled_from(["flip", "flip", "zero", "remove", "insert", "cut"])
+    lengths = st.sampled_from([1, 4, 60, 300, PAGE])
+    places = st.floats(0.0, 1.0, exclude_max=True)
+    ends = st.floats(0.97, 1.0, exclude_max=True)
+    drawn = draw(
+        st.lists(st.tuples(kinds, places | places | ends, lengths), min_size=1, max_size=3)
+    )
+
+    def damage(data: bytes) -> bytes:
+        for kind, place, length in drawn:
+            if not data:
+                break
+            start = int(place * len(data))
+            part = data[start : start + length]
+            replaced = {
+                "flip": bytes([part[0] ^ (1 << length % 8)]) + part[1:],
+                "zero": bytes(len(part)),
+                "remove": b"",
+                "insert": b"\x06" * length + part,
+                "cut": b"",
+            }[kind]
+            data = data[:start] + replaced + (b"" if kind == "cut" else data[start + length :])
+        return data
+
+    return damage
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    """A recording with a chunk for each of six probes."""
+    path = tmp_path_factory.mktemp("whole") / "whole.mcap"
+    events = example_events(steps=6, free=400)
+    for at in range(len(events) - 1, 0, -1):
+        if isinstance(events[at], Probe):
+            events.insert(at, Logged(events[at].step - 1, "info", "a chunk ends here"))
+    data = write_recording(path, events)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    starts = [index.chunk_start_offset for index in summary.chunk_indexes]
+    lengths = [index.chunk_length for index in summary.chunk_indexes]
+    chunks = [data[start : start + n] for start, n in zip(starts, lengths, strict=True)]
+    return Original(data, chunks, list(read_recording(path).events()))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "whole.mcap"
+    data = write_ros2(path, ros2_sent(8), chunk_size=1500)
+    return Original(data, [], messages=Counter(messages_of(path)))
+
+
+def messages_of(path: Path) -> Iterator[RawMessage]:
+    return RawFile(path).messages(None, lambda fault: None)
+
+
+def answer(path: Path, question: Callable[[], T]) -> T | str:
+    """What comes back, or the text of an error, which has to name the file on one line."""
+    try:
+        return question()
+    except (RecordingError, SessionError) as error:
+        text = str(error)
+    assert str(path) in text
+    assert "\n" not in text
+    return text
+
+
+def events_of(path: Path, *, partial: bool) -> list[Event]:
+    return list(read_recording(path, partial=partial).events())
+
+
+def same(read: Sequence[Event], written: Sequence[Event]) -> bool:
+    return len(read) == len(written) and all(map(same_bits, read, written))
+
+
+@examples
+@given(damage=damages())
+def test_reading_a_damaged_recording(tmp_path, original, damage):
+    """All of it, or an error; what is read up to the damage is how it began."""
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(damage(original.data))
+    events = answer(path, lambda: events_of(path, partial=False))
+    assert isinstance(events, str) or same(events, original.events)
+    begin = answer(path, lambda: events_of(path, partial=True))
+    assert isinstance(begin, str) or same(begin, original.events[: len(begin)])
+    info = answer(path, lambda: recording_info(path))
+    if not isinstance(info, str):
+        json.dumps(info, allow_nan=False)
+
+
+@examples
+@given(damage=damages())
+def test_recovering_a_damaged_recording(tmp_path, original, damage):
+    """The chunks before the damage come back at least, and nothing that was not there."""
+    path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
+    out.unlink(missing_ok=True)
+    data = damage(original.data)
+    path.write_bytes(data)
+    found = answer(path, lambda: recover(path, out))
+    if isinstance(found, str):
+        assert not out.exists()
+        return
+    assert path.read_bytes() == data
+    kept = [event for event in read_recording(out).events() if not tells_loss(event)]
+    if isinstance(kept[-1], SessionEnded) and "recovered: " in kept[-1].outcome:
+        del kept[-1]
+    left = iter(original.events)
+    for event in kept:
+        assert any(same_bits(event, written) for written in left), event
+    assert found.lost or found.damage is not None or same(kept, original.events)
+
+
+@examples
+@given(damage=damages())
+def test_reading_a_damaged_log(tmp_path, log, damage):
+    """No message that was not there, and a fault for every one that is missing."""
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(damage(log.data))
+    faults: list[str] = []
+    assert log.messages is not None
+    file = answer(path, lambda: RawFile(path))
+    if isinstance(file, str):
+        assert "is not an MCAP file" in file
+        return
+    messages = Counter(file.messages(None, faults.append))
+    assert messages <= log.messages
+    assert messages == log.messages or faults
+    info = log_info(path)
+    json.dumps(info, allow_nan=False)
+    assert sum(topic["count"] for topic in info["topics"]) <= log.messages.total()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+import zstandard
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
 
-from chsel.errors import RecordingError
+from chsel.cost.cost_settings import CostSettings, interior_points
+from chsel.errors import RecordingError, SdfError, SettingError
+from chsel.methods.chsel import ChselSettings
+from chsel.methods.gradient_descent import DescentSettings
+from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import KnownPoints
+from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.sdf_grid import SdfGrid
+from chsel.qd.emitters import EmitterSettings
+from chsel.qd.selection import ArchiveSettings
 from replay.events import (
     Event,
     HypothesesFound,
@@ -28,7 +40,6 @@ from replay.events import (
     Traced,
 )
 from replay.mcap.reader import read_recording
-from replay.mcap.writer import McapRecorder
 from tests.replay.conftest import with_sensors
 
 Events = list[Event]
@@ -161,15 +172,13 @@ WRONG: dict[str, Change] = {
 
 
 @pytest.fixture
-def robot(make_events: Callable[..., Events]) -> Events:
+def robot(make_events):
     """A session of two probes, with sensors and a registration."""
     return with_sensors(make_events(steps=2, free=3))
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_it_is_refused_by_writer_and_reader(
-    robot: Events, write: Write, monkeypatch: pytest.MonkeyPatch, message: str
-) -> None:
+def test_it_is_refused_by_writer_and_reader(robot, write, monkeypatch, message):
     events = WRONG[message](robot)
     if "does not precede the probe" in message:
         events = without(SessionEnded)([e for e in events if e.step < 1])
@@ -194,16 +203,12 @@ def test_it_is_refused_by_writer_and_reader(
         ({"values": np.zeros(4, np.uint16)}, r"values of uint16 \(4,\); accepted"),
     ],
 )
-def test_pixels_of_another_kind_are_refused(
-    robot: Events, write: Write, values: dict[str, Any], message: str
-) -> None:
+def test_pixels_of_another_kind_are_refused(robot, write, values, message):
     with pytest.raises(RecordingError, match=message):
         write(changed(SensorImage, **values)(robot))
 
 
-def test_a_diverged_start_of_infinite_cost_is_a_result(
-    robot: Events, write: Write, assert_same: Callable[..., None]
-) -> None:
+def test_a_diverged_start_of_infinite_cost_is_a_result(robot, write, assert_same):
     def diverged(found: Any) -> dict[str, Any]:
         cost, poses = found.cost.copy(), found.object_from_world.copy()
         cost[-1], poses[-1, :3] = np.inf, np.nan
@@ -213,22 +218,68 @@ def test_a_diverged_start_of_infinite_cost_is_a_result(
     assert_same(read_recording(write(events)).events(), events)
 
 
-def test_a_refused_event_is_not_in_the_recording(
-    tmp_path: Path, events: Events, assert_same: Callable[..., None]
-) -> None:
-    recorder = McapRecorder(tmp_path / "a.mcap")
-    recorder.record(events[0])
-    recorder.record(events[1])
-    with pytest.raises(RecordingError, match="accepted: contact, free, points"):
-        recorder.record(Probe(0, "gone", KnownPoints()))
-    recorder.close()
-    assert_same(read_recording(tmp_path / "a.mcap").events(), events[:2])
-
-
 @pytest.mark.parametrize("value", [float("nan"), {1, 2}])
-def test_a_configuration_that_is_not_plain_is_refused(
-    events: Events, write: Write, value: Any
-) -> None:
-    start = dataclasses.replace(events[0], config={"a": [value]})  # type: ignore[call-arg]
+def test_a_configuration_that_is_not_plain_is_refused(events, write, value):
+    start = dataclasses.replace(events[0], config={"a": [value]})
     with pytest.raises(RecordingError, match="the configuration cannot be recorded"):
         write([start])
+
+
+Write = Callable[[list[Event]], Path]
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is(events, write, hidden):
+    """hidden: only the compressed data say how much it is."""
+    path = write(events)
+    data = path.read_bytes()
+    packed, size = zstandard.compress(bytes(2**29 + 1)), 2**29 + 1
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    place = summary.chunk_indexes[1].chunk_start_offset
+    head = struct.pack("<QQQI", 0, 0, 5 if hidden else size, 0) + struct.pack("<I", 4) + b"zstd"
+    content = head + struct.pack("<Q", len(packed)) + packed
+    record = struct.pack("<BQ", Opcode.CHUNK, len(content)) + content
+    path.write_bytes(data[:place] + record + data[place:])
+    with pytest.raises(RecordingError, match=f"a chunk claims {size} bytes, unpacked"):
+        read_recording(path)
+    assert read_recording(path, partial=True).start.object == events[0].object
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: DescentSettings(restarts=1_000_001), "restarts is 1000001; accepted: at most"),
+        (
+            lambda: DescentSettings(restarts=10**5, iterations=11),
+            "restarts x iterations is 1100000",
+        ),
+        (lambda: EmitterSettings(iterations=10**7), "iterations is 10000000; accepted: at most"),
+        (lambda: ArchiveSettings(bins=4000), r"bins \*\* 2, the number of cells, is 16000000"),
+        (lambda: ArchiveSettings(measure="rotation_6", bins=15), r"bins \*\* 6"),
+        (lambda: OnlineSettings(hypotheses=10**7), "hypotheses is 10000000; accepted: at most"),
+        (lambda: ChselSettings(passes=10_001), "passes is 10001; accepted: at most 10_000"),
+    ],
+)
+def test_settings_have_upper_bounds(make, message):
+    with pytest.raises(SettingError, match=message):
+        make()
+
+
+def test_a_spacing_too_fine_for_the_grid_is_refused(events):
+    sdf: SdfGrid = events[0].sdf
+    with pytest.raises(SettingError, match=r"interior_spacing 1e-06 m makes 3\.0e\+15 nodes"):
+        interior_points(sdf, CostSettings(-0.01, free_term="interior", interior_spacing=1e-6))
+
+
+def test_grids_whose_nodes_cannot_be_told_apart_are_refused(events):
+    sdf: SdfGrid = events[0].sdf
+    for resolution in (1e-320, 1e300):
+        with pytest.raises(SdfError, match=r"SDF resolution is .*accepted: 1e-06 to 1000"):
+            dataclasses.replace(sdf, resolution=resolution)
+    with pytest.raises(SdfError, match=r"SDF origin is .*; accepted: up to 1e"):
+        dataclasses.replace(sdf, origin=np.full(3, 1e308))
+    problem: RegistrationProblem = next(e.problem for e in events if isinstance(e, ProblemPosed))
+    with pytest.raises(SettingError, match="free_resolution is 1e-300; accepted"):
+        dataclasses.replace(problem, free_resolution=1e-300)

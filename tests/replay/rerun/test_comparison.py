@@ -2,44 +2,33 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
-from rerun.blueprint.components import PlayState
 
 from chsel.cost.compiled_cost import CompiledCost
 from chsel.errors import RecordingError
 from chsel.problem.poses import compose, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.trust import trust_in
-from replay.colors import cost_colors, number
 from replay.comparing.comparison import common_cost, numbers_under
-from replay.events import Event
 from replay.mcap.reader import Recording, read_recording
 from replay.rerun.comparison_view import ranked, save_comparison
-from replay.rerun.hypotheses import LEVELS
-from tests.tools.rrd_rows import Row, opens_at, read, shown_at
+from replay.rerun.scene import LEVELS
+from tests.tools.rrd_rows import Row, read, shown_at
 
 pytestmark = pytest.mark.filterwarnings("ignore:no node of the SDF is deeper")  # a thin box
 
-DISPLAYED = "ViewBlueprint:display_name"
 AWKWARD = "Ωther/way, b=½ {x} \\"
 
 
 @pytest.fixture
-def recording(
-    make_events: Callable[..., list[Event]], write: Callable[[list[Event]], Path]
-) -> Recording:
+def recording(make_events, write):
     """Registrations at steps 1 to 3 of four probes."""
     return read_recording(write(make_events(steps=4)))
 
 
 @pytest.fixture
-def results(recording: Recording) -> dict[str, dict[int, Hypotheses]]:
+def results(recording):
     """Two methods; the second has nearly the worst pose of the first alone, and lacks step 2."""
     first = {step: recording.hypotheses(step) for step in (1, 2)}
     worst = ranked(first[1], judge_of(recording, 1)).object_from_world[-1:]
@@ -58,7 +47,7 @@ def judge_of(recording: Recording, step: int) -> CompiledCost:
 
 
 @pytest.fixture
-def saved(recording: Recording, results: dict[str, dict[int, Hypotheses]], tmp_path: Path) -> Path:
+def saved(recording, results, tmp_path):
     path = tmp_path / "comparison.rrd"
     save_comparison(path, recording, results)
     return path
@@ -83,19 +72,7 @@ def drawn(
     return found
 
 
-def test_the_scene_is_there_once_and_the_hypotheses_for_each_method(saved: Path) -> None:
-    rows = read(saved)
-    roots = {entity.split("/")[1] for entity in rows}
-    assert roots == {"__properties", "scene", "hypotheses", "summary", "curves"}
-    assert len(rows["/scene/object"]) == 1
-    assert [times["probe"] for times, _ in rows["/scene/free/new"]] == [0, 1, 2]
-    names = {entity.split("/")[2] for entity in rows if entity.startswith("/hypotheses/")}
-    assert names == {"0", "1"}
-
-
-def test_hypotheses_stand_at_their_poses_with_the_costs_of_one_judge(
-    saved: Path, recording: Recording, results: dict[str, dict[int, Hypotheses]]
-) -> None:
+def test_hypotheses_stand_at_their_poses_with_the_costs_of_one_judge(saved, recording, results):
     rows = read(saved)
     judge = judge_of(recording, 1)
     for n, label in enumerate(results):
@@ -108,33 +85,7 @@ def test_hypotheses_stand_at_their_poses_with_the_costs_of_one_judge(
             np.testing.assert_allclose(shown[cost][0], pose, atol=1e-6)
 
 
-def test_one_scale_colours_all_methods_of_a_step(saved: Path, results: dict[str, Any]) -> None:
-    rows = read(saved)
-    both = [drawn(rows, n, 1) for n in range(len(results))]
-    costs = [cost for shown in both for cost in shown]
-    low, high = min(costs), max(costs)
-    for shown in both:
-        for cost, (_, color) in shown.items():
-            level = min(int(LEVELS * np.log(cost / low) / np.log(high / low)), LEVELS - 1)
-            assert color == tuple(cost_colors((level + 0.5) / LEVELS))
-    best = [shown[min(shown)][1] for shown in both]
-    assert best[0] != best[1]
-    for n in range(len(both)):
-        (text,) = shown_at(rows[f"/summary/{n}"], 1)["TextDocument:text"]
-        assert text.endswith(f"drawn; cost {number(low)} (yellow) to {number(high)} (violet)")
-
-
-def test_a_step_without_a_result_hides_the_method_and_says_so(saved: Path) -> None:
-    rows = read(saved)
-    assert drawn(rows, 1, 2) == {}
-    assert len(drawn(rows, 0, 2)) == 3
-    assert shown_at(rows["/summary/1"], 2)["TextDocument:text"] == ["no result"]
-    assert "3 of 5 hypotheses drawn" in shown_at(rows["/summary/0"], 2)["TextDocument:text"][0]
-
-
-def test_curves_are_the_numbers_of_the_table(
-    saved: Path, recording: Recording, results: dict[str, dict[int, Hypotheses]]
-) -> None:
+def test_curves_are_the_numbers_of_the_table(saved, recording, results):
     rows = read(saved)
     for step in (1, 2):
         judge = judge_of(recording, step)
@@ -155,43 +106,7 @@ def test_curves_are_the_numbers_of_the_table(
             assert shown["SeriesLines:names"] == ["chsel"]
 
 
-def test_it_ends_at_the_last_compared_step(
-    recording: Recording, results: dict[str, dict[int, Hypotheses]], saved: Path
-) -> None:
-    assert recording.steps == (1, 2, 3)
-    probes = {times.get("probe", 0) for rows in read(saved).values() for times, _ in rows}
-    assert probes == {0, 1, 2}
-    assert opens_at(saved) == ("probe", PlayState.Following)
-
-
-@pytest.mark.parametrize("pose_known", [True, False])
-@pytest.mark.parametrize(("count", "columns"), [(1, 1), (4, 4), (7, 3)])
-def test_each_method_has_a_view_of_the_scene_and_of_its_hypotheses(
-    recording: Recording, tmp_path: Path, count: int, columns: int, pose_known: bool
-) -> None:
-    if not pose_known:
-        recording.start = dataclasses.replace(recording.start, world_from_object=None)
-    found = {1: recording.hypotheses(1)}
-    labels = [f"method {n}" for n in range(count)]
-    save_comparison(tmp_path / "a.rrd", recording, dict.fromkeys(labels, found))
-    rows = read(tmp_path / "a.rrd", blueprint=True)
-    values = {
-        entity: {k: v for _, row in of for k, v in row.items()} for entity, of in rows.items()
-    }
-    views = {
-        row[DISPLAYED][0]: values[f"{entity}/ViewContents"]["ViewContents:query"]
-        for entity, row in values.items()
-        if row.get("ViewBlueprint:class_identifier") == ["3D"]
-    }
-    assert views == {label: ["$origin/**", f"/hypotheses/{n}/**"] for n, label in enumerate(labels)}
-    titles = {row[DISPLAYED][0] for row in values.values() if DISPLAYED in row}
-    assert ("Rotation error of the best [°]" in titles) is pose_known
-    assert "log₁₀ best cost" in titles
-    grid = [row for row in values.values() if row.get("ContainerBlueprint:grid_columns")]
-    assert [row["ContainerBlueprint:grid_columns"] for row in grid] == [[columns]]
-
-
-def test_ranking_sorts_all_that_belongs_to_a_hypothesis(recording: Recording) -> None:
+def test_ranking_sorts_all_that_belongs_to_a_hypothesis(recording):
     found = recording.hypotheses(1)
     judge = judge_of(recording, 1)
     again = ranked(found, judge)
@@ -204,7 +119,7 @@ def test_ranking_sorts_all_that_belongs_to_a_hypothesis(recording: Recording) ->
     assert order.tolist() != list(range(len(order)))
 
 
-def test_mistakes_are_named_and_leave_nothing(recording: Recording, tmp_path: Path) -> None:
+def test_mistakes_are_named_and_leave_nothing(recording, tmp_path):
     path = tmp_path / "a.rrd"
     found = recording.hypotheses(1)
     with pytest.raises(RecordingError, match="no result to compare; accepted: at least one"):

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import compose
-from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
-from replay.colors import UNAVAILABLE
-from replay.events import ActionsOffered, Decided, Event, Probe, SessionEnded, SessionStarted
-from replay.rerun.rerun_recorder import RerunRecorder
-from tests.tools.rrd_rows import Row, at_probe, read, shown_at, views_of_the_last_layout
+from replay.events import ActionsOffered, Decided, Event, Probe, SessionEnded
+from tests.replay.rerun.test_recorder import SDF, WORKSPACE, started, write
+from tests.tools.rrd_rows import Row, read, shown_at
 
-MESH = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
-SDF = SdfGrid.from_mesh(MESH, 0.05)
-WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
 ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # its last column
 ACTIONS = Actions(
     compose(
@@ -32,7 +26,6 @@ ACTIONS = Actions(
     np.array([0.5, 0.02, 0.4]),
 )
 HAND = HandShape.of(trimesh.creation.box(extents=(0.02, 0.04, 0.1)))
-ENTITIES = ("/scene/actions", "/decision")
 
 
 def decided(step: int, chosen: int, score: list[float], stop: str = "") -> Decided:
@@ -69,19 +62,7 @@ def probe(step: int, *, hit: bool) -> Probe:
 
 
 def session() -> Iterator[Event]:
-    yield SessionStarted(
-        runner="probe",
-        object="box",
-        session="kinematic",
-        method="anchored",
-        seed=3,
-        config={"policy": {"name": "information"}},
-        mesh=MESH,
-        sdf=SDF,
-        workspace=WORKSPACE,
-        free_resolution=0.01,
-        initial_points=KnownPoints(),
-    )
+    yield dataclasses.replace(started(None), initial_points=KnownPoints())
     yield ActionsOffered(-1, ACTIONS, HAND)
     yield decided(-1, 0, [3.0, 1.0, 2.0])
     yield probe(0, hit=True)
@@ -91,27 +72,17 @@ def session() -> Iterator[Event]:
     yield SessionEnded(1, "finished")
 
 
-def write(path: Path, events: Iterator[Event]) -> Path:
-    recorder = RerunRecorder(path)
-    for event in events:
-        recorder.record(event)
-    recorder.close()
-    return path
-
-
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory):
     return write(tmp_path_factory.mktemp("rerun") / "a.rrd", session())
 
 
 @pytest.fixture(scope="module")
-def rows(recording: Path) -> dict[str, list[Row]]:
+def rows(recording):
     return read(recording)
 
 
-def test_every_action_is_an_arrow_along_its_way_no_longer_than_it(
-    rows: dict[str, list[Row]],
-) -> None:
+def test_every_action_is_an_arrow_along_its_way_no_longer_than_it(rows):
     shown = shown_at(rows["/scene/actions/offered"], -1)
     np.testing.assert_allclose(
         shown["Arrows3D:origins"], ACTIONS.world_from_hand[:, :3, 3], rtol=1e-6
@@ -124,23 +95,8 @@ def test_every_action_is_an_arrow_along_its_way_no_longer_than_it(
     assert 0.02 < lengths[0] < 0.2
 
 
-@pytest.mark.parametrize(("step", "can"), [(-1, [0, 1, 2]), (0, [2]), (1, [])])
-def test_better_actions_are_brighter_and_those_not_possible_grey(
-    rows: dict[str, list[Row]], step: int, can: list[int]
-) -> None:
-    shown = shown_at(rows["/scene/actions/offered"], step)
-    colors = np.array([[c >> 24, c >> 16 & 255, c >> 8 & 255] for c in shown["Arrows3D:colors"]])
-    grey = (colors == UNAVAILABLE).all(axis=1)
-    assert np.flatnonzero(~grey).tolist() == can
-    if step == -1:
-        brightness = colors @ [0.2126, 0.7152, 0.0722]
-        assert np.argsort(brightness).tolist() == [1, 2, 0]
-
-
 @pytest.mark.parametrize(("step", "chosen"), [(-1, 0), (0, 2), (1, None)])
-def test_the_next_probe_and_its_forecast_stand_at_the_step_before_it(
-    rows: dict[str, list[Row]], step: int, chosen: int | None
-) -> None:
+def test_the_next_probe_and_its_forecast_stand_at_the_step_before_it(rows, step, chosen):
     way = shown_at(rows["/scene/actions/chosen"], step)
     forecast = shown_at(rows["/scene/actions/forecast"], step)["Points3D:positions"]
     if chosen is None:
@@ -150,14 +106,6 @@ def test_the_next_probe_and_its_forecast_stand_at_the_step_before_it(
     np.testing.assert_allclose(way["Arrows3D:origins"], pose[None, :3, 3], rtol=1e-6)
     np.testing.assert_allclose(way["Arrows3D:vectors"], length * pose[None, :3, 2], rtol=1e-6)
     np.testing.assert_allclose(forecast, [[0.0, 0.0, -0.15]], rtol=1e-6)
-
-
-def test_a_moment_of_iterations_shows_the_decision_before_its_probe(
-    rows: dict[str, list[Row]],
-) -> None:
-    decisions = [times["iteration"] for times, _ in rows["/scene/actions/chosen"]]
-    probes = [times["iteration"] for times, _ in rows["/scene/gripper/path"]]
-    assert decisions[0] < probes[0] < decisions[1] < probes[1] < decisions[2]
 
 
 def curve(rows: dict[str, list[Row]], name: str) -> dict[int, float]:
@@ -179,42 +127,5 @@ def curve(rows: dict[str, list[Row]], name: str) -> dict[int, float]:
         ("surprise/surprise", {0: 0.5, 1: 1.0}),
     ],
 )
-def test_what_happened_stands_beside_its_forecast(
-    rows: dict[str, list[Row]], name: str, expected: dict[int, float]
-) -> None:
+def test_what_happened_stands_beside_its_forecast(rows, name, expected):
     assert curve(rows, name) == pytest.approx(expected)
-
-
-def test_the_hand_of_the_actions_is_drawn_where_the_probe_is_deepest(
-    rows: dict[str, list[Row]],
-) -> None:
-    shown = shown_at(rows["/scene/hand"], 0)
-    assert len(shown["Mesh3D:triangle_indices"]) == len(HAND.faces)
-    np.testing.assert_allclose(shown["InstancePoses3D:translations"], [[0.0, 0.0, -0.3]], rtol=1e-6)
-
-
-def test_the_log_says_what_was_decided(rows: dict[str, list[Row]]) -> None:
-    lines = [values["TextLog:text"][0] for _, values in rows["/log"]]
-    assert lines == [
-        "next action 0 of 3: score 3, hits by 75%; spread 100 mm, 30 mm expected",
-        "next action 2 of 3: score 7, hits by 25%; spread 50 mm, 25 mm expected",
-        "stop, no action is left: spread 33.3 mm",
-    ]
-
-
-def test_the_text_about_the_session_names_the_policy(rows: dict[str, list[Row]]) -> None:
-    ((_, values),) = rows["/session"]
-    assert "| policy | **information** |" in values["TextDocument:text"][0]
-
-
-def test_only_steered_sessions_have_views_of_decisions(tmp_path: Path, recording: Path) -> None:
-    kept: Any = (e for e in session() if not isinstance(e, ActionsOffered | Decided))
-    plain = write(tmp_path / "b.rrd", kept)
-    assert not [name for name in read(plain) if name.startswith(ENTITIES)]
-    assert not any(at_probe(found, -1) for found in read(plain).values())
-    more = views_of_the_last_layout(recording) - views_of_the_last_layout(plain)
-    assert more == {
-        "Spread and its forecast [mm]",
-        "Hit: chance and outcome",
-        "Surprise [nats]",
-    }

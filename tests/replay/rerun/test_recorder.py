@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import re
-import signal
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-import yaml
-from rerun.blueprint.components import PlayState
 
 from chsel.errors import RecordingError
 from chsel.problem.points import KnownPoints, Workspace
@@ -24,10 +17,10 @@ from chsel.problem.registration_problem import (
     ArchiveSnapshot,
     Hypotheses,
     RegistrationProblem,
-    Trust,
 )
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
+from replay.colors import CostScale
 from replay.events import (
     Event,
     HypothesesFound,
@@ -42,16 +35,13 @@ from replay.events import (
     Traced,
 )
 from replay.rerun import viewer as rerun_viewer
-from replay.rerun.hypotheses import LEVELS, MOST
 from replay.rerun.rerun_recorder import RerunRecorder
-from replay.rerun.text import verdict_markdown
+from replay.rerun.scene import LEVELS, cost_levels
 from tests.tools.rrd_rows import (
     Row,
     at_probe,
-    opens_at,
     read,
     until_probe,
-    views_of_the_last_layout,
 )
 
 WORKSPACE = Workspace((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
@@ -173,16 +163,16 @@ def write(path: Path, events: Iterable[Event]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory):
     return write(tmp_path_factory.mktemp("rerun") / "recording.rrd", session())
 
 
 @pytest.fixture(scope="module")
-def rows(recording: Path) -> dict[str, list[Row]]:
+def rows(recording):
     return read(recording)
 
 
-def test_contacts_and_points_are_those_of_the_probe(rows: dict[str, list[Row]]) -> None:
+def test_contacts_and_points_are_those_of_the_probe(rows):
     for step in range(3):
         points = probe(step).new_points
         expected = {
@@ -200,12 +190,7 @@ def test_contacts_and_points_are_those_of_the_probe(rows: dict[str, list[Row]]) 
             )
 
 
-def test_points_known_before_the_first_probe_are_drawn(rows: dict[str, list[Row]]) -> None:
-    first = at_probe(rows["/scene/free"], 0)[0]["Points3D:positions"]
-    np.testing.assert_allclose(first, [[0.4, 0.4, 0.4]], rtol=1e-6)
-
-
-def test_normals_are_arrows_at_the_contacts_that_have_one(tmp_path: Path) -> None:
+def test_normals_are_arrows_at_the_contacts_that_have_one(tmp_path):
     normals = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     event = dataclasses.replace(probe(1), contact_normals=normals)
     arrows = read(write(tmp_path / "a.rrd", [started(), event]))["/scene/contacts/normals"][-1][1]
@@ -218,13 +203,7 @@ def test_normals_are_arrows_at_the_contacts_that_have_one(tmp_path: Path) -> Non
     )
 
 
-def test_the_gripper_path_is_one_line_through_its_positions(rows: dict[str, list[Row]]) -> None:
-    shown = at_probe(rows["/scene/gripper/path"], 2)[-1]["LineStrips3D:strips"]
-    expected = probe(2).gripper_path[:, :3, 3].astype(np.float32)
-    np.testing.assert_array_equal(np.array(shown, dtype=np.float32), expected[None])
-
-
-def test_the_object_stands_at_its_true_pose(rows: dict[str, list[Row]]) -> None:
+def test_the_object_stands_at_its_true_pose(rows):
     values = {name: value for _, row in rows["/scene/object"] for name, value in row.items()}
     np.testing.assert_allclose(values["Transform3D:translation"], [[0.1, 0.0, 0.0]], rtol=1e-6)
     assert len(values["Mesh3D:triangle_indices"]) == len(MESH.faces)
@@ -245,7 +224,7 @@ def shown_hypotheses(rows: dict[str, list[Row]], step: int) -> dict[float, tuple
     return found
 
 
-def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows: dict[str, list[Row]]) -> None:
+def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows):
     expected = hypotheses(6, snapshot(5))
     distinct = np.flatnonzero(~expected.duplicate)
     for step in range(3):
@@ -255,21 +234,6 @@ def test_every_distinct_hypothesis_is_drawn_once_at_its_pose(rows: dict[str, lis
             pose, _ = shown[float(expected.cost[index])]
             world_from_object = inverse(expected.object_from_world[index])
             np.testing.assert_allclose(pose, world_from_object, atol=1e-6)
-
-
-def test_the_lowest_cost_is_drawn_as_the_best_and_the_highest_in_the_last_step(
-    rows: dict[str, list[Row]],
-) -> None:
-    shown = shown_hypotheses(rows, 0)
-    assert shown[min(shown)][1] == "/scene/hypotheses/best"
-    assert shown[max(shown)][1] == f"/scene/hypotheses/cost_step_{LEVELS}"
-
-
-def test_no_mesh_is_drawn_before_the_first_hypotheses(rows: dict[str, list[Row]]) -> None:
-    for entity in MESH_ENTITIES:
-        first = at_probe(rows[entity], 0)[0]
-        assert np.isnan(first["cost"]).all()
-        assert not np.any(first["InstancePoses3D:mat3x3"])
 
 
 def images(rows: list[Row], step: int, dtype: type, channels: int) -> list[np.ndarray]:
@@ -285,9 +249,7 @@ def images(rows: list[Row], step: int, dtype: type, channels: int) -> list[np.nd
     return found
 
 
-def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(
-    rows: dict[str, list[Row]],
-) -> None:
+def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(rows):
     first, last = images(rows["/archive/cost"], 1, np.float32, 1)
     costs = first[..., 0]  # cells 0 and 1 of 4 x 3: first column, from below
     expected = np.full((3, 4), np.nan)
@@ -300,15 +262,7 @@ def test_the_archive_shows_the_cost_of_each_cell_and_marks_empty_ones(
     assert len(np.unique(colors[~empty], axis=0)) == 7
 
 
-def test_the_archive_says_what_its_axes_are(rows: dict[str, list[Row]]) -> None:
-    labels = at_probe(rows["/archive/text"], 2)[-1]["Points2D:labels"]
-    assert labels == [
-        "probe 2, iteration 5: 7 of 12 cells filled, cost 1 to 7\nupwards y [m]: -0.3 to 0.3",
-        "x [m]: -0.3 to 0.3",
-    ]
-
-
-def test_hypotheses_are_marked_in_their_cells(rows: dict[str, list[Row]]) -> None:
+def test_hypotheses_are_marked_in_their_cells(rows):
     marks = at_probe(rows["/archive/hypotheses"], 0)[-1]
     np.testing.assert_allclose(  # cells 0, 1, 3, 4, 5 of 4 x 3, y down
         marks["Points2D:positions"], [(0.5, 2.5), (0.5, 1.5), (1.5, 2.5), (1.5, 1.5), (1.5, 0.5)]
@@ -316,15 +270,13 @@ def test_hypotheses_are_marked_in_their_cells(rows: dict[str, list[Row]]) -> Non
     assert marks["Points2D:labels"][:2] == ["cost 1.5", "cost 6"]
 
 
-def test_iterations_run_on_over_stages_and_registrations(rows: dict[str, list[Row]]) -> None:
+def test_iterations_run_on_over_stages_and_registrations(rows):
     drawn = [times for times, values in rows["/archive/cost"] if "Image:buffer" in values]
     times = [(times["probe"], times["iteration"]) for times in drawn]
     assert times == [(0, 51), (0, 56), (1, 107), (1, 112), (2, 163), (2, 168)]
 
 
-def test_costs_of_the_search_are_on_the_timeline_of_iterations_alone(
-    rows: dict[str, list[Row]],
-) -> None:
+def test_costs_of_the_search_are_on_the_timeline_of_iterations_alone(rows):
     series = [
         (times, values["Scalars:scalars"][0])
         for times, values in rows["/search/highest"]
@@ -348,9 +300,7 @@ def test_costs_of_the_search_are_on_the_timeline_of_iterations_alone(
         ("/seconds/gradient_descent", [0.25] * 3),
     ],
 )
-def test_numbers_of_a_step_stand_at_its_probe(
-    rows: dict[str, list[Row]], entity: str, expected: list[float]
-) -> None:
+def test_numbers_of_a_step_stand_at_its_probe(rows, entity, expected):
     series = {
         times["probe"]: values["Scalars:scalars"]
         for times, values in rows[entity]
@@ -359,69 +309,7 @@ def test_numbers_of_a_step_stand_at_its_probe(
     assert series == {step: [pytest.approx(value)] for step, value in enumerate(expected)}
 
 
-def test_the_text_tells_the_session_and_its_whole_configuration(rows: dict[str, list[Row]]) -> None:
-    ((_, values),) = rows["/session"]
-    (text,) = values["TextDocument:text"]
-    assert "| method | **chsel, preset paper** |" in text
-    shown = yaml.safe_load(text.split("```")[1])
-    assert shown == {"preset": {"name": "paper"}, "method": {"qd": {"bins": [40, 40]}}}
-
-
-def test_the_log_has_every_line_with_its_level(rows: dict[str, list[Row]]) -> None:
-    lines = [(v["TextLog:text"][0], v["TextLog:level"][0]) for _, v in rows["/log"]]
-    warned = [line for line in lines if line[1] == "WARN"]
-    assert warned == [(f"line {step}", "WARN") for step in range(3)]
-    results = [text for text, level in lines if level == "INFO"]
-    assert len(results) == 3
-    assert all(re.fullmatch(r"best cost \S+, 5 distinct hypotheses", text) for text in results)
-
-
-def test_the_verdict_is_a_text_with_its_reasons(tmp_path: Path) -> None:
-    trust = Trust(0.0005, 0.02, 1.5, 3, 0.0042, "several modes", 4)
-    numbers = [trust.numbers, {"verdict": 9.0}, {"verdict": float("nan")}]
-    told = [started(), *(Measured(step, values) for step, values in enumerate(numbers))]
-    (row,) = read(write(tmp_path / "session.rrd", told))["/result"]
-    reasons = "3 modes, spread 4.2 mm, noise 0.5 mm, 2 % outliers, misfit 1.5 noise levels"
-    few = ": no evidence, a pose can fit so few contacts exactly"
-    (text,) = row[1]["TextDocument:text"]
-    assert text.strip() == f"# several modes\n\n{reasons}{few}"
-    assert verdict_markdown(trust.numbers, 7) == f"# several modes\n\n{reasons}\n"
-
-
-def test_without_a_true_pose_no_object_is_drawn(tmp_path: Path) -> None:
-    events = [started(world_from_object=None), probe(0), *registration(0)]
-    rows = read(write(tmp_path / "a.rrd", events))
-    assert "/scene/object" not in rows
-    assert len(shown_hypotheses(rows, 0)) == 5
-
-
-def test_a_probe_that_tells_nothing_draws_nothing(tmp_path: Path) -> None:
-    rows = read(write(tmp_path / "a.rrd", [started(), Probe(0, "free", KnownPoints())]))
-    for name in ("contacts", "occupied", "known", "free/new", "gripper/end"):
-        assert at_probe(rows[f"/scene/{name}"], 0)[-1]["Points3D:positions"] == []
-    assert at_probe(rows["/scene/gripper/path"], 0)[-1]["LineStrips3D:strips"] == []
-
-
-@pytest.mark.parametrize(
-    ("shape", "size", "filled"),
-    [
-        ((20,), (5, 20), 7 * 5),
-        ((4, 3, 2), (3, 4), 4),
-        ((9, 1), (2, 9), 7 * 2),
-        ((1, 9), (9, 2), 14),
-    ],
-)
-def test_archives_of_other_shapes_are_maps_too(
-    tmp_path: Path, shape: tuple[int, ...], size: tuple[int, int], filled: int
-) -> None:
-    events = [started(), probe(0), *registration(0, shape=shape)]
-    rows = read(write(tmp_path / "a.rrd", events))
-    costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
-    assert costs.shape == size
-    assert np.isfinite(costs).sum() == filled
-
-
-def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path: Path) -> None:
+def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path):
     events = [started(), probe(0), *registration(0, shape=(4, 3, 2))]
     rows = read(write(tmp_path / "a.rrd", events))
     costs = images(rows["/archive/cost"], 0, np.float32, 1)[-1][..., 0]
@@ -429,63 +317,12 @@ def test_of_cells_over_a_third_measure_the_lowest_cost_is_shown(tmp_path: Path) 
     assert costs[1, 0] == 3.0
 
 
-def test_a_method_without_an_archive_leaves_it_out(tmp_path: Path) -> None:
-    events = [started(), probe(0), *registration(0, shape=None)]
-    rows = read(write(tmp_path / "a.rrd", events))
-    assert "/archive/cost" not in rows
-    assert len(shown_hypotheses(rows, 0)) == 5
-
-
-@pytest.mark.parametrize(("count", "drawn"), [(1, 1), (1000, MOST)])
-def test_few_and_many_hypotheses_are_drawn(tmp_path: Path, count: int, drawn: int) -> None:
-    events = [started(), probe(0), *registration(0, count=count)]
-    rows = read(write(tmp_path / "a.rrd", events))
-    shown = shown_hypotheses(rows, 0)
-    assert len(shown) == drawn
-    assert max(shown) == hypotheses(count).cost[~hypotheses(count).duplicate][drawn - 1]
-    (text,) = at_probe(rows["/result"], 0)[0]["TextDocument:text"]
-    costs = "1.5 (yellow)" if count > 1 else "1.5 (yellow) to 1.5 (violet)"
-    assert text.startswith(f"{drawn} of {count} hypotheses drawn; cost {costs}")
-
-
-def test_costs_of_zero_are_drawn_as_the_lowest(tmp_path: Path) -> None:
-    found = dataclasses.replace(hypotheses(4), cost=np.zeros(4))
-    rows = read(write(tmp_path / "a.rrd", [started(), HypothesesFound(0, found)]))
-    first = at_probe(rows["/scene/hypotheses/cost_step_1"], 0)[-1]
-    assert first["cost"] == [0.0, 0.0]
-
-
-def test_it_opens_at_the_last_probe_with_views_of_what_there_is(tmp_path: Path) -> None:
-    untimed = [event for event in session(1) if not isinstance(event, Timed)]
-    path = write(tmp_path / "a.rrd", untimed)
-    assert opens_at(path) == ("probe", PlayState.Following)
-    layout = views_of_the_last_layout(path)
-    assert {"Position error [mm]", "Rotation error [°]"} < layout
-    assert "Spread and noise [mm]" in layout
-    assert "Seconds by stage" not in layout
-    late = [*untimed[:2], Timed(0, {"probe": 0.5}), *untimed[2:]]
-    timed = views_of_the_last_layout(write(tmp_path / "b.rrd", late))
-    assert timed - layout == {"Seconds by stage"}
-
-
-def test_closing_twice_is_closing_once(tmp_path: Path) -> None:
-    recorder = RerunRecorder(tmp_path / "a.rrd")
-    recorder.record(started())
-    recorder.close()
-    size = (tmp_path / "a.rrd").stat().st_size
-    recorder.close()
-    assert (tmp_path / "a.rrd").stat().st_size == size
-    assert "/scene/workspace" in read(tmp_path / "a.rrd")
-
-
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(RecordingError, match=r"cannot be written .*accepted: a new \.rrd file"):
         RerunRecorder(tmp_path)
 
 
-def test_without_a_viewer_the_live_view_is_a_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_viewer_the_live_view_is_a_warning(tmp_path, monkeypatch):
     monkeypatch.setattr(rerun_viewer, "is_listening", lambda port: False)
     monkeypatch.setattr(rerun_viewer, "has_screen", lambda: True)
     monkeypatch.setattr(rerun_viewer, "viewer_program", lambda: tmp_path / "no_viewer")
@@ -498,46 +335,12 @@ def test_without_a_viewer_the_live_view_is_a_warning(
     assert "/scene/workspace" in read(tmp_path / "a.rrd")
 
 
-def test_long_searches_are_drawn_to_the_last_iteration(tmp_path: Path) -> None:
-    events: list[Event] = [started(), probe(0), next(registration(0))]
-    for iteration in range(0, 1000, 10):
-        events.append(Traced(0, "cma_mega", iteration, "0", 1.0, 2.0, 3.0 + iteration))
-        events.append(SnapshotTaken(0, snapshot(iteration % 10)))
-    rows = read(write(tmp_path / "a.rrd", events))
-    highest = [
-        values["Scalars:scalars"][0]
-        for _, values in rows["/search/highest"]
-        if "Scalars:scalars" in values
-    ]
-    assert highest == [3.0 + iteration for iteration in range(0, 1000, 10)]
-    assert len(images(rows["/archive/cost"], 0, np.float32, 1)) == 100
+def test_places_on_the_scale_are_logarithmic():
+    scale = CostScale.of([100.0, 1.0, 7.0, np.nan])
+    np.testing.assert_allclose(scale.fraction([1.0, 10.0, 100.0, 500.0]), [0.0, 0.5, 1.0, 1.0])
 
 
-_KILLED = """
-import os, signal, sys
-from pathlib import Path
-sys.path.insert(0, sys.argv[2])
-import test_recorder as example
-recorder = example.RerunRecorder(Path(sys.argv[1]))
-for event in example.session():
-    recorder.record(event)
-    if isinstance(event, example.Logged):
-        recorder.flush()
-        if event.step == 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
-@pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL on Windows")
-def test_every_flushed_probe_survives_a_kill(tmp_path: Path, rows: dict[str, list[Row]]) -> None:
-    path = tmp_path / "killed.rrd"
-    command = [sys.executable, "-c", _KILLED, str(path), str(Path(__file__).parent)]
-    killed = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    survived = read(path)
-    for entity, expected in rows.items():
-        until = [row for row in expected if row[0].get("probe", 0) < 2]
-        if "search/" not in entity and "log" not in entity:
-            np.testing.assert_equal(survived[entity], until, err_msg=entity)
-    assert len(survived["/log"]) == 4  # a line that was logged and one about the result, twice
+def test_steps_of_cost_run_from_the_lowest_to_the_highest():
+    assert cost_levels(np.array([1.0, 16.0, 256.0])).tolist() == [0, LEVELS // 2, LEVELS - 1]
+    assert cost_levels(np.array([2.0, 2.0])).tolist() == [0, 0]
+    assert cost_levels(np.zeros(0)).tolist() == []
