@@ -18,7 +18,7 @@ from replay.events import Logged, Probe
 from runners.command.choices import CONF
 from runners.sensors.rig import Annotations, BoxRig, ForceRig, HandRig, Rig
 from runners.sessions.sensors import SensorsSession, SensorsSettings
-from runners.simulated_robot.ros_messages import header, transform
+from runners.simulated_robot.log_writer import header, transform
 from tests.runners.sensors.small_logs import BEGIN, SECOND, write_ros2
 
 HAND = HandRig("hand", boxes=(BoxRig((0.04, 0.06, 0.1), (0.0, 0.0, 0.05)),))

@@ -519,7 +519,7 @@ def test_damaged_logs_give_points_or_one_clear_error(
 
 def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    from runners.simulated_robot.robot_configurations import find_cabinet_configuration
+    from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
     from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
     from runners.simulated_robot.simulation import simulate_log
 
@@ -528,7 +528,7 @@ def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
         probes=1, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=64)
     )
     log = tmp_path / "log.mcap"
-    made = simulate_log(log, find_cabinet_configuration("cabinet_mustard"), mesh, 0, small)
+    made = simulate_log(log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh, 0, small)
     rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
     rig["cameras"][0]["edge_reach"] = 2  # of fewer pixels than usual
     session = SensorsSession(session_settings("sensors", {"path": str(log), "rig": rig}), 0)

@@ -9,11 +9,10 @@ from chsel.errors import SessionError
 from chsel.problem.poses import apply, inverse
 from runners.objects.loader import load_model
 from runners.simulated_robot import wrist
-from runners.simulated_robot.robot_configurations import (
+from runners.simulated_robot.cabinet import (
     CABINET_CONFIGURATIONS,
     REST,
     SHELF,
-    find_cabinet_configuration,
     stood_on_shelf,
 )
 from runners.simulated_robot.settings import RobotSettings
@@ -70,8 +69,3 @@ def test_an_object_that_is_too_large_is_refused() -> None:
     configuration = CABINET_CONFIGURATIONS["cabinet_drill"]
     with pytest.raises(SessionError, match="more than the cabinet has"):
         stood_on_shelf(load_model("drill").apply_scale(2.5), configuration)
-
-
-def test_an_unknown_configuration_names_all() -> None:
-    with pytest.raises(SessionError, match=r"'drill'.*cabinet_drill, .*cabinet_mustard_sideways"):
-        find_cabinet_configuration("drill")

@@ -15,12 +15,12 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply
 from runners.objects.loader import load_model
 from runners.simulated_robot import cabinet, wrist
-from runners.simulated_robot.physics_scene import NEAR, PhysicsScene
-from runners.simulated_robot.robot_configurations import (
+from runners.simulated_robot.cabinet import (
     CABINET_CONFIGURATIONS,
     REST,
     stood_on_shelf,
 )
+from runners.simulated_robot.physics_scene import NEAR, PhysicsScene
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RenderedCamera
 
 pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 only")

@@ -21,8 +21,8 @@ from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import apply, compose, inverse
 from runners.objects.loader import load_model
+from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS, REST
 from runners.simulated_robot.recorder import START, TICK
-from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS, REST
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 from runners.simulated_robot.simulation import SimulatedLog, simulate_log
 

@@ -38,7 +38,7 @@ from runners.sensors.log.messages import (
 from runners.sensors.log.raw_log import RawLog
 from runners.sensors.log.ros2 import ros2_decoder
 from runners.sensors.log.ros2_definitions import full_definition
-from runners.simulated_robot.ros_messages import joint_state
+from runners.simulated_robot.log_writer import joint_state
 from tests.runners.sensors.small_logs import (
     BEGIN,
     SECOND,
