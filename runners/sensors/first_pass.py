@@ -13,7 +13,6 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from runners.sensors.depth_camera import metres
 from runners.sensors.log.clocks import Clocks
-from runners.sensors.log.joints import JointHistory
 from runners.sensors.log.messages import (
     CameraInfoMessage,
     CloudMessage,
@@ -27,7 +26,7 @@ from runners.sensors.log.messages import (
 )
 from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed_windows, whole_log
 from runners.sensors.log.raw_log import RawLog
-from runners.sensors.log.transforms import TransformError, TransformTree
+from runners.sensors.log.transforms import JointHistory, TransformError, TransformTree
 from runners.sensors.pad import membrane_reference
 from runners.sensors.rig import BubbleRig, CameraRig, Rig
 from runners.sensors.session_report import LogWarnings

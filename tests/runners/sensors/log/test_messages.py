@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,12 @@ from mcap_ros2.writer import Writer
 
 from chsel.problem.poses import check_rigid
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.sensors.log.foxglove import foxglove_decoder
+from runners.sensors.log.decoding import decoder
 from runners.sensors.log.messages import (
     CameraInfoMessage,
     CloudMessage,
     Content,
     Decode,
-    Decoded,
     ImageMessage,
     JointsMessage,
     MarkerMessage,
@@ -36,7 +34,6 @@ from runners.sensors.log.messages import (
     WrenchMessage,
 )
 from runners.sensors.log.raw_log import RawLog
-from runners.sensors.log.ros2 import ros2_decoder
 from runners.sensors.log.ros2_definitions import full_definition
 from runners.simulated_robot.log_writer import joint_state
 from tests.runners.sensors.small_logs import (
@@ -230,14 +227,11 @@ def sent(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Decode, bytes]]
     write_ros2(folder / "ros2.mcap", ros2_sent(1))
     write_foxglove(folder / "foxglove.mcap", foxglove_sent())
     found = []
-    for path, decoder in (
-        (folder / "ros2.mcap", ros2_decoder),
-        (folder / "foxglove.mcap", foxglove_decoder),
-    ):
+    for path in (folder / "ros2.mcap", folder / "foxglove.mcap"):
         with path.open("rb") as file:
-            for schema, _, message in make_reader(file).iter_messages():
-                decode = decoder(schema.name) if schema else None
-                assert decode is not None
+            for schema, channel, message in make_reader(file).iter_messages():
+                assert schema is not None
+                decode = decoder(schema.name, channel.message_encoding)
                 found.append((decode, message.data))
     return found
 
@@ -258,10 +252,9 @@ def test_messages_of_other_bytes_are_well_formed_or_faults(
     decode, data = sent[which]
     start = 4 + int(place * len(data) - 4) // 4 * 4  # where numbers of ROS 2 begin
     rest = b"" if other is None else other + data[start + len(other) :]
-    found: list[Decoded] = []
-    with suppress(UnusableMessage):
-        found += decode(data[:start] + rest)
-    for stamp, content in found:
+    for stamp, content in decode(data[:start] + rest):
+        if isinstance(content, UnusableMessage):
+            continue
         assert stamp is None or 0 < stamp < 2**63
         for name, value in vars(content).items():
             if isinstance(content, ImageMessage) and name == "values":

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from runners.sensors.log.clocks import SLACK, ClockCorrection, in_time_order
-from runners.sensors.log.joints import MOST_OF_A_PROBE, JointHistory
 from runners.sensors.log.messages import MarkerMessage, Received
 from runners.sensors.log.probe_windows import marked_windows
+from runners.sensors.log.transforms import MOST_OF_A_PROBE, JointHistory
 from runners.sensors.session_report import MOST_KINDS, LogWarnings
 
 

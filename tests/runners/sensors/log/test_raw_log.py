@@ -15,9 +15,8 @@ from mcap.writer import CompressionType
 from chsel.errors import SessionError
 from replay.files import file_digest
 from replay.mcap.log_file import Channel, RawMessage
-from runners.sensors.log.log_files import merged
 from runners.sensors.log.messages import MarkerMessage
-from runners.sensors.log.raw_log import RawLog
+from runners.sensors.log.raw_log import RawLog, merged
 from tests.runners.sensors.small_logs import BEGIN, ros2_image, ros2_sent, write_ros2
 
 MAGIC = 8  # bytes
@@ -220,7 +219,7 @@ def test_files_of_a_bag_that_hold_a_topic_each_are_read_in_order_of_time(
     log = RawLog(bag)
     both = [
         [(one.log_time, one.topic, repr(one.content)) for one in of.messages(of.topics, progress=p)]
-        for of, p in ((log, lambda *done: told.append(done)), (RawLog(whole), None))
+        for of, p in ((log, lambda *done: told.append(done)), (RawLog(whole), lambda *done: None))
     ]
     assert len(both[0]) > 80
     assert both[0] == both[1]

@@ -8,7 +8,7 @@ import pytest
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, rotation_angle
 from runners.sensors.log.clocks import ClockCorrection
-from runners.sensors.log.message_fields import rigid
+from runners.sensors.log.decoding import rigid
 from runners.sensors.log.messages import Received, TransformMessage, UnusableMessage
 from runners.sensors.log.transforms import TransformError, TransformTree, unit_quaternion
 
