@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import csv
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
-from chsel.errors import PointsError, SettingError, require_positive
+import numpy as np
+
+from chsel.errors import ChselError, PointsError, PoseError, SettingError, require_positive
+from chsel.numerics.arrays import FloatArray, IntArray, frozen
 from chsel.problem.defaults import FREE_RESOLUTION, workspace_around
+from chsel.problem.file_checks import read_npz, refuse_special_file
 from chsel.problem.points import FreeVoxels, KnownPoints, Lattice, Workspace, check_points
+from chsel.problem.poses import nearest_rigid
 from chsel.problem.sdf_grid import OBJECT_PADDING
+from chsel.problem.streams import LAST_STEP
 from replay.events import Probe
 from runners.objects.loader import ObjectModel
-from runners.sessions.point_files import read_points
 from runners.sessions.session import Progress, unwatched
 
 
@@ -86,3 +95,226 @@ def _given_workspace(settings: PointsSettings) -> Workspace | None:
         return None
     (x0, x1), (y0, y1), (z0, z1) = settings.workspace
     return Workspace((x0, y0, z0), (x1, y1, z1))
+
+
+KINDS = ("surface", "free", "occupied", "known")
+_LONGEST_TEXT = 60  # characters that an error quotes of a file
+_COLUMNS = ("x", "y", "z", "kind", "sdf", "step")
+
+
+@dataclass(frozen=True, eq=False)
+class PointClass:
+    """Points (N, 3) of one kind, their signed distances (N,), and the steps (N,) they come at."""
+
+    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    sdf: FloatArray = field(default_factory=lambda: np.zeros(0))
+    steps: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def at(self, step: int) -> PointClass:
+        """Those that become known at a step, in the order of the file."""
+        order, steps = self._by_step
+        first, last = np.searchsorted(steps, (step, step + 1))
+        now = order[first:last]
+        return PointClass(self.points[now], self.sdf[now], self.steps[now])
+
+    @cached_property
+    def _by_step(self) -> tuple[IntArray, IntArray]:
+        """The points (N,) in the order of their steps, and these steps (N,)."""
+        order = np.argsort(self.steps, kind="stable")
+        return order, self.steps[order]
+
+
+@dataclass(frozen=True, eq=False)
+class PointFile:
+    """What a file holds: a class for each of KINDS, and the true pose (4, 4) where it is given."""
+
+    classes: dict[str, PointClass]
+    world_from_object: FloatArray | None = None
+
+    @property
+    def steps(self) -> list[int]:
+        """The steps at which anything becomes known, ascending."""
+        every = np.concatenate([group.steps for group in self.classes.values()])
+        return [int(step) for step in np.unique(every)]
+
+    def at(self, step: int) -> KnownPoints:
+        """All that becomes known at a step; surface points are known points of distance 0."""
+        now = {kind: self.classes[kind].at(step) for kind in KINDS}
+        return KnownPoints(
+            free=now["free"].points,
+            occupied=now["occupied"].points,
+            known=np.concatenate([now["surface"].points, now["known"].points]),
+            known_sdf=np.concatenate([now["surface"].sdf, now["known"].sdf]),
+        )
+
+
+def read_points(path: str | Path) -> PointFile:
+    """Read .npz, .csv, or the vertices of .ply, .off, .xyz and .stl as surface points.
+
+    Raises PointsError, which names the file and the array or line, for anything malformed.
+    """
+    path = Path(path).expanduser()
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise PointsError(
+            f"point file {path} has the suffix {path.suffix!r}; accepted: {', '.join(_READERS)}"
+        )
+    refuse_special_file(f"point file {path}", path, PointsError)
+    if not path.is_file():
+        raise PointsError(f"point file {path} does not exist; accepted: a file")
+    try:
+        content = reader(path)
+    except ChselError as error:
+        raise PointsError(f"point file {path}: {error}") from None
+    if not content.steps:
+        raise PointsError(f"point file {path} holds no points; accepted: at least one")
+    return content
+
+
+def _read_npz(path: Path) -> PointFile:
+    accepted = [*KINDS, "known_sdf", *(f"{kind}_step" for kind in KINDS), "world_from_object"]
+    arrays = read_npz(path, accepted=accepted, error=PointsError)
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiu":
+            raise PointsError(f"{name} has type {array.dtype}; accepted: numbers")
+    if not any(kind in arrays for kind in KINDS):
+        raise PointsError(f"no array of points; accepted: at least one of {', '.join(KINDS)}")
+    if ("known" in arrays) != ("known_sdf" in arrays):
+        raise PointsError("known and known_sdf stand only together")
+    classes = {kind: _npz_class(kind, arrays) for kind in KINDS}
+    return PointFile(classes, _npz_pose(arrays))
+
+
+def _npz_class(kind: str, arrays: dict[str, Any]) -> PointClass:
+    if kind not in arrays:
+        return PointClass()
+    points = frozen(kind, arrays[kind], (None, 3))
+    sdf = arrays["known_sdf"] if kind == "known" else np.zeros(len(points))
+    name = f"{kind}_step"
+    steps = np.asarray(arrays.get(name, np.zeros(len(points), dtype=np.int64)))
+    if not np.issubdtype(steps.dtype, np.integer) or steps.shape != (len(points),):
+        raise PointsError(
+            f"{name} has type {steps.dtype} and shape {steps.shape}; accepted: integers, shape "
+            f"({len(points)},)"
+        )
+    refused = (steps < 0) | (steps > LAST_STEP)
+    if refused.any():
+        row = int(np.argmax(refused))
+        raise PointsError(f"{name}[{row}] is {steps[row]}; accepted: 0 to {LAST_STEP}")
+    return PointClass(points, frozen("known_sdf", sdf, (len(points),)), steps.astype(np.int64))
+
+
+def _npz_pose(arrays: dict[str, Any]) -> FloatArray | None:
+    if "world_from_object" not in arrays:
+        return None
+    pose = frozen("world_from_object", arrays["world_from_object"], (4, 4), error=PoseError)
+    return nearest_rigid("world_from_object", pose[None])[0]
+
+
+def _read_csv(path: Path) -> PointFile:
+    rows: dict[str, list[tuple[list[float], float, int]]] = {kind: [] for kind in KINDS}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            header = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = header
+            _check_header(header)
+            for row in reader:
+                kind, point, sdf, step = _csv_row(row, reader.line_num)
+                rows[kind].append((point, sdf, step))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise PointsError(f"not a readable .csv file ({error})") from None
+    return PointFile({kind: _csv_class(entries) for kind, entries in rows.items()})
+
+
+def _check_header(header: list[str]) -> None:
+    wanted = "x,y,z,kind[,sdf][,step]"
+    if not {"x", "y", "z", "kind"} <= set(header) or set(header) - set(_COLUMNS):
+        shown = repr(",".join(header)[:_LONGEST_TEXT])
+        raise PointsError(f"line 1 is {shown}; accepted: the header {wanted}")
+    if len(set(header)) != len(header):
+        raise PointsError(f"line 1 names a column twice; accepted: the header {wanted}")
+
+
+def _csv_row(row: dict[Any, Any], line: int) -> tuple[str, list[float], float, int]:
+    if None in row or None in row.values():
+        raise PointsError(f"line {line} has another number of fields than the header")
+    kind = row["kind"].strip()
+    if kind not in KINDS:
+        shown = repr(kind[:_LONGEST_TEXT])
+        raise PointsError(f"line {line}: kind is {shown}; accepted: {', '.join(KINDS)}")
+    point = [_number(row[axis], axis, line) for axis in "xyz"]
+    given = row.get("sdf", "").strip()
+    if kind == "known" and not given:
+        raise PointsError(f"line {line}: a known point needs an sdf")
+    if kind == "surface" and given and _number(given, "sdf", line) != 0.0:
+        raise PointsError(f"line {line}: a surface point has sdf {given}; accepted: 0 or nothing")
+    if kind in ("free", "occupied") and given:
+        raise PointsError(f"line {line}: a {kind} point has an sdf; accepted: nothing")
+    step = _number(row.get("step", "").strip() or "0", "step", line)
+    if step != int(step) or not 0 <= step <= LAST_STEP:
+        raise PointsError(
+            f"line {line}: step is {row['step'][:_LONGEST_TEXT]}; "
+            f"accepted: an integer from 0 to {LAST_STEP}"
+        )
+    return kind, point, _number(given or "0", "sdf", line), int(step)
+
+
+def _number(text: str, name: str, line: int) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        shown = repr(text[:_LONGEST_TEXT])
+        raise PointsError(f"line {line}: {name} is {shown}; accepted: a finite number")
+    return value
+
+
+def _csv_class(entries: list[tuple[list[float], float, int]]) -> PointClass:
+    if not entries:
+        return PointClass()
+    points, sdf, steps = zip(*entries, strict=True)
+    return PointClass(
+        frozen("points", points, (None, 3)), np.array(sdf), np.array(steps, dtype=np.int64)
+    )
+
+
+def _read_surface(path: Path) -> PointFile:
+    """Every vertex of a mesh or point cloud is a surface point, those at one place together one."""
+    import trimesh
+
+    kind = path.suffix.lower().removeprefix(".")
+    try:
+        loaded = trimesh.load(str(path), file_type=kind, process=False)
+        geometries = list(getattr(loaded, "geometry", {"": loaded}).values())
+        vertices = np.concatenate([_vertices(geometry) for geometry in geometries])
+    except Exception as error:  # readers of foreign formats raise anything
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise PointsError(f"not a readable .{kind} file ({reason[:200]})") from None
+    points = frozen("surface", vertices, (None, 3))
+    nothing = {kind: PointClass() for kind in KINDS}
+    steps = np.zeros(len(points), dtype=np.int64)
+    return PointFile({**nothing, "surface": PointClass(points, np.zeros(len(points)), steps)})
+
+
+def _vertices(geometry: Any) -> FloatArray:
+    """All vertices (V, 3); of those of a mesh's faces, one for each place."""
+    import trimesh
+
+    vertices = np.asarray(geometry.vertices, dtype=np.float64).reshape(-1, 3)
+    if not isinstance(geometry, trimesh.Trimesh) or not np.isfinite(vertices).all():
+        return vertices
+    beside = vertices[~geometry.referenced_vertices]
+    geometry.process()
+    return np.concatenate([np.asarray(geometry.vertices).reshape(-1, 3), beside])
+
+
+_READERS: dict[str, Callable[[Path], PointFile]] = {
+    ".npz": _read_npz,
+    ".csv": _read_csv,
+    ".ply": _read_surface,
+    ".off": _read_surface,
+    ".xyz": _read_surface,
+    ".stl": _read_surface,
+}

@@ -19,7 +19,7 @@ from replay.__main__ import main
 from replay.verbs import VERBS
 from runners.sensors.depth_frame import read_depth_frame
 from runners.sensors.pose_file import read_pose
-from runners.sessions.point_files import read_points
+from runners.sessions.points import read_points
 from runners.sessions.problem_source import open_source
 from tests.tools.verb_arguments import verb_arguments
 

@@ -24,7 +24,7 @@ from replay.mcap.writer import McapRecorder
 from replay.recorder import ListRecorder
 from runners.run.recording import RecordingConfig
 from runners.run.session_run import SessionRun
-from runners.sessions.point_files import PointClass
+from runners.sessions.points import PointClass
 
 STEPS, EACH = 150, 7
 ALL = STEPS * EACH

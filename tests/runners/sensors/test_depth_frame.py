@@ -27,7 +27,7 @@ from runners.sensors.depth_frame import (
     read_depth_frame,
 )
 from runners.sensors.rig import GateRig, Rig
-from runners.sessions.depth_frame_session import DepthFrameSession
+from runners.sessions.sensors import DepthFrameSession
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 WIDTH, HEIGHT = 80, 60

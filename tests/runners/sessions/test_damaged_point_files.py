@@ -13,7 +13,7 @@ import pytest
 
 from chsel.errors import ChselError, PointsError
 from chsel.problem import file_checks
-from runners.sessions.point_files import PointFile, read_points
+from runners.sessions.points import PointFile, read_points
 
 POINTS = np.arange(9.0).reshape(3, 3) / 100
 ARRAYS: dict[str, np.ndarray[Any, Any]] = {

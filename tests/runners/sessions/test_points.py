@@ -10,8 +10,7 @@ import trimesh
 from chsel.errors import PointsError, SettingError
 from chsel.problem.defaults import object_grid
 from runners.objects.loader import ObjectModel
-from runners.sessions.point_files import read_points
-from runners.sessions.points import PointsSession, PointsSettings
+from runners.sessions.points import PointsSession, PointsSettings, read_points
 
 BOX = ObjectModel("box", trimesh.creation.box((0.03, 0.04, 0.12)), 1.0, 0.001, "box")
 SURFACE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
