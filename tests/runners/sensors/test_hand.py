@@ -122,7 +122,9 @@ def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
     assert len(whole.parts()) == 5
     assert whole.joint_names == ("wrist", "slide", "bend")
     np.testing.assert_allclose(whole.parts()[1].bounds[:, 2], [1.0, 1.1])
-    with pytest.raises(SettingError, match=r"hand\.root 'wrist' is no link .*accepted: arm, palm"):
+    with pytest.raises(
+        SettingError, match=r"'wrist' is not one of .*accepted: arm, palm"
+    ):
         HandModel(hand(urdf(tmp_path), "wrist"))
 
 
@@ -210,23 +212,21 @@ CYCLE = (
         ("<robot", "is not a URDF"),
         ("<robot/>", "is not a URDF"),
         ('<robot name="r"><link name="a"/></robot>', "no collision shape at or below link a"),
-        (f'<robot name="r">{LINK}<link name="b"/></robot>', r"several base links; .*: a, b"),
+        (f'<robot name="r">{LINK}<link name="b"/></robot>', r"hand\.root None is .*: a, b"),
         ('<robot name="r" xmlns:xacro="x"><xacro:arm/></robot>', "holds xacro macros"),
         (CYCLE, "is not a tree"),
         (GRIPPER.replace('child link="tip"', 'child link="left"'), "is not a tree"),
-        (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist holds link 'leg'"),
-        (GRIPPER.replace('type="revolute"', 'type="screw"'), "joint wrist has type 'screw'"),
+        (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist joins 'leg', 'palm'"),
         (GRIPPER.replace('"0 2 0"', '"0 0 0"'), "joint slide: axis is"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics 'follow'"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="thumb"'), "follow mimics 'thumb'"),
         (GRIPPER.replace('radius="0.01"', 'radius="-1"'), "link left: size "),
-        (GRIPPER.replace('"0.04 0.2 0.1"', '"0.04 0.2"'), "link palm: size "),
     ],
 )
 def test_unusable_files_are_refused_in_a_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(SettingError, match=message) as caught:
         HandModel(hand(urdf(tmp_path, text)))
-    assert str(caught.value).startswith(f"hand.urdf {tmp_path}")
+    assert f"hand.urdf {tmp_path}" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
