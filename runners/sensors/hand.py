@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import trimesh
 
 _MOVING = ("revolute", "continuous", "prismatic")
+_TYPES = (*_MOVING, "fixed", "floating", "planar")
 _CYLINDER_SIDES = 32  # the prism lies within the cylinder, so it claims no free space too much
 
 
@@ -138,6 +139,8 @@ class _Linkage:
                 raise self._error(
                     f"joint {joint.name} joins {joint.parent!r}, {joint.child!r}; accepted: links"
                 )
+            if joint.type not in _TYPES:
+                raise self._error(f"joint {joint.name} has type {joint.type!r}; accepted: {_TYPES}")
             if joint.type in _MOVING and not (len(joint.axis) == 3 and np.any(joint.axis)):
                 raise self._error(f"joint {joint.name}: axis is {joint.axis}; accepted: x y z")
 

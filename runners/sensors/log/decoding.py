@@ -96,9 +96,7 @@ def _reader(
             kind = getattr(import_module(f"foxglove_schemas_protobuf.{short}_pb2"), short)
         except ImportError:
             raise UnusableMessage(f"foxglove-schemas-protobuf lacks {name}: update it") from None
-        has_header = "timestamp" in kind.DESCRIPTOR.fields_by_name
-        header = _foxglove_header if has_header else _no_header
-        return kind.FromString, header, _FOXGLOVE[name]
+        return kind.FromString, _foxglove_header, _FOXGLOVE[name]
     raise UnusableMessage(f"messages {name} as {encoding or 'unknown bytes'} are not read")
 
 
@@ -125,6 +123,8 @@ def _ros2_header(message: Any) -> Header:
 
 
 def _foxglove_header(message: Any) -> Header:
+    if not hasattr(message, "timestamp"):
+        return _no_header(message)
     time = message.timestamp
     return time.seconds, time.nanos, getattr(message, "frame_id", "")
 

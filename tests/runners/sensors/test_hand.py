@@ -122,9 +122,7 @@ def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
     assert len(whole.parts()) == 5
     assert whole.joint_names == ("wrist", "slide", "bend")
     np.testing.assert_allclose(whole.parts()[1].bounds[:, 2], [1.0, 1.1])
-    with pytest.raises(
-        SettingError, match=r"'wrist' is not one of .*accepted: arm, palm"
-    ):
+    with pytest.raises(SettingError, match=r"'wrist' is not one of .*accepted: arm, palm"):
         HandModel(hand(urdf(tmp_path), "wrist"))
 
 
@@ -217,6 +215,7 @@ CYCLE = (
         (CYCLE, "is not a tree"),
         (GRIPPER.replace('child link="tip"', 'child link="left"'), "is not a tree"),
         (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist joins 'leg', 'palm'"),
+        (GRIPPER.replace('type="revolute"', 'type="screw"'), "joint wrist has type 'screw'"),
         (GRIPPER.replace('"0 2 0"', '"0 0 0"'), "joint slide: axis is"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics 'follow'"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="thumb"'), "follow mimics 'thumb'"),
