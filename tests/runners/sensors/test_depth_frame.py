@@ -260,19 +260,6 @@ def test_free_space_is_what_rays_passed(tmp_path: Path) -> None:
     assert not set(map(tuple, taken.tolist())) & set(map(tuple, near.tolist()))
 
 
-def test_the_references_way_and_an_own_workspace_are_options(tmp_path: Path) -> None:
-    frame = read_depth_frame(written(tmp_path, label=None, object_class=None))
-    bounds = ((-0.1, 0.1), (-0.1, 0.1), (0.3, 0.6))
-    own = dataclasses.replace(rig(rays="scaled_images"), workspace=bounds)
-    images = depth_frame_points(frame, own, free_resolution=0.01)
-    own = dataclasses.replace(rig(), workspace=bounds)
-    rays = depth_frame_points(frame, own, free_resolution=0.01)
-    assert 0 < len(images.points.free) < len(rays.points.free)
-    assert len(rays.points.known) == 0
-    assert not rays.surface.any()
-    np.testing.assert_allclose(rays.workspace.bounds[1], [0.1, 0.1, 0.6])
-
-
 def test_one_point_a_voxel_is_kept_the_one_nearest_its_centre() -> None:
     points = np.array([[0.004, 0, 0], [0.011, 0, 0], [0.001, 0.001, 0], [0.01, 0, 0]])
     np.testing.assert_array_equal(one_per_voxel(points, 0.01), points[[2, 3]])

@@ -224,20 +224,3 @@ def test_the_rig_to_start_from_is_read() -> None:
     rig = build_settings(Rig, values, "session.rig")
     assert rig.forces == (ForceRig("/wrist/wrench"),)
     assert rig.hand is not None
-
-
-def test_forces_that_are_not_finite_are_passed_by(tmp_path: Path) -> None:
-    broken = wrench(0.5)
-    broken["wrench"]["force"]["x"] = float("nan")
-    path = tmp_path / "log.mcap"
-    stamp = BEGIN + SECOND // 2
-    moving = {"transforms": [transform("world", "hand", hand_pose(0.5), stamp)]}
-    write_ros2(
-        path,
-        [
-            ("/tf", "tf2_msgs/TFMessage", moving, stamp),
-            ("/wrench", "geometry_msgs/WrenchStamped", broken, stamp),
-        ],
-    )
-    with pytest.raises(SessionError, match=r"gives no forces \(a force or torque is not finite,"):
-        read(path, replace(RIG, markers=None))
