@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
-from chsel.errors import SettingError, require_positive
+from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import KnownPoints, check_points
-from replay.events import Logged, Probe, RigDescribed, SensorImage
+from chsel.problem.settings import CheckedSettings, not_negative, positive
+from replay.events import Logged, Probe, RigDescribed
 from replay.files import file_digest
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import FreeMap, RobotCell
-from runners.sensors.depth_camera import intrinsics_of, recorded
+from runners.sensors.depth_camera import recorded_image
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
 from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.first_pass import FirstPass
@@ -36,35 +38,27 @@ _MANY = 0.4  # of a camera's pixels at edges: rather a slanted surface, seen in 
 
 
 @dataclass(frozen=True)
-class SensorsSettings:
-    """path: of the log, an .mcap file or a rosbag2 folder, or of a depth image's YAML.
-
-    rig: what the log's topics are. pose: file of the true pose, by default that beside the log if
-    there is one; "none": unknown. free_resolution: side of a free voxel, metres.
-    object_resolution, object_padding: of the SDF grid, metres. start_contacts, start_probe: a
-    registration needs so many contacts and this probe index. images: record the images, too.
-    """
+class SensorsSettings(CheckedSettings):
+    """A log of sensors, and what its topics are."""
 
     rig: Rig
-    path: str | None = None
+    path: str | None = None  # an .mcap file, a rosbag2 folder, or the YAML of a depth image
     pose: str | None = None
-    free_resolution: float = 0.01
-    object_resolution: float = 0.005
-    object_padding: float = 0.05
-    start_contacts: int = 4
-    start_probe: int = 0
-    images: bool = True
+    """File of the true pose; None: that beside the log, if there is one; "none": unknown."""
+    free_resolution: Annotated[float, positive] = 0.01  # side of a free voxel, m
+    object_resolution: Annotated[float, positive] = 0.005  # of the object's SDF grid, m
+    object_padding: Annotated[float, positive] = 0.05  # of the object's SDF grid, m
+    start_contacts: Annotated[int, not_negative] = 4  # a registration needs so many contacts
+    start_probe: Annotated[int, not_negative] = 0  # and this index of the probe
+    images: bool = True  # record the images, too
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.path:
             raise SettingError(
                 "path is missing; pass session.path=LOG, an .mcap file, a rosbag2 folder, or the "
                 ".yaml of a depth image"
             )
-        for name in ("free_resolution", "object_resolution", "object_padding"):
-            require_positive(name, getattr(self, name))
-        for name in ("start_contacts", "start_probe"):
-            require_positive(name, getattr(self, name), zero=True)
 
 
 def open_sensors(
@@ -227,7 +221,11 @@ class DepthFrameSession:
         self.report.by_probe[0] = {camera.name: found.counts}
         yield RigDescribed(-1, self._rig.name, file_digest(self._path))
         if self._images:
-            yield self._image(camera.name)
+            depth = np.nan_to_num(self._frame.depth, posinf=0.0, neginf=0.0)
+            pose, pinhole = self._frame.world_from_camera, self._frame.camera
+            yield recorded_image(
+                0, camera.name, "depth", depth, depth > 0.0, found.rays, pinhole, pose
+            )
         count = len(found.points.known)
         text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
         yield Logged(0, "info", text)
@@ -257,17 +255,3 @@ class DepthFrameSession:
 
     def close(self) -> None:
         """Nothing is held open."""
-
-    def _image(self, name: str) -> SensorImage:
-        depth, frame = np.nan_to_num(self._frame.depth, posinf=0.0, neginf=0.0), self._frame
-        values, unit = recorded(depth, depth > 0.0)
-        return SensorImage(
-            0,
-            name,
-            "depth",
-            values,
-            unit,
-            self._points.rays,
-            intrinsics_of(frame.camera),
-            frame.world_from_camera,
-        )
