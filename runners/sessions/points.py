@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -212,72 +213,66 @@ def _npz_pose(arrays: dict[str, Any]) -> FloatArray | None:
 
 
 def _read_csv(path: Path) -> PointFile:
-    rows: dict[str, list[tuple[list[float], float, int]]] = {kind: [] for kind in KINDS}
+    columns: dict[str, tuple[list[Any], list[Any], list[Any]]] = {k: ([], [], []) for k in KINDS}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             header = [name.strip() for name in reader.fieldnames or []]
             reader.fieldnames = header
-            _check_header(header)
+            named = set(header)
+            if not {"x", "y", "z", "kind"} <= named <= set(_COLUMNS) or len(named) < len(header):
+                raise PointsError(
+                    f"line 1 is {','.join(header)[:_LONGEST_TEXT]!r}; accepted: the header "
+                    "x,y,z,kind[,sdf][,step], each column once"
+                )
             for row in reader:
-                kind, point, sdf, step = _csv_row(row, reader.line_num)
-                rows[kind].append((point, sdf, step))
+                try:
+                    kind, *values = _csv_row(row)
+                except ValueError as error:
+                    raise PointsError(f"line {reader.line_num}: {error}") from None
+                for column, value in zip(columns[kind], values, strict=True):
+                    column.append(value)
     except (UnicodeDecodeError, csv.Error) as error:
         raise PointsError(f"not a readable .csv file ({error})") from None
-    return PointFile({kind: _csv_class(entries) for kind, entries in rows.items()})
+    return PointFile(
+        {
+            kind: PointClass(
+                frozen("points", np.reshape(points, (-1, 3)), (None, 3)),
+                np.array(sdf, dtype=np.float64),
+                np.array(steps, dtype=np.int64),
+            )
+            for kind, (points, sdf, steps) in columns.items()
+        }
+    )
 
 
-def _check_header(header: list[str]) -> None:
-    wanted = "x,y,z,kind[,sdf][,step]"
-    if not {"x", "y", "z", "kind"} <= set(header) or set(header) - set(_COLUMNS):
-        shown = repr(",".join(header)[:_LONGEST_TEXT])
-        raise PointsError(f"line 1 is {shown}; accepted: the header {wanted}")
-    if len(set(header)) != len(header):
-        raise PointsError(f"line 1 names a column twice; accepted: the header {wanted}")
-
-
-def _csv_row(row: dict[Any, Any], line: int) -> tuple[str, list[float], float, int]:
+def _csv_row(row: dict[Any, Any]) -> tuple[str, list[float], float, int]:
+    """Kind, point, signed distance and step of a row; ValueError for what is wrong."""
     if None in row or None in row.values():
-        raise PointsError(f"line {line} has another number of fields than the header")
+        raise ValueError("it has another number of fields than the header")
     kind = row["kind"].strip()
     if kind not in KINDS:
-        shown = repr(kind[:_LONGEST_TEXT])
-        raise PointsError(f"line {line}: kind is {shown}; accepted: {', '.join(KINDS)}")
-    point = [_number(row[axis], axis, line) for axis in "xyz"]
+        raise ValueError(f"kind is {kind[:_LONGEST_TEXT]!r}; accepted: {', '.join(KINDS)}")
     given = row.get("sdf", "").strip()
-    if kind == "known" and not given:
-        raise PointsError(f"line {line}: a known point needs an sdf")
-    if kind == "surface" and given and _number(given, "sdf", line) != 0.0:
-        raise PointsError(f"line {line}: a surface point has sdf {given}; accepted: 0 or nothing")
-    if kind in ("free", "occupied") and given:
-        raise PointsError(f"line {line}: a {kind} point has an sdf; accepted: nothing")
-    step = _number(row.get("step", "").strip() or "0", "step", line)
+    sdf = _number(given or "0", "sdf")
+    if not given and kind == "known":
+        raise ValueError("a known point needs an sdf")
+    if given and (kind in ("free", "occupied") or (kind == "surface" and sdf != 0.0)):
+        raise ValueError(f"a {kind} point has sdf {sdf:g}; accepted: nothing")
+    step = _number(row.get("step", "").strip() or "0", "step")
     if step != int(step) or not 0 <= step <= LAST_STEP:
-        raise PointsError(
-            f"line {line}: step is {row['step'][:_LONGEST_TEXT]}; "
-            f"accepted: an integer from 0 to {LAST_STEP}"
-        )
-    return kind, point, _number(given or "0", "sdf", line), int(step)
+        raise ValueError(f"step is {step:.20g}; accepted: an integer from 0 to {LAST_STEP}")
+    return kind, [_number(row[axis], axis) for axis in "xyz"], sdf, int(step)
 
 
-def _number(text: str, name: str, line: int) -> float:
+def _number(text: str, name: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        shown = repr(text[:_LONGEST_TEXT])
-        raise PointsError(f"line {line}: {name} is {shown}; accepted: a finite number")
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{name} is {text[:_LONGEST_TEXT]!r}; accepted: a finite number")
     return value
-
-
-def _csv_class(entries: list[tuple[list[float], float, int]]) -> PointClass:
-    if not entries:
-        return PointClass()
-    points, sdf, steps = zip(*entries, strict=True)
-    return PointClass(
-        frozen("points", points, (None, 3)), np.array(sdf), np.array(steps, dtype=np.int64)
-    )
 
 
 def _read_surface(path: Path) -> PointFile:
