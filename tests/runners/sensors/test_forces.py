@@ -208,13 +208,6 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         read(without)
     with pytest.raises(SettingError, match=r"forces need the solids of the hand.*hand\.boxes"):
         replace(RIG, hand=HandRig("hand"))
-    with pytest.raises(SettingError, match=r"forces need the solids of the hand"):
-        replace(RIG, hand=None)
-    with pytest.raises(SettingError, match=r"acts is 'me'; accepted: on_hand, by_hand"):
-        ForceRig("/wrench", acts="me")
-    for threshold in (0.0, float("nan")):
-        with pytest.raises(SettingError, match=r"threshold is "):
-            ForceRig("/wrench", threshold=threshold)
     with pytest.raises(SettingError, match=r"rig pusher has no sensor; accepted: .*clouds, hand"):
         read(without, replace(RIG, hand=None, forces=()))
 

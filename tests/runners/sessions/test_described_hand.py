@@ -96,7 +96,6 @@ def _open(kind: str, mesh: trimesh.Trimesh, settings: ProbingSettings) -> Probin
         ({"boxes": [{"size": [0.01, 0.01, 0.1]}]}, "no interior point 0.01 m deep; accepted: a"),
         ({"boxes": [{"size": [0.4, 0.4, 0.4]}] * 2}, "m^2 of surface; accepted: at most 1"),
         ({"boxes": [{"size": [0.1, -0.1, 0.1]}]}, "size is -0.1"),
-        ({"joints": "x"}, "session.hand.joints does not exist"),
     ],
 )
 def test_a_hand_that_cannot_be_is_an_error(
