@@ -12,7 +12,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from rich.filesize import decimal
 
-from chsel.errors import SettingError
+from chsel.errors import SettingError, require_choice
 from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
 from replay.console import Console
@@ -21,10 +21,8 @@ from runners.command.program import command, plain
 from runners.objects.loader import ObjectConfig, load_object
 from runners.objects.scans import AssetsConfig
 from runners.run.display import counting_bar
-from runners.simulated_robot.robot_configurations import (
-    CabinetConfiguration,
-    find_cabinet_configuration,
-)
+from runners.sessions.configurations import Configuration
+from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import RobotSettings
 from runners.simulated_robot.simulation import Push, SimulatedLog, probe_count, simulate_log
 
@@ -45,6 +43,7 @@ class SimulateRigConfig:
 
     def __post_init__(self) -> None:
         StreamKey(self.seed, 0)
+        require_choice("configuration", self.configuration, CABINET_CONFIGURATIONS)
         if not self.out or Path(self.out).suffix != ".mcap":
             raise SettingError(f"out is {self.out}; accepted: the name of a file, out=FILE.mcap")
 
@@ -56,7 +55,7 @@ def main(config: DictConfig) -> None:
     own = {name: values.pop(name) for name in SimulateRigConfig.__dataclass_fields__}
     checked = build_settings(SimulateRigConfig, own, "simulate_rig")
     settings = build_settings(RobotSettings, values, "simulate_rig")
-    configuration = find_cabinet_configuration(checked.configuration)
+    configuration = CABINET_CONFIGURATIONS[checked.configuration]
     count = probe_count(configuration, settings)
     chosen = _object(checked.object, configuration)
     log = Path(checked.out or "").expanduser()
@@ -95,7 +94,7 @@ def main(config: DictConfig) -> None:
     console.print("  the true pose")
 
 
-def _object(values: dict[str, Any], configuration: CabinetConfiguration) -> ObjectConfig:
+def _object(values: dict[str, Any], configuration: Configuration) -> ObjectConfig:
     """The chosen object; without a choice, our own model of the configuration's."""
     if "kind" not in values:
         values = {"name": configuration.object, "epsilon": EPSILON, **values}

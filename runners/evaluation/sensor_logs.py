@@ -12,7 +12,7 @@ from chsel.problem.poses import compose, roll_pitch_yaw
 from runners.evaluation.plan import Plan, Trial
 from runners.objects.loader import load_object
 from runners.sensors.pose_file import SUFFIX, beside, read_pose, write_pose
-from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
+from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import RobotSettings
 
 TRUTH = ".truth.yaml"

@@ -14,7 +14,7 @@ from chsel.problem.settings import build_settings, settings_mapping
 from runners.objects.loader import OBJECTS, ObjectConfig
 from runners.sessions.configurations import CONFIGURATIONS
 from runners.sessions.faults import CLEAN, LEVELS
-from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
+from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 
 SENSORS = "sensors"
 MOST_PROBES = 1_000

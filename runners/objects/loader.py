@@ -5,39 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import numpy as np
 
-from chsel.errors import MeshWarning, SettingError, require_choice, require_positive
+from chsel.errors import MeshWarning, SettingError, require_choice
 from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
 from chsel.problem.points import Workspace
 from chsel.problem.sdf_grid import SdfGrid
+from chsel.problem.settings import CheckedSettings, one_of, positive
 from runners.objects.scans import SCANS, scan_file
 
 if TYPE_CHECKING:
     import trimesh
 
-KINDS = ("model", "scan", "file")
-
 
 @dataclass(frozen=True)
-class ObjectConfig:
+class ObjectConfig(CheckedSettings):
     """Which object, and how large."""
 
     name: str
-    scale: float  # multiplies the mesh into the metres of the session
-    epsilon: float  # tolerance of the plausible set, metres (CHSEL, Sec. V)
+    scale: Annotated[float, positive]  # multiplies the mesh into the metres of the session
+    epsilon: Annotated[float, positive]  # tolerance of the plausible set, metres (CHSEL, Sec. V)
     configuration: str  # how simulated sessions place and probe it
-    kind: str = "model"  # ships with the project; "scan": of the YCB set; or "file"
+    kind: Annotated[str, one_of("model", "scan", "file")] = "model"
+    """"model" ships with the project, "scan" is of the YCB set."""
     path: str | None = None  # the mesh, for "file"
     scan: str | None = None  # official folder name, for "scan"
 
     def __post_init__(self) -> None:
-        require_choice("kind", self.kind, KINDS)
-        require_positive("scale", self.scale)
-        require_positive("epsilon", self.epsilon)
+        super().__post_init__()
         if self.kind == "file" and not self.path:
             raise SettingError("path is missing; pass object.path=FILE, a mesh file")
         if self.kind == "scan" and not self.scan:

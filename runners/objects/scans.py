@@ -11,7 +11,6 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, cast
-from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -48,7 +47,8 @@ class AssetsConfig:
     def __post_init__(self) -> None:
         if not self.dir.strip():
             raise SettingError("dir is empty; accepted: a folder")
-        _require_web_address("url", self.url)
+        if not self.url.startswith(("http://", "https://")):
+            raise SettingError(f"url is {self.url!r}; accepted: an http:// or https:// address")
 
     @property
     def folder(self) -> Path:
@@ -129,17 +129,6 @@ def download_scan(scan: str, assets: AssetsConfig) -> str:
         folder.mkdir(parents=True)
         os.replace(mesh, folder / MESH_FILE)
     return described
-
-
-def _require_web_address(name: str, url: str) -> None:
-    """Raise SettingError unless `url` is an http or https address."""
-    try:
-        parts = urlsplit(url)
-        accepted = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # the port or the host is not valid
-        accepted = False
-    if not accepted or re.search(r"[^!-~]", url):
-        raise SettingError(f"{name} is {url!r}; accepted: an http:// or https:// address")
 
 
 def _choice(scan: str) -> str:

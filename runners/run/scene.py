@@ -22,10 +22,9 @@ from runners.objects.scans import AssetsConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.session_report import Report
 from runners.sessions import open_session, session_settings
-from runners.sessions.depth_frame_session import DepthFrameSession
 from runners.sessions.probing_settings import without_defaults
 from runners.sessions.recorded import RecordedSession
-from runners.sessions.sensors import SensorsSession
+from runners.sessions.sensors import DepthFrameSession, SensorsSession
 from runners.sessions.session import Progress, Session, Steerable, unwatched
 
 if TYPE_CHECKING:

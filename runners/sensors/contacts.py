@@ -95,8 +95,11 @@ class ContactFinder:
             return Contacts.joined([])
         key = StreamKey(self._seed, step)
         found = []
-        for index, (name, most) in enumerate(self._shares(imprints).items()):
-            imprint = imprints[name]
+        sizes, rule = [imprint.size for imprint in imprints.values()], self._rig.contact
+        shared = rule.per == "contact"
+        shares = share(sizes, rule.points) if shared else [rule.points] * len(sizes)
+        for index, (name, imprint) in enumerate(imprints.items()):
+            most = shares[index]
             chosen = contact_subset(imprint.size, most, key.stream(Purpose.CONTACT_POINTS, index))
             points, normals = self._pads[name].contacts(imprint, chosen)
             kept = self._cell.free.within(points)
@@ -131,10 +134,3 @@ class ContactFinder:
             count = len(contacts.points)
             self._cell.warnings.note(f"probe {step}: {count} contacts added, as the rig annotates")
         return contacts
-
-    def _shares(self, imprints: Mapping[str, Imprint]) -> dict[str, int]:
-        """How many points each pad gives."""
-        sizes, rule = [imprint.size for imprint in imprints.values()], self._rig.contact
-        if rule.per == "contact":
-            return dict(zip(imprints, share(sizes, rule.points), strict=True))
-        return dict.fromkeys(imprints, rule.points)

@@ -70,16 +70,22 @@ def metres(values: np.ndarray, unit: float | None) -> FloatArray:
     return values.astype(np.float64) * unit
 
 
-def recorded(image: FloatArray, usable: BoolArray) -> tuple[np.ndarray, float]:
-    """An image (H, W) of metres as uint16 with its unit in metres; 0 where it does not count."""
-    kept = np.where(usable, image, 0.0)
+def recorded_image(
+    step: int,
+    sensor: str,
+    kind: str,
+    image: FloatArray,
+    known: BoolArray,
+    mask: BoolArray,
+    camera: PinholeCamera,
+    world_from_camera: FloatArray,
+) -> SensorImage:
+    """An image (H, W) of metres, 0 where it is not known (H, W), as recordings have it."""
+    kept = np.where(known, image, 0.0)
     unit = FINE if kept.max(initial=0.0) < 65535 * FINE else COARSE
-    return np.clip(np.rint(kept / unit), 0, 65535).astype(np.uint16), unit
-
-
-def intrinsics_of(camera: PinholeCamera) -> FloatArray:
-    """fx, fy, cx, cy (4,), pixels, as recordings have them."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    values = np.clip(np.rint(kept / unit), 0, 65535).astype(np.uint16)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    return SensorImage(step, sensor, kind, values, unit, mask, intrinsics, world_from_camera)
 
 
 _EARLY = 0.95  # of the interval between two images: stamps are not exact
@@ -149,16 +155,9 @@ class DepthCamera:
         if self._last is None:
             return None
         (view, usable), self._last = self._last, None
-        values, unit = recorded(view.metres, view.valid)
-        return SensorImage(
-            step,
-            self._rig.name,
-            "depth",
-            values,
-            unit,
-            usable,
-            intrinsics_of(self._camera),
-            view.world_from_camera,
+        name, pose = self._rig.name, view.world_from_camera
+        return recorded_image(
+            step, name, "depth", view.metres, view.valid, usable, self._camera, pose
         )
 
     def _too_soon(self, time: int) -> bool:

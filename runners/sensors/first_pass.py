@@ -13,7 +13,6 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.sensing.depth_camera import PinholeCamera, valid_pixels
 from runners.sensors.depth_camera import metres
 from runners.sensors.log.clocks import Clocks
-from runners.sensors.log.joints import JointHistory
 from runners.sensors.log.messages import (
     CameraInfoMessage,
     CloudMessage,
@@ -27,7 +26,7 @@ from runners.sensors.log.messages import (
 )
 from runners.sensors.log.probe_windows import ProbeWindow, marked_windows, timed_windows, whole_log
 from runners.sensors.log.raw_log import RawLog
-from runners.sensors.log.transforms import TransformError, TransformTree
+from runners.sensors.log.transforms import JointHistory, TransformError, TransformTree
 from runners.sensors.pad import membrane_reference
 from runners.sensors.rig import BubbleRig, CameraRig, Rig
 from runners.sensors.session_report import LogWarnings
@@ -65,7 +64,6 @@ class FirstPass:
         self._sensed = {sensor.depth: _Sensed(ImageMessage) for sensor in rig.sensors}
         self._sensed |= {cloud.topic: _Sensed(CloudMessage) for cloud in rig.clouds}
         self._sensed |= {force.topic: _Sensed(WrenchMessage) for force in rig.forces}
-        self._units = {sensor.name: _UnitCheck(sensor) for sensor in rig.sensors}
         self._infos: dict[str, CameraInfoMessage] = {}
         self._changed_infos: Counter[str] = Counter()
         self._markers: list[tuple[Received, str]] = []
@@ -110,15 +108,14 @@ class FirstPass:
                 sensed.sizes[height, width] += 1
                 if len(sensed.first) < self._rig.contact.reference_images:
                     sensed.first.append((received, content.values))
-                for sensor in self._rig.sensors:
-                    if sensor.depth == topic:
-                        self._units[sensor.name].add(content.values)
+                if sensed.count.bit_count() == 1:
+                    sensed.samples.append(content.values)
 
     def _check_sensors(self) -> None:
         """Messages of every sensor, units, and the poses of sensors and hand."""
         for sensor in self._rig.sensors:
             self._check_topic(sensor.name, sensor.depth, "depth images", sensor.frame)
-            suspicious = self._units[sensor.name].judge()
+            suspicious = _suspicious_unit(sensor, self._sensed[sensor.depth].samples)
             if suspicious:
                 self._warnings.warn(suspicious)
             times = self._sensed[sensor.depth].times
@@ -269,6 +266,7 @@ class _Sensed:
     frame: str | None = None  # of the first message
     sizes: Counter[tuple[int, int]] = field(default_factory=Counter)  # (H, W) of images
     first: list[tuple[Received, np.ndarray]] = field(default_factory=list)  # a few images
+    samples: list[np.ndarray] = field(default_factory=list)  # images 1, 2, 4, 8, ...
     times: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(N,), nanoseconds, ascending."""
 
@@ -286,44 +284,25 @@ def missing_images(times: IntArray) -> int:
 _LEAST_WITHIN = 0.01  # of the numbers, or else these are no depths in metres
 
 
-class _UnitCheck:
-    """Looks at the images 1, 2, 4, 8, ... of a sensor, so at all times of a log."""
+def _suspicious_unit(rig: CameraRig | BubbleRig, samples: list[np.ndarray]) -> str | None:
+    """What is suspicious about images (H, W) of a sensor, as they were sent; None if nothing is.
 
-    def __init__(self, rig: CameraRig | BubbleRig) -> None:
-        self._rig = rig
-        self._images = self._numbers = self._within = 0
-        self._medians: list[float] = []
-        self._unit = 1.0
-
-    def add(self, values: np.ndarray) -> None:
-        """Take note of an image (H, W), as it was sent."""
-        self._images += 1
-        if self._images & (self._images - 1):
-            return
-        numbers = metres(values, self._rig.unit)
-        numbers = numbers[np.isfinite(numbers) & (numbers > 0.0)]
-        nearest, furthest = self._rig.range
-        self._numbers += len(numbers)
-        self._within += int(valid_pixels(numbers, nearest=nearest, furthest=furthest).sum())
-        if len(numbers):
-            self._medians.append(float(np.median(numbers)))
-        self._unit = float(metres(np.ones(1, values.dtype), self._rig.unit)[0])
-
-    def judge(self) -> str | None:
-        """What is suspicious; None if nothing is.
-
-        Raises SessionError if there are numbers, and next to none of them is a depth within range.
-        """
-        if isinstance(self._rig, BubbleRig) and self._rig.kind == "deformation":
-            return None
-        if not self._medians:
-            return f"{self._rig.name}: no image that was looked at has a measurement"
-        if self._within >= _LEAST_WITHIN * self._numbers:
-            return None
-        nearest, furthest = self._rig.range
-        raise SessionError(
-            f"topic {self._rig.depth} of {self._rig.name} has depths of "
-            f"{float(np.median(self._medians)):.4g} m (median, at {self._unit:g} m a unit); "
-            f"accepted: from {nearest:g} to {furthest:g} m, its range: set unit, the metres of a "
-            "unit of its images, or range"
-        )
+    Raises SessionError if there are numbers, and next to none of them is a depth within range.
+    """
+    if isinstance(rig, BubbleRig) and rig.kind == "deformation":
+        return None
+    images = [metres(values, rig.unit) for values in samples]
+    measured = [image[np.isfinite(image) & (image > 0.0)] for image in images]
+    medians = [float(np.median(depths)) for depths in measured if len(depths)]
+    if not medians:
+        return f"{rig.name}: no image that was looked at has a measurement"
+    nearest, furthest = rig.range
+    within = valid_pixels(np.concatenate(measured), nearest=nearest, furthest=furthest)
+    if within.mean() >= _LEAST_WITHIN:
+        return None
+    unit = metres(np.ones(1, samples[-1].dtype), rig.unit)[0]
+    raise SessionError(
+        f"topic {rig.depth} of {rig.name} has depths of {np.median(medians):.4g} m (median, at "
+        f"{unit:g} m a unit); accepted: from {nearest:g} to {furthest:g} m, its range: set unit, "
+        "the metres of a unit of its images, or range"
+    )

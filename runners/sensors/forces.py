@@ -15,8 +15,8 @@ from chsel.sensing.contact_sensing import contact_ahead, contact_on_axis
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import Contacts
 from runners.sensors.hand import HandModel
-from runners.sensors.log.joints import JointHistory
 from runners.sensors.log.messages import WrenchMessage
+from runners.sensors.log.transforms import JointHistory
 from runners.sensors.rig import ForceRig, HandRig
 from runners.sensors.session_report import Counts
 

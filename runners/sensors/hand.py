@@ -61,21 +61,15 @@ def _box(box: BoxRig) -> trimesh.Trimesh:
 
 
 class _Linkage:
-    """The links of a URDF below one of them, which move with it; kinematics by yourdfpy.
+    """The links of a URDF at and below `root`, which move with it; kinematics by yourdfpy."""
 
-    path: of the file. root: the link whose frame is the hand's; None: the link that is below no
-    other. joint_names: joints whose values move any link. warnings: on how the file was taken.
-    Raises SettingError, which names the file, for one that cannot be used.
-    """
-
-    def __init__(self, path: Path, root: str | None = None) -> None:
+    def __init__(self, path: Path, root: str | None) -> None:
         self._where = f"hand.urdf {path}"
         path = path.expanduser()
         robot = self._read(path)
         links = {link.name: link for link in robot.links}
         joints = {joint.name: joint for joint in robot.joints}
-        for joint in robot.joints:
-            self._check_joint(joint, links)
+        self._check_joints(robot.joints, links)
         self._root = self._chosen_root(root, [link.name for link in robot.links], robot.joints)
         below = [self._root]
         for link in below:  # grows while it is walked
@@ -88,7 +82,7 @@ class _Linkage:
         self.warnings = [
             f"{self._where}: joint {joint.name} is {joint.type}; it stays at its origin"
             for joint in robot.joints
-            if joint.type in ("floating", "planar")
+            if joint.type not in (*_MOVING, "fixed")
         ]
         self._shapes = [
             (link.name, self._solid(collision, path, f"{self._where} link {link.name}"))
@@ -139,27 +133,26 @@ class _Linkage:
             ) from None
         return robot
 
-    def _check_joint(self, joint: Any, links: Mapping[str, Any]) -> None:
-        for link in (joint.parent, joint.child):
-            if link not in links:
-                raise self._error(f"joint {joint.name} holds link {link!r}, which is missing")
-        if joint.type not in _TYPES:
-            raise self._error(
-                f"joint {joint.name} has type {joint.type!r}; accepted: {', '.join(_TYPES)}"
-            )
-        if joint.type in _MOVING and not (len(joint.axis) == 3 and np.any(joint.axis)):
-            raise self._error(f"joint {joint.name}: axis is {joint.axis}; accepted: x y z")
+    def _check_joints(self, joints: list[Any], links: Mapping[str, Any]) -> None:
+        for joint in joints:
+            if not {joint.parent, joint.child} <= links.keys():
+                raise self._error(
+                    f"joint {joint.name} joins {joint.parent!r}, {joint.child!r}; accepted: links"
+                )
+            if joint.type not in _TYPES:
+                raise self._error(f"joint {joint.name} has type {joint.type!r}; accepted: {_TYPES}")
+            if joint.type in _MOVING and not (len(joint.axis) == 3 and np.any(joint.axis)):
+                raise self._error(f"joint {joint.name}: axis is {joint.axis}; accepted: x y z")
 
     def _chosen_root(self, root: str | None, links: list[str], joints: list[Any]) -> str:
         children = [joint.child for joint in joints]
         bases = [name for name in links if name not in children]
         if len(set(links)) < len(links) or len(set(children)) < len(children) or not bases:
             raise self._error("is not a tree; accepted: each link once, with one parent at most")
-        if root is None and len(bases) > 1:
-            raise self._error(f"has several base links; set hand.root, accepted: {_some(bases)}")
-        if root is not None and root not in links:
+        accepted = bases if root is None and len(bases) > 1 else links
+        if root not in accepted and (root is not None or len(bases) > 1):
             raise SettingError(
-                f"hand.root {root!r} is no link of {self._where}; accepted: {_some(links)}"
+                f"hand.root {root!r} is not one of {self._where}; accepted: {', '.join(accepted)}"
             )
         return root or bases[0]
 
@@ -201,25 +194,16 @@ class _Linkage:
         import trimesh
 
         shape = collision.geometry
-        sizes = []
-        if shape.box is not None:
-            sizes = list(shape.box.size)
-        elif shape.sphere is not None:
-            sizes = [shape.sphere.radius]
-        elif shape.cylinder is not None:
-            sizes = [shape.cylinder.radius, shape.cylinder.length]
-        if not all(size > 0.0 for size in sizes) or (shape.box is not None and len(sizes) != 3):
-            raise SettingError(f"{where}: size {sizes} of a shape; accepted: finite, above 0")
-        if shape.box is not None:
-            solid = trimesh.creation.box(sizes)
-        elif shape.sphere is not None:
-            solid = trimesh.creation.icosphere(subdivisions=2, radius=sizes[0])
-        elif shape.cylinder is not None:
-            solid = trimesh.creation.cylinder(
-                radius=sizes[0], height=sizes[1], sections=_CYLINDER_SIDES
-            )
-        else:
+        if shape.mesh is not None:
             solid = self._mesh(shape.mesh, urdf, where)
+        elif shape.box is not None:
+            solid = trimesh.creation.box(_sizes(where, *shape.box.size))
+        elif shape.sphere is not None:
+            (radius,) = _sizes(where, shape.sphere.radius)
+            solid = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+        else:
+            radius, height = _sizes(where, shape.cylinder.radius, shape.cylinder.length)
+            solid = trimesh.creation.cylinder(radius, height, sections=_CYLINDER_SIDES)
         if collision.origin is not None:
             solid.apply_transform(collision.origin)
         if not np.isfinite(solid.vertices).all():
@@ -279,6 +263,8 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200]
 
 
-def _some(names: list[str]) -> str:
-    """Names for a message, which stays a line."""
-    return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+def _sizes(where: str, *sizes: float) -> list[float]:
+    """The measures of a shape, metres, all above 0."""
+    if not all(size > 0.0 for size in sizes):
+        raise SettingError(f"{where}: size {sizes} of a shape; accepted: above 0")
+    return list(sizes)

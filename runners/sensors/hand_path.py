@@ -14,8 +14,8 @@ from chsel.sensing.free_space import interior_lattice, poses_between
 from runners.sensors.cell import RobotCell
 from runners.sensors.contacts import PushEnd
 from runners.sensors.hand import HandModel
-from runners.sensors.log.joints import JointHistory
 from runners.sensors.log.probe_windows import ProbeWindow
+from runners.sensors.log.transforms import JointHistory
 from runners.sensors.rig import HandRig
 from runners.sensors.session_report import Counts
 

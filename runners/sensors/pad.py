@@ -21,7 +21,7 @@ from chsel.sensing.depth_camera import (
 )
 from replay.events import SensorImage
 from runners.sensors.cell import RobotCell
-from runners.sensors.depth_camera import View, intrinsics_of, metres, recorded, view_of
+from runners.sensors.depth_camera import View, metres, recorded_image, view_of
 from runners.sensors.log.images import read_image
 from runners.sensors.log.messages import ImageMessage
 from runners.sensors.rig import BubbleRig, ContactRig
@@ -146,16 +146,14 @@ class Pad:
 
     def image(self, step: int, imprint: Imprint) -> SensorImage:
         """The deformation with the pixels in contact."""
-        usable = imprint.view.valid & (imprint.pressed > 0.0)
-        values, unit = recorded(imprint.pressed, usable)
-        return SensorImage(
+        return recorded_image(
             step,
             self._rig.name,
             "deformation",
-            values,
-            unit,
+            imprint.pressed,
+            imprint.view.valid & (imprint.pressed > 0.0),
             imprint.touching,
-            intrinsics_of(self._camera),
+            self._camera,
             imprint.view.world_from_camera,
         )
 

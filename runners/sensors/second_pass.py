@@ -19,8 +19,8 @@ from runners.sensors.hand import HandModel
 from runners.sensors.hand_path import HandPath
 from runners.sensors.log.messages import CloudMessage, ImageMessage, Received, WrenchMessage
 from runners.sensors.log.probe_windows import ProbeWindow
-from runners.sensors.pad import Imprint, Pad
-from runners.sensors.rig import BubbleRig, Rig
+from runners.sensors.pad import Pad
+from runners.sensors.rig import Rig
 from runners.sensors.session_report import Report
 
 HAND = "hand"
@@ -51,7 +51,19 @@ class SecondPass:
             sensor.name: DepthCamera(sensor, first_pass.cameras[sensor.name], cell)
             for sensor in rig.cameras
         }
-        self._pads = {sensor.name: self._pad(sensor, first_pass) for sensor in rig.bubbles}
+        # Where the reference's sweep is chosen, no other free space follows from pads.
+        self._backwards = rig.hand is not None and rig.hand.sweep == "backwards"
+        self._pads = {
+            sensor.name: Pad(
+                sensor,
+                rig.contact,
+                first_pass.cameras[sensor.name],
+                first_pass.references[sensor.name],
+                cell,
+                inside=not self._backwards,
+            )
+            for sensor in rig.bubbles
+        }
         self._clouds = {
             cloud.topic: Clouds(cloud, cell, rig.surface_resolution) for cloud in rig.clouds
         }
@@ -65,7 +77,7 @@ class SecondPass:
                 for force in rig.forces
             }
             self._hand = HandPath(rig.hand, hand, first_pass.joints, first_pass.tree.times, cell)
-            if self._asks_for_push_end():
+            if self._backwards or any(extra.foremost for extra in rig.annotations.contacts):
                 self._push_end = PushWatch(rig.hand.frame, cell)
 
     def events(self, messages: Iterator[tuple[int, Received]]) -> Iterator[Event]:
@@ -87,17 +99,6 @@ class SecondPass:
             suspicious = cloud.check(total[topic]) if topic in total else None
             if suspicious:
                 self._cell.warnings.warn(suspicious)
-
-    def _pad(self, sensor: BubbleRig, first_pass: FirstPass) -> Pad:
-        """A pad; where the reference's sweep is chosen, no other free space follows from it."""
-        return Pad(
-            sensor,
-            self._rig.contact,
-            first_pass.cameras[sensor.name],
-            first_pass.references[sensor.name],
-            self._cell,
-            inside=not self._sweeps_backwards(),
-        )
 
     def _take(self, window: ProbeWindow, time: int, message: Received) -> None:
         """Hand a message to whoever reads its topic."""
@@ -130,13 +131,20 @@ class SecondPass:
             if (imprint := pad.strongest(self._report.counts(step, name))) is not None
         }
         push_end = self._push_end.next() if self._push_end else None
-        if push_end is not None and self._hand is not None and self._sweeps_backwards():
+        if push_end is not None and self._hand is not None and self._backwards:
             self._hand.backwards(push_end, self._report.counts(step, HAND))
         by_sensor = self._report.by_probe[step]
         felt = self._contacts.felt(step, imprints, by_sensor)
         added = self._contacts.annotated(step, push_end)
         scanned = self._scanned(step, contacts=True)
-        pushed = self._pushed(step)
+        pushed = Contacts.joined(
+            [
+                force.contacts(self._report.counts(step, name))
+                for name, force in self._forces.items()
+            ]
+        )
+        if step in self._rig.annotations.exclude:
+            pushed = Contacts.joined([])
         contacts = Contacts.joined([felt, added, Contacts.without_normals(scanned), pushed])
         surface = self._scanned(step, contacts=False)
         new = KnownPoints(
@@ -144,7 +152,10 @@ class SecondPass:
             known=np.concatenate([contacts.points, surface]),
         )
         if self._images:
-            yield from self._shown_images(step, imprints)
+            shown = [camera.image(step) for camera in self._cameras.values()]
+            yield from (image for image in shown if image is not None)
+            for name, imprint in imprints.items():
+                yield self._pads[name].image(step, imprint)
         yield from self._summary(step, new, contacts)
         yield Probe(
             step,
@@ -167,22 +178,6 @@ class SecondPass:
                 found.append(points)
         return np.concatenate(found)
 
-    def _pushed(self, step: int) -> Contacts:
-        """Contacts by the forces on the hand."""
-        found = [
-            force.contacts(self._report.counts(step, name)) for name, force in self._forces.items()
-        ]
-        return Contacts.joined([] if step in self._rig.annotations.exclude else found)
-
-    def _shown_images(self, step: int, imprints: dict[str, Imprint]) -> Iterator[SensorImage]:
-        """The images by which a person can follow what became known."""
-        for camera in self._cameras.values():
-            image = camera.image(step)
-            if image is not None:
-                yield image
-        for name, imprint in imprints.items():
-            yield self._pads[name].image(step, imprint)
-
     def _summary(self, step: int, new: KnownPoints, contacts: Contacts) -> Iterator[Logged]:
         """What a probe came to, in a line; and whether its points contradict one another."""
         by_sensor = self._report.by_probe[step].items()
@@ -203,13 +198,6 @@ class SecondPass:
             "a contact lies in a free voxel whose centre is behind it, in the object",
             int(inside.sum()),
         )
-
-    def _asks_for_push_end(self) -> bool:
-        asked = any(extra.foremost for extra in self._rig.annotations.contacts)
-        return self._rig.hand is not None and (asked or self._sweeps_backwards())
-
-    def _sweeps_backwards(self) -> bool:
-        return self._rig.hand is not None and self._rig.hand.sweep == "backwards"
 
 
 def _by_topic(rig: Rig) -> dict[str, list[str]]:

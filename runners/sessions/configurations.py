@@ -19,21 +19,17 @@ MESH_YAW = {"drill": -0.58, "mustard": -0.59, "cracker_box": 0.17, "spam_can": 0
 
 @dataclass(frozen=True)
 class Configuration:
-    """Where an object is let go, and the grid of its probes.
-
-    object: whose configuration it is. position: of the centre of mass, metres, in the world.
-    rotation: roll, pitch, yaw in radians about the world's axes x, y, z, in this order. y, z: the
-    gripper's positions in metres; all z for the first y, then for the next. workspace: the box in
-    which the object is sought.
-    """
+    """Where an object is let go, and the grid of its probes."""
 
     name: str
-    object: str
-    position: Triple
-    rotation: Triple
-    y: tuple[float, ...]
+    object: str  # whose configuration it is
+    y: tuple[
+        float, ...
+    ]  # the gripper's positions, metres: all z for the first y, then for the next
     z: tuple[float, ...]
-    workspace: Workspace = WORKSPACE
+    position: Triple = (0.25, 0.0, 0.2)  # of the centre of mass in the world, metres
+    rotation: Triple = (0.0, 0.0, 0.0)  # radians about the world's axes x, y, z, in this order
+    workspace: Workspace = WORKSPACE  # in which the object is sought
 
     @property
     def grid(self) -> list[tuple[float, float]]:
@@ -42,145 +38,95 @@ class Configuration:
 
 
 _DRILL_Y = (0.0, 0.2, 0.3, -0.2, -0.3)
+_DRILL_Z = (0.05, 0.15, 0.25, 0.4, 0.51)
+_FALLEN = (pi / 2.0, 0.0, 0.2)
 
 _ALL = (
     Configuration(
-        name="drill",
-        object="drill",
+        "drill",
+        "drill",
+        _DRILL_Y,
+        (0.05, 0.15, 0.25, 0.325, 0.4, 0.5),
         position=(0.27, 0.0, 0.2),
-        rotation=(0.0, 0.0, 0.0),
-        y=_DRILL_Y,
-        z=(0.05, 0.15, 0.25, 0.325, 0.4, 0.5),
     ),
+    Configuration("drill_opposite", "drill", _DRILL_Y, _DRILL_Z, (0.33, 0.0, 0.2), (0.0, 0.0, pi)),
     Configuration(
-        name="drill_opposite",
-        object="drill",
-        position=(0.33, 0.0, 0.2),
-        rotation=(0.0, 0.0, pi),
-        y=_DRILL_Y,
-        z=(0.05, 0.15, 0.25, 0.4, 0.51),
+        "drill_slanted", "drill", _DRILL_Y, _DRILL_Z, (0.35, 0.1, 0.2), (0.0, 0.0, 2.0 * pi / 3.0)
     ),
+    Configuration("drill_fallen", "drill", _DRILL_Y, (0.05, 0.18, 0.25, 0.4), rotation=_FALLEN),
+    Configuration("mustard", "mustard", (0.0, 0.18, 0.24, -0.25), (0.05, 0.2, 0.35, 0.52)),
     Configuration(
-        name="drill_slanted",
-        object="drill",
-        position=(0.35, 0.1, 0.2),
-        rotation=(0.0, 0.0, 2.0 * pi / 3.0),
-        y=_DRILL_Y,
-        z=(0.05, 0.15, 0.25, 0.4, 0.51),
-    ),
-    Configuration(
-        name="drill_fallen",
-        object="drill",
-        position=(0.25, 0.0, 0.2),
-        rotation=(pi / 2.0, 0.0, 0.2),
-        y=_DRILL_Y,
-        z=(0.05, 0.18, 0.25, 0.4),
-    ),
-    Configuration(
-        name="mustard",
-        object="mustard",
-        position=(0.25, 0.0, 0.2),
-        rotation=(0.0, 0.0, 0.0),
-        y=(0.0, 0.18, 0.24, -0.25),
-        z=(0.05, 0.2, 0.35, 0.52),
-    ),
-    Configuration(
-        name="mustard_sideways",
-        object="mustard",
+        "mustard_sideways",
+        "mustard",
+        (0.0, 0.2, -0.2),
+        (0.05, 0.2, 0.35, 0.52),
         position=(0.25, 0.03, 0.2),
         rotation=(0.0, 0.0, pi / 2.0),
-        y=(0.0, 0.2, -0.2),
-        z=(0.05, 0.2, 0.35, 0.52),
     ),
     Configuration(
-        name="mustard_fallen",
-        object="mustard",
-        position=(0.25, 0.0, 0.2),
-        rotation=(pi / 2.0, 0.0, 0.2),
-        y=(0.0, 0.3, -0.15, -0.36),
-        z=(0.05, 0.2, 0.35),
+        "mustard_fallen", "mustard", (0.0, 0.3, -0.15, -0.36), (0.05, 0.2, 0.35), rotation=_FALLEN
     ),
     Configuration(
-        name="mustard_fallen_sideways",
-        object="mustard",
-        position=(0.25, 0.0, 0.2),
+        "mustard_fallen_sideways",
+        "mustard",
+        (0.0, 0.2, 0.35, -0.2, -0.35),
+        (0.05, 0.12, 0.2),
         rotation=(pi / 2.0, pi / 2.0, 0.4),
-        y=(0.0, 0.2, 0.35, -0.2, -0.35),
-        z=(0.05, 0.12, 0.2),
     ),
     Configuration(
-        name="hammer",
-        object="hammer",
+        "hammer",
+        "hammer",
+        (0.0, -0.2, 0.2, 0.4),
+        (0.05, 0.15, 0.25, 0.4),
         position=(0.25, 0.1, 0.2),
-        rotation=(0.0, 0.0, 0.0),
-        y=(0.0, -0.2, 0.2, 0.4),
-        z=(0.05, 0.15, 0.25, 0.4),
         workspace=HAMMER_WORKSPACE,
     ),
     Configuration(
-        name="hammer_straight",
-        object="hammer",
+        "hammer_straight",
+        "hammer",
+        (0.0, 0.15, -0.15),
+        (0.05, 0.1, 0.2, 0.4),
         position=(0.52, 0.0, 0.3),
         rotation=(pi / 2.0, 1.2, 0.0),
-        y=(0.0, 0.15, -0.15),
-        z=(0.05, 0.1, 0.2, 0.4),
     ),
     Configuration(
-        name="hammer_fallen",
-        object="hammer",
+        "hammer_fallen",
+        "hammer",
+        (0.0, 0.15, 0.4, -0.15),
+        (0.05, 0.15, 0.25),
         position=(0.3, 0.05, 0.3),
         rotation=(-0.3, 0.4, 0.4),
-        y=(0.0, 0.15, 0.4, -0.15),
-        z=(0.05, 0.15, 0.25),
         workspace=HAMMER_WORKSPACE,
     ),
     Configuration(
-        name="box",
-        object="cracker_box",
-        position=(0.25, 0.0, 0.2),
+        "box",
+        "cracker_box",
+        (0.0, 0.18, -0.2),
+        (0.05, 0.15, 0.25, 0.37),
         rotation=(0.0, 0.0, pi / 2.0),
-        y=(0.0, 0.18, -0.2),
-        z=(0.05, 0.15, 0.25, 0.37),
     ),
     Configuration(
-        name="box_fallen",
-        object="cracker_box",
-        position=(0.25, 0.0, 0.2),
-        rotation=(pi / 2.0, 0.0, 0.2),
-        y=(0.0, 0.15, 0.25, -0.1),
-        z=(0.05, 0.15, 0.3),
+        "box_fallen", "cracker_box", (0.0, 0.15, 0.25, -0.1), (0.05, 0.15, 0.3), rotation=_FALLEN
+    ),
+    Configuration("can", "spam_can", (0.0, 0.2, -0.15), (0.05, 0.12, 0.2, 0.3)),
+    Configuration(
+        "can_fallen", "spam_can", (0.0, 0.15, 0.25, -0.1), (0.05, 0.12, 0.2), rotation=_FALLEN
     ),
     Configuration(
-        name="can",
-        object="spam_can",
-        position=(0.25, 0.0, 0.2),
-        rotation=(0.0, 0.0, 0.0),
-        y=(0.0, 0.2, -0.15),
-        z=(0.05, 0.12, 0.2, 0.3),
-    ),
-    Configuration(
-        name="can_fallen",
-        object="spam_can",
-        position=(0.25, 0.0, 0.2),
-        rotation=(pi / 2.0, 0.0, 0.2),
-        y=(0.0, 0.15, 0.25, -0.1),
-        z=(0.05, 0.12, 0.2),
-    ),
-    Configuration(
-        name="clamp",
-        object="clamp",
+        "clamp",
+        "clamp",
+        (0.0, 0.18, -0.2),
+        (0.05, 0.08, 0.15, 0.25),
         position=(0.3, 0.0, 0.2),
         rotation=(0.0, 0.0, pi),
-        y=(0.0, 0.18, -0.2),
-        z=(0.05, 0.08, 0.15, 0.25),
     ),
     Configuration(
-        name="clamp_sideways",
-        object="clamp",
+        "clamp_sideways",
+        "clamp",
+        (0.0, 0.22, -0.23),
+        (0.05, 0.18, 0.26, 0.32),
         position=(0.32, 0.0, 0.2),
         rotation=(pi / 2.0, 0.0, 2.0),
-        y=(0.0, 0.22, -0.23),
-        z=(0.05, 0.18, 0.26, 0.32),
     ),
 )
 

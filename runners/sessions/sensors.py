@@ -1,18 +1,25 @@
-"""A session whose known points come from what a robot's sensors wrote into a log."""
+"""Sessions whose known points come from a robot's log, or from one depth image."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from chsel.errors import SettingError, require_positive
+import numpy as np
+
+from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.points import KnownPoints
-from replay.events import Logged, RigDescribed
+from chsel.problem.points import KnownPoints, check_points
+from chsel.problem.settings import CheckedSettings, not_negative, positive
+from replay.events import Logged, Probe, RigDescribed
+from replay.files import file_digest
 from runners.objects.loader import ObjectModel
 from runners.sensors.cell import FreeMap, RobotCell
+from runners.sensors.depth_camera import recorded_image
 from runners.sensors.depth_frame import SUFFIXES as FRAME_SUFFIXES
+from runners.sensors.depth_frame import depth_frame_points, read_depth_frame
 from runners.sensors.first_pass import FirstPass
 from runners.sensors.hand import HandModel
 from runners.sensors.log.clocks import in_time_order
@@ -22,7 +29,6 @@ from runners.sensors.pose_file import beside, read_pose
 from runners.sensors.rig import Rig
 from runners.sensors.second_pass import SecondPass
 from runners.sensors.session_report import LogWarnings, Report
-from runners.sessions.depth_frame_session import DepthFrameSession
 from runners.sessions.free_space import box_shell
 from runners.sessions.session import Progress, Session, SessionEvent, unwatched
 
@@ -32,35 +38,27 @@ _MANY = 0.4  # of a camera's pixels at edges: rather a slanted surface, seen in 
 
 
 @dataclass(frozen=True)
-class SensorsSettings:
-    """path: of the log, an .mcap file or a rosbag2 folder, or of a depth image's YAML.
-
-    rig: what the log's topics are. pose: file of the true pose, by default that beside the log if
-    there is one; "none": unknown. free_resolution: side of a free voxel, metres.
-    object_resolution, object_padding: of the SDF grid, metres. start_contacts, start_probe: a
-    registration needs so many contacts and this probe index. images: record the images, too.
-    """
+class SensorsSettings(CheckedSettings):
+    """A log of sensors, and what its topics are."""
 
     rig: Rig
-    path: str | None = None
+    path: str | None = None  # an .mcap file, a rosbag2 folder, or the YAML of a depth image
     pose: str | None = None
-    free_resolution: float = 0.01
-    object_resolution: float = 0.005
-    object_padding: float = 0.05
-    start_contacts: int = 4
-    start_probe: int = 0
-    images: bool = True
+    """File of the true pose; None: that beside the log, if there is one; "none": unknown."""
+    free_resolution: Annotated[float, positive] = 0.01  # side of a free voxel, m
+    object_resolution: Annotated[float, positive] = 0.005  # of the object's SDF grid, m
+    object_padding: Annotated[float, positive] = 0.05  # of the object's SDF grid, m
+    start_contacts: Annotated[int, not_negative] = 4  # a registration needs so many contacts
+    start_probe: Annotated[int, not_negative] = 0  # and this index of the probe
+    images: bool = True  # record the images, too
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.path:
             raise SettingError(
                 "path is missing; pass session.path=LOG, an .mcap file, a rosbag2 folder, or the "
                 ".yaml of a depth image"
             )
-        for name in ("free_resolution", "object_resolution", "object_padding"):
-            require_positive(name, getattr(self, name))
-        for name in ("start_contacts", "start_probe"):
-            require_positive(name, getattr(self, name), zero=True)
 
 
 def open_sensors(
@@ -186,3 +184,74 @@ class SensorsSession:
             self._progress(f"{stage}, MB", done // _MEGABYTE, -(-total // _MEGABYTE))
 
         return show
+
+
+_MANY = 0.2  # of a label's pixels left out: rather a wrong label
+
+
+class DepthFrameSession:
+    """The known points of a depth image as a single probe; see `Session`."""
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        object_model: ObjectModel,
+        *,
+        free_resolution: float,
+        images: bool,
+    ) -> None:
+        self.report = Report()
+        self.free_resolution = free_resolution
+        self.initial_points = KnownPoints()
+        self.count = 1
+        self._rig, self._path, self._images = rig, path, images
+        self._frame = read_depth_frame(path)
+        diameter = object_model.diameter
+        self._points = depth_frame_points(
+            self._frame, rig, free_resolution=free_resolution, diameter=diameter
+        )
+        self.workspace = self._points.workspace
+        self.world_from_object = self._frame.world_from_object
+        check_points(self._points.points, diameter, free_resolution, self.workspace)
+
+    def probes(self) -> Iterator[SessionEvent]:
+        """The image, and what follows from it."""
+        found, (camera,) = self._points, self._rig.cameras
+        self.report.by_probe[0] = {camera.name: found.counts}
+        yield RigDescribed(-1, self._rig.name, file_digest(self._path))
+        if self._images:
+            depth = np.nan_to_num(self._frame.depth, posinf=0.0, neginf=0.0)
+            pose, pinhole = self._frame.world_from_camera, self._frame.camera
+            yield recorded_image(
+                0, camera.name, "depth", depth, depth > 0.0, found.rays, pinhole, pose
+            )
+        count = len(found.points.known)
+        text = f"{count} points on the object's surface, {len(found.points.free)} free voxels"
+        yield Logged(0, "info", text)
+        self.report.lines = list(self._remarks(camera.name))
+        yield from (Logged(0, level, text) for level, text in self.report.lines)
+        yield Probe(0, "points", found.points)
+
+    def _remarks(self, name: str) -> Iterator[tuple[str, str]]:
+        """Levels and texts on what was left out, and on what is suspicious."""
+        found, label = self._points, self._points.labelled
+        for sensor, counts in ((name, found.counts), ("label", label)):
+            if counts is not None and (left_out := counts.left_out()):
+                yield "info", f"{sensor}: {left_out}"
+        if label is not None and label.small + label.far > _MANY * label.pixels:
+            share = 100 * (label.small + label.far) // label.pixels
+            yield (
+                "warning",
+                f"{share} % of the label's pixels are left out, as they are not connected with the "
+                "largest region; check label, object_class and gate.jump",
+            )
+        lower, upper = self.workspace.bounds
+        known = found.points.known
+        outside = ((known < lower) | (known > upper)).any(axis=1).sum()
+        if outside:
+            text = f"{outside} of {len(known)} surface points are out of the workspace"
+            yield "warning", text
+
+    def close(self) -> None:
+        """Nothing is held open."""

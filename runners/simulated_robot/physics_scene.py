@@ -53,7 +53,7 @@ class PhysicsScene:
 
         Nothing nearer than camera.near is seen. Accurate to some micrometres.
         """
-        self._place_hand(_AWAY if world_from_wrist is None else world_from_wrist)
+        _place(self._world, self._hand, _AWAY if world_from_wrist is None else world_from_wrist)
         image = self._world.getCameraImage(
             camera.width,
             camera.height,
@@ -68,7 +68,7 @@ class PhysicsScene:
 
     def clearance(self, world_from_wrist: FloatArray) -> float:
         """Metres between the hand's rigid parts and anything, below 0 inside; NEAR at most."""
-        self._place_hand(world_from_wrist)
+        _place(self._world, self._hand, world_from_wrist)
         nearest = [
             record[_DISTANCE]
             for body in self._fixed
@@ -116,9 +116,6 @@ class PhysicsScene:
         self._world.changeDynamics(body, -1, collisionMargin=0.0)
         _place(self._world, body, pose)
         return body
-
-    def _place_hand(self, world_from_wrist: FloatArray) -> None:
-        _place(self._world, self._hand, world_from_wrist)
 
 
 _DEPTH = 3  # in the answer of getCameraImage

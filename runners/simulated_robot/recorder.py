@@ -9,7 +9,7 @@ import numpy as np
 
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey
-from runners.simulated_robot import cabinet, ros_messages, wrist
+from runners.simulated_robot import cabinet, log_writer, wrist
 from runners.simulated_robot.log_writer import LogWriter
 from runners.simulated_robot.noise import bubble_depth, stereo_depth
 from runners.simulated_robot.pads import Pads
@@ -69,9 +69,9 @@ class Recorder:
     def tick(self, position: FloatArray) -> None:
         """Send what is due with the wrist at position (3,), and let the clock go on."""
         pose, now = wrist.world_from_wrist(position), self.now
-        moved = ros_messages.transform(WORLD, WRIST, pose, now)
+        moved = log_writer.transform(WORLD, WRIST, pose, now)
         self._send("/tf", "tf2_msgs/TFMessage", {"transforms": [moved]}, now)
-        joints = ros_messages.joint_state(JOINTS, position.tolist(), now)
+        joints = log_writer.joint_state(JOINTS, position.tolist(), now)
         self._send("/joint_states", "sensor_msgs/JointState", joints, now)
         if self._due(self._settings.bubbles.rate):
             self._send_bubbles(pose)
@@ -91,10 +91,10 @@ class Recorder:
 
     def _send_static(self) -> None:
         now = self.now
-        fixed = [ros_messages.transform(WORLD, CAMERA, self._world_from_camera, now)]
+        fixed = [log_writer.transform(WORLD, CAMERA, self._world_from_camera, now)]
         for pad in wrist.PADS:
             pose = wrist.wrist_from_bubble_camera(pad)
-            fixed.append(ros_messages.transform(WRIST, bubble_frame(pad), pose, now))
+            fixed.append(log_writer.transform(WRIST, bubble_frame(pad), pose, now))
         self._send("/tf_static", "tf2_msgs/TFMessage", {"transforms": fixed}, now)
 
     def _send_bubbles(self, pose: FloatArray) -> None:
@@ -106,8 +106,8 @@ class Recorder:
                 continue
             topic, frame = f"/bubble_{pad}/depth", bubble_frame(pad)
             values = bubble_depth(depth, bubbles, noise)
-            sent = ros_messages.image(frame, values, self.now)
-            info = ros_messages.camera_info(frame, bubbles.pinhole, self.now)
+            sent = log_writer.image(frame, values, self.now)
+            info = log_writer.camera_info(frame, bubbles.pinhole, self.now)
             self._send(f"{topic}/image_raw", "sensor_msgs/Image", sent, self.now, _SLOW)
             self._send(f"{topic}/camera_info", "sensor_msgs/CameraInfo", info, self.now)
 
@@ -121,11 +121,11 @@ class Recorder:
             "camera", pose, lambda: self._scene.depth(pinhole, self._world_from_camera, pose)
         )
         values = stereo_depth(depth, pinhole, camera, noise)
-        topic, info = "/camera/depth", ros_messages.camera_info(CAMERA, pinhole, stamp)
+        topic, info = "/camera/depth", log_writer.camera_info(CAMERA, pinhole, stamp)
         if self._settings.compressed:
-            kind, sent = "CompressedImage", ros_messages.compressed_image(CAMERA, values, stamp)
+            kind, sent = "CompressedImage", log_writer.compressed_image(CAMERA, values, stamp)
         else:
-            kind, sent = "Image", ros_messages.image(CAMERA, values, stamp)
+            kind, sent = "Image", log_writer.image(CAMERA, values, stamp)
         self._send(f"{topic}/image_raw", f"sensor_msgs/{kind}", sent, self.now, _SLOW)
         self._send(f"{topic}/camera_info", "sensor_msgs/CameraInfo", info, self.now)
 

@@ -14,12 +14,13 @@ from chsel.errors import SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.streams import Purpose, StreamKey, normals
 from replay.files import whole_file
+from runners.sessions.configurations import Configuration
 from runners.simulated_robot import wrist
+from runners.simulated_robot.cabinet import REST, stood_on_shelf
 from runners.simulated_robot.log_writer import LogWriter
 from runners.simulated_robot.pads import Pads
 from runners.simulated_robot.physics_scene import PhysicsScene
 from runners.simulated_robot.recorder import TICK, Recorder
-from runners.simulated_robot.robot_configurations import REST, CabinetConfiguration, stood_on_shelf
 from runners.simulated_robot.settings import RobotSettings
 
 HOME = (0.48, 0.0, 0.433)  # m: where the wrist is before and after all probes
@@ -56,7 +57,7 @@ class SimulatedLog:
 
 def simulate_log(
     path: Path,
-    configuration: CabinetConfiguration,
+    configuration: Configuration,
     mesh: trimesh.Trimesh,
     seed: int,
     settings: RobotSettings,
@@ -87,7 +88,7 @@ def simulate_log(
     return SimulatedLog(world_from_object, tuple(pushes), robot.seconds, log.messages)
 
 
-def probe_count(configuration: CabinetConfiguration, settings: RobotSettings) -> int:
+def probe_count(configuration: Configuration, settings: RobotSettings) -> int:
     """How many probes there will be; SettingError for more than the configuration has."""
     most = len(configuration.grid)
     if settings.probes is not None and settings.probes > most:

@@ -25,7 +25,7 @@ from runners import align, plausible, probe
 from runners.evaluation.true_poses import sought_pose
 from runners.objects.loader import load_model
 from runners.sensors.pose_file import beside, read_pose
-from runners.simulated_robot.robot_configurations import CABINET_CONFIGURATIONS
+from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
 from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 from tests.runners.in_process import Done, run
 

@@ -14,12 +14,12 @@ from runners.command.choices import CONF
 from runners.objects.loader import load_model
 from runners.sensors.rig import Rig
 from runners.simulated_robot import wrist
-from runners.simulated_robot.recorder import WORLD, WRIST
-from runners.simulated_robot.robot_configurations import (
+from runners.simulated_robot.cabinet import (
     CABINET_CONFIGURATIONS,
     CABINET_WORKSPACE,
     stood_on_shelf,
 )
+from runners.simulated_robot.recorder import WORLD, WRIST
 from runners.simulated_robot.wrist import CAP, CAP_BASE
 from tests.runners.in_process import run
 

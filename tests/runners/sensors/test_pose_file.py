@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from chsel.errors import ChselError, RecordingError, SessionError
+from chsel.errors import RecordingError, SessionError
 from chsel.problem.poses import compose, rotation_vector
 from runners.sensors.pose_file import beside, read_pose, write_pose
 
@@ -58,7 +58,6 @@ def test_a_rotation_written_by_hand_is_made_exact(tmp_path: Path) -> None:
         ("x: 1", "accepted: YAML with world_from_object"),
         (ROWS.replace("0.5", ".nan"), "not finite"),
         (ROWS.replace("[[1,", "[[2,"), "world_from_object.* not a rigid"),
-        (ROWS.replace("[[1,", "[[-1,"), "world_from_object.* not a rigid"),
         ("world_from_object: [[[", "not YAML"),
     ],
 )
@@ -69,8 +68,5 @@ def test_another_file_is_one_line(tmp_path: Path, text: str, message: str) -> No
         read_pose(path)
     assert "\n" not in str(error.value)
     assert "accepted: YAML with world_from_object" in str(error.value)
-
-
-def test_a_missing_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ChselError, match=r"pose file .* cannot be read"):
+    with pytest.raises(SessionError, match=r"pose file .* cannot be read"):
         read_pose(tmp_path / "none.yaml")

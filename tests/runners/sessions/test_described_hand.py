@@ -91,12 +91,11 @@ def _open(kind: str, mesh: trimesh.Trimesh, settings: ProbingSettings) -> Probin
             {"urdf": "STICK"},
             "has 0.8 m, its largest extent; accepted: at most 0.5. Choose the link",
         ),
-        ({"urdf": "STICK", "root": "thumb"}, "hand.root 'thumb' is no link of"),
+        ({"urdf": "STICK", "root": "thumb"}, "hand.root 'thumb' is not one of"),
         ({"root": "stick"}, "hand.root without hand.urdf; accepted: both, or neither"),
         ({"boxes": [{"size": [0.01, 0.01, 0.1]}]}, "no interior point 0.01 m deep; accepted: a"),
         ({"boxes": [{"size": [0.4, 0.4, 0.4]}] * 2}, "m^2 of surface; accepted: at most 1"),
         ({"boxes": [{"size": [0.1, -0.1, 0.1]}]}, "size is -0.1"),
-        ({"joints": "x"}, "session.hand.joints does not exist"),
     ],
 )
 def test_a_hand_that_cannot_be_is_an_error(

@@ -144,13 +144,6 @@ def test_a_seed_fixes_every_bit_and_another_one_does_not() -> None:
     assert first[0].new_points.digest != other[0].new_points.digest
 
 
-def test_without_noise_the_hand_pushes_along_a_line() -> None:
-    _, _, probes = _run("box", replace(DEFAULT, noise=0.0))
-    pushed = probes[0].gripper_path[:, :3, 3]
-    forward = pushed[pushed[:, 0] > X_REST + 1e-3]
-    assert np.ptp(forward[:, 1:], axis=0).max() == 0.0
-
-
 def test_sweeping_mini_steps_frees_all_that_control_steps_do_and_more() -> None:
     fine = _run("can")[2]
     coarse = _run("can", replace(DEFAULT, sweep="control_steps"))[2]
@@ -186,12 +179,3 @@ def test_no_free_voxel_of_the_shell_is_in_an_object_that_reaches_out_of_its_work
     distance, _ = mesh_sdf(mesh, apply(inverse(session.world_from_object), every))
     assert (distance <= 0.0).any()
     np.testing.assert_array_equal(session.initial_points.free, every[distance > 0.0])
-
-
-def test_a_real_scan_can_be_probed(ycb_directory) -> None:  # type: ignore[no-untyped-def]
-    from chsel.problem.mesh import load_mesh
-
-    file = ycb_directory / "010_potted_meat_can" / "google_16k" / "nontextured.ply"
-    session = open_probing("kinematic", load_mesh(file, scale=2.5), "can", DEFAULT, 0)
-    contacts = [len(next(session.probes()).contacts)]
-    assert sum(contacts) >= 1

@@ -9,9 +9,9 @@ import trimesh
 
 from chsel.errors import PointsError, SettingError
 from chsel.problem.defaults import object_grid
+from chsel.problem.file_checks import read_npz
 from runners.objects.loader import ObjectModel
-from runners.sessions.point_files import read_points
-from runners.sessions.points import PointsSession, PointsSettings
+from runners.sessions.points import PointsSession, PointsSettings, read_points
 
 BOX = ObjectModel("box", trimesh.creation.box((0.03, 0.04, 0.12)), 1.0, 0.001, "box")
 SURFACE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0]])
@@ -112,6 +112,15 @@ def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path: Path, suffix
     np.testing.assert_allclose(found, SURFACE[np.lexsort(SURFACE.T)], atol=1e-7)
 
 
+def test_vertices_beside_the_faces_are_points_too(tmp_path: Path) -> None:
+    off = "OFF\n5 1 0\n0 0 0\n1 0 0\n0 1 0\n0 0 0\n{} 2 2\n3 0 1 2\n"
+    found = read_points(text(tmp_path, off.format("2"), "points.off")).at(0).known
+    expected = [[0, 0, 0], [0, 0, 0], [0, 1, 0], [1, 0, 0], [2, 2, 2]]
+    assert sorted(found.tolist()) == expected
+    with pytest.raises(PointsError, match=r"surface\[4\] is not finite"):
+        read_points(text(tmp_path, off.format("nan"), "points.off"))
+
+
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
@@ -124,6 +133,11 @@ def test_vertices_of_meshes_and_clouds_are_surface_points(tmp_path: Path, suffix
         ({"surface": SURFACE, "surface_step": np.zeros(3)}, "surface_step has type float64"),
         ({"surface": SURFACE, "world_from_object": 2 * np.eye(4)}, "not a rigid transform"),
         ({"surface": np.zeros((0, 3))}, "holds no points"),
+        ({"free": np.array([["1", "2", "3"]])}, "free has type <U1; accepted: numbers"),
+        (
+            {"free": SURFACE, "free_step": np.array([0, 2**32, 1])},
+            r"free_step\[1\] is 4294967296; accepted: 0 to 4294967295",
+        ),
         ({"surface": np.array([[object()] * 3])}, "not a readable .npz"),
     ],
 )
@@ -132,20 +146,30 @@ def test_malformed_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], mess
         read_points(npz(tmp_path, **arrays))
 
 
+def test_arrays_larger_than_the_limit_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "points.npz"
+    np.savez_compressed(path, free=np.zeros((100_000, 3)))
+    assert path.stat().st_size < 20_000
+    with pytest.raises(PointsError, match=r"have 2 MiB unpacked; accepted: at most 1 MiB"):
+        read_npz(path, most_bytes=2**20, error=PointsError)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ("x,y,z\n0,0,0\n", "line 1 is 'x,y,z'; accepted: the header x,y,z,kind"),
         ("x,y,z,kind,colour\n0,0,0,free,red\n", "line 1 is"),
-        ("x,y,z,kind,kind\n0,0,0,free,free\n", "names a column twice"),
+        ("x,y,z,kind,kind\n0,0,0,free,free\n", "each column once"),
         ("x,y,z,kind\n0,0,0,solid\n", "line 2: kind is 'solid'; accepted: surface, free"),
         ("x,y,z,kind\n0,0,0,free\n0,b,0,free\n", "line 3: y is 'b'"),
         ("x,y,z,kind\n0,0,inf,free\n", "line 2: z is 'inf'"),
-        ("x,y,z,kind\n0,0\n", "line 2 has another number of fields"),
+        ("x,y,z,kind\n0,0\n", "line 2: it has another number of fields"),
         ("x,y,z,kind,sdf\n0,0,0,known,\n", "line 2: a known point needs an sdf"),
-        ("x,y,z,kind,sdf\n0,0,0,free,0.1\n", "line 2: a free point has an sdf"),
+        ("x,y,z,kind,sdf\n0,0,0,free,0.1\n", "line 2: a free point has sdf 0.1; accepted: nothing"),
         ("x,y,z,kind,sdf\n0,0,0,surface,0.1\n", "line 2: a surface point has sdf 0.1"),
         ("x,y,z,kind,step\n0,0,0,free,1.5\n", "line 2: step is 1.5"),
+        ("x,y,z,kind,step\n0,0,0,free,4294967296\n", "step is .*; accepted: .* to 4294967295"),
+        ("x,y,z,kind,step\n0,0,0,free,-1\n", "step is -1; accepted"),
         ("x,y,z,kind\n", "holds no points"),
         ("", "line 1 is ''"),
     ],

@@ -18,8 +18,7 @@ from runners.sessions.free_space import swept_voxels
 from runners.sessions.probing import open_probing
 from runners.sessions.probing_hand import ROTATION
 from runners.sessions.probing_settings import ProbingSettings
-from runners.sessions.recorded import RecordedSession, RecordedSettings
-from runners.sessions.recorded_actions import RecordedActions
+from runners.sessions.recorded import RecordedActions, RecordedSession, RecordedSettings
 
 REPLAYS = Path(__file__).resolve().parents[2] / "replays"
 GRIDS = [

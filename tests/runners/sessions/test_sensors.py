@@ -8,26 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from chsel.errors import SessionError, SettingError
-from chsel.methods import build_method
-from chsel.problem.online_registration import OnlineRegistration, Start
 from chsel.problem.poses import apply, inverse
-from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
+from chsel.problem.sdf_grid import mesh_sdf
 from chsel.problem.settings import build_settings, settings_mapping
-from replay.events import Logged, Probe, RigDescribed, SensorImage, SessionEnded, SessionStarted
-from replay.mcap.reader import read_recording
-from replay.mcap.writer import McapRecorder
+from replay.events import Logged, Probe, RigDescribed, SensorImage
 from runners.command.choices import CONF
 from runners.objects.loader import ObjectConfig, load_object
-from runners.run.recording import RecordingConfig
-from runners.run.session_run import SessionRun
 from runners.sensors.pose_file import beside, write_pose
 from runners.sensors.rig import (
     Annotations,
@@ -493,33 +484,9 @@ def test_rigs_are_plain_settings_in_which_misspelled_keys_are_errors(log: Path) 
         build_settings(SensorsSettings, {"rig": settings_mapping(RIG)}, "session")
 
 
-@settings(max_examples=24, derandomize=True, deadline=None)
-@given(
-    part=st.floats(0.0, 1.0),
-    flips=st.lists(st.tuples(st.floats(0.0, 0.999), st.integers(0, 255)), max_size=20),
-)
-def test_damaged_logs_give_points_or_one_clear_error(
-    log: Path, part: float, flips: list[tuple[float, int]]
-) -> None:
-    data = bytearray(log.read_bytes())
-    for place, value in flips:
-        data[int(place * len(data))] = value
-    path = log.with_name("damaged.mcap")
-    path.write_bytes(data[: int(part * len(data))] if not flips else data)
-    try:
-        found = probes(open_log(path, images=False).probes())
-    except SessionError as error:
-        text, found = str(error), []
-    else:
-        text = ""
-    assert "\n" not in text
-    for probe in found:
-        assert len(probe.contacts) == 0 or np.abs(heights(probe.contacts)).max() < 0.0015
-
-
 def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    from runners.simulated_robot.robot_configurations import find_cabinet_configuration
+    from runners.simulated_robot.cabinet import CABINET_CONFIGURATIONS
     from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
     from runners.simulated_robot.simulation import simulate_log
 
@@ -528,7 +495,7 @@ def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
         probes=1, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=64)
     )
     log = tmp_path / "log.mcap"
-    made = simulate_log(log, find_cabinet_configuration("cabinet_mustard"), mesh, 0, small)
+    made = simulate_log(log, CABINET_CONFIGURATIONS["cabinet_mustard"], mesh, 0, small)
     rig = OmegaConf.to_container(OmegaConf.load(CONF / "session" / "rig" / "cabinet.yaml"))
     rig["cameras"][0]["edge_reach"] = 2  # of fewer pixels than usual
     session = SensorsSession(session_settings("sensors", {"path": str(log), "rig": rig}), 0)
@@ -544,56 +511,3 @@ def test_the_simulated_cell_is_read_like_any_other(tmp_path: Path) -> None:
     assert (free < 0.0).mean() < 0.01
     lost = [counts.lost for counts in session.report.total().values()]
     assert sum(lost) == 0
-
-
-def test_recordings_of_such_sessions_can_be_read_and_registered_again(
-    log: Path, tmp_path: Path
-) -> None:
-    sphere = trimesh.creation.icosphere(2, RADIUS)
-    sdf = SdfGrid.from_mesh(sphere, 0.005, padding=0.02)
-    session, path = open_log(log), tmp_path / "recording.mcap"
-    recorder = McapRecorder(path)
-    started = SessionStarted(
-        runner="probe",
-        object="sphere",
-        session="sensors",
-        method="icp",
-        seed=0,
-        config={},
-        mesh=sphere,
-        sdf=sdf,
-        workspace=session.workspace,
-        free_resolution=session.free_resolution,
-        initial_points=session.initial_points,
-    )
-    recorder.record(started)
-    method = build_method("icp", {})
-    online = OnlineRegistration(
-        sdf,
-        session.workspace,
-        session.free_resolution,
-        method.online,
-        points=session.initial_points,
-        start=Start(contacts=4),
-    )
-    run = SessionRun(
-        session,
-        online,
-        method,
-        recorder,
-        symmetry=None,
-        recording=RecordingConfig(),
-        show=lambda *_: None,
-    )
-    rows = [row for _, row in run.steps()]
-    recorder.record(SessionEnded(1, "finished"))
-    recorder.close()
-    assert [("best_cost" in row, row["contacts"]) for row in rows] == [(True, 50), (True, 50)]
-    with pytest.raises(SessionError, match=r"is a recording of a session, .* session=recorded"):
-        open_log(path)
-    recording = read_recording(path)
-    assert recording.rig is not None
-    assert (recording.rig.name, recording.rig.source) == ("sphere", session.source)
-    assert [probe.new_points.digest for probe in recording.probes] == [
-        probe.new_points.digest for probe in probes(session.probes())
-    ]

@@ -17,7 +17,7 @@ from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import SdfGrid, mesh_sdf
 from replay.events import Probe
 from runners.objects.loader import load_model
-from runners.sessions.gripper import START, X_REST, Touch
+from runners.sessions.gripper import X_REST
 from runners.sessions.probing import ProbingSession, open_probing
 from runners.sessions.probing_settings import ProbingSettings
 
@@ -124,22 +124,3 @@ def test_a_hand_that_would_start_in_the_object_comes_from_behind(session: Probin
     back = (centre - probe.gripper_path[0, :3, 3]) @ poses[0, :3, 2]
     assert back == pytest.approx(round(back / 0.05) * 0.05)
     assert back > 0.1
-
-
-def test_an_object_without_end_is_an_error() -> None:
-    class Solid:
-        world_from_object = np.eye(4)
-
-        def place(self, pose: np.ndarray) -> bool:
-            return False
-
-        def advance(self, target: np.ndarray) -> Touch:
-            return Touch(np.array(START))
-
-        def close(self) -> None:
-            pass
-
-    from runners.sessions.gripper import Gripper
-
-    with pytest.raises(SessionError, match="the object is at the start of a probe"):
-        Gripper(Solid(), ProbingSettings(), 0).probe_along(np.eye(4), 0.3)

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from chsel.sensing.depth_camera import PinholeCamera
-from runners.simulated_robot import ros_messages
+from runners.simulated_robot import log_writer
 from runners.simulated_robot.log_writer import LogWriter
 
 CAMERA = PinholeCamera(5, 3, 7.25, 7.25, 2.0, 1.0)
@@ -20,12 +20,12 @@ IMAGE = np.arange(15, dtype=np.uint16).reshape(3, 5)
 MESSAGES: dict[str, dict[str, Any]] = {
     "std_msgs/String": {"data": "begin 3"},
     "tf2_msgs/TFMessage": {
-        "transforms": [ros_messages.transform("world", child, POSE, STAMP) for child in ("a", "bc")]
+        "transforms": [log_writer.transform("world", child, POSE, STAMP) for child in ("a", "bc")]
     },
-    "sensor_msgs/Image": ros_messages.image("camera", IMAGE, STAMP),
-    "sensor_msgs/CompressedImage": ros_messages.compressed_image("camera", IMAGE, STAMP),
-    "sensor_msgs/CameraInfo": ros_messages.camera_info("camera", CAMERA, STAMP),
-    "sensor_msgs/JointState": ros_messages.joint_state(["x", "why"], [0.5, -1.5], STAMP),
+    "sensor_msgs/Image": log_writer.image("camera", IMAGE, STAMP),
+    "sensor_msgs/CompressedImage": log_writer.compressed_image("camera", IMAGE, STAMP),
+    "sensor_msgs/CameraInfo": log_writer.camera_info("camera", CAMERA, STAMP),
+    "sensor_msgs/JointState": log_writer.joint_state(["x", "why"], [0.5, -1.5], STAMP),
 }
 
 

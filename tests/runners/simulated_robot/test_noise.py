@@ -74,20 +74,6 @@ def test_the_shadow_of_the_second_eye_is_as_wide_as_geometry_says(
     assert lost[RIGHT + 8] < 0.1  # only on the left, as the second eye is on the right
 
 
-def test_the_same_stream_gives_the_same_image() -> None:
-    depth = np.linspace(0.3, 4.0, PINHOLE.width) * np.ones((PINHOLE.height, 1))
-    images = [stereo_depth(depth, PINHOLE, CAMERA, stream(index)) for index in (1, 1, 2)]
-    assert (images[0] == images[1]).all()
-    assert (images[0] != images[2]).mean() > 0.5
-
-
-def test_depths_out_of_range_are_not_measured() -> None:
-    depth = np.full((PINHOLE.height, PINHOLE.width), 0.1)
-    depth[:, 160:] = 5.9
-    measured = stereo_depth(depth, PINHOLE, CAMERA, stream())
-    assert not np.delete(measured, slice(145, 175), axis=1).any()  # there they may be in between
-
-
 def test_a_bubble_camera_is_noisy_by_what_it_says() -> None:
     bubbles = BubbleSettings()
     measured = bubble_depth(np.full((171, 224), 0.07), bubbles, stream())

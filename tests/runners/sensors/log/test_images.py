@@ -5,8 +5,8 @@ import struct
 import numpy as np
 import pytest
 
+from runners.sensors.log.decoding import packed_points
 from runners.sensors.log.images import compressed_pixels, pixel_rows, png_pixels
-from runners.sensors.log.message_fields import packed_points
 from runners.sensors.log.messages import UnusableMessage
 from tests.runners.sensors.small_logs import png
 

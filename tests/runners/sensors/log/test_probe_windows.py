@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from runners.sensors.log.clocks import SLACK, ClockCorrection, in_time_order
-from runners.sensors.log.joints import MOST_OF_A_PROBE, JointHistory
 from runners.sensors.log.messages import MarkerMessage, Received
 from runners.sensors.log.probe_windows import marked_windows
-from runners.sensors.session_report import MOST_KINDS, LogWarnings
+from runners.sensors.log.transforms import MOST_OF_A_PROBE, JointHistory
+from runners.sensors.session_report import LogWarnings
 
 
 def spans(*texts: str) -> tuple[list[tuple[int, int, int, int, int]], list[str]]:
@@ -62,22 +62,6 @@ def test_marks_that_do_not_fit_are_reported() -> None:
         "probe 1 has a begin and no end; the log's end ends it",
         "probes are marked 2, 1; as these do not rise, they are counted from 0 to 1",
     ]
-
-
-def test_no_marker_that_is_understood_is_no_window() -> None:
-    found, said = spans("begin 99999999999", "stop", "")
-    assert found == []
-    assert len(said) == 3
-
-
-def test_lines_are_few_and_short_whatever_a_log_holds() -> None:
-    warnings = LogWarnings()
-    for index in range(1000):
-        warnings.warn(f"{index} " + 1000 * "x")
-    lines = warnings.lines()
-    assert len(lines) == MOST_KINDS + 1
-    assert lines[-1][1] == "further kinds of trouble (900 times)"
-    assert max(len(text) for _, text in lines) == 400
 
 
 def test_messages_come_in_the_order_of_their_times_if_they_are_not_too_late() -> None:

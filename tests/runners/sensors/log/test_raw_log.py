@@ -5,7 +5,6 @@ import shutil
 import struct
 import tracemalloc
 from collections import Counter
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,11 @@ from mcap.writer import CompressionType
 
 from chsel.errors import SessionError
 from replay.files import file_digest
-from replay.mcap.log_file import Channel, RawMessage
-from runners.sensors.log.log_files import merged
 from runners.sensors.log.messages import MarkerMessage
 from runners.sensors.log.raw_log import RawLog
 from tests.runners.sensors.small_logs import BEGIN, ros2_image, ros2_sent, write_ros2
 
 MAGIC = 8  # bytes
-CHUNK = b"\x04\0\0\0zstd"  # in its head
 
 
 def texts(path: Path, *topics: str) -> list[str]:
@@ -61,25 +57,6 @@ def test_messages_come_in_order_of_log_time(tmp_path: Path) -> None:
     times = [one.log_time for one in RawLog(tmp_path / "log.mcap").messages(["/tf", "/probe"])]
     assert times == sorted(times)
     assert len(ordered) == len(sent)
-
-
-def test_times_that_do_not_fit_are_faults(tmp_path: Path) -> None:
-    late = ("/probe", "std_msgs/String", {"data": "end"}, 2**63)
-    write_ros2(tmp_path / "log.mcap", [*ros2_sent(1), late])
-    log = RawLog(tmp_path / "log.mcap")
-    assert len(list(log.messages(["/probe"]))) == 1
-    assert log.faults == {"/probe: a message at a time beyond the end of time": 1}
-
-
-def test_a_damaged_index_is_not_believed(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    data = write_ros2(path, ros2_sent(4))
-    topics, whole = RawLog(path).topics, texts(path)
-    place = data.rindex(b"/probe") + 1
-    path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-    log = RawLog(path)
-    assert (log.topics, texts(path)) == (topics, whole)
-    assert log.warnings == ["log.mcap: it is read without its index: it has none that can be used"]
 
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
@@ -132,34 +109,19 @@ def flip(data: bytearray) -> None:
     data[data.index(name, len(data) // 3) + (6 if name == b"begin 5" else 30)] ^= 1
 
 
-def claim_more(data: bytearray) -> None:
-    """A chunk claims a monstrous size."""
-    struct.pack_into("<Q", data, data.index(CHUNK) - 12, 2**62)
-
-
-@pytest.mark.parametrize(
-    ("damage", "compression", "fault"),
-    [
-        *((flip, compression, "") for compression in CompressionType),
-        (claim_more, CompressionType.ZSTD, "claims 4611686018427387904 bytes"),
-    ],
-)
+@pytest.mark.parametrize("compression", list(CompressionType))
 def test_damage_costs_the_messages_of_one_chunk_alone(
-    tmp_path: Path,
-    damage: Callable[[bytearray], None],
-    compression: CompressionType,
-    fault: str,
+    tmp_path: Path, compression: CompressionType
 ) -> None:
     path = tmp_path / "log.mcap"
     data = bytearray(write_ros2(path, ros2_sent(8), chunk_size=1500, compression=compression))
     whole = Counter(texts(path))
-    damage(data)
+    flip(data)
     path.write_bytes(data)
     log = RawLog(path)
     left = Counter(repr(one) for one in log.messages(log.topics))
     assert left < whole
     assert left.total() > 0.5 * whole.total()
-    assert any(fault in text for text in log.faults)
     total = log.faults.total()
     assert list(log.messages(log.topics))
     assert log.faults.total() == total  # reading again does not count it again
@@ -220,30 +182,12 @@ def test_files_of_a_bag_that_hold_a_topic_each_are_read_in_order_of_time(
     log = RawLog(bag)
     both = [
         [(one.log_time, one.topic, repr(one.content)) for one in of.messages(of.topics, progress=p)]
-        for of, p in ((log, lambda *done: told.append(done)), (RawLog(whole), None))
+        for of, p in ((log, lambda *done: told.append(done)), (RawLog(whole), lambda *done: None))
     ]
     assert len(both[0]) > 80
     assert both[0] == both[1]
     assert told[-1] == (log.size, log.size)
     assert all(done <= log.size for done, _ in told)
-
-
-def test_of_successive_files_one_is_open_at_a_time() -> None:
-    opened: list[int] = []
-
-    def read(number: int) -> Iterator[RawMessage]:
-        opened.append(number)
-        for time in range(*spans[number]):
-            yield RawMessage(Channel(str(number), "", ""), time, b"")
-
-    spans = [(10, 20), (0, 8), (20, 30), (25, 40)]
-    times, at_once = [], []
-    for message in merged(spans, read):
-        times.append(message.log_time)
-        at_once.append(len(opened))
-    assert times == sorted([*range(8), *range(10, 30), *range(25, 40)])
-    assert opened == [1, 0, 2, 3]
-    assert [at_once[times.index(time)] for time in (7, 19, 24, 26)] == [1, 2, 3, 4]
 
 
 def test_a_missing_file_of_a_bag_is_said(tmp_path: Path) -> None:

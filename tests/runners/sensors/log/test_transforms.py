@@ -8,8 +8,8 @@ import pytest
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.poses import axis_angle, compose, inverse, random_rotations, rotation_angle
 from runners.sensors.log.clocks import ClockCorrection
-from runners.sensors.log.message_fields import rigid
-from runners.sensors.log.messages import Received, TransformMessage, UnusableMessage
+from runners.sensors.log.decoding import rigid
+from runners.sensors.log.messages import Received, TransformMessage
 from runners.sensors.log.transforms import TransformError, TransformTree, unit_quaternion
 
 SECOND = 10**9
@@ -160,20 +160,3 @@ def test_interpolation_turns_at_a_constant_rate() -> None:
         np.testing.assert_allclose(
             rotation_angle(first.T @ found[:3, :3]), fraction * whole, atol=1e-12
         )
-
-
-@pytest.mark.parametrize(
-    ("position", "quaternion"),
-    [
-        ((0, 0, 0), (0, 0, 0, 0)),
-        ((0, 0, 0), (0, np.nan, 0, 1)),
-        ((0, 0, 0), (0, np.inf, 0, 1)),
-        ((0, np.nan, 0), (0, 0, 0, 1)),
-        ((-np.inf, 0, 0), (0, 0, 0, 1)),
-    ],
-)
-def test_poses_that_are_none_are_refused(
-    position: tuple[float, ...], quaternion: tuple[float, ...]
-) -> None:
-    with pytest.raises(UnusableMessage):
-        rigid(xyz(*position), xyz(*quaternion))
