@@ -15,9 +15,9 @@ from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
 from replay.console import Console, Progress
 from runners.command.program import command, plain
+from runners.evaluation.contenders import require_repeats
 from runners.evaluation.plan import Trial
-from runners.evaluation.repeats import require_repeats
-from runners.evaluation.selection import chosen_seeds
+from runners.evaluation.trial_configurations import chosen_seeds
 from runners.evaluation.trial_session import read_told
 from runners.published_package.environment import PackageConfig, interpreter
 from runners.published_package.package_session import PackageSession

@@ -33,7 +33,7 @@ from replay.events import Probe
 from replay.files import whole_file
 from runners.command.program import command, plain
 from runners.evaluation.contenders import chosen_contenders
-from runners.evaluation.selection import chosen_names, chosen_seeds
+from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import Table, number, print_table

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from chsel.cost.cost_settings import CostSettings
 from chsel.cost.torch_cost import RelaxedCost
-from chsel.errors import ChselError, require_positive
+from chsel.errors import ChselError
 from chsel.methods import build_method, preset_settings
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray
@@ -23,7 +23,7 @@ from chsel.problem.registration_problem import (
 )
 from chsel.problem.settings import in_preset
 from runners.benchmarks.problems import PROBLEMS, drill, pose
-from runners.benchmarks.timing import Row, in_turn
+from runners.benchmarks.timing import Row, Steps, in_turn
 from runners.published_package.process import PublishedPackage
 
 WHAT = (
@@ -44,20 +44,6 @@ OURS = (*PRESETS, *SIZES)
 
 class BenchmarkError(ChselError):
     """Both sides would not do the same work."""
-
-
-@dataclass(frozen=True)
-class Steps:
-    """How much EQUAL_STEPS and the package do, neither of which stops early."""
-
-    restarts: int = 10  # of descent
-    adam: int = 50  # Adam steps of a restart
-    search: int = 100  # CMA-MEGA iterations
-    long_search: int = 500  # the same, in the longer row
-
-    def __post_init__(self) -> None:
-        for name in ("restarts", "adam", "search", "long_search"):
-            require_positive(name, getattr(self, name))
 
 
 def method(name: str, steps: Steps, search: int) -> Method:

@@ -17,7 +17,7 @@ from chsel.errors import RecordingError, SettingError
 from chsel.problem.settings import settings_mapping
 from replay.environment import environment
 from replay.files import WritingError, whole_file
-from runners.evaluation.definition import definition_label
+from runners.evaluation.metrics import definition_label
 from runners.evaluation.plan import Plan
 from runners.evaluation.table import ITERATIONS, PROBES, RESULTS, write_table
 from runners.evaluation.trial_configurations import SENSORS
@@ -124,9 +124,9 @@ def read_experiment(folder: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise RecordingError(f"{path} cannot be read ({error})") from None
-    if not isinstance(values, Mapping):
-        raise RecordingError(f"{path} is not the description of an evaluation")
+        raise RecordingError(
+            f"{path} cannot be read ({error}); accepted: a folder that runners.evaluate has written"
+        ) from None
     return dict(values)
 
 
@@ -193,7 +193,7 @@ def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]
         for kind in ("methods", "policies"):
             shared = {label: one for label, one in values[kind].items() if label in others[kind]}
             found |= {f"{kind}.{label}": one for label, one in shared.items()}
-        return dict(_flat(found))
+        return dict(flattened(found))
 
     before, now = fixed(theirs, ours), fixed(ours, theirs)
     differing = [
@@ -209,11 +209,11 @@ def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]
         )
 
 
-def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def flattened(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Nested values by their paths."""
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{path}{name}.")
+            yield from flattened(value, f"{path}{name}.")
         else:
             yield f"{path}{name}", value
 

@@ -23,12 +23,9 @@ class PackageError(ChselError):
 class PackageConfig:
     """Where the published package is."""
 
-    skip: bool = False  # measure this library alone
     python: str | None = None  # an interpreter that has the package
     directory: str = "~/.cache/chsel/published"  # else, where its environment is, or is made
-    pip: tuple[str, ...] = ()  # more arguments for pip
-    equation: tuple[str, ...] = ()
-    """The problems to register with the paper's own free term, too: half a minute each time."""
+    pip: tuple[str, ...] = ()  # more arguments for pip, such as "--index-url=URL"
 
 
 def interpreter(config: PackageConfig, say: Callable[[str], None]) -> Path:

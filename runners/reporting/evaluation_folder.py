@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,10 +14,10 @@ import pyarrow as pa
 
 from chsel.errors import ChselError
 from runners.evaluation import table
-from runners.evaluation.definition import definition_label, definition_text
-from runners.evaluation.repeats import repeat_of
+from runners.evaluation.contenders import repeat_of
+from runners.evaluation.experiment import read_experiment
+from runners.evaluation.metrics import definition_label, definition_text
 
-EXPERIMENT = "experiment.json"
 _ACCEPTED = "accepted: a folder that runners.evaluate has written"
 TRIAL = ["configuration", "seed"]
 """The columns that tell trials apart."""
@@ -111,11 +110,7 @@ def open_evaluation(folder: Path) -> Evaluation:
     Raises ReportError unless it is one of an evaluation, and if its PD are by several definitions
     of plausible sets, as medians over these mean nothing.
     """
-    path = folder / EXPERIMENT
-    try:
-        experiment = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise ReportError(f"{path} cannot be read ({error}); {_ACCEPTED}") from None
+    experiment = read_experiment(folder)
     rows, of_results = _table(folder, "results", table.RESULTS)
     iterations, _ = _table(folder, "iterations", table.ITERATIONS)
     probes, of_probes = _table(folder, "probes", table.PROBES)

@@ -11,6 +11,7 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
+from runners.evaluation.experiment import flattened
 from runners.reporting.evaluation_folder import Evaluation, trials_of
 from runners.reporting.figures import Picture
 from runners.reporting.tables import Table, table_of
@@ -114,14 +115,5 @@ def _made(experiment: Mapping[str, Any]) -> Iterator[Table]:
     others = {f"other {n}": v for n, v in enumerate(experiment.get("other_environments") or ())}
     versions = {**experiment.get("environment", {}), **others}
     for title, values in (("Settings", settings), ("Versions", versions)):
-        lines = ({"name": name, "value": str(value)} for name, value in _flat(values))
+        lines = ({"name": name, "value": str(value)} for name, value in flattened(values))
         yield table_of(title, lines, labels=2)
-
-
-def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested settings by their paths."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{path}{name}.")
-        else:
-            yield f"{path}{name}", value

@@ -35,7 +35,6 @@ SCANCEL = """#!/usr/bin/env bash
 kill -- "-$1"
 """
 SLURM = SlurmConfig(
-    kind="slurm",
     jobs=2,
     processes=8,
     memory="16GB",
@@ -46,8 +45,6 @@ SLURM = SlurmConfig(
     directives=("--constraint=avx2",),
     prologue=("module load python",),
     python="/opt/python",
-    log_directory=None,
-    dashboard=False,
 )
 
 
@@ -143,7 +140,7 @@ def test_a_scheduler_that_is_not_there_is_one_line_at_once(
 ) -> None:
     """Without a client of Dask, which waits for a minute when it is given up."""
     monkeypatch.setattr("distributed.Client", lambda *_, **__: pytest.fail("it has a client"))
-    config = LocalConfig("local", address, False)
+    config = LocalConfig(scheduler=address)
     with (
         pytest.raises(SettingError, match=r"cluster\.scheduler is .*; accepted: the address of"),
         connected(config, None, print),
@@ -157,7 +154,7 @@ def test_a_scheduler_that_is_not_there_is_one_line_at_once(
 def test_the_address_of_the_dashboard_is_printed(
     dashboard: bool, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with connected(LocalConfig("local", None, dashboard), 1, print) as (client, size):
+    with connected(LocalConfig(dashboard=dashboard), 1, print) as (client, size):
         assert len(client.nthreads()) == size == 1
         check_needs_keys(client.cluster.scheduler_address)
         check_needs_keys(*client.nthreads())

@@ -18,7 +18,7 @@ from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
 from runners import report
-from runners.evaluation.definition import definition_label, definition_text
+from runners.evaluation.metrics import definition_label, definition_text
 from runners.evaluation.table import ITERATIONS, RESULTS, write_part, write_table
 from runners.reporting.evaluation_folder import ReportError, open_evaluation
 from tests.chsel.plausible.scenes import WORKSPACE, ball

@@ -33,17 +33,20 @@ from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.events import Measured
 from replay.files import WritingError, whole_file
 from replay.mcap.reader import read_recording
-from runners.evaluation import step_recorder, tasks
+from runners.evaluation import tasks, trial_session
 from runners.evaluation.cluster import LocalConfig, _checked_size, connected
 from runners.evaluation.contenders import Contender, chosen_contenders
 from runners.evaluation.experiment import collect, join_experiment, writing_alone
 from runners.evaluation.external_results import read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
-from runners.evaluation.result_rows import ResultRows
-from runners.evaluation.selection import chosen_configurations, chosen_seeds
+from runners.evaluation.run_method import ResultRows
 from runners.evaluation.tasks import do_tasks, is_finished, tasks_of
-from runners.evaluation.trial_configurations import configurations_of
+from runners.evaluation.trial_configurations import (
+    chosen_configurations,
+    chosen_seeds,
+    configurations_of,
+)
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.sessions.probing_settings import ProbingSettings
 from tests.runners.in_process import do_task
@@ -152,7 +155,7 @@ Cluster = tuple[Client, int]
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A cluster of one worker."""
-    with connected(LocalConfig("local", None, False), 1, print) as cluster:
+    with connected(LocalConfig(), 1, print) as cluster:
         yield cluster
 
 
@@ -284,7 +287,7 @@ def test_what_cannot_be_recorded_is_a_failure_of_its_task_and_leaves_no_file(
         raise RecordingError("not finite")
 
     plan = make_plan()
-    monkeypatch.setattr(step_recorder.McapRecorder, "record", refused)
+    monkeypatch.setattr(trial_session.McapRecorder, "record", refused)
     assert do_task(plan, Task(TRIAL, "icp")) == "not finite"
     assert not list(TRIAL.folder(plan).glob("*icp*"))
 

@@ -17,7 +17,7 @@ from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
-from runners.evaluation.repeats import repeat_seed
+from runners.evaluation.contenders import repeat_seed
 from runners.published_package.environment import PackageError
 from runners.published_package.process import RefusedError
 from runners.published_package.worker import Worker

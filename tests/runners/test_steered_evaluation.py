@@ -18,9 +18,9 @@ from chsel.problem.poses import Poses, apply, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe
+from runners.evaluation.contenders import chosen_policies
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
-from runners.evaluation.policy_contenders import chosen_policies
 from runners.evaluation.run_policy import spread_of, usual_stop
 from tests.runners.in_process import do_task, run
 from tests.runners.made_up_evaluations import tables_of
