@@ -7,18 +7,18 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from chsel.errors import SettingError, require_choice, require_positive
+from chsel.errors import SettingError
 from chsel.methods import METHODS
 from chsel.numerics.threads import require_threads
 from chsel.plausible.pose_scan import TruePoseSettings
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import CheckedSettings, build_settings, one_of, positive
 from replay.console import Console, Progress
 from runners.command.program import command, plain
 from runners.evaluation.cluster import ClusterConfig, cluster_config, connected
@@ -46,7 +46,7 @@ from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.figures import method_styles, policy_styles
 from runners.reporting.method_sections import tables_by_faults, true_pose_table
 from runners.reporting.policy_sections import error_table, needed_table
-from runners.reporting.steered_sessions import steered_sessions
+from runners.reporting.statistics import steered_sessions
 from runners.reporting.tables import Table, number, print_table, table_of
 from runners.run.scene import PresetName
 from runners.sessions.faults import CLEAN, LEVELS
@@ -57,18 +57,14 @@ _OF_TRIAL = ("configuration", "logs")
 
 
 @dataclass(frozen=True)
-class IterationsConfig:
+class IterationsConfig(CheckedSettings):
     """What is measured of searches."""
 
-    every: int | None  # iterations between measures; None: none but of the result
-
-    def __post_init__(self) -> None:
-        if self.every is not None:
-            require_positive("every", self.every)
+    every: Annotated[int | None, positive]  # iterations between measures; None: none
 
 
 @dataclass(frozen=True)
-class EvaluateConfig:
+class EvaluateConfig(CheckedSettings):
     """conf/evaluate.yaml, which has all defaults, checked.
 
     What is Any is checked by whoever it concerns.
@@ -88,23 +84,20 @@ class EvaluateConfig:
     iterations: IterationsConfig
     assets: AssetsConfig
     truth: TruePoseSettings
-    objects: str
+    objects: Annotated[str, one_of(*OBJECTS)]
     steps: str | None
-    starts: str
+    starts: Annotated[str, one_of(OWN, *METHODS)]
     draws: int
     faults: Any
     plausible: bool
     recordings: bool
     policies: Any
     policy: Any
-    workers: int | None
+    workers: Annotated[int | None, require_threads]
     cluster: Any
 
     def __post_init__(self) -> None:
-        if self.workers is not None:
-            require_threads("workers", self.workers)
-        require_choice("objects", self.objects, OBJECTS)
-        require_choice("starts", self.starts, (OWN, *METHODS))
+        super().__post_init__()
         if not self.name or not self.out:
             raise SettingError("name or out is empty; accepted: a name, a folder")
 

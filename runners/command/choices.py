@@ -23,7 +23,7 @@ from runners.evaluation.cluster import CLUSTERS
 from runners.evaluation.metrics import MetricsConfig
 from runners.objects.loader import OBJECTS
 from runners.objects.scans import URL
-from runners.published_package.environment import PackageConfig
+from runners.published_package.process import PackageConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
 from runners.sessions import SESSIONS

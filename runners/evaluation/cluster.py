@@ -10,11 +10,11 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from chsel.errors import SettingError, require_choice, require_positive
+from chsel.errors import SettingError, require_choice
 from chsel.numerics.threads import require_threads
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import CheckedSettings, build_settings, positive
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -40,12 +40,12 @@ class LocalConfig:
 
 
 @dataclass(frozen=True)
-class SlurmConfig:
+class SlurmConfig(CheckedSettings):
     """Workers in jobs of SLURM, each of one core; None leaves a setting to SLURM."""
 
     kind: str = "slurm"
-    jobs: int = 1
-    processes: int = 1  # workers of a job, one core each
+    jobs: Annotated[int, positive] = 1
+    processes: Annotated[int, require_threads] = 1  # workers of a job, one core each
     memory: str = "4GB"  # of a job
     walltime: str = "12:00:00"  # of a job
     queue: str | None = None  # the partition
@@ -56,10 +56,6 @@ class SlurmConfig:
     python: str | None = None  # on the nodes; None: this one
     log_directory: str | None = None  # of the jobs' output; None: where the command runs
     dashboard: bool = False
-
-    def __post_init__(self) -> None:
-        require_positive("jobs", self.jobs)
-        require_threads("processes", self.processes)
 
 
 ClusterConfig = LocalConfig | SlurmConfig

@@ -19,7 +19,7 @@ from replay.environment import environment
 from replay.files import WritingError, whole_file
 from runners.evaluation.metrics import definition_label
 from runners.evaluation.plan import Plan
-from runners.evaluation.table import ITERATIONS, PROBES, RESULTS, write_table
+from runners.evaluation.table import TABLES, joined_parts, write_table
 from runners.evaluation.trial_configurations import SENSORS
 
 FILE = "experiment.json"
@@ -77,17 +77,18 @@ def collect(folder: Path) -> pa.Table:
     whoever made it and when.
     """
     experiment = read_experiment(folder)
-    definition = definition_label(experiment["definition"])
-
-    def written(name: str, schema: pa.Schema, *suffixes: str) -> pa.Table:
-        parts = list(_parts(folder, experiment, *suffixes))
-        return write_table(folder, name, parts, schema, definition)
-
     if experiment["policies"]:
-        return written("probes", PROBES, ".parquet", ".failed.parquet")
+        return write_table(folder, "probes", gathered(folder, experiment, "probes"))
     if experiment["iterations"]["every"] is not None:
-        written("iterations", ITERATIONS, ".iterations.parquet")
-    return written("results", RESULTS, ".parquet", ".failed.parquet")
+        write_table(folder, "iterations", gathered(folder, experiment, "iterations"))
+    return write_table(folder, "results", gathered(folder, experiment, "results"))
+
+
+def gathered(folder: Path, experiment: Mapping[str, Any], name: str) -> pa.Table:
+    """One of TABLES, of the parts that are finished."""
+    suffixes = (".iterations.parquet",) if name == "iterations" else (".parquet", ".failed.parquet")
+    parts = list(_parts(folder, experiment, *suffixes))
+    return joined_parts(parts, TABLES[name], definition_label(experiment["definition"]))
 
 
 def join_experiment(

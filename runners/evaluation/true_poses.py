@@ -93,8 +93,8 @@ def true_poses(folder: Path, experiment: Mapping[str, Any]) -> list[dict[str, An
     simulation knows it, else None.
     """
     found = []
-    for configuration in experiment.get("configurations") or ():
-        for seed in experiment.get("seeds") or ():
+    for configuration in experiment["configurations"]:
+        for seed in experiment["seeds"]:
             path = folder / "trials" / str(configuration) / f"seed_{seed}" / "session.json"
             with suppress(OSError, ValueError, KeyError, TypeError):  # not there, or half there
                 numbers = json.loads(path.read_text())["truth"]
