@@ -19,14 +19,19 @@ from replay.console import Console
 from replay.environment import environment
 from runners.benchmarks import benchmark_report
 from runners.benchmarks.measures import MEASURES, Scope
-from runners.benchmarks.problems import PROBLEMS
-from runners.benchmarks.registrations import Steps, compare
-from runners.benchmarks.timing import Row, cores, load
+from runners.benchmarks.registrations import PROBLEMS, compare
+from runners.benchmarks.timing import Row, Steps, cores, load
 from runners.command.program import command, plain
-from runners.published_package.environment import PackageConfig, interpreter
-from runners.published_package.process import PublishedPackage
-from runners.reporting.figures import FORMATS, drawing, write_picture
-from runners.run.recording import IN_RUN_FOLDER, make_run_folder, write_in_run_folder
+from runners.published_package.process import PackageConfig, PublishedPackage, interpreter
+from runners.run.recording import make_run_folder, write_in_run_folder
+
+
+@dataclass(frozen=True)
+class ComparedPackage(PackageConfig):
+    """The published package, and which problems it registers by another cost, too."""
+
+    skip: bool = False  # measure this library alone
+    equation: tuple[str, ...] = ()  # by the paper's own free term: half a minute each time
 
 
 @dataclass(frozen=True)
@@ -35,10 +40,9 @@ class BenchmarkConfig:
 
     problems: tuple[str, ...]  # which to register
     alone: tuple[str, ...]  # what else to measure of this library
-    package: PackageConfig
+    package: ComparedPackage
     steps: Steps
     logs: str
-    format: str  # of the picture
     repeats: int
     seed: int
     quick: bool
@@ -50,7 +54,6 @@ class BenchmarkConfig:
             require_choice("problem", problem, PROBLEMS)
         for measure in self.alone:
             require_choice("alone", measure, MEASURES)
-        require_choice("format", self.format, FORMATS)
 
     def shortened(self) -> BenchmarkConfig:
         """As much as takes under a minute; its times are not to be quoted."""
@@ -95,9 +98,6 @@ def main(config: DictConfig) -> None:
                     benchmark_report.write(folder, rows, about)
     for line in benchmark_report.page(rows, about):
         console.print(line)
-    with drawing():
-        if (picture := benchmark_report.picture_of_benchmark(rows)) is not None:
-            write_picture(picture, folder, checked.format, accepted=IN_RUN_FOLDER)
     for path in sorted(folder.iterdir()):
         console.print(f"written: {path}")
 

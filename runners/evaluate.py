@@ -6,47 +6,47 @@ import importlib.util
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import degrees
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from chsel.errors import SettingError, require_choice, require_positive
+from chsel.errors import SettingError
 from chsel.methods import METHODS
 from chsel.numerics.threads import require_threads
 from chsel.plausible.pose_scan import TruePoseSettings
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import CheckedSettings, build_settings, one_of, positive
 from replay.console import Console, Progress
 from runners.command.program import command, plain
 from runners.evaluation.cluster import ClusterConfig, cluster_config, connected
-from runners.evaluation.contenders import chosen_contenders, drawn, require_label
-from runners.evaluation.definition import definition_text
+from runners.evaluation.contenders import chosen_contenders, chosen_policies, drawn, require_label
 from runners.evaluation.experiment import (
     add_environments,
     collect,
     join_experiment,
-    read_experiment,
     writing_alone,
 )
 from runners.evaluation.external_results import external_folders, read_external
-from runners.evaluation.metrics import MetricsConfig
+from runners.evaluation.metrics import MetricsConfig, definition_text
 from runners.evaluation.plan import OBJECTS, OWN, Plan, Trial
-from runners.evaluation.policy_contenders import chosen_policies
-from runners.evaluation.selection import chosen_configurations, chosen_names, chosen_seeds
-from runners.evaluation.sensor_logs import check_log, is_missing
 from runners.evaluation.tasks import do_tasks, is_finished, tasks_of
-from runners.evaluation.trial_configurations import SENSORS, faulty_name
-from runners.evaluation.true_poses import true_poses
+from runners.evaluation.trial_configurations import (
+    SENSORS,
+    chosen_configurations,
+    chosen_names,
+    chosen_seeds,
+    faulty_name,
+)
+from runners.evaluation.true_poses import check_log, is_missing
 from runners.objects.scans import AssetsConfig, scan_file
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.figures import method_styles, policy_styles
-from runners.reporting.method_sections import tables_by_faults
+from runners.reporting.method_sections import tables_by_faults, true_pose_table
 from runners.reporting.policy_sections import error_table, needed_table
-from runners.reporting.steered_sessions import steered_sessions
+from runners.reporting.statistics import steered_sessions
 from runners.reporting.tables import Table, number, print_table, table_of
 from runners.run.scene import PresetName
 from runners.sessions.faults import CLEAN, LEVELS
@@ -57,18 +57,14 @@ _OF_TRIAL = ("configuration", "logs")
 
 
 @dataclass(frozen=True)
-class IterationsConfig:
+class IterationsConfig(CheckedSettings):
     """What is measured of searches."""
 
-    every: int | None  # iterations between measures; None: none but of the result
-
-    def __post_init__(self) -> None:
-        if self.every is not None:
-            require_positive("every", self.every)
+    every: Annotated[int | None, positive]  # iterations between measures; None: none
 
 
 @dataclass(frozen=True)
-class EvaluateConfig:
+class EvaluateConfig(CheckedSettings):
     """conf/evaluate.yaml, which has all defaults, checked.
 
     What is Any is checked by whoever it concerns.
@@ -88,23 +84,20 @@ class EvaluateConfig:
     iterations: IterationsConfig
     assets: AssetsConfig
     truth: TruePoseSettings
-    objects: str
+    objects: Annotated[str, one_of(*OBJECTS)]
     steps: str | None
-    starts: str
+    starts: Annotated[str, one_of(OWN, *METHODS)]
     draws: int
     faults: Any
     plausible: bool
     recordings: bool
     policies: Any
     policy: Any
-    workers: int | None
+    workers: Annotated[int | None, require_threads]
     cluster: Any
 
     def __post_init__(self) -> None:
-        if self.workers is not None:
-            require_threads("workers", self.workers)
-        require_choice("objects", self.objects, OBJECTS)
-        require_choice("starts", self.starts, (OWN, *METHODS))
+        super().__post_init__()
         if not self.name or not self.out:
             raise SettingError("name or out is empty; accepted: a name, a folder")
 
@@ -177,8 +170,6 @@ def evaluate(
             console.print("interrupted: what is finished stays, and the same command goes on")
     for table in _tables(plan, results):
         print_table(Console(), table)
-    for line in _true_poses(plan.folder):
-        console.print(line)
     failed = int(results["status"].str.startswith("failed").sum())
     name = "probes" if plan.policies else "results"
     console.print(
@@ -192,7 +183,8 @@ def _tables(plan: Plan, results: pd.DataFrame) -> list[Table]:
     evaluation = open_evaluation(plan.folder)
     if not plan.policies:
         faults = tables_by_faults(evaluation.rows, method_styles(evaluation.methods))
-        return [median_table(results, definition_text(plan.definition)), *faults]
+        tables = [median_table(results, definition_text(plan.definition)), *faults]
+        return [*tables, *filter(lambda table: table.rows, [true_pose_table(evaluation)])]
     sessions = steered_sessions(evaluation)
     styles = policy_styles(sessions.policies)
     return [error_table(sessions, styles), needed_table(sessions, styles)] * bool(sessions.count)
@@ -210,28 +202,6 @@ def median_table(results: pd.DataFrame, definition: str) -> Table:
     ]
     title = "medians over all steps of all trials: PD in mm² by object, ms a registration"
     return table_of(title, lines, note=f"plausible sets: {definition}")
-
-
-def _true_poses(folder: Path) -> list[str]:
-    """How far the true poses that were sought are from a simulated truth."""
-    found = pd.DataFrame(true_poses(folder, read_experiment(folder)))
-    if found.empty:
-        return []
-    lines = [
-        f"true poses were sought in {len(found)} trials: mean |SDF| of contacts "
-        f"{1000.0 * found['mean_distance'].mean():.2f} mm, {found['violations'].sum()} free points "
-        "inside of objects"
-    ]
-    known = found.dropna(subset=["position_error"])
-    if len(known):
-        positions = 1000.0 * known["position_error"]
-        rotations = degrees(1.0) * known["rotation_error"]
-        lines.append(
-            f"from the simulated truth of {len(known)}, modulo symmetries: {positions.mean():.1f} "
-            f"mm on average, {positions.max():.1f} mm at worst; {rotations.mean():.1f} and "
-            f"{rotations.max():.1f} degrees"
-        )
-    return lines
 
 
 def _plan(config: EvaluateConfig) -> Plan:

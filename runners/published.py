@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +13,13 @@ from chsel.errors import SettingError
 from chsel.problem.settings import build_settings
 from replay.console import Console, Progress
 from runners.command.program import command, plain
+from runners.evaluation.contenders import require_repeats
+from runners.evaluation.experiment import read_experiment
 from runners.evaluation.plan import Trial
-from runners.evaluation.repeats import require_repeats
-from runners.evaluation.selection import chosen_seeds
+from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.evaluation.trial_session import read_told
-from runners.published_package.environment import PackageConfig, interpreter
 from runners.published_package.package_session import PackageSession
-from runners.published_package.process import PublishedPackage
-
-_SEED = re.compile(r"seed_(\d{1,19})")
+from runners.published_package.process import PackageConfig, PublishedPackage, interpreter
 
 
 @dataclass(frozen=True)
@@ -91,37 +87,20 @@ def found_trials(config: PublishedConfig) -> list[tuple[Trial, Path]]:
     Raises SettingError if the settings name none.
     """
     folder = Path(config.dir or "").expanduser()
+    experiment = read_experiment(folder)
+    names = chosen_names("configurations", config.configurations, experiment["configurations"])
+    seeds = experiment["seeds"] if config.seeds is None else chosen_seeds(config.seeds)
     found = []
-    for description in folder.glob("trials/*/seed_*/session.json"):
-        seed, session = _SEED.fullmatch(description.parent.name), description.with_suffix(".mcap")
-        if seed is not None and session.is_file():
-            found.append((Trial(int(seed[1]), description.parent.parent.name), session))
+    for trial in sorted(Trial(seed, name) for seed in seeds for name in names):
+        session = folder / "trials" / trial.configuration / f"seed_{trial.seed}" / "session.mcap"
+        if session.is_file() and session.with_suffix(".json").is_file():
+            found.append((trial, session))
     if not found:
         raise SettingError(
-            f"dir {folder} has no sessions; accepted: a folder that runners.evaluate has written"
-        )
-    patterns = _patterns(config.configurations)
-    seeds = None if config.seeds is None else chosen_seeds(config.seeds)
-    chosen = [
-        (trial, session)
-        for trial, session in found
-        if any(fnmatchcase(trial.configuration, pattern) for pattern in patterns)
-        and (seeds is None or trial.seed in seeds)
-    ]
-    if not chosen:
-        names = ", ".join(sorted({trial.configuration for trial, _ in found}))
-        there = ", ".join(map(str, sorted({trial.seed for trial, _ in found})))
-        raise SettingError(
             f"configurations={config.configurations} and seeds={config.seeds} name no session; "
-            f"accepted: all, patterns, or {names}; seeds {there}"
+            f"accepted: {', '.join(names)}; seeds {', '.join(map(str, experiment['seeds']))}"
         )
-    return sorted(chosen)
-
-
-def _patterns(value: Any) -> list[str]:
-    listed = value if isinstance(value, list | tuple) else [value]
-    texts = [text.strip() for part in listed for text in str(part).split(",")]
-    return ["*" if text == "all" else text for text in texts]
+    return found
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import degrees, pi
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.csv
 from omegaconf import DictConfig
 
-from chsel.errors import SettingError, require_positive
+from chsel.errors import SettingError
 from chsel.methods.method import Method
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.threads import require_threads, threads
@@ -25,7 +25,7 @@ from chsel.problem.online_registration import OnlineRegistration
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import apply, inverse
 from chsel.problem.sdf_grid import mesh_sdf
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import CheckedSettings, build_settings, positive
 from chsel.problem.streams import Purpose, StreamKey, uniforms
 from chsel.rehearsal import warm_up
 from replay.console import Console, Progress
@@ -33,7 +33,7 @@ from replay.events import Probe
 from replay.files import whole_file
 from runners.command.program import command, plain
 from runners.evaluation.contenders import chosen_contenders
-from runners.evaluation.selection import chosen_names, chosen_seeds
+from runners.evaluation.trial_configurations import chosen_names, chosen_seeds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.reporting.statistics import spreads
 from runners.reporting.tables import Table, number, print_table
@@ -67,7 +67,7 @@ class CaseConfig:
 
 
 @dataclass(frozen=True)
-class RealConfig:
+class RealConfig(CheckedSettings):
     """conf/real.yaml, which has all defaults and says what they are, checked."""
 
     data: str | None
@@ -76,16 +76,12 @@ class RealConfig:
     seeds: Any
     methods: Any
     settings: Any
-    passes: int
+    passes: Annotated[int, positive]
     halves: bool
     rig: Rig
     preset: PresetName
     out: str
-    threads: int
-
-    def __post_init__(self) -> None:
-        require_positive("passes", self.passes)
-        require_threads("threads", self.threads)
+    threads: Annotated[int, require_threads]
 
 
 @command("real")

@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
     out = Path(checked.out).expanduser() if checked.out else folder / "report"
     evaluation, console = open_evaluation(folder), Console()
     with drawing():
-        if evaluation.experiment.get("policies"):
+        if evaluation.experiment["policies"]:
             sections = sections_on_policies(evaluation, checked.baseline)
             printed = sections[1:]
         else:

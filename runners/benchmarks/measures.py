@@ -19,9 +19,16 @@ from chsel.problem.poses import compose, inverse, product, rotation_vector
 from chsel.problem.streams import Purpose, StreamKey, normals
 from replay.events import Probe
 from runners.benchmarks.pd_over_time import pd_over_time
-from runners.benchmarks.problems import PROBLEMS, drill, pose, standing
-from runners.benchmarks.registrations import PRESETS, StageTimer, Steps, register
-from runners.benchmarks.timing import Row, in_turn, milliseconds
+from runners.benchmarks.registrations import (
+    PRESETS,
+    PROBLEMS,
+    StageTimer,
+    drill,
+    pose,
+    register,
+    standing,
+)
+from runners.benchmarks.timing import Row, Steps, in_turn, milliseconds
 from runners.objects.loader import ObjectConfig, load_object
 from runners.sessions import open_session, session_settings
 from runners.sessions.session import Steerable

@@ -6,11 +6,22 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from chsel.numerics.threads import threads
+from chsel.problem.settings import CheckedSettings, positive
+
+
+@dataclass(frozen=True)
+class Steps(CheckedSettings):
+    """How much registrations do that are compared with the package, none of which stops early."""
+
+    restarts: Annotated[int, positive] = 10  # of descent
+    adam: Annotated[int, positive] = 50  # Adam steps of a restart
+    search: Annotated[int, positive] = 100  # CMA-MEGA iterations
+    long_search: Annotated[int, positive] = 500  # the same, in the longer row
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,15 @@ from omegaconf import OmegaConf
 from chsel.errors import SettingError
 from chsel.methods import METHODS, default_method, preset_settings
 from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
+from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
+from runners.benchmarks.timing import Steps
+from runners.evaluation.cluster import CLUSTERS
+from runners.evaluation.metrics import MetricsConfig
 from runners.objects.loader import OBJECTS
 from runners.objects.scans import URL
+from runners.published_package.process import PackageConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
 from runners.sessions import SESSIONS
@@ -60,6 +65,15 @@ def store_choices() -> None:
         _store("recording", name, settings_mapping(written))
     for preset in PRESETS:
         _store("preset", preset, {"name": preset})
+    for group, settings in (
+        ("metrics", MetricsConfig()),
+        ("package", PackageConfig()),
+        ("search", TruePoseSettings()),
+        ("effort", Steps()),
+    ):
+        _store(group, "default", settings_mapping(settings))
+    for name, cluster in CLUSTERS.items():
+        _store("cluster", name, settings_mapping(cluster()))
     for method in METHODS:
         _store_with_presets("method", method, partial(preset_settings, method), {"name": method})
     for policy in POLICIES:

@@ -10,11 +10,11 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from chsel.errors import SettingError, require_choice, require_positive
+from chsel.errors import SettingError, require_choice
 from chsel.numerics.threads import require_threads
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import CheckedSettings, build_settings, positive
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -34,36 +34,32 @@ _CONNECT = 30.0  # s
 class LocalConfig:
     """Workers on this machine, or a cluster that somebody else has started."""
 
-    kind: str
-    scheduler: str | None  # address of a running Dask scheduler; None: workers of our own
-    dashboard: bool  # whether workers of our own have one
+    kind: str = "local"
+    scheduler: str | None = None  # such as tcp://127.0.0.1:8786; None: workers of our own
+    dashboard: bool = False  # Dask's, of workers of our own, for everybody on this machine
 
 
 @dataclass(frozen=True)
-class SlurmConfig:
+class SlurmConfig(CheckedSettings):
     """Workers in jobs of SLURM, each of one core; None leaves a setting to SLURM."""
 
-    kind: str
-    jobs: int
-    processes: int  # workers of a job
-    memory: str  # of a job, such as 32GB
-    walltime: str  # of a job, H:MM:SS
-    queue: str | None  # the partition
-    account: str | None
-    interface: str | None  # of the network by which jobs reach this machine, such as ib0
-    directives: tuple[str, ...]  # further #SBATCH options
-    prologue: tuple[str, ...]  # lines of the shell before a worker starts
-    python: str | None  # on the nodes; None: this one
-    log_directory: str | None  # of the jobs' output
-    dashboard: bool
-
-    def __post_init__(self) -> None:
-        require_positive("jobs", self.jobs)
-        require_threads("processes", self.processes)
+    kind: str = "slurm"
+    jobs: Annotated[int, positive] = 1
+    processes: Annotated[int, require_threads] = 1  # workers of a job, one core each
+    memory: str = "4GB"  # of a job
+    walltime: str = "12:00:00"  # of a job
+    queue: str | None = None  # the partition
+    account: str | None = None
+    interface: str | None = None  # of the network by which jobs reach this machine, such as ib0
+    directives: tuple[str, ...] = ()  # further #SBATCH options, such as --constraint=fast
+    prologue: tuple[str, ...] = ()  # lines of the shell before a worker starts
+    python: str | None = None  # on the nodes; None: this one
+    log_directory: str | None = None  # of the jobs' output; None: where the command runs
+    dashboard: bool = False
 
 
 ClusterConfig = LocalConfig | SlurmConfig
-_KINDS: dict[str, type[LocalConfig] | type[SlurmConfig]] = {
+CLUSTERS: dict[str, type[LocalConfig] | type[SlurmConfig]] = {
     "local": LocalConfig,
     "slurm": SlurmConfig,
 }
@@ -72,8 +68,8 @@ _KINDS: dict[str, type[LocalConfig] | type[SlurmConfig]] = {
 def cluster_config(values: Mapping[str, Any], workers: int | None) -> ClusterConfig:
     """The choice `cluster`, checked. workers: how many are wanted here, None if that is open."""
     kind = str(values.get("kind"))
-    require_choice("cluster.kind", kind, _KINDS)
-    config = build_settings(_KINDS[kind], values, "cluster")
+    require_choice("cluster.kind", kind, CLUSTERS)
+    config = build_settings(CLUSTERS[kind], values, "cluster")
     here = isinstance(config, LocalConfig) and not config.scheduler
     if workers is not None and not here:
         raise SettingError(

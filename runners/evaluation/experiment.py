@@ -17,9 +17,9 @@ from chsel.errors import RecordingError, SettingError
 from chsel.problem.settings import settings_mapping
 from replay.environment import environment
 from replay.files import WritingError, whole_file
-from runners.evaluation.definition import definition_label
+from runners.evaluation.metrics import definition_label
 from runners.evaluation.plan import Plan
-from runners.evaluation.table import ITERATIONS, PROBES, RESULTS, write_table
+from runners.evaluation.table import TABLES, joined_parts, write_table
 from runners.evaluation.trial_configurations import SENSORS
 
 FILE = "experiment.json"
@@ -77,17 +77,18 @@ def collect(folder: Path) -> pa.Table:
     whoever made it and when.
     """
     experiment = read_experiment(folder)
-    definition = definition_label(experiment["definition"])
-
-    def written(name: str, schema: pa.Schema, *suffixes: str) -> pa.Table:
-        parts = list(_parts(folder, experiment, *suffixes))
-        return write_table(folder, name, parts, schema, definition)
-
     if experiment["policies"]:
-        return written("probes", PROBES, ".parquet", ".failed.parquet")
+        return write_table(folder, "probes", gathered(folder, experiment, "probes"))
     if experiment["iterations"]["every"] is not None:
-        written("iterations", ITERATIONS, ".iterations.parquet")
-    return written("results", RESULTS, ".parquet", ".failed.parquet")
+        write_table(folder, "iterations", gathered(folder, experiment, "iterations"))
+    return write_table(folder, "results", gathered(folder, experiment, "results"))
+
+
+def gathered(folder: Path, experiment: Mapping[str, Any], name: str) -> pa.Table:
+    """One of TABLES, of the parts that are finished."""
+    suffixes = (".iterations.parquet",) if name == "iterations" else (".parquet", ".failed.parquet")
+    parts = list(_parts(folder, experiment, *suffixes))
+    return joined_parts(parts, TABLES[name], definition_label(experiment["definition"]))
 
 
 def join_experiment(
@@ -124,9 +125,9 @@ def read_experiment(folder: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise RecordingError(f"{path} cannot be read ({error})") from None
-    if not isinstance(values, Mapping):
-        raise RecordingError(f"{path} is not the description of an evaluation")
+        raise RecordingError(
+            f"{path} cannot be read ({error}); accepted: a folder that runners.evaluate has written"
+        ) from None
     return dict(values)
 
 
@@ -193,7 +194,7 @@ def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]
         for kind in ("methods", "policies"):
             shared = {label: one for label, one in values[kind].items() if label in others[kind]}
             found |= {f"{kind}.{label}": one for label, one in shared.items()}
-        return dict(_flat(found))
+        return dict(flattened(found))
 
     before, now = fixed(theirs, ours), fixed(ours, theirs)
     differing = [
@@ -209,11 +210,11 @@ def _check_same(folder: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]
         )
 
 
-def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def flattened(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Nested values by their paths."""
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{path}{name}.")
+            yield from flattened(value, f"{path}{name}.")
         else:
             yield f"{path}{name}", value
 

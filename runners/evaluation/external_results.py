@@ -18,9 +18,9 @@ from chsel.problem.poses import Poses, check_rigid, inverse
 from chsel.problem.registration_problem import Hypotheses
 from chsel.qd.selection import repeated
 from replay.files import file_digest
+from runners.evaluation.contenders import MOST_REPEATS, repeat_label
 from runners.evaluation.plan import Plan, Trial
-from runners.evaluation.repeats import MOST_REPEATS, repeat_label
-from runners.evaluation.result_rows import ResultRows
+from runners.evaluation.run_method import ResultRows
 from runners.evaluation.table import RESULTS, Row, write_part
 from runners.evaluation.trial_session import open_recorded, problems
 

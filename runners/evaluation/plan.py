@@ -17,10 +17,8 @@ from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.problem.settings import build_settings
 from replay.arguments import chosen_steps
-from runners.evaluation.contenders import Contender
-from runners.evaluation.definition import definition_label, definition_settings
-from runners.evaluation.metrics import MetricsConfig
-from runners.evaluation.policy_contenders import PolicyContender
+from runners.evaluation.contenders import Contender, PolicyContender
+from runners.evaluation.metrics import MetricsConfig, definition_label, definition_settings
 from runners.evaluation.table import PROBES, RESULTS
 from runners.evaluation.trial_configurations import (
     MOST_PROBES,

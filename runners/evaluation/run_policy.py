@@ -24,11 +24,10 @@ from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import StreamKey
 from chsel.rehearsal import warm_up, warm_up_policy
 from replay.events import Logged, SessionEnded
-from runners.evaluation.contenders import Contender
+from runners.evaluation.contenders import Contender, PolicyContender
 from runners.evaluation.plan import Plan, Trial
-from runners.evaluation.policy_contenders import PolicyContender
-from runners.evaluation.step_recorder import StepRecorder, recording_in
 from runners.evaluation.table import PROBES, Row, write_part
+from runners.evaluation.trial_session import StepRecorder, recording_in
 from runners.objects.scans import AssetsConfig
 from runners.run.recording import RecordingConfig
 from runners.run.scene import PresetName, ProbeConfig, Scene, open_scene, session_started

@@ -93,6 +93,7 @@ their weights. poses: how many these are. spread: of the belief. promised: by ho
 action would narrow it. stop: why a session with the usual rules would end here, "" if it goes on.
 seconds: of the registration. decision_seconds: of choosing what comes next. status: "ok" or
 "failed: REASON"; what a row does not have is null."""
+TABLES = {"results": RESULTS, "iterations": ITERATIONS, "probes": PROBES}
 _ORDER = ("object", "configuration", "seed", "policy", "method", "step", "iteration")
 
 
@@ -134,13 +135,15 @@ def part_source(path: Path) -> str | None:
     return metadata.get(b"about", b"").decode()
 
 
-def write_table(
-    folder: Path, name: str, parts: Sequence[Path], schema: pa.Schema, definition: str
-) -> pa.Table:
-    """Put parts by one definition together in order, as NAME.parquet and NAME.csv."""
+def joined_parts(parts: Sequence[Path], schema: pa.Schema, definition: str) -> pa.Table:
+    """All rows of parts by one definition, in order."""
     tables = [read_part(path, schema, definition) for path in parts]
     order = [(key, "ascending") for key in _ORDER if key in schema.names]
-    table = pa.concat_tables([schema.empty_table(), *tables]).sort_by(order).combine_chunks()
+    return pa.concat_tables([schema.empty_table(), *tables]).sort_by(order).combine_chunks()
+
+
+def write_table(folder: Path, name: str, table: pa.Table) -> pa.Table:
+    """Write NAME.parquet and NAME.csv."""
     with whole_file(folder / f"{name}.parquet") as beside:
         pa.parquet.write_table(table, beside)
     with whole_file(folder / f"{name}.csv") as beside:

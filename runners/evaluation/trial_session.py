@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,22 @@ from chsel.plausible.plausible_set import (
 )
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.problem.online_registration import OnlineSettings
-from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.registration_problem import ArchiveSnapshot, RegistrationProblem
 from replay.environment import environment
-from replay.events import Event, Logged, Probe, Recorder, SessionEnded, SessionStarted
+from replay.events import (
+    Event,
+    Logged,
+    Probe,
+    Recorder,
+    SessionEnded,
+    SessionStarted,
+    SnapshotTaken,
+)
 from replay.files import WritingError, whole_file
+from replay.mcap.writer import McapRecorder
 from runners.evaluation.plan import Plan, Trial
-from runners.evaluation.sensor_logs import ensure_log, guessed_pose, simulated_truth
-from runners.evaluation.step_recorder import recording_in
 from runners.evaluation.trial_configurations import SENSORS
-from runners.evaluation.true_poses import sought_pose
+from runners.evaluation.true_poses import ensure_log, guessed_pose, simulated_truth, sought_pose
 from runners.objects.loader import check_size, load_object
 from runners.sessions import open_session
 from runners.sessions.problem_source import ProbedProblems
@@ -37,6 +45,48 @@ METHOD = "none"
 """The method that the recording of a session alone names."""
 TRUTH = "truth"
 """Key of the configuration under which stands how a true pose was found."""
+_ONE = OnlineSettings(hypotheses=1)
+
+
+class StepRecorder(Recorder):
+    """Hands the events of a step to another recorder, if there is one, when the step ends."""
+
+    def __init__(self, recorder: Recorder | None) -> None:
+        self.snapshots: list[ArchiveSnapshot] = []  # of the last step
+        self._recorder = recorder
+        self._waiting: list[Event] = []
+
+    def record(self, event: Event) -> None:
+        """Keep it until the step ends."""
+        self._waiting.append(event)
+
+    def flush(self) -> None:
+        """Record what was kept."""
+        self.snapshots = [e.archive for e in self._waiting if isinstance(e, SnapshotTaken)]
+        if self._recorder is not None:
+            for event in self._waiting:
+                self._recorder.record(event)
+            self._recorder.flush()
+        self._waiting.clear()
+
+
+@contextmanager
+def recording_in(path: Path | None) -> Iterator[StepRecorder]:
+    """A recorder into a file that is there whole at the end of the context, or not at all.
+
+    path: None for no file.
+    """
+    if path is None:
+        yield StepRecorder(None)
+        return
+    with whole_file(path) as beside:
+        file = McapRecorder(beside)
+        try:
+            recorder = StepRecorder(file)
+            yield recorder
+            recorder.flush()
+        finally:
+            file.close()
 
 
 def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
@@ -96,9 +146,6 @@ def record_session(plan: Plan, trial: Trial, recorder: Recorder) -> None:
         session.close()
 
 
-_ONE = OnlineSettings(hypotheses=1)
-
-
 @dataclass(frozen=True)
 class TrialSession:
     """What session.json tells: steps with a registration, and why some have no plausible set."""
@@ -127,7 +174,7 @@ def make_session(plan: Plan, trial: Trial) -> None:
         if clean != trial or not plan.plausible:
             continue
         try:
-            before = _made(folder / "plausible", problem, truth, settings, before)
+            before, _ = made_set(folder / "plausible", problem, truth, settings, before)
         except EvaluationError as error:
             failures[str(step)] = " ".join(str(error).split())
     told: dict[str, Any] = {"steps": steps, "no_plausible_set": failures}
@@ -198,19 +245,20 @@ def load_members(
     return found
 
 
-def _made(
+def made_set(
     folder: Path,
     problem: RegistrationProblem,
     truth: FloatArray,
     settings: PlausibleSettings,
     before: PlausibleSet | None,
-) -> PlausibleSet:
-    """The set of a step, which is made unless it is there. before: that of the step before."""
+) -> tuple[PlausibleSet, bool]:
+    """The set of a step, and whether it was there. before: that of the step before."""
     found = load_plausible(folder, problem, settings, world_from_object=truth)
-    if found is None:
-        found = plausible_set(problem, truth, settings, survivors=before)
-        try:
-            save_plausible(folder, found)
-        except EvaluationError as error:
-            raise WritingError(str(error)) from error
-    return found
+    if found is not None:
+        return found, True
+    found = plausible_set(problem, truth, settings, survivors=before)
+    try:
+        save_plausible(folder, found)
+    except EvaluationError as error:
+        raise WritingError(str(error)) from error
+    return found, False

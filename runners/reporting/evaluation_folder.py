@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,11 +13,11 @@ import pandas as pd
 import pyarrow as pa
 
 from chsel.errors import ChselError
-from runners.evaluation import table
-from runners.evaluation.definition import definition_label, definition_text
-from runners.evaluation.repeats import repeat_of
+from runners.evaluation.contenders import repeat_of
+from runners.evaluation.experiment import gathered, read_experiment
+from runners.evaluation.metrics import definition_label, definition_text
+from runners.evaluation.table import TABLES
 
-EXPERIMENT = "experiment.json"
 _ACCEPTED = "accepted: a folder that runners.evaluate has written"
 TRIAL = ["configuration", "seed"]
 """The columns that tell trials apart."""
@@ -40,38 +39,34 @@ class Evaluation:
     # the first of several draws of a method.
     rows: pd.DataFrame
     iterations: pd.DataFrame  # the same for moments within registrations
-    probes: (
-        pd.DataFrame
-    )  # a row per probe with the columns of PROBES, where policies were evaluated
-    gathered: bool  # the rows are those of finished parts, as there is no table of all yet
-    definition: str  # label of the definition of the plausible sets behind all PD
+    probes: pd.DataFrame  # a row per probe with the columns of PROBES, of policies
 
     @property
     def name(self) -> str:
         """The name that the evaluation was given."""
-        return str(self.experiment.get("name", self.folder.name))
+        return str(self.experiment["name"])
+
+    @property
+    def definition(self) -> str:
+        """The label of the definition of the plausible sets behind all PD."""
+        return definition_label(self.experiment["definition"])
 
     @property
     def definition_text(self) -> str:
-        """The definition of the plausible sets, and which poses are members by it."""
-        asked = self.experiment["definition"]
-        return (
-            definition_text(asked)
-            if definition_label(asked) == self.definition
-            else self.definition
-        )
+        """The same, and which poses are members by it."""
+        return definition_text(self.experiment["definition"])
 
     @cached_property
     def methods(self) -> list[str]:
         """Methods that were asked for, then the others that have a row."""
-        asked = [*self.experiment.get("methods", ()), *self.experiment.get("outside", ())]
+        asked = [*self.experiment["methods"], *self.experiment["outside"]]
         names = [repeat_of(label, asked)[0] for label in asked]
         return list(dict.fromkeys([*names, *sorted(self.rows["method"].unique())]))
 
     @cached_property
     def policies(self) -> list[str]:
         """Policies that were asked for, then the others that have a row; none for methods alone."""
-        asked = self.experiment.get("policies", ())
+        asked = self.experiment["policies"]
         return list(dict.fromkeys([*asked, *sorted(self.probes["policy"].unique())]))
 
     @cached_property
@@ -81,10 +76,8 @@ class Evaluation:
 
     @cached_property
     def planned_trials(self) -> list[Trial]:
-        """Trials that were asked for; without that information, those with a row."""
-        names, seeds = (self.experiment.get(key) for key in ("configurations", "seeds"))
-        if not names or not seeds:
-            return sorted(trials_of(self.rows))
+        """Trials that were asked for."""
+        names, seeds = self.experiment["configurations"], self.experiment["seeds"]
         return [(name, seed) for name in names for seed in seeds]
 
 
@@ -106,56 +99,27 @@ def last_half(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def open_evaluation(folder: Path) -> Evaluation:
-    """Read the tables of a folder.
-
-    Raises ReportError unless it is one of an evaluation, and if its PD are by several definitions
-    of plausible sets, as medians over these mean nothing.
-    """
-    path = folder / EXPERIMENT
-    try:
-        experiment = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise ReportError(f"{path} cannot be read ({error}); {_ACCEPTED}") from None
-    rows, of_results = _table(folder, "results", table.RESULTS)
-    iterations, _ = _table(folder, "iterations", table.ITERATIONS)
-    probes, of_probes = _table(folder, "probes", table.PROBES)
-    if experiment.get("policies"):
-        rows, iterations, gathered = rows[:0], iterations[:0], of_probes
-    else:
-        probes, gathered = probes[:0], of_results
+    """Read the tables of a folder; of an evaluation that has none yet, what is finished."""
+    experiment = read_experiment(folder)
+    rows, iterations, probes = (_table(folder, experiment, name) for name in TABLES)
     rows, iterations = _with_draws(rows, experiment), _with_draws(iterations, experiment)
-    usual = definition_label(experiment["definition"])
-    labels = pd.concat([rows["definition"], iterations["definition"]]).fillna(usual).unique()
-    if len(labels) > 1:
-        raise ReportError(
-            f"{folder} has numbers by {len(labels)} definitions of plausible sets, "
-            f"{', '.join(sorted(labels))}; accepted: one, each in an out=DIR of its own"
-        )
-    definition = str(labels[0]) if len(labels) else usual
-    return Evaluation(folder, experiment, rows, iterations, probes, gathered, definition)
+    return Evaluation(folder, experiment, rows, iterations, probes)
 
 
-def _table(folder: Path, name: str, schema: pa.Schema) -> tuple[pd.DataFrame, bool]:
-    """The rows of a table, sorted; without one, those of its parts, and whether that was so."""
-    whole = folder / f"{name}.parquet"
-    parts = sorted(folder.glob("trials/*/seed_*/*.parquet"))
-    moments = name == "iterations"
-    parts = [
-        part
-        for part in parts
-        if part.name.endswith(".iterations.parquet") == moments
-        # A part that says how something failed that is there now.
-        and Path(str(part).replace(".failed.parquet", ".parquet")) not in {*parts} - {part}
-    ]
-    paths = [whole] if whole.exists() else parts
-    frames = [schema.empty_table().to_pandas()]
-    for path in paths:
+def _table(folder: Path, experiment: Mapping[str, Any], name: str) -> pd.DataFrame:
+    """The rows of a table, sorted; none of a kind that the evaluation does not have."""
+    path, schema = folder / f"{name}.parquet", TABLES[name]
+    if bool(experiment["policies"]) != (name == "probes"):
+        rows = schema.empty_table().to_pandas()
+    elif not path.exists():
+        rows = gathered(folder, experiment, name).to_pandas()
+    else:
         try:
-            frames.append(pd.read_parquet(path, partitioning=None))
+            rows = pd.read_parquet(path, partitioning=None)
         except (pa.ArrowException, ValueError, OSError) as error:
             reason = " ".join(str(error).split())
             raise ReportError(f"{path} cannot be read ({reason}); {_ACCEPTED}") from None
-    rows = pd.concat(frames if len(frames) == 1 else frames[1:]).reindex(columns=schema.names)
+    rows = rows.reindex(columns=schema.names)
     integers = [field.name for field in schema if pa.types.is_integer(field.type)]
     rows = rows.astype(dict.fromkeys(integers, "Int64"))
     numbers = rows[[field.name for field in schema if pa.types.is_floating(field.type)]]
@@ -164,12 +128,12 @@ def _table(folder: Path, name: str, schema: pa.Schema) -> tuple[pd.DataFrame, bo
     keys = ("object", *TRIAL, "method", "policy", "step", "iteration")
     by = [key for key in keys if key in schema.names]
     rows = rows.sort_values(by, kind="stable", na_position="first", ignore_index=True)
-    return rows.astype({"seed": int}), paths == parts and bool(parts)
+    return rows.astype({"seed": int})
 
 
 def _with_draws(rows: pd.DataFrame, experiment: Mapping[str, Any]) -> pd.DataFrame:
     """The rows with the label of their method and their draw apart."""
-    labels = {*rows["method"], *experiment.get("methods", ()), *experiment.get("outside", ())}
+    labels = {*rows["method"], *experiment["methods"], *experiment["outside"]}
     names = rows["method"].unique()
     draws = pd.DataFrame([repeat_of(name, labels) for name in names], names, ["method", "draw"])
     found = draws.reindex(rows["method"])

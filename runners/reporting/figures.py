@@ -237,17 +237,16 @@ def _legend(figure: Figure, styles: Sequence[Style]) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, handlelength=2.6)
 
 
-def positive_scale(axes: Axes, values: pd.Series, axis: str = "y") -> None:
-    """A logarithmic axis for these numbers; linear below the least above zero where zeros are."""
+def positive_scale(axes: Axes, values: pd.Series) -> None:
+    """A logarithmic y axis for these numbers; linear below the least above zero where zeros are."""
     positive = values[values > 0.0]
     if positive.empty:
         return
-    scale: Any = axes.set_yscale if axis == "y" else axes.set_xscale
     if values.min() > 0.0:
-        scale("log")
+        axes.set_yscale("log")
     else:
-        scale("symlog", linthresh=positive.min())
-    ticks = axes.yaxis if axis == "y" else axes.xaxis
+        axes.set_yscale("symlog", linthresh=positive.min())
+    ticks = axes.yaxis
     written = FuncFormatter(lambda value, _: f"{value:g}")
     ticks.set_major_formatter(written)
     few = positive.max() < 60.0 * positive.min()  # hardly two powers of ten are in view

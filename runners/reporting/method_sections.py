@@ -139,9 +139,21 @@ def _what_was_run(evaluation: Evaluation, styles: Styles) -> Section:
 
 def _true_poses(evaluation: Evaluation) -> Iterator[Section]:
     """Where true poses of recorded sensors were sought."""
+    text = (
+        "The true pose of a recorded session is not known: it is the one of least evaluation cost "
+        "near a pose that a person set (or, of a simulated log, its truth as roughly as a person "
+        "would set it), by all that is known after the last probe. Plausible sets are made around "
+        "it."
+    )
+    if (table := true_pose_table(evaluation)).rows:
+        yield Section("True poses", text, [table])
+
+
+def true_pose_table(evaluation: Evaluation) -> Table:
+    """How well true poses fit, and how far they are from the guesses and a simulated truth."""
     found = pd.DataFrame(true_poses(evaluation.folder, evaluation.experiment))
     if found.empty:
-        return
+        return table_of("True poses found", [])
     groups = [(str(name), some) for name, some in found.groupby("configuration", sort=False)]
     columns = {
         "mean |SDF| of contacts, mm": ("mean_distance", 1e3),
@@ -158,17 +170,11 @@ def _true_poses(evaluation: Evaluation) -> Iterator[Section]:
             values = factor * some[column].astype(float)
             line[heading] = f"{number(values.mean())} [{number(values.max())}]"
         lines.append(line)
-    text = (
-        "The true pose of a recorded session is not known: it is the one of least evaluation cost "
-        "near a pose that a person set (or, of a simulated log, its truth as roughly as a person "
-        "would set it), by all that is known after the last probe. Plausible sets are made around "
-        "it."
-    )
     note = (
         "Means over trials, and the greatest in brackets. Distances and angles between poses are "
         "modulo the object's symmetries, at its centre."
     )
-    yield Section("True poses", text, [table_of("True poses found", lines, note=note)])
+    return table_of("True poses found", lines, note=note)
 
 
 def tables_by_faults(rows: pd.DataFrame, styles: Styles) -> list[Table]:

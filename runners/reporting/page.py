@@ -11,6 +11,7 @@ from typing import Any
 
 from markdown_it import MarkdownIt
 
+from runners.evaluation.experiment import flattened
 from runners.reporting.evaluation_folder import Evaluation, trials_of
 from runners.reporting.figures import Picture
 from runners.reporting.tables import Table, table_of
@@ -47,7 +48,7 @@ def as_markdown(
             parts.append(link if kind == "pdf" else f"!{link}")
             parts.append(f"[The numbers drawn]({picture.name}.csv)")
         parts += [part for table in section.tables if table.rows for part in _table(table)]
-    commands = [*evaluation.experiment.get("commands", ()), command]
+    commands = [*evaluation.experiment["commands"], command]
     parts += ["## How it was made", "```\n" + "\n".join(commands) + "\n```"]
     parts += [part for table in _made(evaluation.experiment) for part in _table(table)]
     return "\n\n".join(parts) + "\n"
@@ -68,8 +69,6 @@ def as_html(markdown: str, pictures: Mapping[str, bytes]) -> str:
 def _lead(evaluation: Evaluation) -> Iterator[str]:
     """What the report is about."""
     rows, probes = evaluation.rows, evaluation.probes
-    if evaluation.gathered:
-        yield "There is no table of the whole evaluation yet: this is what is finished."
     if len(probes):
         yield (
             f"{probes['policy'].nunique()} policies on {len(trials_of(probes))} trials of "
@@ -111,17 +110,8 @@ def _escaped(text: str) -> str:
 def _made(experiment: Mapping[str, Any]) -> Iterator[Table]:
     """Settings and versions."""
     settings = {name: value for name, value in experiment.items() if name not in _NOT_SHOWN}
-    others = {f"other {n}": v for n, v in enumerate(experiment.get("other_environments") or ())}
-    versions = {**experiment.get("environment", {}), **others}
+    others = {f"other {n}": v for n, v in enumerate(experiment["other_environments"])}
+    versions = {**experiment["environment"], **others}
     for title, values in (("Settings", settings), ("Versions", versions)):
-        lines = ({"name": name, "value": str(value)} for name, value in _flat(values))
+        lines = ({"name": name, "value": str(value)} for name, value in flattened(values))
         yield table_of(title, lines, labels=2)
-
-
-def _flat(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested settings by their paths."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{path}{name}.")
-        else:
-            yield f"{path}{name}", value

@@ -12,17 +12,20 @@ import pandas as pd
 from runners.reporting.evaluation_folder import TRIAL, Evaluation, trials_of
 from runners.reporting.figures import Picture, Styles, curves, policy_styles
 from runners.reporting.page import Section
-from runners.reporting.statistics import censored_quantile, first_below, hit_bins, shares
-from runners.reporting.steered_sessions import (
+from runners.reporting.statistics import (
     GOOD,
     LEAST_ERROR,
     LIMITS,
     SteeredSessions,
+    censored_quantile,
+    first_below,
     first_stops,
     geometric_means,
+    hit_bins,
     means_with_intervals,
     paired,
     ratios_to_best,
+    shares,
     steered_sessions,
 )
 from runners.reporting.tables import Table, bold_best, number, percent_range, table_of, with_range

@@ -7,8 +7,10 @@ import re
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Annotated
 
-from chsel.errors import RecordingError, require_positive
+from chsel.errors import RecordingError
+from chsel.problem.settings import CheckedSettings, not_negative
 from replay.events import Recorder
 from replay.files import WritingError, whole_file
 from replay.mcap.writer import McapRecorder
@@ -21,18 +23,16 @@ _LOG_FILTER = "error,re_log_encoding=off,re_sdk=off"
 
 
 @dataclass(frozen=True)
-class RecordingConfig:
+class RecordingConfig(CheckedSettings):
     """What is written down of a session."""
 
     mcap: bool = True  # write recording.mcap
     rerun: bool = True  # write recording.rrd
     live: bool = False  # show the session in the viewer while it runs
-    snapshot_interval: int = 25  # iterations between archives; 0: the first and the last alone
+    # Iterations between archives; 0: the first and the last alone.
+    snapshot_interval: Annotated[int, not_negative] = 25
     timings: bool = False
     """Also wall-clock seconds by stage, with which no two recordings are equal to the byte."""
-
-    def __post_init__(self) -> None:
-        require_positive("snapshot_interval", self.snapshot_interval, zero=True)
 
 
 def make_run_folder(logs: Path, *names: str) -> Path:

@@ -35,20 +35,6 @@ def recording(folder: Path, rounds: int) -> Path:
     raise AssertionError(f"no recording of {rounds} rounds")
 
 
-def test_the_page_has_files_and_commands(folder: Path) -> None:
-    assert {file.name for file in write_files(PAGE, folder)} == {
-        "hill_climb.py",
-        "pyproject.toml",
-        "hasty.yaml",
-    }
-    assert [line.split()[2] for line in commands(PAGE)[1:]] == [
-        "runners.probe",
-        "replay",
-        "replay",
-        "runners.probe",
-    ]
-
-
 def test_a_session_is_recorded_with_the_method_and_its_settings(folder: Path) -> None:
     read = read_recording(recording(folder, 50))
     assert read.start.method == "hill_climb"

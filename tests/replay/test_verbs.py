@@ -15,7 +15,7 @@ from replay.arguments import chosen_steps
 from replay.verbs import ALIASES, VERBS
 from runners.sensors.depth_frame import read_depth_frame
 from runners.sensors.pose_file import read_pose
-from runners.sessions.point_files import read_points
+from runners.sessions.points import read_points
 from runners.sessions.problem_source import open_source
 from tests.tools.verb_arguments import verb_arguments
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import pyarrow.parquet
 
 from chsel.plausible.plausible_settings import plausible_settings
 from chsel.problem.settings import settings_mapping
-from runners.evaluation.table import ITERATIONS, RESULTS
+from runners.evaluation.table import ITERATIONS, PROBES, RESULTS
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.method_sections import sections_on_methods
 from runners.reporting.policy_sections import sections_on_policies
@@ -45,6 +45,12 @@ def write_evaluation(
         "preset": "default",
         "session": {"kind": "kinematic"},
         "definition": DEFINITION,
+        "methods": {},
+        "outside": {},
+        "policies": {},
+        "configurations": list(dict.fromkeys(one["configuration"] for one in rows or ())),
+        "seeds": sorted({one["seed"] for one in rows or ()}),
+        "other_environments": [],
         "commands": ["python -m runners.evaluate experiment=made_up"],
         "environment": {"python": "3.11", "package numpy": "2.4"},
         **experiment,
@@ -64,7 +70,7 @@ def write_table(path: Path, rows: Sequence[Row], schema: pa.Schema | None = RESU
 def tables_of(folder: Path, baseline: str | None = None) -> dict[str, list[list[str]]]:
     """The tables of a report by their titles, with their headers, without what is bold."""
     evaluation = open_evaluation(folder)
-    steered = bool(evaluation.experiment.get("policies"))
+    steered = bool(evaluation.experiment["policies"])
     sections = (sections_on_policies if steered else sections_on_methods)(evaluation, baseline)
     return {
         table.title: [
@@ -73,3 +79,45 @@ def tables_of(folder: Path, baseline: str | None = None) -> dict[str, list[list[
         for section in sections
         for table in section.tables
     }
+
+
+def session(
+    configuration: str, seed: int, policy: str, errors: Sequence[float], **columns: Sequence[Any]
+) -> list[Row]:
+    """A row per probe. errors: millimetres. columns: further ones, a value for each probe."""
+    about = {"object": configuration.split("_")[0], "configuration": configuration, "seed": seed}
+    about |= {"policy": policy, "method": "anchored", "preset": "default", "faults": "clean"}
+    return [
+        {
+            **about,
+            "step": index,
+            "probes": index + 1,
+            "status": "ok",
+            "contacts": index,
+            "error": 1e-3 * error,
+            "belief_error": 1e-3 * error,
+            "spread": 1e-3 * error,
+            "stop": "",
+            **{name: values[index] for name, values in columns.items()},
+        }
+        for index, error in enumerate(errors)
+    ]
+
+
+def write_sessions(folder: Path, rows: Sequence[Row], budgets: Mapping[str, int | None]) -> Path:
+    """A folder with these rows. budgets: probes of a session, by policy."""
+    policies = {
+        name: {"name": name, "settings": {"probes": probes}} for name, probes in budgets.items()
+    }
+    trials = {name: sorted({row[name] for row in rows}) for name in ("configuration", "seed")}
+    write_evaluation(
+        folder,
+        None,
+        policies=policies,
+        steered=True,
+        methods={"anchored": {"name": "anchored"}},
+        configurations=trials["configuration"],
+        seeds=trials["seed"],
+    )
+    write_table(folder / "probes.parquet", rows, PROBES)
+    return folder

@@ -129,14 +129,6 @@ def test_a_sweep_over_files_and_seeds(home: Path, monkeypatch: pytest.MonkeyPatc
     assert sorted(one["seed"] for one in finished) == [0, 0, 1, 1]
 
 
-def test_a_missing_file_of_a_strange_name_is_named(home: Path) -> None:
-    points = ("session=points", "session.path=~/Prüf körper,1.npz")
-    done = run(probe.main, "object=mesh", "object.path=~/ä,=[.obj", *points, *SHORT)
-    assert done.returncode == 2
-    assert f"{home}/ä,=[.obj" in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
 def test_words_without_a_key_get_that_of_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

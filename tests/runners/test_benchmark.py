@@ -13,21 +13,29 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from matplotlib.container import BarContainer
 
 from chsel.policies import POLICIES
 from chsel.problem.poses import apply, inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.sdf_grid import mesh_sdf
 from runners import benchmark
-from runners.benchmarks.benchmark_report import picture_of_benchmark, slower
-from runners.benchmarks.pd_over_time import PD, pd_over_time
-from runners.benchmarks.problems import PROBLEMS, WORKSPACE, Problem, drill, pose, standing
-from runners.benchmarks.registrations import PRESETS, SIZES, BenchmarkError, require_equal
+from runners.benchmarks.benchmark_report import slower
+from runners.benchmarks.pd_over_time import pd_over_time
+from runners.benchmarks.registrations import (
+    PRESETS,
+    PROBLEMS,
+    SIZES,
+    WORKSPACE,
+    BenchmarkError,
+    Problem,
+    drill,
+    pose,
+    require_equal,
+    standing,
+)
 from runners.benchmarks.timing import Row, in_turn
 from runners.evaluation.plan import Trial
-from runners.published_package.environment import PackageError
-from runners.published_package.process import PublishedPackage
+from runners.published_package.process import PackageError, PublishedPackage
 from runners.published_package.worker import GridSdf
 from tests.runners.in_process import run as in_process
 
@@ -244,7 +252,7 @@ def test_every_measure_of_this_library_alone_is_in_the_file_and_shown(tmp_path: 
     assert done.returncode == 0, done.stderr
     folder, rows = found(tmp_path)
     names = {file.name for file in folder.iterdir()}
-    assert names == {"benchmark.json", "benchmark.png", "benchmark.csv", "config.yaml", "speed.md"}
+    assert names == {"benchmark.json", "config.yaml", "speed.md"}
     who = [row["who"] for row in rows if row["measure"] == "registration"]
     assert who == [*(f"ours, {preset}" for preset in PRESETS), *SIZES]
     cases: dict[str, list[str]] = {}
@@ -321,22 +329,3 @@ def test_the_published_package_does_as_many_steps(problem: RegistrationProblem) 
             rotation = np.array(answer["poses"])[:, :3, :3]
             product = np.einsum("bij,bkj->bik", rotation, rotation)
             np.testing.assert_allclose(product, np.tile(np.eye(3), (4, 1, 1)), atol=1e-4)
-
-
-def test_bars_are_medians_with_their_quartiles() -> None:
-    rows = [
-        compared("ours, reference", 6.0, 10.0, 18.0, case="real_5"),
-        compared("package", 500.0, case="real_5"),
-        Row(PD, "3 iterations", "icp", "mm²", (90.0,), at=8.0),
-        Row(PD, "1 iterations", "icp", "mm²", (400.0,), at=2.0),
-    ]
-    picture = picture_of_benchmark(rows)
-    assert picture is not None
-    bars, curves = picture.figure.axes
-    first, second = (one for one in bars.containers if isinstance(one, BarContainer))
-    assert [first[0].get_height(), second[0].get_height()] == [10.0, 500.0]
-    (segment,) = first.errorbar[2][0].get_segments()
-    assert segment[:, 1].tolist() == [8.0, 14.0]
-    assert curves.lines[0].get_xydata().tolist() == [[2.0, 400.0], [8.0, 90.0]]
-    assert picture.data["median"].tolist() == [10.0, 500.0, 90.0, 400.0]
-    assert picture_of_benchmark([]) is None

@@ -12,10 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from chsel.errors import RecordingError
 from replay.__main__ import main as replay_main
 from replay.mcap.reader import Recording, read_recording
-from runners.run.recording import RecordingConfig, open_recorder
 from tests.tools.kill_sessions import points_session, reported_probes
 
 pytestmark = pytest.mark.slow
@@ -117,18 +115,6 @@ def test_a_folder_that_is_removed_during_the_run_is_noticed(
     assert not folder.exists()
 
 
-@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder no one can write to")
-def test_a_folder_that_cannot_be_written_is_one_error(session: tuple[str, ...]) -> None:
-    """Not even by root."""
-    process = start(Path("/proc/self"), *session)
-    _, errors = process.communicate(timeout=TIMEOUT)
-    assert process.returncode == 2
-    assert errors.count("\n") == 1
-    assert errors.startswith("error: run folder /proc/self/probe/")
-    assert "cannot be made (" in errors
-    assert errors.endswith("); accepted: a writable logs=DIR\n")
-
-
 def test_two_runs_at_once_write_two_whole_and_equal_recordings(
     session: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -159,11 +145,3 @@ def test_output_that_nobody_reads_ends_the_run_with_a_whole_recording(
     assert 1 <= len(recording.steps) < PROBES
     summary = json.loads((run_folder(tmp_path) / "summary.json").read_text())
     assert summary["outcome"] == "interrupted"
-
-
-def test_two_runs_never_share_a_recording(tmp_path: Path) -> None:
-    config = RecordingConfig(rerun=False)
-    recorder = open_recorder(tmp_path, config)
-    with pytest.raises(RecordingError, match=r"recording\.mcap cannot be written: File exists"):
-        open_recorder(tmp_path, config)
-    recorder.close()

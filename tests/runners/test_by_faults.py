@@ -11,8 +11,7 @@ from chsel.errors import SettingError
 from runners import evaluate
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
-from runners.evaluation.selection import chosen_names
-from runners.evaluation.trial_configurations import configurations_of, with_faults
+from runners.evaluation.trial_configurations import chosen_names, configurations_of, with_faults
 from runners.reporting.evaluation_folder import open_evaluation
 from runners.reporting.figures import method_styles
 from runners.reporting.method_sections import tables_by_faults

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
-import re
-import ssl
 import subprocess
 import sys
 import time
@@ -17,8 +14,6 @@ from typing import Any
 
 import pyarrow.parquet
 import pytest
-import requests
-from distributed.comm import connect
 
 from chsel.errors import SettingError
 from runners.evaluation.cluster import LocalConfig, SlurmConfig, connected, slurm_cluster
@@ -35,7 +30,6 @@ SCANCEL = """#!/usr/bin/env bash
 kill -- "-$1"
 """
 SLURM = SlurmConfig(
-    kind="slurm",
     jobs=2,
     processes=8,
     memory="16GB",
@@ -46,8 +40,6 @@ SLURM = SlurmConfig(
     directives=("--constraint=avx2",),
     prologue=("module load python",),
     python="/opt/python",
-    log_directory=None,
-    dashboard=False,
 )
 
 
@@ -143,42 +135,12 @@ def test_a_scheduler_that_is_not_there_is_one_line_at_once(
 ) -> None:
     """Without a client of Dask, which waits for a minute when it is given up."""
     monkeypatch.setattr("distributed.Client", lambda *_, **__: pytest.fail("it has a client"))
-    config = LocalConfig("local", address, False)
+    config = LocalConfig(scheduler=address)
     with (
         pytest.raises(SettingError, match=r"cluster\.scheduler is .*; accepted: the address of"),
         connected(config, None, print),
     ):
         pass
-
-
-@pytest.mark.parametrize(
-    ("dashboard", "shown"), [(True, r"dashboard: http://127\.0\.0\.1:\d+/status\n"), (False, "")]
-)
-def test_the_address_of_the_dashboard_is_printed(
-    dashboard: bool, shown: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with connected(LocalConfig("local", None, dashboard), 1, print) as (client, size):
-        assert len(client.nthreads()) == size == 1
-        check_needs_keys(client.cluster.scheduler_address)
-        check_needs_keys(*client.nthreads())
-        served = client.cluster.scheduler_info["services"]["dashboard"]
-        assert served != 8787, "Dask's own port is for other clusters, and for all machines"
-        assert client.cluster.dashboard_link.startswith("http://127.0.0.1:")
-        printed = capsys.readouterr().out
-        assert re.fullmatch(shown, printed)
-        if dashboard:
-            assert requests.get(printed.split()[1], timeout=30).status_code == 200
-
-
-def check_needs_keys(*addresses: str) -> None:
-    """Nobody without the keys of the run can connect, such as another user of the machine."""
-    trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # has no key, and asks for none
-    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
-    for address in addresses:
-        plain = address.replace("tls://", "tcp://")
-        for where, keys in ((plain, {}), (address, {"ssl_context": trusting})):
-            with pytest.raises(OSError, match=where):
-                asyncio.run(connect(where, timeout=1, **keys))
 
 
 def wait_until(is_so: Callable[[], bool]) -> None:

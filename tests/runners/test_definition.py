@@ -17,13 +17,9 @@ from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import settings_mapping
 from chsel.problem.streams import StreamKey
-from runners import report
-from runners.evaluation.definition import definition_label, definition_text
-from runners.evaluation.table import ITERATIONS, RESULTS, write_part, write_table
-from runners.reporting.evaluation_folder import ReportError, open_evaluation
+from runners.evaluation.metrics import definition_label
+from runners.evaluation.table import ITERATIONS, RESULTS, joined_parts, write_part
 from tests.chsel.plausible.scenes import WORKSPACE, ball
-from tests.runners.in_process import run
-from tests.runners.made_up_evaluations import row, write_evaluation
 
 
 def definition(name: str, **changes: Any) -> dict[str, Any]:
@@ -50,16 +46,6 @@ def test_every_definition_has_its_own_name_and_changed_ones_have_others() -> Non
     assert definition_label(disguised) == "paper"
 
 
-def test_the_text_of_a_definition_says_sums_or_means() -> None:
-    assert definition_text(definition("paper")) == (
-        "paper, cost by sums over points (the paper's), free points at most 0 mm inside of "
-        "members, epsilon that of each object"
-    )
-    text = definition_text(definition("wide_means_10mm", epsilon=0.0005))
-    assert "cost by means over points, free points at most 10 mm inside" in text
-    assert text.endswith("epsilon 0.5 mm")
-
-
 @pytest.mark.parametrize(("name", "expected"), [("wide_sums", 0.02), ("wide_means", 0.005)])
 def test_wide_definitions_add_up_contacts_or_take_their_mean(name: str, expected: float) -> None:
     """A ball that is 5 mm off four contacts on its sides."""
@@ -77,51 +63,6 @@ def test_wide_definitions_add_up_contacts_or_take_their_mean(name: str, expected
     assert settings.cost.tolerance == 0.0
 
 
-def test_a_report_refuses_a_table_of_two_definitions(tmp_path: Path) -> None:
-    rows = [
-        row("can", seed, "icp", 4, diversity=1.0) | {"definition": name}
-        for seed, name in enumerate(("wide_sums", "wide_means", "wide_sums"))
-    ]
-    done = run(report.main, str(write_evaluation(tmp_path, rows)))
-    assert done.returncode == 2
-    assert done.stderr == (
-        f"error: {tmp_path} has numbers by 2 definitions of plausible sets, wide_means, wide_sums; "
-        "accepted: one, each in an out=DIR of its own\n"
-    )
-    moment = {"configuration": "can", "seed": 0, "method": "icp", "definition": "wide_means"}
-    with pytest.raises(ReportError, match="wide_means, wide_sums"):
-        open_evaluation(write_evaluation(tmp_path / "moments", rows[:1], [moment]))
-
-
-def test_a_report_says_by_which_definition_its_numbers_are(tmp_path: Path) -> None:
-    rows = [
-        row("can", 0, method, 4, diversity=1.0, exact_members=0.5) | {"definition": "wide_sums"}
-        for method in ("chsel", "icp")
-    ]
-    folder = write_evaluation(tmp_path, rows, definition=definition("wide_sums"))
-    done = run(report.main, str(folder), "baseline=icp")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "PD and its ratios over all registrations, by wide_sums" in done.stdout
-    text = (folder / "report" / "report.md").read_text().replace("\\", "")
-    lead = text.split("##")[0]
-    assert "by the definition wide_sums, cost by sums over points (the paper's)" in lead
-    assert (
-        "Of hypotheses that fulfil the definition of the plausible set themselves, wide_sums"
-        in (text)
-    )
-
-
-def test_rows_from_before_there_was_a_column_have_the_definition_of_their_folder(
-    tmp_path: Path,
-) -> None:
-    rows = [row("can", 0, "icp", 4, diversity=1.0)]
-    folder = write_evaluation(tmp_path, rows, definition=definition("paper"))
-    assert open_evaluation(folder).definition == "paper"
-    rows += [row("can", 1, "icp", 4) | {"definition": "default"}]
-    with pytest.raises(ReportError, match="default, paper"):
-        open_evaluation(write_evaluation(tmp_path, rows, definition=definition("paper")))
-
-
 @pytest.mark.parametrize("schema", [RESULTS, ITERATIONS], ids=["results", "iterations"])
 def test_parts_by_another_definition_go_into_no_table(tmp_path: Path, schema: pa.Schema) -> None:
     found = dict.fromkeys(schema.names) | {"method": "icp", "step": 4}
@@ -129,8 +70,8 @@ def test_parts_by_another_definition_go_into_no_table(tmp_path: Path, schema: pa
     write_part(one, [found | {"definition": "paper"}], schema)
     write_part(other, [found | {"definition": "default"}], schema)
     with pytest.raises(RecordingError, match=r"other\.parquet has numbers by the def.* default"):
-        write_table(tmp_path, "results", [one, other], schema, "paper")
-    table = write_table(tmp_path, "results", [one], schema, "paper")
+        joined_parts([one, other], schema, "paper")
+    table = joined_parts([one], schema, "paper")
     assert table["definition"].to_pylist() == ["paper"]
 
 

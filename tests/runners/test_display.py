@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from rich.console import Console
 
 from runners.objects.loader import ObjectConfig
 from runners.objects.scans import AssetsConfig
-from runners.run.display import Bar
 from runners.run.recording import RecordingConfig
 from runners.run.scene import PresetName, ProbeConfig, open_scene
-
-
-def test_a_bar_stands_there_before_the_work_begins() -> None:
-    screen = io.StringIO()
-    bar = Bar(Console(file=screen, force_terminal=True, width=80))
-    bar.show("signed distance grid, nodes", 0, 64_124)
-    shown = screen.getvalue()  # at once: what is done next may keep the thread that draws
-    bar.clear()
-    assert "signed distance grid, nodes" in shown
-    assert "0/64124" in shown
 
 
 def test_the_object_of_a_session_shows_its_size_and_how_far_its_grid_is(

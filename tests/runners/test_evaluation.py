@@ -17,9 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from distributed import Client
-from filelock import FileLock, Timeout
 
-from chsel.errors import ChselError, RecordingError, SettingError
+from chsel.errors import ChselError, SettingError
 from chsel.methods.icp import Icp
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.plausible.plausible_set import read_plausible
@@ -31,19 +30,21 @@ from chsel.problem.registration_problem import Hypotheses
 from chsel.problem.settings import settings_mapping
 from replay.comparing.verification import EQUAL, NO_RESULT, verify
 from replay.events import Measured
-from replay.files import WritingError, whole_file
 from replay.mcap.reader import read_recording
-from runners.evaluation import step_recorder, tasks
+from runners.evaluation import tasks
 from runners.evaluation.cluster import LocalConfig, _checked_size, connected
 from runners.evaluation.contenders import Contender, chosen_contenders
-from runners.evaluation.experiment import collect, join_experiment, writing_alone
+from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.external_results import read_external
 from runners.evaluation.metrics import MetricsConfig
 from runners.evaluation.plan import OWN, Plan, Task, Trial
-from runners.evaluation.result_rows import ResultRows
-from runners.evaluation.selection import chosen_configurations, chosen_seeds
+from runners.evaluation.run_method import ResultRows
 from runners.evaluation.tasks import do_tasks, is_finished, tasks_of
-from runners.evaluation.trial_configurations import configurations_of
+from runners.evaluation.trial_configurations import (
+    chosen_configurations,
+    chosen_seeds,
+    configurations_of,
+)
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.sessions.probing_settings import ProbingSettings
 from tests.runners.in_process import do_task
@@ -152,7 +153,7 @@ Cluster = tuple[Client, int]
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A cluster of one worker."""
-    with connected(LocalConfig("local", None, False), 1, print) as cluster:
+    with connected(LocalConfig(), 1, print) as cluster:
         yield cluster
 
 
@@ -231,21 +232,6 @@ def test_a_session_that_fails_fails_its_methods_and_no_others(
     assert row["status"].startswith("failed: session: ")
 
 
-def test_a_second_run_in_a_folder_waits_for_the_first(tmp_path: Path) -> None:
-    said: list[str] = []
-    lock = FileLock(tmp_path / ".lock")
-    lock.acquire()
-
-    def end_the_first(line: str) -> None:
-        said.append(line)
-        lock.release()
-
-    with writing_alone(tmp_path, end_the_first):
-        assert said == [f"another run is at work in {tmp_path}; this one waits until it ends"]
-        with pytest.raises(Timeout):
-            lock.acquire(timeout=0)
-
-
 @pytest.mark.parametrize("name", ["session.json", "icp.parquet"])
 def test_a_damaged_file_is_made_again(make_plan: MakePlan, cluster: Cluster, name: str) -> None:
     plan = make_plan()
@@ -275,36 +261,6 @@ def test_a_file_on_a_full_disk_is_named_and_not_left_half_written(
     path = TRIAL.folder(plan) / "icp.parquet"
     assert failure.startswith(f"{path} cannot be written (No space left on device)")
     assert not list(TRIAL.folder(plan).glob("*icp*"))
-
-
-def test_what_cannot_be_recorded_is_a_failure_of_its_task_and_leaves_no_file(
-    make_plan: MakePlan, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(self: Any, event: Any) -> None:
-        raise RecordingError("not finite")
-
-    plan = make_plan()
-    monkeypatch.setattr(step_recorder.McapRecorder, "record", refused)
-    assert do_task(plan, Task(TRIAL, "icp")) == "not finite"
-    assert not list(TRIAL.folder(plan).glob("*icp*"))
-
-
-def _half_written(path: Path) -> None:
-    path.write_text("half")
-    raise ZeroDivisionError
-
-
-def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
-    path = tmp_path / "a" / "file"
-    with pytest.raises(ZeroDivisionError), whole_file(path) as beside:
-        _half_written(beside)
-    assert list(path.parent.iterdir()) == []
-    with whole_file(path) as beside:
-        beside.write_text("whole")
-        assert not path.exists()
-    assert path.read_text() == "whole"
-    with pytest.raises(WritingError, match="cannot be written"), whole_file(path / "x"):
-        pass
 
 
 def test_errors_are_modulo_symmetries_at_the_centre(make_plan: MakePlan) -> None:

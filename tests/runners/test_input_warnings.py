@@ -63,13 +63,6 @@ def sequence(surface: FloatArray = SURFACE, free: FloatArray = FREE) -> dict[str
     return {"surface": surface, "surface_step": STEPS, "free": free}
 
 
-@pytest.mark.parametrize("method", ["chsel", "anchored"])
-def test_good_points_give_no_warning(tmp_path: Path, method: str) -> None:
-    choice = [] if method == "chsel" else ["method=anchored", "method.size=small"]
-    done, told, logged = probe(tmp_path, *choice, points=sequence())
-    assert (said(done), told, logged) == ([], [], [])
-
-
 def test_a_warning_is_given_once_with_the_step_at_which_it_first_holds(tmp_path: Path) -> None:
     surface = SURFACE.copy()
     surface[[15, 25]] = [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]  # of the second and third probe
@@ -96,12 +89,6 @@ def test_free_points_alone_are_a_warning_at_the_end(tmp_path: Path) -> None:
     assert [(each["step"], each["code"]) for each in told] == [(2, "no_contact")]
     assert "all known points are free" in said(done)[0]
     assert logged == [(2, told[0]["text"])]
-
-
-def test_contacts_that_come_late_are_no_warning(tmp_path: Path) -> None:
-    late = {"surface": SURFACE, "surface_step": STEPS + 2, "free": FREE}
-    _, told, _ = probe(tmp_path, points=late)
-    assert told == []
 
 
 def test_points_outside_of_a_given_workspace_are_a_warning_even_unregistered(

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 import chsel
 from chsel.errors import MeshError
-from chsel.methods import METHODS, build_method
+from chsel.methods import build_method
 from chsel.numerics.arrays import FloatArray
 from chsel.plausible.pose_metrics import result_numbers
 from chsel.plausible.symmetry import object_symmetry
@@ -137,16 +137,6 @@ def test_a_run_ends_with_the_best_pose_and_the_command_that_exports_all(
     assert replay(command[3:]) == 0
     exported = np.load("recording_hypotheses.npz")["step_2/object_from_world"]
     np.testing.assert_array_equal(exported, recording.hypotheses(2).object_from_world)
-
-
-def test_the_table_has_the_time_of_registrations_alone(finished: tuple[Path, Done]) -> None:
-    folder, done = finished
-    table = [line.split() for line in done.stdout.splitlines() if line.split()[1:2] == ["10"]]
-    row = json.loads((folder / "summary.json").read_text())["steps"][1]
-    stages = row["seconds_by_stage"]
-    own = sum(stages.values()) - stages["probe"]
-    assert row["registration_seconds"] == pytest.approx(own)
-    assert f"{1000.0 * own:.0f} ms" in " ".join(table[0])
 
 
 def test_points_of_ones_own_are_registered_by_anchored_unless_a_method_is_named(
@@ -291,14 +281,6 @@ def test_ctrl_c_ends_with_a_whole_recording_and_status_130(
     assert recording.ended.outcome == "interrupted"
 
 
-def test_a_sweep_runs_every_value(points: tuple[str, ...], tmp_path: Path) -> None:
-    overrides = ["-m", *points, *QUICK[:2], "method=gradient_descent", "seed=1,2", "recording=none"]
-    done = run(tmp_path, *overrides)
-    assert done.returncode == 0, done.stderr
-    summaries = [json.loads(f.read_text()) for f in tmp_path.rglob("summary.json")]
-    assert sorted(summary["seed"] for summary in summaries) == [1, 2]
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -369,14 +351,6 @@ def test_a_mistake_is_one_line_and_status_2(
 def test_traceback_is_shown_when_asked_for(points: tuple[str, ...], tmp_path: Path) -> None:
     with pytest.raises(MeshError):  # which Python prints with its traceback
         run(tmp_path, *points, "object.path=nothing.obj", "--traceback")
-
-
-def test_help_names_every_group_with_its_choices(tmp_path: Path) -> None:
-    done = run(tmp_path, "--help")
-    assert done.returncode == 0
-    assert f"  method={'|'.join(sorted(METHODS))}\n" in done.stdout
-    assert "ycb/drill" in done.stdout
-    assert "free_scale: 20.0" in done.stdout
 
 
 @pytest.mark.parametrize(("name", "limit"), [("icub_lego", 10e-3), ("ycbv_gelatin_box", 4e-3)])

@@ -17,9 +17,8 @@ from chsel.problem.poses import inverse
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, published
-from runners.evaluation.repeats import repeat_seed
-from runners.published_package.environment import PackageError
-from runners.published_package.process import RefusedError
+from runners.evaluation.contenders import repeat_seed
+from runners.published_package.process import PackageError, RefusedError
 from runners.published_package.worker import Worker
 from tests.runners.in_process import Done, run
 from tests.runners.test_evaluate import SMALL, table
@@ -189,8 +188,8 @@ def test_a_process_that_ends_stops_all_and_leaves_what_is_finished(
     ("arguments", "message"),
     [
         ([], "dir is missing; pass dir=FOLDER"),
-        (["dir=/nowhere"], "dir /nowhere has no sessions; accepted: a folder that"),
-        (["dir=FOLDER", "configurations=drill*"], "name no session; accepted: all, patterns, or"),
+        (["dir=/nowhere"], "experiment.json cannot be read"),
+        (["dir=FOLDER", "configurations=drill*"], "configurations names 'drill*'; accepted: all"),
         (["dir=FOLDER", "seeds=3..4"], "seeds=3..4 name no session"),
         (["dir=FOLDER", "draws=0"], "draws is 0; accepted"),
         (["dir=FOLDER", "package.python=/nowhere"], "package.python /nowhere does not run"),

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from chsel.problem.streams import StreamKey
 from replay.events import Event, Recorder, SnapshotTaken, Traced
 from replay.recorder import ListRecorder
 from replay.registration import StepObserver
-from runners.run.recording import RecordingConfig, make_run_folder, open_recorder
+from runners.run.recording import make_run_folder
 
 
 def test_run_folders_of_one_second_differ_and_stay_in_the_log_folder(tmp_path: Path) -> None:
@@ -89,12 +88,3 @@ def test_a_trace_is_of_the_moment_at_which_it_was_handed_over(count: int) -> Non
     StepObserver(recorder, 0, 5, lambda *_: None).trace("descent", 10, vectors, cost)
     vectors[:], cost[:] = 0.0, 0.0
     assert recorder.events == [Traced(0, "descent", 10, *expected)]
-
-
-def test_without_files_nothing_runs_in_the_background(tmp_path: Path) -> None:
-    before = threading.active_count()
-    recorder = open_recorder(tmp_path, RecordingConfig(mcap=False, rerun=False))
-    assert threading.active_count() == before
-    recorder.record(Traced(0, "descent", 0, "0", 0.0, 0.0, 0.0))
-    recorder.close()
-    assert list(tmp_path.iterdir()) == []

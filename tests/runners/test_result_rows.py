@@ -13,10 +13,10 @@ from chsel.plausible.plausible_set import PlausibleSet
 from chsel.problem.poses import compose, inverse, product, rotation_vector
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from chsel.problem.streams import StreamKey
+from runners.evaluation.contenders import MOST_REPEATS, repeat_seed
 from runners.evaluation.metrics import HypothesisMetrics, MetricsConfig
 from runners.evaluation.plan import Task
-from runners.evaluation.repeats import MOST_REPEATS, repeat_seed
-from runners.evaluation.result_rows import ResultRows
+from runners.evaluation.run_method import ResultRows
 from runners.evaluation.trial_session import open_recorded, problems
 from runners.sessions.recorded import RecordedSession
 from tests.runners.in_process import do_task

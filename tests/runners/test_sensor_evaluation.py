@@ -20,8 +20,9 @@ from replay.mcap.reader import read_recording
 from runners import evaluate
 from runners.command.choices import CONF
 from runners.evaluation.plan import Plan, Task, Trial
-from runners.evaluation.selection import chosen_configurations
-from runners.evaluation.sensor_logs import (
+from runners.evaluation.trial_configurations import chosen_configurations, configurations_of
+from runners.evaluation.trial_session import open_recorded
+from runners.evaluation.true_poses import (
     TRUTH,
     angles_of,
     as_set_by_hand,
@@ -29,9 +30,6 @@ from runners.evaluation.sensor_logs import (
     guessed_pose,
     is_missing,
 )
-from runners.evaluation.trial_configurations import configurations_of
-from runners.evaluation.trial_session import open_recorded
-from runners.evaluation.true_poses import true_poses
 from runners.sensors.pose_file import beside, read_pose, write_pose
 from tests.runners.in_process import do_task, run
 from tests.runners.test_evaluation import plan_in
@@ -167,13 +165,13 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("pybullet")
-    from runners.evaluation import sensor_logs
+    from runners.evaluation import true_poses
     from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 
     small = RobotSettings(
         probes=2, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=96)
     )
-    monkeypatch.setattr(sensor_logs, "RobotSettings", lambda: small)
+    monkeypatch.setattr(true_poses, "RobotSettings", lambda: small)
     plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
     assert do_task(plan, Task(trial)) == ""
     log = trial.log(plan)

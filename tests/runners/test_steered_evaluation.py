@@ -18,12 +18,11 @@ from chsel.problem.poses import Poses, apply, inverse
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
 from replay.mcap.reader import read_recording
 from runners import evaluate, probe
+from runners.evaluation.contenders import chosen_policies
 from runners.evaluation.experiment import collect, join_experiment
 from runners.evaluation.plan import Task, Trial
-from runners.evaluation.policy_contenders import chosen_policies
 from runners.evaluation.run_policy import spread_of, usual_stop
 from tests.runners.in_process import do_task, run
-from tests.runners.made_up_evaluations import tables_of
 from tests.runners.test_evaluate import stamps
 from tests.runners.test_evaluation import plan_in
 
@@ -213,17 +212,6 @@ def test_a_mistake_is_one_line_on_stderr(folder: Path, arguments: list[str], mes
     done = run(evaluate.main, *SMALL, POLICIES, f"out={folder}", *arguments)
     assert (done.returncode, message in done.stderr) == (2, True), done.stderr
     assert stamps(folder) == before
-
-
-def test_a_report_is_about_these_sessions(folder: Path) -> None:
-    tables = tables_of(folder)
-    assert tables["What is there"][1][:2] == ["grid", "2 of 2"]
-    errors = tables["Error of the set after so many probes, mm"]
-    assert errors[0] == ["policy", "1", "2", "3"]
-    last = [
-        row["error"] for row in rows_of(folder) if (row["policy"], row["probes"]) == ("grid", 3)
-    ]
-    assert float(errors[1][3]) == pytest.approx(1000.0 * np.sqrt(np.prod(last)), rel=0.01)
 
 
 def test_a_registration_that_fails_is_a_row_with_the_error_of_the_one_before(

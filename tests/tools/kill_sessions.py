@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import hydra
@@ -46,23 +46,6 @@ PROBES = 6
 _QUICK = ("method.descent.restarts=2", "method.descent.iterations=20", "recording=mcap")
 _CHSEL = ("method.emitter.iterations=40", "recording.snapshot_interval=10")
 _POSE = compose(axis_angle(np.array([0.0, 0.0, 1.0]), np.array(0.5)), np.array([0.1, 0.2, 0.3]))
-_TIMED_EVERY = 20  # kills
-_LATEST = 1.0  # of the undisturbed duration: some sessions end before their kill
-
-
-@dataclass(frozen=True)
-class Figures:
-    """What came of some kills.
-
-    without: left no session yet. reported, recovered: probes. ended: sessions that were faster.
-    """
-
-    kills: int
-    without: int
-    ended: int
-    reported: int
-    recovered: int
-    seconds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +86,8 @@ def reported_probes(output: str) -> int:
     return sum(re.fullmatch(r"probe +\d+ .*\n", line) is not None for line in lines)
 
 
-def kill_many(count: int, seed: int, tell: Callable[[int], None] = lambda _: None) -> Figures:
+def kill_many(count: int, seed: int) -> str:
     """Run and kill `count` sessions. AssertionError at the first that does not come back right."""
-    begun = time.perf_counter()
     torch.set_num_threads(1)
     random = np.random.default_rng(seed)
     without = ended = reported = recovered = 0
@@ -113,22 +95,20 @@ def kill_many(count: int, seed: int, tell: Callable[[int], None] = lambda _: Non
         folder = Path(name)
         references = [_reference(folder, method) for method in METHODS]
         for index in range(count):
-            if index and index % _TIMED_EVERY == 0:  # the machine may be busier than it was
-                references = [_timed(folder, reference) for reference in references]
             reference = references[index % len(references)]
-            moment = random.uniform(0.0, _LATEST * reference.seconds)
             logs = folder / str(index)
-            output, killed = _forked(reference, logs, moment)
-            ended += not killed
+            output, killed = _forked(reference, logs, random.uniform(0.0, reference.seconds))
             told = reported_probes(output)
             kept = _recovered_probes(reference.events, logs, told)
+            ended += not killed
             without += kept is None
             reported += told
             recovered += kept or 0
             shutil.rmtree(logs, ignore_errors=True)  # there may be none yet
-            tell(index + 1)
-    seconds = time.perf_counter() - begun
-    return Figures(count, without, ended, reported, recovered, seconds)
+    return (
+        f"{count} kills, {without} before there was a session, {ended} after its end; {reported} "
+        f"probes reported, {recovered} recovered, every event equal"
+    )
 
 
 def _reference(folder: Path, method: str) -> Reference:
@@ -140,21 +120,11 @@ def _reference(folder: Path, method: str) -> Reference:
     (path,) = logs.rglob("recording.mcap")
     events = list(read_recording(path).events())
     assert sum(isinstance(event, ProblemPosed) for event in events) == PROBES
-    return _timed(folder, Reference(session, events, 60.0))
-
-
-def _timed(folder: Path, reference: Reference) -> Reference:
-    """With the time that it takes now: by the middle one of three."""
-    durations = []
-    for _ in range(3):
-        logs = folder / "timed"
-        begun = time.perf_counter()
-        output, killed = _forked(reference, logs, 60.0)
-        durations.append(time.perf_counter() - begun)
-        assert not killed
-        assert reported_probes(output) == PROBES
-        shutil.rmtree(logs)
-    return replace(reference, seconds=sorted(durations)[1])
+    begun = time.perf_counter()
+    output, killed = _forked(Reference(session, events, 60.0), folder / "timed", 60.0)
+    assert not killed
+    assert reported_probes(output) == PROBES
+    return Reference(session, events, time.perf_counter() - begun)
 
 
 def quick_session(folder: Path, method_name: str) -> Callable[[Path], None]:
@@ -244,24 +214,9 @@ def _count_of_reported(events: list[Event], reported: int) -> int:
     return [*starts, len(events) - last_two][reported] if reported else 0
 
 
-def main() -> None:
-    """Kill, and print the figures."""
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-
-    def tell(done: int) -> None:
-        if sys.stderr.isatty() or done % 500 == 0:
-            print(f"\r{done} of {given.count}", end="", file=sys.stderr, flush=True)
-
-    figures = kill_many(given.count, given.seed, tell)
-    print(
-        f"{figures.kills} kills, {figures.without} before there was a session, {figures.ended} "
-        f"after its end; {figures.reported} probes reported, {figures.recovered} recovered, "
-        f"every event equal; {figures.seconds:.0f} s"
-    )
-
-
-if __name__ == "__main__":
-    main()
+    print(kill_many(given.count, given.seed))
