@@ -24,7 +24,7 @@ from chsel.numerics.cell_set import Box, box_of, triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, exps, sine_cosine
 from chsel.numerics.pose_tuples import Triple, composed, moved, pose_at, turned_back
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
@@ -150,7 +150,7 @@ class Cvo(ConfiguredMethod[CvoSettings]):
                 observer.trace("ascent", 0, estimates.vectors, _costs(climbers.value, norm))
             for first, last in pairwise(ends):
                 run = partial(climb, product, ascent, climbers, last - first)
-                spread(run, len(poses), lambda: None)
+                parallel_for(run, len(poses), lambda: None)
                 estimates = Poses(climbers.poses.copy())
                 done = level * settings.max_iterations + last
                 observer.trace("ascent", done, estimates.vectors, _costs(climbers.value, norm))
@@ -424,7 +424,7 @@ class Product(NamedTuple):
 def values_of(product: Product, poses: FloatArray) -> FloatArray:
     """F (B,) at poses (B, 12)."""
     out = np.empty(len(poses))
-    spread(partial(_fill_values, product, poses, out), len(poses), lambda: None)
+    parallel_for(partial(_fill_values, product, poses, out), len(poses), lambda: None)
     return out
 
 
@@ -619,7 +619,7 @@ def _blurred(
         before, after = source.shape[:axis], source.shape[axis + 1 :]
         rows = source.reshape(math.prod(before), source.shape[axis], math.prod(after))
         out = np.empty((len(rows), shape[axis], rows.shape[2]))
-        spread(partial(_blur_rows, rows, weights, stride, out), shape[axis], lambda: None)
+        parallel_for(partial(_blur_rows, rows, weights, stride, out), shape[axis], lambda: None)
         source = out.reshape(*before, shape[axis], *after)
     return source
 

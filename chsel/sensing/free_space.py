@@ -13,7 +13,7 @@ from chsel.errors import PointsError, PoseError, SettingError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, frozen
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import moved, pose_at
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.points import Lattice, Workspace
 from chsel.problem.poses import (
     SENSOR_TOLERANCE,
@@ -175,7 +175,7 @@ class FreeGrid:
         def run(first: int, last: int, _: None) -> None:
             kernel(self._grid, *arguments, first, last)
 
-        spread(run, count, lambda: None, least=least)
+        parallel_for(run, count, lambda: None, least=least)
 
     def _settle(self, views: int) -> int:
         """Count the marked voxels as seen in `views` more views; how many became free."""
