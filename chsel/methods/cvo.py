@@ -513,15 +513,18 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
     is as exact as a field; else of a quarter of ell, with points moved to the nearest nodes,
     within 1 %. Points that span too large a grid are taken one by one, too.
     """
+    pairs_within = _FAR * kernel.ell
+    if len(points) <= _FEW:
+        return kernel.amplitude * _sum_of_pairs(points, kernel.ell, pairs_within)
     spacing, narrow, nodes = lattice, kernel, _nodes_of(points, lattice)
     if nodes is None:
         spacing = kernel.ell / _SNAPPED_FINENESS
         narrow = kernel.widened(-spacing * spacing / 6.0)  # either point moves by half of it
         nodes = np.rint((points - points.min(axis=0)) / spacing).astype(np.int64)
     reach = narrow.reach(spacing)
-    sides = (nodes.max(axis=0, initial=0) + 1).tolist()
-    if len(points) <= _FEW or math.prod(side + 2 * reach for side in sides) > MOST_NODES:
-        return kernel.amplitude * _sum_of_pairs(points, kernel.ell, _FAR * kernel.ell)
+    sides = (nodes.max(axis=0) + 1).tolist()
+    if math.prod(side + 2 * reach for side in sides) > MOST_NODES:
+        return kernel.amplitude * _sum_of_pairs(points, kernel.ell, pairs_within)
     grid = np.zeros(sides)
     np.add.at(grid, tuple(nodes.T), 1.0)
     around = [side + 2 * reach for side in sides]
