@@ -469,13 +469,6 @@ def test_a_coarser_field_stands_for_a_fine_grid_all_the_same() -> None:
     np.testing.assert_allclose(values(product, transforms), expected, rtol=0, atol=0.002 * most)
 
 
-def test_a_field_is_made_once_for_a_grid() -> None:
-    sdf = SdfGrid(SDF.origin, SDF.resolution, SDF.values, SDF.gradients)
-    assert class_field(sdf, KERNEL, 0.01, "free") is class_field(sdf, KERNEL, 0.01, "free")
-    assert class_field(sdf, KERNEL, 0.01, "free") is not class_field(sdf, KERNEL, 0.02, "free")
-    assert class_field(sdf, KERNEL, 0.01, "free") is not class_field(sdf, KERNEL, 0.01, "surface")
-
-
 def pair_sum(points: FloatArray) -> float:
     total = 0.0
     for point in points:
