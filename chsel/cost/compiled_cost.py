@@ -15,7 +15,7 @@ from chsel.numerics.arrays import FloatArray
 from chsel.numerics.cell_set import bounds_of, box_of, cell_set_of, triple
 from chsel.numerics.near_points import PointTree, point_tree
 from chsel.numerics.pose_tuples import Triple
-from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.numerics.threads import parallel_for, require_ieee_arithmetic
 from chsel.problem.points import KnownPoints, VoxelGrid, require_parts
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import RegistrationProblem
@@ -92,7 +92,7 @@ class CompiledCost:
             partial(costs_of_poses, self.model, poses.numbers, costs),
             partial(work_of, self.model),
         )
-        spread(run, len(poses), work, least=_POSES_PER_THREAD, multiple=LANES)
+        parallel_for(run, len(poses), work, least=_POSES_PER_THREAD, multiple=LANES)
         return costs
 
 

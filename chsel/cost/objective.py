@@ -22,7 +22,7 @@ from chsel.cost.free_kernels import MOST_SLACK, SEARCH_SLACK
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, implements, leaf, spliced
 from chsel.numerics.pose_tuples import all_finite, decode, pull_back
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.search_space import SearchSpace
 
 BETA1, BETA2 = 0.9, 0.999  # of Adam (Kingma and Ba, 2015)
@@ -146,7 +146,7 @@ class Objective:
         costs, gradients = np.empty(len(vectors)), np.empty(vectors.shape)
         space = self.space_arrays
         run = partial(costs_and_gradients, self.model, space, vectors, costs, gradients)
-        spread(run, len(vectors), self.work, multiple=LANES)
+        parallel_for(run, len(vectors), self.work, multiple=LANES)
         return costs, gradients
 
     def descended(
@@ -177,5 +177,5 @@ class Objective:
         moved, costs = vectors.copy(), np.empty(len(vectors))
         adam = iterations, float(rate), float(divisor), ends_on_poses
         run = partial(descend, self.model, self.space_arrays, moved, costs, *adam)
-        spread(run, len(vectors), self.work, multiple=LANES)
+        parallel_for(run, len(vectors), self.work, multiple=LANES)
         return moved, costs

@@ -18,7 +18,7 @@ from chsel.errors import SettingError
 from chsel.methods.anchor_kernels import NO_POSE, UNIT, Box32, CoarseScore, keep_best
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import bounds_of, set_voxels
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, product, rotated, rotation_matrices
 from chsel.problem.registration_problem import RegistrationProblem
@@ -209,7 +209,7 @@ class AnchorSampler:
                 numbers = np.arange(first + part.start, first + part.stop)
                 keep_best(score, self._placed(shares[:, part], numbers, ends), first + at, heap)
 
-        spread(run, shares.shape[1], scratch, least=_SAMPLES_PER_THREAD)
+        parallel_for(run, shares.shape[1], scratch, least=_SAMPLES_PER_THREAD)
         found = np.unique(np.concatenate(heaps))
         return found[found < NO_POSE][:most]
 

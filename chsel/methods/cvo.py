@@ -10,7 +10,7 @@ are of 32 bits, sums of 64.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -24,7 +24,7 @@ from chsel.numerics.cell_set import Box, box_of, triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, exps, sine_cosine
 from chsel.numerics.pose_tuples import Triple, composed, moved, pose_at, turned_back
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
@@ -50,7 +50,7 @@ _NEAR = 0.05  # steps count as equally long if they differ by less than this fra
 MOST_NODES = 30_000_000
 FINENESS = 10  # at least so many nodes of a field per ell, if the SDF has them
 TRUNCATION = 3.5  # ell; beyond it lie 0.02 % of a Gaussian on either side
-_FEW, _MANY = 2000, 50_000  # points that are, and that may be, taken one by one
+_FEW = 2000  # points that are taken one by one
 _FAR = 8.0  # ell; nothing is left of a kernel there
 _SNAPPED_FINENESS = 4  # nodes per ell that points are moved to
 _ON_LATTICE = 1e-6  # spacings that a point may be away from a node
@@ -144,13 +144,13 @@ class Cvo(ConfiguredMethod[CvoSettings]):
         total = settings.max_iterations * len(settings.levels)
         ends = [*range(0, settings.max_iterations, _BLOCK), settings.max_iterations]
         for level, ell in enumerate(settings.levels):
-            product, norm = self._clouds(problem, ell)
+            product, norm = self._clouds(problem, Kernel(ell))
             climbers = climbers_at(poses, values_of(product, poses))
             if level == 0:
                 observer.trace("ascent", 0, estimates.vectors, _costs(climbers.value, norm))
             for first, last in pairwise(ends):
                 run = partial(climb, product, ascent, climbers, last - first)
-                spread(run, len(poses), lambda: None)
+                parallel_for(run, len(poses), lambda: None)
                 estimates = Poses(climbers.poses.copy())
                 done = level * settings.max_iterations + last
                 observer.trace("ascent", done, estimates.vectors, _costs(climbers.value, norm))
@@ -160,31 +160,26 @@ class Cvo(ConfiguredMethod[CvoSettings]):
             poses = climbers.poses
         return ranked(estimates.matrices, _costs(climbers.value, norm))
 
-    def _clouds(self, problem: RegistrationProblem, ell: float) -> tuple[Product, float]:
+    def _clouds(self, problem: RegistrationProblem, kernel: Kernel) -> tuple[Product, float]:
         """F, and |f_x| |f_z|."""
-        settings, sdf, kernel = self.settings, problem.sdf, Kernel(ell)
-        lattice = problem.free_resolution
-        band = sdf.resolution if settings.surface_band is None else settings.surface_band
-        contacts = problem.points.contacts
-        free = problem.points.free if settings.free_space else np.zeros((0, 3))
-        surface_z = class_field(sdf, kernel, band, "surface")
-        free_z = class_field(sdf, kernel, band, "free") if settings.free_space else surface_z
+        sdf, lattice, contacts = problem.sdf, problem.free_resolution, problem.points.contacts
+        band = self.settings.surface_band or sdf.resolution
+        free = problem.points.free if self.settings.free_space else np.zeros((0, 3))
         weight = 1.0
-        if settings.balanced and len(contacts) and len(free):
+        if self.settings.balanced and len(contacts) and len(free):
             weight = len(free) / len(contacts)
+        surface_z = class_field(sdf, kernel, band, "surface")
         observed = weight * cloud_norm(contacts, kernel, lattice)
         of_object = weight * surface_z.norm
-        if settings.free_space:
+        terms = [surface_z.term(contacts, weight)]
+        if self.settings.free_space:
+            free_z = class_field(sdf, kernel, band, "free")
             observed += cloud_norm(free, kernel, lattice)
             of_object += free_z.norm
-        alone, cubes, wide = full_cubes(free, kernel, lattice)
-        cube_z = class_field(sdf, wide, band, "free") if len(cubes) else free_z
-        product = Product(
-            free=free_z.term(alone, 1.0),
-            cubes=cube_z.term(cubes, 1.0),
-            surface=surface_z.term(contacts, weight),
-        )
-        return product, float(np.sqrt(observed * of_object))
+            alone, cubes, wide = full_cubes(free, kernel, lattice)
+            cube_z = class_field(sdf, wide, band, "free") if len(cubes) else free_z
+            terms = [free_z.term(alone, 1.0), cube_z.term(cubes, 1.0), *terms]
+        return tuple(terms), float(np.sqrt(observed * of_object))
 
 
 def _costs(values: FloatArray, norm: float) -> FloatArray:
@@ -413,18 +408,14 @@ class ClassTerm(NamedTuple):
     weight: float  # W of the class
 
 
-class Product(NamedTuple):
-    """F(X) = sum over classes of W sum_i f(R x_i + t)."""
-
-    free: ClassTerm
-    cubes: ClassTerm  # centres of cubes of free points
-    surface: ClassTerm
+Product = tuple[ClassTerm, ...]
+"""F(X) = sum over classes of W sum_i f(R x_i + t)."""
 
 
 def values_of(product: Product, poses: FloatArray) -> FloatArray:
     """F (B,) at poses (B, 12)."""
     out = np.empty(len(poses))
-    spread(partial(_fill_values, product, poses, out), len(poses), lambda: None)
+    parallel_for(partial(_fill_values, product, poses, out), len(poses), lambda: None)
     return out
 
 
@@ -501,11 +492,6 @@ def _class_field(sdf: SdfGrid, members: BoolArray, kernel: Kernel) -> ClassField
     stride = max(1, math.floor(kernel.ell / (FINENESS * spacing) + 1e-9))
     reach = kernel.reach(spacing, stride)
     shape = [-(-(count - 1 + 2 * reach) // stride) + 1 for count in sdf.shape]
-    if math.prod(shape) > MOST_NODES:
-        raise SettingError(
-            f"ell {kernel.ell} m makes a field of {math.prod(shape):.1e} nodes around an SDF of "
-            f"resolution {spacing} m; accepted: at most {MOST_NODES:.0e}, so a smaller ell"
-        )
     source, table = members.astype(np.float64), np.empty((*shape, 4), dtype=np.float32)
     table[..., 0] = value = kernel.amplitude * _blurred(source, kernel, spacing, shape, stride)
     for axis in range(3):  # ell^2 grad f = sum k(., z) z - f p
@@ -515,10 +501,9 @@ def _class_field(sdf: SdfGrid, members: BoolArray, kernel: Kernel) -> ClassField
         table[..., axis + 1] = spacing / (kernel.ell * kernel.ell) * slope
     box = box_of(sdf.origin - reach * spacing, stride * spacing, shape, between=True)
     field = ClassField(box, table.reshape(-1), 0.0)
-    nothing = field.term(np.zeros((0, 3)), 0.0)
-    own = field.term(sdf.origin + np.argwhere(members) * spacing, 1.0)
-    norm = values_of(Product(own, nothing, nothing), Poses.of(np.eye(4)[None]).numbers)
-    return ClassField(box, field.table, float(norm[0]))
+    nodes = sdf.origin + np.argwhere(members) * spacing
+    norm = values_of((field.term(nodes, 1.0),), Poses.of(np.eye(4)[None]).numbers)
+    return replace(field, norm=float(norm[0]))
 
 
 def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
@@ -528,33 +513,24 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
     is as exact as a field; else of a quarter of ell, with points moved to the nearest nodes,
     within 1 %. Points that span too large a grid are taken one by one, too.
     """
+    pairs_within = _FAR * kernel.ell
     if len(points) <= _FEW:
-        return _pair_by_pair(points, kernel)
-    first, spacing, narrow = points.min(axis=0), lattice, kernel
-    nodes = _nodes_of(points, lattice)
+        return kernel.amplitude * _sum_of_pairs(points, kernel.ell, pairs_within)
+    spacing, narrow, nodes = lattice, kernel, _nodes_of(points, lattice)
     if nodes is None:
         spacing = kernel.ell / _SNAPPED_FINENESS
         narrow = kernel.widened(-spacing * spacing / 6.0)  # either point moves by half of it
-    with np.errstate(over="ignore"):
-        steps = np.rint((points - first) / spacing)
-    sides, reach = steps.max(axis=0) + 1.0, narrow.reach(spacing)
-    if not math.prod((sides + 2.0 * reach).tolist()) <= MOST_NODES:
-        return _pair_by_pair(points, kernel)
-    grid = np.zeros(sides.astype(np.int64))
-    np.add.at(grid, tuple(steps.astype(np.int64).T), 1.0)
-    around = [side + 2 * reach for side in grid.shape]
-    inside = tuple(slice(reach, reach + side) for side in grid.shape)
+        nodes = np.rint((points - points.min(axis=0)) / spacing).astype(np.int64)
+    reach = narrow.reach(spacing)
+    sides = (nodes.max(axis=0) + 1).tolist()
+    if math.prod(side + 2 * reach for side in sides) > MOST_NODES:
+        return kernel.amplitude * _sum_of_pairs(points, kernel.ell, pairs_within)
+    grid = np.zeros(sides)
+    np.add.at(grid, tuple(nodes.T), 1.0)
+    around = [side + 2 * reach for side in sides]
+    inside = tuple(slice(reach, reach + side) for side in sides)
     terms = (grid * _blurred(grid, narrow, spacing, around, 1)[inside]).reshape(-1)
     return narrow.amplitude * float(np.cumsum(terms)[-1])  # added in their order
-
-
-def _pair_by_pair(points: FloatArray, kernel: Kernel) -> float:
-    if len(points) > _MANY:
-        raise SettingError(
-            f"{len(points)} points of one class are far apart; accepted: at most {_MANY:_}, or "
-            "points within a box that is small beside ell"
-        )
-    return kernel.amplitude * _sum_of_pairs(points, kernel.ell, _FAR * kernel.ell)
 
 
 @compiled
@@ -577,12 +553,9 @@ def _sum_of_pairs(points: FloatArray, ell: float, radius: float) -> float:
 
 def _nodes_of(points: FloatArray, lattice: float) -> IntArray | None:
     """Indices (N, 3) of lattice nodes from the first on, or None if points are elsewhere."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        steps = (points - points.min(axis=0)) / lattice
-        nodes = np.rint(steps)
-        if not (np.abs(steps - nodes) < _ON_LATTICE).all() or nodes.max() >= 2.0**20:
-            return None
-    return nodes.astype(np.int64)
+    steps = (points - points.min(axis=0)) / lattice
+    nodes = np.rint(steps)
+    return nodes.astype(np.int64) if (np.abs(steps - nodes) < _ON_LATTICE).all() else None
 
 
 def full_cubes(
@@ -619,7 +592,7 @@ def _blurred(
         before, after = source.shape[:axis], source.shape[axis + 1 :]
         rows = source.reshape(math.prod(before), source.shape[axis], math.prod(after))
         out = np.empty((len(rows), shape[axis], rows.shape[2]))
-        spread(partial(_blur_rows, rows, weights, stride, out), shape[axis], lambda: None)
+        parallel_for(partial(_blur_rows, rows, weights, stride, out), shape[axis], lambda: None)
         source = out.reshape(*before, shape[axis], *after)
     return source
 

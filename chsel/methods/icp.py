@@ -14,7 +14,7 @@ from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.eigen import decompose
 from chsel.numerics.pose_tuples import finite, moved, pose_at, turned
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.poses import Poses
 from chsel.problem.registration_problem import Hypotheses, Observer, RegistrationProblem
@@ -90,7 +90,8 @@ class Icp(ConfiguredMethod[IcpSettings]):
         for first in range(0, total, _BLOCK):
             count = min(_BLOCK, total - first)
             history, after = np.empty((count, len(poses), 12)), np.empty((count, len(poses)))
-            spread(partial(_iterate, sets, poses.numbers, history, after), len(poses), scratch)
+            run = partial(_iterate, sets, poses.numbers, history, after)
+            parallel_for(run, len(poses), scratch)
             falling = self._falling(np.concatenate([errors[None], after]))
             count = count if falling.all() else int(np.argmin(falling)) + 1
             poses, errors = Poses(history[count - 1]), after[count - 1]
@@ -119,7 +120,7 @@ def _distances(sets: _PointSets, poses: Poses) -> FloatArray:
     """The rms distances (B,) of the contacts to their nearest surface points, metres."""
     out = np.empty(len(poses))
     run = partial(_fill_distances, sets, poses.numbers, out)
-    spread(run, len(poses), partial(_scratch, sets))
+    parallel_for(run, len(poses), partial(_scratch, sets))
     return out
 
 

@@ -19,7 +19,7 @@ from chsel.numerics.cell_set import Places, locate, places_for, squared_clearanc
 from chsel.numerics.compiler import compiled, implements, inner, spliced
 from chsel.numerics.elementary import logs
 from chsel.numerics.pose_tuples import all_finite, decode, finite, pose_at
-from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.numerics.threads import parallel_for, require_ieee_arithmetic
 from chsel.problem.online_registration import OnlineSettings
 from chsel.problem.points import VoxelGrid, Workspace
 from chsel.problem.poses import Poses
@@ -210,7 +210,7 @@ class MedialCost:
         """Costs (B,) of poses; infinite for one that is not finite."""
         costs = np.empty(len(poses))
         run = partial(_fill_costs, self.model, poses.numbers, costs)
-        spread(run, len(poses), self.work, least=_POSES_PER_THREAD)
+        parallel_for(run, len(poses), self.work, least=_POSES_PER_THREAD)
         return costs
 
     def work(self) -> Places:
@@ -375,7 +375,7 @@ def run_all(
                 evolve(objective.model, objective.space_arrays, work, run, drawn, settings.tolfun)
 
     for done in range(0, total, block):
-        spread(advance, len(runs), objective.work)
+        parallel_for(advance, len(runs), objective.work)
         _trace(observer, runs)
         observer.progress("cma_es", min(done + block, total), total)
         if all(run.ended[0] for run in runs):

@@ -10,7 +10,7 @@ import numpy as np
 from chsel.next_probe.decision_problem import Actions, Belief, HandShape
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.compiler import compiled, inner, leaf
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.streams import Purpose, StreamKey
@@ -90,7 +90,7 @@ def first_contacts(
         for moves in groups:
             meet(surface, poses, moves, front, view, cell, (travel, contact), (first, last))
 
-    spread(run, count, scratch, least=10)
+    parallel_for(run, count, scratch, least=10)
     return FirstContacts(travel, contact)
 
 

@@ -14,7 +14,7 @@ from chsel.next_probe.first_contact import FirstContacts, first_contacts
 from chsel.numerics.arrays import BoolArray, FloatArray
 from chsel.numerics.compiler import compiled
 from chsel.numerics.elementary import exp, log
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.outline import (
     in_order,
     outline_distances,
@@ -168,7 +168,7 @@ class Forecast:
         def run(first: int, last: int, scratch: Any) -> None:
             overlap(contacts, weights, distances, self.noise, gains, scratch, (first, last))
 
-        spread(run, count, lambda: np.empty((4, size)), least=20)
+        parallel_for(run, count, lambda: np.empty((4, size)), least=20)
         return gains
 
     def _chance(self, flags: BoolArray) -> FloatArray:

@@ -8,6 +8,7 @@ called: its last bits depend on its version and on the CPU.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import factorial
 
 import numpy as np
@@ -264,33 +265,32 @@ def _fill_arctangents(y: FloatArray, x: FloatArray, out: FloatArray) -> None:
         out[i] = arctangent(y[i], x[i])
 
 
+def _filled(
+    fill: Callable[..., None], *arguments: FloatArray | float, outputs: int = 1
+) -> list[FloatArray]:
+    """The arrays that a kernel fills, of the shape that its arguments broadcast to."""
+    arrays = np.broadcast_arrays(*(np.asarray(each, dtype=np.float64) for each in arguments))
+    out = [np.empty(arrays[0].size) for _ in range(outputs)]
+    fill(*(array.flatten() for array in arrays), *out)
+    return [each.reshape(arrays[0].shape) for each in out]
+
+
 def sines_cosines(x: FloatArray | float) -> tuple[FloatArray, FloatArray]:
     """sin x and cos x, each of the shape of x."""
-    x = np.asarray(x, dtype=np.float64)
-    sine, cosine = np.empty(x.size), np.empty(x.size)
-    _fill_sines_cosines(x.flatten(), sine, cosine)
-    return sine.reshape(x.shape), cosine.reshape(x.shape)
+    sine, cosine = _filled(_fill_sines_cosines, x, outputs=2)
+    return sine, cosine
 
 
 def exps(x: FloatArray | float) -> FloatArray:
     """e^x, of the shape of x."""
-    x = np.asarray(x, dtype=np.float64)
-    out = np.empty(x.size)
-    _fill_exps(x.flatten(), out)
-    return out.reshape(x.shape)
+    return _filled(_fill_exps, x)[0]
 
 
 def logs(x: FloatArray | float) -> FloatArray:
     """ln x, of the shape of x."""
-    x = np.asarray(x, dtype=np.float64)
-    out = np.empty(x.size)
-    _fill_logs(x.flatten(), out)
-    return out.reshape(x.shape)
+    return _filled(_fill_logs, x)[0]
 
 
 def arctangents(y: FloatArray | float, x: FloatArray | float) -> FloatArray:
     """The angles of the points (x, y), of the shape that x and y broadcast to."""
-    y, x = np.broadcast_arrays(np.asarray(y, dtype=np.float64), np.asarray(x, dtype=np.float64))
-    out = np.empty(x.size)
-    _fill_arctangents(y.flatten(), x.flatten(), out)
-    return out.reshape(x.shape)
+    return _filled(_fill_arctangents, y, x)[0]

@@ -34,7 +34,7 @@ def require_ieee_arithmetic() -> None:
         )
 
 
-def spread(
+def parallel_for(
     run: Callable[[int, int, Any], None],
     count: int,
     scratch: Callable[[], Any],

@@ -20,7 +20,7 @@ from chsel.numerics.near_points import (
     to_cells,
 )
 from chsel.numerics.pose_tuples import finite, pose_at, rigid, turned_back
-from chsel.numerics.threads import require_ieee_arithmetic, spread
+from chsel.numerics.threads import parallel_for, require_ieee_arithmetic
 from chsel.plausible.plausible_settings import EvaluationCostSettings
 from chsel.problem.points import KnownPoints, Lattice, VoxelGrid, voxels_spanned
 from chsel.problem.poses import Poses, inverse
@@ -103,7 +103,7 @@ class EvaluationCost:
         poses = Poses.of(object_from_world)
         costs = np.empty(len(poses))
         run = partial(costs_below, self.model, poses.numbers, limit, costs)
-        spread(run, len(poses), partial(scratch_for, self.model), least=_POSES_PER_THREAD)
+        parallel_for(run, len(poses), partial(scratch_for, self.model), least=_POSES_PER_THREAD)
         return costs
 
     def at(self, world_from_object: FloatArray) -> float:

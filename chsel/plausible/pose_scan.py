@@ -17,7 +17,7 @@ from chsel.numerics.arrays import FloatArray, IntArray, frozen
 from chsel.numerics.cell_set import node_of
 from chsel.numerics.compiler import compiled, leaf
 from chsel.numerics.pose_tuples import pose_at, turned
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.plausible.evaluation_cost import (
     EvaluationCost,
     EvaluationModel,
@@ -150,7 +150,7 @@ def scan_grid(cost: EvaluationCost, grid: PoseGrid, limit: float) -> tuple[IntAr
             cost=np.empty(count + _CAPACITY),
         )
 
-    spread(run, len(grid.rotations), make_buffer, least=_ROTATIONS_PER_THREAD)
+    parallel_for(run, len(grid.rotations), make_buffer, least=_ROTATIONS_PER_THREAD)
     pieces = [piece for first in sorted(found) for piece in found[first]]
     index = np.concatenate([piece[0] for piece in pieces])
     if len(index) > MOST_MEMBERS:

@@ -18,7 +18,7 @@ from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.cell_set import Places, locate, places_for
 from chsel.numerics.compiler import compiled
 from chsel.numerics.pose_tuples import composed, inverted, pose_at
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses, compose, inverse, product, rotated, stacked
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import distance_field, distance_in_place
@@ -104,7 +104,7 @@ class SurfaceDistance:
                     self._field, self._points, to_object, to_world, back, total, first, last, places
                 )
 
-        spread(run, len(total), lambda: places_for(self._points.shape[1]))
+        parallel_for(run, len(total), lambda: places_for(self._points.shape[1]))
         return total * (SQUARE_MILLIMETRES / len(self._directions))
 
     def _exact(

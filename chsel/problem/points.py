@@ -129,17 +129,8 @@ class GrowingPoints:
 
     def same(self, points: KnownPoints) -> bool:
         """Whether these are all points so far in their order, to the bit; faster than digests."""
-        for name in _CLASSES:
-            whole, parts = getattr(points, name), [getattr(part, name) for part in self._parts]
-            if len(whole) != sum(map(len, parts)):
-                return False
-            first = 0
-            for part in parts:
-                if not same_bits(whole[first : first + len(part)], part):
-                    return False
-                first += len(part)
-        self._parts = [points]  # joined, without another copy
-        return True
+        so_far = self.all()
+        return all(same_bits(getattr(points, name), getattr(so_far, name)) for name in _CLASSES)
 
     @property
     def count(self) -> int:

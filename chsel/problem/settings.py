@@ -225,15 +225,14 @@ class NamedChoices(Generic[Made]):
         return self.entry(name)[0](settings)
 
     def _load(self, name: str) -> Entry[Made]:
-        point, *others = self._offers[name]
-        package = self._packages(name)
-        if others:
+        packages = self._packages(name)
+        if len(packages) > 1:
             raise SettingError(
-                f"{self.kind} {name} is of {' and '.join(package)}; accepted: one of them"
+                f"{self.kind} {name} is of {' and '.join(packages)}; accepted: one of them"
             )
-        who = f"{self.kind} {name} of package {package[0]}"
+        who = f"{self.kind} {name} of package {packages[0]}"
         try:
-            offered = point.load()
+            offered = self._offers[name][0].load()
             default = offered()
         except Exception as error:  # whatever somebody else's code raises
             reason = " ".join(f"{type(error).__name__}: {error}".split())
@@ -241,9 +240,8 @@ class NamedChoices(Generic[Made]):
                 f"{who} cannot be loaded: {reason}; accepted: a class as in {self.page}"
             ) from error
         settings = getattr(default, "settings", None)
-        if not dataclasses.is_dataclass(settings):
-            lacks: str | None = f"settings {settings!r}; accepted: a frozen dataclass"
-        else:
+        lacks: str | None = f"settings {settings!r}; accepted: a frozen dataclass"
+        if dataclasses.is_dataclass(settings):
             lacks = self.lacks(default)
         if lacks:
             raise SettingError(f"{who} has {lacks}; see {self.page}")

@@ -9,7 +9,7 @@ import numpy as np
 from chsel.numerics.arrays import FloatArray, IntArray
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import pose_at
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses, rotated
 from chsel.problem.sdf_grid import SdfGrid
 from chsel.problem.sdf_lookup import distance_at, distance_field
@@ -96,7 +96,7 @@ def surface_distances(sdf: SdfGrid, poses: Poses, points: FloatArray) -> FloatAr
         distances_from_surface(field, numbers, places, distances, first, last)
 
     least = 1 + _LOOKUPS_PER_THREAD // max(len(points), 1)
-    spread(run, len(poses), lambda: None, least=least)
+    parallel_for(run, len(poses), lambda: None, least=least)
     return distances
 
 

@@ -13,7 +13,7 @@ from chsel.errors import PointsError, PoseError, SettingError, require_positive
 from chsel.numerics.arrays import BoolArray, FloatArray, frozen
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import moved, pose_at
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.points import Lattice, Workspace
 from chsel.problem.poses import (
     SENSOR_TOLERANCE,
@@ -90,8 +90,7 @@ class FreeGrid:
         self.count = 0
         self._views = int(views)
         voxels = int(np.prod(self.shape))
-        self._words = np.zeros(-(-voxels // 8), dtype=np.uint64)
-        marks = self._words.view(np.uint8)[:voxels]  # in the current view
+        marks = np.zeros(voxels, dtype=np.uint8)  # in the current view
         self._seen = np.zeros(voxels, dtype=np.uint8)  # number of views, then _REPORTED
         self._grid = MarkedVoxels(marks, self.shape, np.array(workspace.lower), float(spacing))
 
@@ -175,11 +174,16 @@ class FreeGrid:
         def run(first: int, last: int, _: None) -> None:
             kernel(self._grid, *arguments, first, last)
 
-        spread(run, count, lambda: None, least=least)
+        parallel_for(run, count, lambda: None, least=least)
 
     def _settle(self, views: int) -> int:
         """Count the marked voxels as seen in `views` more views; how many became free."""
-        fresh = int(settle(self._words, self._grid.marks, self._seen, views, self._views))
+        marks, seen = self._grid.marks, self._seen
+        marked = np.flatnonzero(marks.view(np.bool_))
+        marks[marked] = 0
+        marked = marked[seen[marked] < self._views]
+        seen[marked] = np.minimum(seen[marked].astype(np.int64) + views, self._views)
+        fresh = int(np.count_nonzero(seen[marked] == self._views))
         self.count += fresh
         return fresh
 
@@ -254,25 +258,6 @@ def mark_points(grid, points, moves, first, last):
             k = np.rint((z - lower[2]) / spacing)
             if 0.0 <= i < nx and 0.0 <= j < ny and 0.0 <= k < nz:
                 grid.marks[(int(i) * ny + int(j)) * nz + int(k)] = 1
-
-
-@compiled
-def settle(words, marks, seen, gain, enough):
-    """Add `gain` to the views `seen` (V,) of marked voxels, up to `enough`, and unmark them.
-
-    words: the bytes of `marks` (V,) by eights, as most voxels are not marked. Returns the number of
-    voxels that reached `enough`. Voxels with more than enough views stay as they are.
-    """
-    fresh = 0
-    for word in range(len(words)):
-        if words[word]:
-            for n in range(8 * word, min(8 * word + 8, len(marks))):
-                if marks[n]:
-                    marks[n] = 0
-                    if seen[n] < enough:
-                        seen[n] = min(seen[n] + gain, enough)
-                        fresh += 1 if seen[n] == enough else 0
-    return fresh
 
 
 @leaf

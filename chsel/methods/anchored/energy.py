@@ -17,7 +17,7 @@ from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, exps, log, logs
 from chsel.numerics.near_points import NearPoints, gather, near_points_for, select, to_cells
 from chsel.numerics.pose_tuples import moved, pose_at, rigid
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.noise import EXTENT, LATER, SHARE, NoiseModel
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses
@@ -116,7 +116,7 @@ class Energy:
         def run(first: int, last: int, work: Any) -> None:
             energies_of(self.model, self.likelihood, poses.numbers, energies, first, last, work)
 
-        spread(run, len(poses), self.scratch, least=50)
+        parallel_for(run, len(poses), self.scratch, least=50)
         return energies
 
 

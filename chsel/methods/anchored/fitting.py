@@ -28,7 +28,7 @@ from chsel.numerics.arrays import FloatArray, scratch
 from chsel.numerics.cell_set import triple
 from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.pose_tuples import composed, moved, pose_at
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses
 from chsel.problem.sdf_lookup import distance_between_nodes, distance_with_gradient
 from chsel.problem.search_space import SE2Space, SearchSpace
@@ -83,7 +83,7 @@ def fitted(energy: Energy, twists: Twists, poses: Poses, steps: int) -> Poses:
     def run(first: int, last: int, fit: Any) -> None:
         fit_poses(energy.model, energy.likelihood, twists, result, steps, first, last, fit)
 
-    spread(run, len(result), own, least=8)
+    parallel_for(run, len(result), own, least=8)
     return Poses(result)
 
 

@@ -21,7 +21,7 @@ from chsel.numerics.compiler import compiled, inner, leaf
 from chsel.numerics.elementary import exp, log
 from chsel.numerics.philox import Stream, fill_uniforms
 from chsel.numerics.pose_tuples import moved, origin_within, pose_at
-from chsel.numerics.threads import spread
+from chsel.numerics.threads import parallel_for
 from chsel.problem.poses import Poses
 from chsel.problem.search_space import SE2Space, SearchSpace
 
@@ -95,7 +95,7 @@ def walked(
     def run(first: int, last: int, work: Any) -> None:
         walk_below(model, likelihood, stride, floor, chains, stream, moves, first, last, *work)
 
-    spread(run, count, own, least=2)
+    parallel_for(run, count, own, least=2)
     return chains
 
 

@@ -327,20 +327,8 @@ def test_free_voxels_are_read_on_their_borders_as_the_torch_cost_reads_them() ->
     step = 2.0**-6
     free = np.array([[0.0, 0.0, 0.0], [step, 0.0, 0.0], [0.0, 2 * step, step], [3 * step, 0, 0]])
     changes = CostSettings(free_term="interior", interior_spacing=0.5 * step)
-    vectors = SE3Space().encode(
-        Poses.of(
-            compose(
-                np.tile(np.eye(3), (3, 1, 1)),
-                np.array(
-                    [
-                        [0.0, 0.0, 0.0],
-                        [0.5 * step, 0.0, 0.25 * step],
-                        [1.5 * step, -step, 2.5 * step],
-                    ]
-                ),
-            )
-        )
-    )
+    shifts = step * np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.25], [1.5, -1.0, 2.5]])
+    vectors = SE3Space().encode(Poses.of(compose(np.tile(np.eye(3), (3, 1, 1)), shifts)))
     case = Case("dyadic", KnownPoints(free), changes, step, vectors, SE3Space())
     assert case.objective().costs(vectors)[0] > 0.0
     assert_equals_torch(case)
@@ -376,12 +364,6 @@ EDGES = [
     "no known", "one free", "one occupied", "one known", "one point a thousand times",
     "some points many times", "in a plane", "on a line", "10 m away",
 ]  # fmt: skip
-
-
-def test_an_unknown_culling_is_refused() -> None:
-    sdf = SdfGrid.from_mesh(trimesh.creation.box((0.1, 0.1, 0.1)), 0.01)
-    with pytest.raises(SettingError, match="culling is 'quick'; accepted: octree, none"):
-        CompiledCost(sdf, KnownPoints(free=np.eye(3) * 0.2), culling="quick")
 
 
 @pytest.mark.parametrize(
@@ -426,27 +408,6 @@ def test_a_scene_far_from_the_origin_is_culled_without_loss(far: float, free_ter
 
 
 @pytest.mark.parametrize("free_term", ["direct", "interior"])
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1.7e308])
-def test_poses_beyond_all_numbers_cost_infinitely_much_and_harm_no_other(
-    bad: float, free_term: str
-) -> None:
-    stream = np.random.default_rng(9)
-    near = stream.uniform(-0.05, 0.05, (40, 3))
-    points = KnownPoints(near, near[:3], near[:9])
-    cost = CompiledCost(grid_of("box"), points, CostSettings(free_term=free_term))
-    transforms = np.tile(np.eye(4), (14, 1, 1))
-    for n in range(12):
-        transforms[n].reshape(-1)[n] = bad
-    transforms[12, :3, :3] = bad
-    costs = cost.evaluate(transforms)
-    assert_same_bits(costs[:13], np.full(13, np.inf))
-    assert_same_bits(costs[13:], cost.evaluate(np.eye(4)[None]))
-    assert 0.0 < costs[13] < np.inf
-    vectors = SE3Space().encode(Poses.of(transforms))
-    Objective(cost, SE3Space()).descended(vectors, 1.0, 0.01, 3)
-
-
-@pytest.mark.parametrize("free_term", ["direct", "interior"])
 @pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e300])
 def test_a_pose_that_is_not_finite_leaves_the_lanes_beside_it_to_the_bit_as_they_are(
     bad: float, free_term: str
@@ -473,47 +434,6 @@ def test_a_pose_that_is_not_finite_leaves_the_lanes_beside_it_to_the_bit_as_they
         assert_same_bits(gradients[others], slopes[others])
         assert_same_bits(objective.costs(spoiled)[others], costs[others])
         assert_same_bits(objective.descended(spoiled, 3.0, 0.01, 20)[others], moved[others])
-
-
-@pytest.mark.parametrize("name", ["free", "occupied", "known"])
-@pytest.mark.parametrize("lookup", ["nearest", "trilinear"])
-def test_products_that_are_no_number_read_nothing_outside_of_the_grid(
-    lookup: str, name: str
-) -> None:
-    """inf - inf in R x + t: an index made of it would be anywhere, and the process would die."""
-    points = np.array([[1e200, 1e200, 1e200], [0.01, 0.0, 0.02], [0.0, 0.2, 0.0]])
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[1, :3, :3] = [[1e150, -1e150, 0.0], [1e150, 0.0, -1e150], [0.0, 1e150, -1e150]]
-    for free_resolution in (0.01, 1e200):
-        cost = CompiledCost(
-            grid_of("box"),
-            KnownPoints(**{name: points}),
-            CostSettings(lookup=lookup),
-            free_resolution=free_resolution,
-        )
-        expected = cost.evaluate(poses[:1])[0]
-        assert_same_bits(cost.evaluate(poses)[[0, 2]], [expected, expected])
-
-
-@pytest.mark.parametrize("free_resolution", [0.01, 0.022])
-@pytest.mark.parametrize("free_term", ["direct", "interior"])
-def test_matrices_that_are_no_rotations_cost_the_same_bits_with_every_culling(
-    free_term: str, free_resolution: float
-) -> None:
-    stream = np.random.default_rng(15)
-    free = np.unique(np.rint(stream.uniform(-9.0, 9.0, (3000, 3))), axis=0) * free_resolution
-    transforms = np.tile(np.eye(4), (40, 1, 1))
-    transforms[:, :3, :3] = stream.uniform(-3.0, 3.0, (40, 3, 3))
-    transforms[0, :3, :3] = 5.0 * np.eye(3)
-    transforms[1, :3, :3] = np.diag([0.1, 4.0, 0.0])
-    sdf, points, changes = grid_of("box"), KnownPoints(free), CostSettings(free_term=free_term)
-    tree, direct = (
-        CompiledCost(sdf, points, changes, free_resolution=free_resolution, culling=culling)
-        for culling in ("octree", "none")
-    )
-    costs = direct.evaluate(transforms)
-    assert (costs > 0.0).sum() > 20
-    assert_same_bits(tree.evaluate(transforms), costs)
 
 
 def test_an_sdf_that_32_bits_cannot_hold_is_read_in_64_bits() -> None:
@@ -558,11 +478,10 @@ def test_an_interior_term_without_interior_points_says_what_to_do(cost: Any) -> 
         cost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0]]), changes)
 
 
-@pytest.mark.parametrize("far", [1e9, 1e19, 1e300])
-def test_free_voxels_that_span_too_much_are_an_error(far: float) -> None:
+def test_free_voxels_that_span_too_much_are_an_error() -> None:
     changes = CostSettings(free_term="interior")
     with pytest.raises(SettingError, match="coarser free_resolution"):
-        CompiledCost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0], [far, far, far]]), changes)
+        CompiledCost(grid_of("box"), KnownPoints([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), changes)
 
 
 @pytest.mark.parametrize("cost", [CompiledCost, RelaxedCost])

@@ -19,7 +19,7 @@ from chsel.plausible.pose_metrics import pose_errors
 from chsel.plausible.symmetry import ObjectSymmetry
 from chsel.problem.noise import LATER, WRONG, noise_model
 from chsel.problem.outline import outline_distances_to
-from chsel.problem.points import KnownPoints, Workspace
+from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, check_rigid, compose, inverse
 from chsel.problem.registration_problem import (
     Hypotheses,
@@ -150,21 +150,6 @@ def test_a_good_pose_of_the_last_step_is_not_lost() -> None:
     method = anchored(replace(EFFORT, samples=10))
     problem = posed(method, low_cost_set=inverse(TRUTH)[None])
     assert_found(registered(method, problem))
-
-
-@pytest.mark.parametrize(
-    "workspace",
-    [
-        Workspace((0.2, 0.1, 0.3), (0.201, 0.101, 0.301)),
-        Workspace((50.0, 50.0, 50.0), (51.0, 51.0, 51.0)),
-        Workspace((1e6, 1e6, 1e6), (1e6 + 1.0, 1e6 + 1.0, 1e6 + 1.0)),
-        Workspace((-1e6, -1e6, -1e6), (1e6, 1e6, 1e6)),
-    ],
-    ids=["tiny", "elsewhere", "far", "vast"],
-)
-def test_odd_workspaces_have_results(workspace: Workspace) -> None:
-    method = anchored()
-    registered(method, posed(method, workspace=workspace))
 
 
 @pytest.mark.parametrize("count", [1, 700])
@@ -303,12 +288,6 @@ def test_updates_on_the_same_points_never_lose_the_best() -> None:
         previous = method.register(posed(method, INEXACT, previous))
         lowest.append(previous.cost[0])
     assert (np.diff(lowest) <= 1e-12).all()
-
-
-def test_stages_that_do_nothing_are_left_out() -> None:
-    effort = replace(EFFORT, first_steps=0, steps=0, descent_moves=0, moves=0, polished=0)
-    method = anchored(effort)
-    registered(method, posed(method))
 
 
 def test_a_limit_that_excludes_nearly_all_still_gives_hypotheses() -> None:

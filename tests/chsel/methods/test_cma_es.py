@@ -121,15 +121,6 @@ def test_every_start_draws_from_a_stream_of_its_own() -> None:
     assert len({tuple(run.best) for run in three}) == 3
 
 
-def test_blocks_of_any_length_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = replace(UNENDING, generations=60)
-    expected = runs_on(SPHERE, settings, np.ones((1, D)))[0]
-    monkeypatch.setattr(medial_constraint, "_BLOCK", 7)
-    found = runs_on(SPHERE, settings, np.ones((1, D)))[0]
-    np.testing.assert_array_equal(found.best, expected.best)
-    np.testing.assert_array_equal(found.strategy.covariance, expected.strategy.covariance)
-
-
 def ended_at(kind: int, **changes: Any) -> tuple[int, Run]:
     (run,) = runs_on(kind, replace(UNENDING, **changes), np.ones((1, D)))
     return int(run.generations[0]), run

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chsel.numerics.arrays import FloatArray
-from chsel.numerics.threads import threads
 from chsel.problem.noise import INDEPENDENT, WRONG, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, compose, inverse, random_rotations
@@ -74,13 +72,3 @@ def test_the_same_points_by_another_noise() -> None:
     again = energy.by(other).of(poses)
     np.testing.assert_array_equal(again, energy_of(points, other).of(poses))
     assert (again < energy.of(poses)).all()
-
-
-def test_energies_do_not_depend_on_threads() -> None:
-    energy, poses = energy_of(points_with(6), noise_model(SENSOR)), near_and_far()
-    poses = poses[np.arange(200) % len(poses)]
-    found: list[FloatArray] = []
-    for count in (1, 2):
-        with threads(count):
-            found.append(energy.of(poses))
-    np.testing.assert_array_equal(*found)

@@ -7,7 +7,6 @@ from scipy.optimize import minimize
 
 from chsel.methods.anchored.fitting import fitted, twists_of
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.threads import threads
 from chsel.problem.noise import LEVELS, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, axis_angle, compose, rotation_angle
@@ -86,15 +85,6 @@ def test_no_fit_raises_an_energy_and_none_of_no_steps_moves() -> None:
     energy, poses = energy_of(AT_ODDS, NOISE), poses_around_truth(40, 0.1, 1.5)
     assert (energy.of(fitted(energy, TWISTS, poses, 4)) <= energy.of(poses)).all()
     np.testing.assert_array_equal(fitted(energy, TWISTS, poses, 0).numbers, poses.numbers)
-
-
-def test_fits_do_not_depend_on_threads() -> None:
-    energy, poses = energy_of(AT_ODDS, NOISE), poses_around_truth(40, 0.02, 0.2)
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            found.append(fitted(energy, TWISTS, poses, 4).numbers)
-    np.testing.assert_array_equal(*found)
 
 
 def test_on_a_plane_fits_stay_on_it() -> None:

@@ -23,8 +23,6 @@ from chsel.methods.medial_constraint import (
     medial_balls,
 )
 from chsel.numerics.arrays import BoolArray, FloatArray, IntArray
-from chsel.numerics.cell_set import squared_clearances
-from chsel.numerics.threads import threads
 from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import Poses, apply, compose
 from chsel.problem.registration_problem import RegistrationProblem
@@ -150,36 +148,6 @@ def test_points_over_too_many_voxels_are_an_error_that_says_so() -> None:
         medial_balls(points, WORKSPACE, 0.001, 0.02)
 
 
-def clearances(inside: BoolArray) -> IntArray:
-    squared = np.full(inside.shape, -7, dtype=np.int64)
-    squared_clearances(inside, squared, 1)
-    return squared
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    shape=st.sampled_from([(12, 12, 12), (1, 9, 4), (7, 1, 1), (3, 16, 5)]),
-    share=st.sampled_from([0.0, 0.5, 0.9, 0.99]),
-)
-def test_clearances_are_those_of_brute_force(
-    seed: int, shape: tuple[int, int, int], share: float
-) -> None:
-    random = np.random.default_rng(seed)
-    inside = random.random(shape) < share
-    inside[tuple(random.integers(0, shape))] = False
-    apart = np.abs(np.indices(shape).reshape(3, -1).T[:, None] - np.argwhere(~inside)[None])
-    squares = (np.maximum(2 * apart - 1, 0) ** 2).sum(axis=2)
-    np.testing.assert_array_equal(clearances(inside).reshape(-1), squares.min(axis=1))
-
-
-def test_a_slab_is_half_as_wide_as_its_clearance_in_the_middle() -> None:
-    inside = np.ones((11, 3, 3), dtype=bool)
-    inside[[0, -1]] = False
-    expected = [0, 1, 9, 25, 49, 81, 49, 25, 9, 1, 0]
-    np.testing.assert_array_equal(clearances(inside)[:, 1, 1], expected)
-
-
 RADIUS = 0.1
 IDENTITY = Poses.of(np.eye(4)[None])
 
@@ -281,22 +249,6 @@ def test_the_true_pose_among_balls_of_its_own_free_space_costs_almost_nothing() 
 
 def cost_problem(free: FloatArray) -> RegistrationProblem:
     return problem(KnownPoints(free=free, known=[[RADIUS, 0.0, 0.0]]))
-
-
-def test_poses_that_are_not_finite_cost_infinitely_much() -> None:
-    bad = poses(3)
-    bad[0, 0, 3], bad[1, 1, 1] = np.inf, np.nan
-    cost = MedialCost(problem(contacts()), balls=some_balls()).evaluate(Poses.of(bad))
-    np.testing.assert_array_equal(np.isinf(cost), [True, True, False])
-
-
-def test_costs_do_not_depend_on_threads_or_on_the_batch() -> None:
-    cost = MedialCost(problem(contacts()), balls=some_balls())
-    many = poses(700)
-    together = cost.evaluate(Poses.of(many))
-    with threads(2):
-        np.testing.assert_array_equal(cost.evaluate(Poses.of(many)), together)
-    np.testing.assert_array_equal(cost.evaluate(Poses.of(many[41:42])), together[41:42])
 
 
 def plain(generations: int) -> MedialConstraint:

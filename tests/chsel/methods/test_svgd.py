@@ -180,17 +180,6 @@ def test_a_kernel_of_wide_reach_keeps_particles_apart() -> None:
     assert spreads[1] > spreads[0] + 0.001
 
 
-def test_an_observer_sees_every_fifty_iterations_and_changes_nothing() -> None:
-    problem, kept = posed(), Watcher()
-    method = Svgd(SvgdSettings(iterations=120))
-    assert method.register(problem, kept).digest == method.register(problem).digest
-    assert [trace[:2] for trace in kept.traces] == [("svgd", n) for n in (0, 50, 100, 120)]
-    assert kept.progressed == [("svgd", done, 120) for done in (50, 100, 120)]
-    np.testing.assert_array_equal(kept.traces[0].vectors, Poses.of(problem.initial_set).vectors)
-    means = [float(trace.cost.mean()) for trace in kept.traces]
-    assert means[-1] < 0.5 * means[0]
-
-
 def test_a_particle_need_not_remember_what_is_around_it(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = posed()
     first = Svgd().register(problem).digest

@@ -8,7 +8,6 @@ import pytest
 from chsel.methods.anchored.energy import Energy
 from chsel.methods.anchored.walking import Chains, stride_of, walked
 from chsel.numerics.arrays import FloatArray
-from chsel.numerics.threads import threads
 from chsel.problem.noise import LEVELS, NoiseModel, noise_model
 from chsel.problem.points import KnownPoints
 from chsel.problem.poses import Poses, apply, inverse
@@ -100,15 +99,3 @@ def test_walks_from_above_come_down_to_a_floor_and_stop() -> None:
     assert chains_of(energy, starts, 0.0, 200).energies.mean() < floor
     kept = chains_of(energy, starts, -100.0, 20, 2)
     assert np.isinf(kept.kept_energies).all()
-
-
-def test_walks_do_not_depend_on_threads() -> None:
-    energy, starts = energy_of(AROUND, noise_model(0.0005)), poses_around_truth(12, 0.01, 0.1)
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            found.append(
-                [*chains_of(energy, starts, 0.0, 60), *chains_of(energy, starts, 1e3, 60, 3)]
-            )
-    for one, two in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, two)

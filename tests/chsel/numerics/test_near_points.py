@@ -166,14 +166,6 @@ def test_few_points_are_gathered_about_a_small_set() -> None:
     assert len(gathered) < 2 * 27 * inside  # neighbouring cells are 0 away, too
 
 
-@pytest.mark.parametrize("far", [1e9, 1e200])
-def test_points_far_apart_keep_their_numbers(far: float) -> None:
-    points = np.array([[0.0, 0.0, 0.0], [far, 0.0, 0.0], [0.0, -far, far], [0.01, 0.0, 0.0]])
-    tree = point_tree(points, 0.01)
-    assert sorted(tree.order.tolist()) == [0, 1, 2, 3]
-    np.testing.assert_array_equal(tree.points.T, points[tree.order])
-
-
 def test_points_whose_extent_is_infinite_are_refused() -> None:
     with pytest.raises(PointsError, match="accepted: a finite extent"):
         point_tree(np.array([[-1.5e308, 0.0, 0.0], [1.5e308, 0.0, 0.0]]), 0.01)

@@ -18,7 +18,7 @@ import torch
 import chsel
 from chsel.errors import EngineError, SettingError
 from chsel.numerics import threads as numerics_threads
-from chsel.numerics.threads import require_ieee_arithmetic, require_threads, spread
+from chsel.numerics.threads import parallel_for, require_ieee_arithmetic, require_threads
 from chsel.numerics.threads import threads as use_threads
 from tests.chsel.samples import ball_grid
 
@@ -51,7 +51,7 @@ def test_pieces_cover_the_range_once(threads: int, count: int, multiple: int, le
         starts.append(first)
         done.extend(range(first, last))
 
-    spread(run, count, no_scratch, least=least, multiple=multiple)
+    parallel_for(run, count, no_scratch, least=least, multiple=multiple)
     assert sorted(done) == list(range(count))
     assert all(first % multiple == 0 for first in starts)
 
@@ -101,7 +101,7 @@ def test_every_thread_works_in_scratch_of_its_own(threads: int) -> None:
         used[threading.get_ident()].add(id(own))
 
     kept: list[object] = []
-    spread(run, 200, lambda: kept.append(object()) or kept[-1])
+    parallel_for(run, 200, lambda: kept.append(object()) or kept[-1])
     assert len(used) == threads
     assert all(len(own) == 1 for own in used.values())
     assert len(set.union(*used.values())) == threads
@@ -113,7 +113,7 @@ def test_an_error_in_a_piece_reaches_the_caller(threads: int) -> None:
             raise ValueError("piece with 57")
 
     with pytest.raises(ValueError, match="piece with 57"):
-        spread(run, 100, no_scratch)
+        parallel_for(run, 100, no_scratch)
 
 
 def test_work_may_spread_work(threads: int) -> None:
@@ -125,9 +125,9 @@ def test_work_may_spread_work(threads: int) -> None:
             def inner(start: int, stop: int, _: Any, n: int = n) -> None:
                 parts[n, start:stop] += n + np.arange(start, stop)
 
-            spread(inner, 20, no_scratch)
+            parallel_for(inner, 20, no_scratch)
 
-    spread(outer, 12, no_scratch)
+    parallel_for(outer, 12, no_scratch)
     np.testing.assert_array_equal(parts, np.add.outer(np.arange(12), np.arange(20)))
 
 
@@ -141,7 +141,7 @@ def test_arithmetic_that_flushes_subnormals_is_refused(threads: int) -> None:
             require_ieee_arithmetic()
         if threads > 1:
             with pytest.raises(EngineError, match="flushes subnormal numbers to zero"):
-                spread(lambda first, last, _: None, 100, no_scratch)
+                parallel_for(lambda first, last, _: None, 100, no_scratch)
     finally:
         torch.set_flush_denormal(False)
 

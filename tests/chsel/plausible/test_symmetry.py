@@ -11,7 +11,6 @@ import trimesh
 from scipy.optimize import brentq
 
 from chsel.numerics.arrays import FloatArray
-from chsel.plausible import symmetry
 from chsel.plausible.symmetry import (
     ObjectSymmetry,
     RotatedSurface,
@@ -219,12 +218,6 @@ def test_the_centre_is_where_every_symmetry_leaves_it() -> None:
     np.testing.assert_allclose(object_symmetry(cone).centre, expected, atol=1e-5)
 
 
-def test_size_does_not_matter() -> None:
-    for size in (1e-6, 1.0, 1e3):
-        mesh = trimesh.creation.box((0.1 * size, 0.2 * size, 0.3 * size))
-        assert_same_set(object_symmetry(mesh).rotations, dihedral(2))
-
-
 @pytest.mark.parametrize(
     "vertices", [[[1.0, 2.0, 3.0]] * 3, [[0.0, 2.0, 3.0], [1.0, 2.0, 3.0], [2.0, 2.0, 3.0]]]
 )
@@ -232,13 +225,6 @@ def test_a_mesh_without_an_area_has_no_symmetry(vertices: list[list[float]]) -> 
     found = object_symmetry(trimesh.Trimesh(vertices, [[0, 1, 2]], process=False))
     assert_same_set(found.rotations, np.eye(3)[None])
     np.testing.assert_allclose(found.centre, [1.0, 2.0, 3.0])
-
-
-def test_vertices_of_no_face_do_not_count() -> None:
-    box = trimesh.creation.box((0.1, 0.2, 0.3))
-    vertices = np.concatenate([box.vertices, [[99.0, 0.0, 0.0]]])
-    found = object_symmetry(trimesh.Trimesh(vertices, box.faces, process=False))
-    assert_same_set(found.rotations, dihedral(2))
 
 
 def test_a_mesh_of_a_million_faces_is_merged_first() -> None:
@@ -250,16 +236,6 @@ def test_a_mesh_of_a_million_faces_is_merged_first() -> None:
     found = object_symmetry(mesh)
     assert len(found.rotations) == 4
     np.testing.assert_allclose(found.centre, 0.0, atol=1e-9)
-
-
-def test_the_same_mesh_gives_the_same_bits() -> None:
-    first = object_symmetry(load_model("spam_can"))
-    symmetry._FOUND.clear()
-    second = object_symmetry(load_model("spam_can"))
-    assert second is not first
-    np.testing.assert_array_equal(first.rotations, second.rotations)
-    np.testing.assert_array_equal(first.centre, second.centre)
-    assert object_symmetry(load_model("spam_can")) is second
 
 
 @pytest.mark.parametrize(("name", "count"), SCANS.items())

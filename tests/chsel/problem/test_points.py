@@ -65,10 +65,6 @@ def test_merging_appends_class_by_class_and_changes_the_digest() -> None:
     assert len({first.digest, second.digest, both.digest, second.merged(first).digest}) == 4
 
 
-def test_digest_tells_classes_apart() -> None:
-    assert KnownPoints(free=[[1, 2, 3]]).digest != KnownPoints(occupied=[[1, 2, 3]]).digest
-
-
 def test_the_same_points_are_those_of_the_same_digest() -> None:
     arrays = ({"free": [[0, 1, 2]]}, {"free": [[-0.0, 1, 2]]}, {"known": [[0, 1, 2]]})
     points = [KnownPoints(**arrays[n]) for n in (0, 0, 1, 2)]

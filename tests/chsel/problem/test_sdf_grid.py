@@ -227,13 +227,6 @@ def test_active_cells_are_those_that_read_a_value_below_the_level(
     assert 0.01 < flags.mean() < 0.3
 
 
-def test_two_builds_have_the_same_digest_and_another_object_has_not(box: trimesh.Trimesh) -> None:
-    again = SdfGrid.from_mesh(box.copy(), 0.01)
-    assert SdfGrid.from_mesh(box, 0.01).digest == again.digest
-    wider = trimesh.creation.box(SIZE * [1.0, 1.0, 1.0001])
-    assert SdfGrid.from_mesh(wider, 0.01).digest != again.digest
-
-
 def test_grids_that_make_no_sense_are_refused(grid: SdfGrid, box: trimesh.Trimesh) -> None:
     with pytest.raises(SdfError, match="border"):
         SdfGrid(grid.origin, 0.01, grid.values[10:], grid.gradients[10:])

@@ -416,15 +416,6 @@ def test_poses_that_are_not_finite_or_repeated_are_left_out() -> None:
         trust_in(posed, found, 0.0)
 
 
-def test_many_points_and_hypotheses_take_a_moment() -> None:
-    rng = np.random.default_rng(0)
-    known = np.tile(at_height(0.0), (1000, 1)) + 0.001 * rng.standard_normal((60_000, 3))
-    points = chsel.KnownPoints(free=rng.uniform(0.5, 2.0, (200_000, 3)), known=known)
-    shifts = compose(np.tile(np.eye(3), (3000, 1, 1)), CENTRE + 0.001 * rng.random((3000, 3)))
-    trust = trust_in(problem(points), hypotheses(*shifts), NOISE)
-    assert (trust.verdict, trust.modes) == ("determined", 1)
-
-
 def test_an_object_thinner_than_its_grid_is_judged_too() -> None:
     """No node is inside, and no point of the surface known exactly."""
     plate = trimesh.creation.box((0.1, 0.1, 0.001))

@@ -207,11 +207,6 @@ def test_a_gradient_of_nan_is_no_direction() -> None:
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-def test_one_pose_is_enough(name: str) -> None:
-    assert len(found(name, QUADRATIC, count=1).occupied) > 3
-
-
-@pytest.mark.parametrize("name", SEARCHES)
 def test_without_improvement_it_restarts_from_the_chosen_elite(name: str) -> None:
     stepper = Stepper(name)
     for _ in range(8):

@@ -30,19 +30,6 @@ def test_points_project_back_onto_their_pixels() -> None:
     np.testing.assert_allclose(v, np.tile([[0.0], [1.0], [2.0]], (1, 4)), atol=1e-12)
 
 
-def test_directions_are_points_at_depth_one() -> None:
-    directions = CAMERA.directions()
-    np.testing.assert_array_equal(directions[..., 2], 1.0)
-    np.testing.assert_array_equal(directions[0, 3], [1.0, -0.375, 1.0])
-
-
-def test_depths_that_are_no_numbers_give_no_points() -> None:
-    depth = np.ones((3, 4))
-    depth[0, 0], depth[1, 1] = np.nan, np.inf
-    finite = np.isfinite(CAMERA.back_project(depth)).all(axis=-1)
-    np.testing.assert_array_equal(finite, np.isfinite(depth))
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -154,11 +141,6 @@ def test_pixels_that_do_not_count_are_in_no_region_and_connect_none() -> None:
     assert regions(diagonal, camera=PinholeCamera(3, 3, 9.0, 9.0, 1.0, 1.0)).max() == 3
 
 
-def test_an_image_without_a_pixel_that_counts_has_no_region() -> None:
-    assert regions(np.zeros((1, 1)), camera=PinholeCamera(1, 1, 9.0, 9.0, 0.0, 0.0)).max() == 0
-    assert not small_regions(regions(np.zeros((40, 60))), 100).any()
-
-
 def test_small_regions_are_those_of_fewer_pixels() -> None:
     depth = np.full((40, 60), 0.6)
     depth[10:13, 10:13] = 0.9
@@ -224,8 +206,3 @@ def test_the_largest_region_is_kept_and_large_ones_within_the_objects_diameter(
     np.testing.assert_array_equal(found.kept, np.repeat(kept, sizes))
     assert (found.small, found.far) == (small, far)
     assert main_regions(regions, part=0.0).kept.all()
-
-
-def test_no_measurement_is_no_region() -> None:
-    found = main_regions(np.zeros(0, dtype=np.int64), part=0.05)
-    assert (len(found.kept), found.small, found.far) == (0, 0, 0)

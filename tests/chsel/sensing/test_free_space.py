@@ -107,18 +107,6 @@ def test_rays_may_have_an_origin_each() -> None:
     np.testing.assert_array_equal(together.new(), one_by_one.new())
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1e17])
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_numbers_that_are_no_places_mark_nothing(bad: float, axis: int) -> None:
-    inside, outside = np.array([0.9, 0.0, 0.5]), np.array([0.9, 0.0, 0.5])
-    outside[axis] = bad
-    free = grid()
-    assert free.along_rays(inside, outside) == 0
-    assert free.along_rays(outside, inside) == 0
-    assert free.at(outside) == 0
-    assert free.at(inside) == 1
-
-
 def test_points_are_in_the_voxels_of_the_lattice() -> None:
     stream = np.random.default_rng(2)
     points = stream.uniform([0.7, -0.2, 0.31], [1.1, 0.2, 0.6], (500, 3))
