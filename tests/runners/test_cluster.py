@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
+import ssl
 import subprocess
 import sys
 import time
@@ -14,6 +16,7 @@ from typing import Any
 
 import pyarrow.parquet
 import pytest
+from distributed.comm import connect
 
 from chsel.errors import SettingError
 from runners.evaluation.cluster import LocalConfig, SlurmConfig, connected, slurm_cluster
@@ -141,6 +144,19 @@ def test_a_scheduler_that_is_not_there_is_one_line_at_once(
         connected(config, None, print),
     ):
         pass
+
+
+@pytest.mark.parametrize("dashboard", [True, False])
+def test_nobody_without_the_keys_of_a_run_can_connect(dashboard) -> None:
+    trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # has no key, and asks for none
+    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+    with connected(LocalConfig(dashboard=dashboard), 1, print) as (client, _):
+        for address in (client.cluster.scheduler_address, *client.nthreads()):
+            plain = address.replace("tls://", "tcp://")
+            for where, keys in ((plain, {}), (address, {"ssl_context": trusting})):
+                with pytest.raises(OSError, match=where):
+                    asyncio.run(connect(where, timeout=1, **keys))
+        assert client.cluster.dashboard_link.startswith("http://127.0.0.1:")
 
 
 def wait_until(is_so: Callable[[], bool]) -> None:
