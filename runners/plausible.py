@@ -13,7 +13,12 @@ from omegaconf import DictConfig
 from chsel.errors import EvaluationError, SettingError
 from chsel.numerics.arrays import FloatArray
 from chsel.numerics.threads import require_threads, threads
-from chsel.plausible.plausible_set import PlausibleSet
+from chsel.plausible.plausible_set import (
+    PlausibleSet,
+    load_plausible,
+    plausible_set,
+    save_plausible,
+)
 from chsel.plausible.plausible_settings import PlausibleSettings
 from chsel.problem.registration_problem import RegistrationProblem
 from chsel.problem.settings import build_settings
@@ -27,7 +32,6 @@ from runners.evaluation.metrics import (
     definition_label,
     definition_settings,
 )
-from runners.evaluation.trial_session import made_set
 from runners.objects.scans import AssetsConfig
 from runners.reporting.tables import Table, print_table, table_of
 from runners.sensors.pose_file import beside, read_pose
@@ -128,13 +132,18 @@ def _rows(
         for step in progress.track(steps, description="plausible sets"):
             problem = source.problems.problem(step)
             begun = time.perf_counter()
-            try:
-                before, was_there = made_set(folder, problem, truth, settings, before)
-            except EvaluationError as error:
-                failures.append(f"step {step}: {error}")
-                continue
-            row = _row(problem, before, "found" if was_there else time.perf_counter() - begun)
-            rows.append(row | metrics.compute(problem, before, source.problems.found(step)))
+            found = load_plausible(folder, problem, settings, world_from_object=truth)
+            again = found is None
+            if found is None:
+                try:
+                    found = plausible_set(problem, truth, settings, survivors=before)
+                except EvaluationError as error:
+                    failures.append(f"step {step}: {error}")
+                    continue
+                save_plausible(folder, found)
+            before = found
+            row = _row(problem, found, time.perf_counter() - begun if again else "found")
+            rows.append(row | metrics.compute(problem, found, source.problems.found(step)))
     return rows, failures
 
 

@@ -520,13 +520,13 @@ def cloud_norm(points: FloatArray, kernel: Kernel, lattice: float) -> float:
     if nodes is None:
         spacing = kernel.ell / _SNAPPED_FINENESS
         narrow = kernel.widened(-spacing * spacing / 6.0)  # either point moves by half of it
-        nodes = np.rint((points - points.min(axis=0)) / spacing).astype(np.int64)
-    reach = narrow.reach(spacing)
-    sides = (nodes.max(axis=0) + 1).tolist()
-    if math.prod(side + 2 * reach for side in sides) > MOST_NODES:
+        nodes = np.rint((points - points.min(axis=0)) / spacing)
+    reach, most = narrow.reach(spacing), nodes.max(axis=0)
+    if not math.prod((most + 1.0 + 2.0 * reach).tolist()) <= MOST_NODES:
         return kernel.amplitude * _sum_of_pairs(points, kernel.ell, pairs_within)
+    sides = [int(last) + 1 for last in most]
     grid = np.zeros(sides)
-    np.add.at(grid, tuple(nodes.T), 1.0)
+    np.add.at(grid, tuple(nodes.astype(np.int64).T), 1.0)
     around = [side + 2 * reach for side in sides]
     inside = tuple(slice(reach, reach + side) for side in sides)
     terms = (grid * _blurred(grid, narrow, spacing, around, 1)[inside]).reshape(-1)
@@ -551,11 +551,11 @@ def _sum_of_pairs(points: FloatArray, ell: float, radius: float) -> float:
     return total
 
 
-def _nodes_of(points: FloatArray, lattice: float) -> IntArray | None:
+def _nodes_of(points: FloatArray, lattice: float) -> FloatArray | None:
     """Indices (N, 3) of lattice nodes from the first on, or None if points are elsewhere."""
     steps = (points - points.min(axis=0)) / lattice
-    nodes = np.rint(steps)
-    return nodes.astype(np.int64) if (np.abs(steps - nodes) < _ON_LATTICE).all() else None
+    nodes: FloatArray = np.rint(steps)
+    return nodes if (np.abs(steps - nodes) < _ON_LATTICE).all() else None
 
 
 def full_cubes(

@@ -87,8 +87,6 @@ def trust_in(
     that is not above 0.
     """
     require_positive("sensor_noise", sensor_noise)
-    from scipy.sparse.csgraph import connected_components  # slow to import
-
     (poses, indices), sdf, points = _compared(hypotheses), problem.sdf, problem.points
     off = signed_distances(sdf, poses[:1], points.known)[0] - points.sdf
     noise = estimate_noise(off, sensor_noise)
@@ -113,7 +111,7 @@ def trust_in(
     width = max(MOST_WIDTH * sdf.diameter, LEAST_LEVELS * sensor_noise)
     gap = max(width, LEAST_GAP * noise.sigma)
     near = apart <= gap
-    count, mode = connected_components(near & ~turned(sdf, poses, near), directed=False)
+    count, mode = _components(near & ~turned(sdf, poses, near))
     parts = [np.flatnonzero(mode == one) for one in range(count)]
     redundancy = max(len(off) - FREEDOMS, 0)
     worst = max(MOST_NOISE, LEAST_LEVELS * sensor_noise)
@@ -260,6 +258,21 @@ def _mean_error(
         errors.append(depths[depths > tolerance])
     every = np.concatenate(errors)
     return float(in_order(every)) / max(len(every), 1)
+
+
+def _components(adjacent: BoolArray) -> tuple[int, IntArray]:
+    """How many parts a symmetric graph (K, K) has, and the part of each of its nodes (K,)."""
+    count, part = 0, np.full(len(adjacent), -1)
+    for first in range(len(adjacent)):
+        if part[first] >= 0:
+            continue
+        reached = np.zeros(len(adjacent), dtype=np.bool_)
+        newest = np.arange(len(adjacent)) == first
+        while newest.any():
+            reached |= newest
+            newest = adjacent[newest].any(axis=0) & ~reached
+        part[reached], count = count, count + 1
+    return count, part
 
 
 def can_be_moved(

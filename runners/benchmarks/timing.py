@@ -11,7 +11,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from chsel.numerics.threads import threads
-from chsel.problem.settings import CheckedSettings, positive
+from chsel.problem.settings import CheckedSettings, positive, settings_mapping
+from runners.command.choices import store
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,9 @@ class Steps(CheckedSettings):
     adam: Annotated[int, positive] = 50  # Adam steps of a restart
     search: Annotated[int, positive] = 100  # CMA-MEGA iterations
     long_search: Annotated[int, positive] = 500  # the same, in the longer row
+
+
+store("effort", "default", settings_mapping(Steps()))
 
 
 @dataclass(frozen=True)

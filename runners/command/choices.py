@@ -18,12 +18,8 @@ from chsel.plausible.plausible_settings import DEFINITIONS, plausible_settings
 from chsel.plausible.pose_scan import TruePoseSettings
 from chsel.policies import POLICIES, policy_settings
 from chsel.problem.settings import PRESETS, in_preset, settings_mapping
-from runners.benchmarks.timing import Steps
-from runners.evaluation.cluster import CLUSTERS
-from runners.evaluation.metrics import MetricsConfig
 from runners.objects.loader import OBJECTS
 from runners.objects.scans import URL
-from runners.published_package.process import PackageConfig
 from runners.run.recording import RecordingConfig
 from runners.sensors.rig import Rig
 from runners.sessions import SESSIONS
@@ -48,41 +44,33 @@ def _method(session: str, policy: str, preset: str) -> str:
 @cache
 def store_choices() -> None:
     """Offer all that the code knows by name, with its settings. Once in a process."""
-    _store("", "base", {"hydra": {"output_subdir": None, "run": {"dir": "."}}}, package="_global_")
+    store("", "base", {"hydra": {"output_subdir": None, "run": {"dir": "."}}}, package="_global_")
     assets = '${oc.env:CHSEL_ASSETS,"~/.cache/chsel/ycb"}'
-    _store("assets", "default", {"dir": assets, "url": URL})
+    store("assets", "default", {"dir": assets, "url": URL})
     for choice, config in OBJECTS.items():
         group, _, name = f"object/{choice}".rpartition("/")
-        _store(group, name, settings_mapping(config), package="object")
+        store(group, name, settings_mapping(config), package="object")
     mesh = {"name": "mesh", "kind": "file", "scale": 1.0, "epsilon": 0.001, "scan": None}
-    _store("object", "mesh", {**mesh, "configuration": "drill", "path": None})
+    store("object", "mesh", {**mesh, "configuration": "drill", "path": None})
     for name, written in (
         ("both", RecordingConfig()),
         ("mcap", RecordingConfig(rerun=False)),
         ("rerun", RecordingConfig(mcap=False)),
         ("none", RecordingConfig(mcap=False, rerun=False)),
     ):
-        _store("recording", name, settings_mapping(written))
+        store("recording", name, settings_mapping(written))
     for preset in PRESETS:
-        _store("preset", preset, {"name": preset})
-    for group, settings in (
-        ("metrics", MetricsConfig()),
-        ("package", PackageConfig()),
-        ("search", TruePoseSettings()),
-        ("effort", Steps()),
-    ):
-        _store(group, "default", settings_mapping(settings))
-    for name, cluster in CLUSTERS.items():
-        _store("cluster", name, settings_mapping(cluster()))
+        store("preset", preset, {"name": preset})
+    store("search", "default", settings_mapping(TruePoseSettings()))
     for method in METHODS:
         _store_with_presets("method", method, partial(preset_settings, method), {"name": method})
     for policy in POLICIES:
         with suppress(SettingError):  # of an installed policy; who chooses it gets the message
-            _store("policy", policy, {"name": policy, **settings_mapping(policy_settings(policy))})
+            store("policy", policy, {"name": policy, **settings_mapping(policy_settings(policy))})
     for name in DEFINITIONS:
         values = settings_mapping(plausible_settings(name, 1.0))
         # None: that of the object.
-        _store("definition", name, {"name": name, **values, "epsilon": None})
+        store("definition", name, {"name": name, **values, "epsilon": None})
     _store_sessions()
 
 
@@ -98,12 +86,12 @@ def _store_sessions() -> None:
             values: dict[str, Any] = {"kind": kind, **_defaults(settings_class)}
             if kind == "sensors":
                 values["defaults"] = [{"presets/rig@rig": "default"}, {"rig": "cabinet"}, "_self_"]
-            _store("session", kind, values)
+            store("session", kind, values)
     for level, faults in LEVELS.items():
-        _store("session/faults", level, settings_mapping(faults))
+        store("session/faults", level, settings_mapping(faults))
     rig = settings_mapping(Rig(name="", world=""))  # what a rig's file leaves out
     del rig["name"], rig["world"]
-    _store("session/presets/rig", "default", rig)
+    store("session/presets/rig", "default", rig)
 
 
 def _defaults(settings: type) -> dict[str, Any]:
@@ -130,13 +118,14 @@ def _store_with_presets(
     """
     with suppress(SettingError):  # of an installed method; who chooses it gets the message
         for preset in PRESETS:
-            _store(f"{group}/presets/{name}", preset, settings_mapping(settings(preset)))
+            store(f"{group}/presets/{name}", preset, settings_mapping(settings(preset)))
         defaults = [{f"presets/{name}@_here_": "${preset}"}, *choices, "_self_"]
         node = {"defaults": defaults, **node}
-    _store(group, name, node)
+    store(group, name, node)
 
 
-def _store(group: str, name: str, node: dict[str, Any], package: str | None = None) -> None:
+def store(group: str, name: str, node: dict[str, Any], package: str | None = None) -> None:
+    """Offer an option of a group; a command does so for the groups that it alone has."""
     ConfigStore.instance().store(name, node, group or None, package)
 
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from chsel.errors import SettingError, require_choice
 from chsel.numerics.threads import require_threads
-from chsel.problem.settings import CheckedSettings, build_settings, positive
+from chsel.problem.settings import CheckedSettings, build_settings, positive, settings_mapping
+from runners.command.choices import store
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -63,6 +64,8 @@ CLUSTERS: dict[str, type[LocalConfig] | type[SlurmConfig]] = {
     "local": LocalConfig,
     "slurm": SlurmConfig,
 }
+for _name, _settings in CLUSTERS.items():
+    store("cluster", _name, settings_mapping(_settings()))
 
 
 def cluster_config(values: Mapping[str, Any], workers: int | None) -> ClusterConfig:

@@ -107,7 +107,9 @@ def chosen_policies(policies: Any, settings: Mapping[str, Any]) -> dict[str, Pol
     SettingError for what does not exist, and for a label that is taken.
     """
     chosen: dict[str, PolicyContender] = {}
-    for label, entry in _entries("policies", policies or [], POLICIES, _POLICIES_HELP).items():
+    if policies is None:
+        return chosen
+    for label, entry in _entries("policies", policies, POLICIES, _POLICIES_HELP).items():
         if entry.preset is not None:
             raise SettingError(f"policies has {label!r}; accepted: {_POLICIES_HELP}")
         values = changed_settings(policy_settings(entry.name), settings, "policy")
@@ -121,7 +123,7 @@ def _entries(setting: str, value: Any, every: Iterable[str], accepted: str) -> d
     if isinstance(value, str):
         value = list(every) if value == "all" else [text.strip() for text in value.split(",")]
     listed = [value] if isinstance(value, Mapping) else value
-    if not isinstance(listed, list | tuple):
+    if not isinstance(listed, list | tuple) or not listed:
         raise SettingError(f"{setting} is {value!r}; accepted: all, or a list of {accepted}")
     entries: dict[str, _Entry] = {}
     for one in listed:

@@ -15,8 +15,9 @@ from chsel.plausible.plausible_settings import PlausibleSettings, definition_nam
 from chsel.plausible.pose_metrics import calibration, cheapest, plausible_diversity
 from chsel.plausible.surface_distance import DistanceSettings, SurfaceDistance, surface_points
 from chsel.problem.registration_problem import Hypotheses, RegistrationProblem
-from chsel.problem.settings import build_settings
+from chsel.problem.settings import build_settings, settings_mapping
 from chsel.problem.streams import StreamKey
+from runners.command.choices import store
 
 _COMBINED = {"sums": "sums over points (the paper's)", "means": "means over points"}
 
@@ -66,6 +67,9 @@ class MetricsConfig(DistanceSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         cheapest(np.zeros(1), self.quantile)
+
+
+store("metrics", "default", settings_mapping(MetricsConfig()))
 
 
 class HypothesisMetrics:

@@ -19,6 +19,8 @@ import numpy as np
 from chsel.errors import ChselError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.registration_problem import RegistrationProblem
+from chsel.problem.settings import settings_mapping
+from runners.command.choices import store
 
 PUBLISHED = "0.2.1"
 
@@ -34,6 +36,9 @@ class PackageConfig:
     python: str | None = None  # an interpreter that has the package
     directory: str = "~/.cache/chsel/published"  # else, where its environment is, or is made
     pip: tuple[str, ...] = ()  # more arguments for pip, such as "--index-url=URL"
+
+
+store("package", "default", settings_mapping(PackageConfig()))
 
 
 def interpreter(config: PackageConfig, say: Callable[[str], None]) -> Path:

@@ -29,6 +29,7 @@ from runners.evaluation.true_poses import (
     check_log,
     guessed_pose,
     is_missing,
+    true_poses,
 )
 from runners.sensors.pose_file import beside, read_pose, write_pose
 from tests.runners.in_process import do_task, run
@@ -165,13 +166,12 @@ def test_a_trial_gets_its_log_its_true_pose_and_its_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("pybullet")
-    from runners.evaluation import true_poses
     from runners.simulated_robot.settings import BubbleSettings, CameraSettings, RobotSettings
 
     small = RobotSettings(
         probes=2, camera=CameraSettings(width=96), bubbles=BubbleSettings(width=96)
     )
-    monkeypatch.setattr(true_poses, "RobotSettings", lambda: small)
+    monkeypatch.setattr("runners.evaluation.true_poses.RobotSettings", lambda: small)
     plan, trial = sensors_plan(tmp_path), Trial(0, "cabinet_drill")
     assert do_task(plan, Task(trial)) == ""
     log = trial.log(plan)
