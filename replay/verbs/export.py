@@ -1,7 +1,7 @@
 """Write hypotheses, points, archives, numbers, images or decisions as npz, csv or json.
 
-npz holds arrays; csv and json hold a table. Every number is exact, but that what is not finite is
-empty in a csv file if it is NaN, and null in a json file.
+An npz file holds arrays, a csv or json file a table. Numbers are exact. NaN is an empty cell in a
+csv file; NaN and infinity are null in a json file.
 """
 
 from __future__ import annotations

@@ -34,6 +34,7 @@ from replay.events import (
     Timed,
     Traced,
 )
+from tests.tools.small_recordings import steered_session
 
 WORKSPACE = Workspace((-0.3, -0.3, 0.0), (0.3, 0.3, 0.5))
 FREE_RESOLUTION = 0.02
@@ -328,3 +329,9 @@ def write(tmp_path):
         return path
 
     return record
+
+
+@pytest.fixture(scope="module")
+def steered():
+    """The events of three probes; a surprise starts the last registration afresh."""
+    return steered_session()

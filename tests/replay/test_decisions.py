@@ -30,12 +30,6 @@ from tests.tools.small_recordings import steered_session, write_recording
 pytest_plugins = ["pytester"]
 
 
-@pytest.fixture(scope="module")
-def steered():
-    """Three probes; a surprise starts the last registration afresh."""
-    return steered_session()
-
-
 @pytest.fixture
 def path(steered, write):
     return write(steered)

@@ -1,4 +1,4 @@
-"""What `info` tells of a recording, and of MCAP files of other programs."""
+"""What `info` says about a recording, and about MCAP files of other programs."""
 
 from __future__ import annotations
 

@@ -18,14 +18,9 @@ from replay.comparing.choices import POLICY, chosen
 from replay.events import Decided
 from replay.mcap.reader import Recording, read_recording
 from replay.verbs.compare import policy_decisions
-from tests.tools.small_recordings import STEERED, steered_session
+from tests.tools.small_recordings import STEERED
 
 OTHERS = ("voxel_entropy", "nearest_mean", "grid")
-
-
-@pytest.fixture(scope="module")
-def steered():
-    return steered_session()
 
 
 @pytest.fixture
