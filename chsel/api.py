@@ -107,22 +107,12 @@ def _warn(points_warnings: list[PointsWarning]) -> None:
 
 def _known_points(surface: Any, free: Any, occupied: Any, known: Any, sdf: Any) -> KnownPoints:
     """All classes together; None stands for no points."""
-    classes = {"surface": surface, "free": free, "occupied": occupied, "known": known}
+    none = np.zeros((0, 3))
     surface, free, occupied, known = (
-        frozen(name, np.zeros((0, 3)) if value is None else value, (None, 3))
-        for name, value in classes.items()
+        none if points is None else points for points in (surface, free, occupied, known)
     )
-    sdf = frozen("known_sdf", np.zeros(0) if sdf is None else sdf, (None,))
-    if len(known) != len(sdf):
-        raise PointsError(
-            f"known has {len(known)} points and known_sdf {len(sdf)}; accepted: equal"
-        )
-    points = KnownPoints(
-        free,
-        occupied,
-        known=np.concatenate([surface, known]),
-        known_sdf=np.concatenate([np.zeros(len(surface)), sdf]),
-    )
+    others = KnownPoints(free, occupied, known, np.zeros(0) if sdf is None else sdf)
+    points = KnownPoints(known=frozen("surface", surface, (None, 3))).merged(others)
     if points.count == 0:
         raise PointsError("no point was given; accepted: surface, free, occupied or known points")
     return points

@@ -94,10 +94,5 @@ def digest(*arrays: NDArray[Any]) -> str:
     return state.hexdigest()
 
 
-def same_bits(a: FloatArray, b: FloatArray) -> bool:
-    """Equal in shape and to the bit, unlike `==`, for which -0 is 0."""
-    return np.array_equal(a.view(np.int64), b.view(np.int64))
-
-
 def _show(shape: tuple[int | None, ...]) -> str:
     return "(" + ", ".join("any" if length is None else str(length) for length in shape) + ")"

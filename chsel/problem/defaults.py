@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     import trimesh
 
 FREE_RESOLUTION = 0.01  # side of a voxel of free space, metres
-_KEPT_NODES = 2 * DEFAULT_NODES  # of all grids that are kept
-_kept: dict[tuple[str, float | None, float], SdfGrid] = {}  # the last used, in this order
+_MOST_KEPT = 4  # grids
+_kept: dict[tuple[str, float | None, float], SdfGrid] = {}  # those made last, in this order
 
 
 def object_grid(
@@ -24,14 +24,14 @@ def object_grid(
     padding: float = OBJECT_PADDING,
     progress: Callable[[int, int], None] | None = None,
 ) -> SdfGrid:
-    """The grid of a clean mesh by `SdfGrid.from_mesh`, kept for the next call with this mesh."""
+    """The grid of a clean mesh by `SdfGrid.from_mesh`, kept for later calls with this mesh."""
     key = mesh_digest(mesh), resolution, padding
-    grid = _kept.pop(key, None)
+    grid = _kept.get(key)
     if grid is None:
         grid = SdfGrid.from_mesh(mesh, resolution, padding=padding, progress=progress)
-    _kept[key] = grid
-    for oldest in list(_kept):
-        if sum(each.values.size for each in list(_kept.values())) > _KEPT_NODES:
+        if grid.values.size <= DEFAULT_NODES:
+            _kept[key] = grid
+        for oldest in list(_kept)[:-_MOST_KEPT]:
             _kept.pop(oldest, None)
     return grid
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from chsel.errors import PoseError, require_instance
 from chsel.numerics.arrays import FloatArray
-from chsel.problem.points import GrowingPoints, KnownPoints, Workspace, require_parts
+from chsel.problem.points import KnownPoints, Workspace, require_parts
 from chsel.problem.poses import (
     axis_angle,
     compose,
@@ -183,7 +183,7 @@ class OnlineRegistration:
         self._settings, self._seed = settings, seed
         self._start, self._only, self._sensor_noise = start, only, sensor_noise
         self._larger = 1
-        self.points = GrowingPoints(points)
+        self.points = points
         self.previous = previous
 
     def steps(
@@ -202,7 +202,7 @@ class OnlineRegistration:
         """
         for step, new_points in perceived:
             require_parts(points=new_points)
-            self.points.add(new_points)  # X <- perceived from environment
+            self.points = self.points.merged(new_points)  # X <- perceived from environment
             problem = hypotheses = failure = None
             if self.enough(step):
                 try:
@@ -221,7 +221,7 @@ class OnlineRegistration:
     def enough(self, step: int) -> bool:
         """Whether a step registers, with the points that are known."""
         chosen = self._only is None or step in self._only
-        started = step >= self._start.step and self.points.contacts >= self._start.contacts
+        started = step >= self._start.step and len(self.points.contacts) >= self._start.contacts
         return chosen and started and self.points.count > 0
 
     def pose(self, step: int) -> RegistrationProblem:
@@ -232,7 +232,7 @@ class OnlineRegistration:
         """
         return pose_problem(
             self.sdf,
-            self.points.all(),
+            self.points,
             self._workspace,
             self._free_resolution,
             StreamKey(self._seed, step),

@@ -24,7 +24,6 @@ from chsel.numerics.arrays import (
     digest,
     frozen,
     read_only,
-    same_bits,
 )
 from chsel.numerics.cell_set import bounds_of, set_voxels
 from chsel.problem.sdf_grid import SdfGrid
@@ -103,39 +102,6 @@ class KnownPoints(ShapesShown):
     def all_points(self) -> FloatArray:
         """Every point of every class (N + K + M, 3)."""
         return np.concatenate([self.free, self.occupied, self.known])
-
-
-class GrowingPoints:
-    """The known points of a session so far, joined only when all are asked for."""
-
-    def __init__(self, initial: KnownPoints) -> None:
-        self.free = self.occupied = self.known = self.contacts = 0  # numbers of points
-        self._parts: list[KnownPoints] = []
-        self.add(initial)
-
-    def add(self, new: KnownPoints) -> None:
-        """Append new points."""
-        self._parts.append(new)
-        self.free += len(new.free)
-        self.occupied += len(new.occupied)
-        self.known += len(new.known)
-        self.contacts += len(new.contacts)
-
-    def all(self) -> KnownPoints:
-        """All points so far; the same value until more are added."""
-        if len(self._parts) > 1:
-            self._parts = [KnownPoints.joined(self._parts)]
-        return self._parts[0]
-
-    def same(self, points: KnownPoints) -> bool:
-        """Whether these are all points so far in their order, to the bit; faster than digests."""
-        so_far = self.all()
-        return all(same_bits(getattr(points, name), getattr(so_far, name)) for name in _CLASSES)
-
-    @property
-    def count(self) -> int:
-        """Number of points in all classes."""
-        return self.free + self.occupied + self.known
 
 
 @dataclass(frozen=True)

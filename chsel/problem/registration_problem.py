@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -83,16 +83,6 @@ class ArchiveSnapshot:
     def digest(self) -> str:
         """Digest of the snapshot."""
         return digest(self.cells, self.solutions, self.objectives, self.measures)
-
-    def same(self, other: ArchiveSnapshot) -> bool:
-        """Whether all fields are those of the other, to the bit; faster than digests."""
-        pairs = [(getattr(self, one.name), getattr(other, one.name)) for one in fields(self)]
-        return all(
-            (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
-            if isinstance(a, np.ndarray) and isinstance(b, np.ndarray)
-            else type(a) is type(b) and a == b
-            for a, b in pairs
-        )
 
 
 VERDICTS = ("determined", "several modes", "wide", "nothing fits")

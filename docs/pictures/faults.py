@@ -62,7 +62,7 @@ def draw(level: str, path: Path) -> str:
     )
     for event in islice(session.probes(), _PROBE + 1):
         assert isinstance(event, Probe)
-        online.points.add(event.new_points)
+        online.points = online.points.merged(event.new_points)
     problem = online.pose(_PROBE)
     found, true_pose = method.register(problem), inverse(truth[None])
     trust = trust_by(method, problem, found)

@@ -119,7 +119,7 @@ class _SessionAgain:
         self._lost = self._lost or tells_loss(event)
         if not isinstance(event, Probe):
             return
-        self._online.points.add(event.new_points)
+        self._online.points = self._online.points.merged(event.new_points)
         before, self._surprise = self._before, None
         if before is None or before.step != event.step - 1 or before.decision.chosen < 0:
             return

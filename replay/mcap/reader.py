@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from chsel.errors import ChselError, RecordingError
-from chsel.problem.points import GrowingPoints
+from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from replay.events import (
     ActionsOffered,
@@ -73,11 +73,11 @@ class Recording:
 
         Images are read from the file once more, one at a time, or left out.
         """
-        points = GrowingPoints(self.start.initial_points)
+        points = self.start.initial_points
         seen = self._images()
         for entry in self._entries:
             if isinstance(entry, Probe):
-                points.add(entry.new_points)
+                points = points.merged(entry.new_points)
             if isinstance(entry, RecordedProblem):
                 yield ProblemPosed(entry.step, self._completed(entry, points))
             elif isinstance(entry, RecordedDecision):
@@ -171,25 +171,25 @@ class Recording:
             raise RecordingError(f"recording {self.path} has changed while it was read")
         return found
 
-    def _found(self, kind: type[Placed], step: int) -> tuple[Placed, GrowingPoints]:
+    def _found(self, kind: type[Placed], step: int) -> tuple[Placed, KnownPoints]:
         """An entry of a step that is there, and all points before it."""
-        points = GrowingPoints(self.start.initial_points)
+        points = self.start.initial_points
         for entry in self._entries:
             if isinstance(entry, Probe):
-                points.add(entry.new_points)
+                points = points.merged(entry.new_points)
             if isinstance(entry, kind) and entry.step == step:
                 break
         assert isinstance(entry, kind)
         return entry, points
 
-    def _decided(self, entry: RecordedDecision, points: GrowingPoints) -> Decided:
+    def _decided(self, entry: RecordedDecision, points: KnownPoints) -> Decided:
         assert self.offered is not None  # as the decision was read
         with _blaming(self.path):
-            return entry.completed(self.start, self.offered, points.all())
+            return entry.completed(self.start, self.offered, points)
 
-    def _completed(self, entry: RecordedProblem, points: GrowingPoints) -> RegistrationProblem:
+    def _completed(self, entry: RecordedProblem, points: KnownPoints) -> RegistrationProblem:
         with _blaming(self.path):
-            return entry.completed(self.start.sdf, points.all())
+            return entry.completed(self.start.sdf, points)
 
     def _check_step(self, step: int, accepted: tuple[int, ...], what: str) -> None:
         if step not in accepted:

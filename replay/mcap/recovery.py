@@ -10,7 +10,7 @@ from typing import Any
 
 from chsel.errors import ChselError, RecordingError
 from chsel.problem.defaults import object_grid
-from chsel.problem.points import GrowingPoints, KnownPoints
+from chsel.problem.points import KnownPoints
 from replay.events import (
     ActionsOffered,
     Event,
@@ -108,7 +108,7 @@ class _Recovery:
         self._file = McapFile(path, TOPIC_SCHEMAS, partial=True)
         self._reader = EventReader(self._file.attachments)
         self._order = EventOrder()
-        self._points = GrowingPoints(KnownPoints())  # those that are kept
+        self._points = KnownPoints()  # those that are kept
         self._start: SessionStarted | None = None
         self._offered: ActionsOffered | None = None
 
@@ -182,7 +182,7 @@ class _Recovery:
         if not isinstance(entry, RecordedProblem | RecordedDecision):
             return entry
         assert self._start is not None
-        points = self._points.all()
+        points = self._points
         if isinstance(entry, RecordedProblem):
             return ProblemPosed(entry.step, entry.completed(self._start.sdf, points))
         if self._offered is None:
@@ -192,11 +192,11 @@ class _Recovery:
     def _note(self, event: Event) -> None:
         match event:
             case SessionStarted():
-                self._start, self._points = event, GrowingPoints(event.initial_points)
+                self._start, self._points = event, event.initial_points
             case ActionsOffered():
                 self._offered = event
             case Probe():
-                self._points.add(event.new_points)
+                self._points = self._points.merged(event.new_points)
                 self.found.probes.append(event.step)
             case ProblemPosed():
                 self.found.problems.append(event.step)

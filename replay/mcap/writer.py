@@ -14,8 +14,8 @@ from mcap.writer import CompressionType, Writer
 
 from chsel.errors import RecordingError
 from chsel.next_probe.decision_problem import DecisionProblem
-from chsel.numerics.arrays import FloatArray, same_bits
-from chsel.problem.points import GrowingPoints, KnownPoints
+from chsel.numerics.arrays import FloatArray, digest
+from chsel.problem.points import KnownPoints
 from chsel.problem.registration_problem import RegistrationProblem
 from replay.events import (
     ActionsOffered,
@@ -63,7 +63,7 @@ class McapRecorder(Recorder):
         self._closed = False
         self._order = EventOrder()
         self._views = Views()
-        self._points: GrowingPoints | None = None  # all that is known, once a session has started
+        self._points: KnownPoints | None = None  # all that is known, once a session has started
         self._start: SessionStarted | None = None
         self._offered: ActionsOffered | None = None
         self._last_snapshot: SnapshotTaken | None = None
@@ -153,7 +153,7 @@ class McapRecorder(Recorder):
         self._record(event.topic, event.step, values)
         for topic in STARTING_EMPTY:
             self._add(topic, event.step, empty_cloud)
-        self._points = GrowingPoints(KnownPoints())
+        self._points = KnownPoints()
         self._write_points(event.step, event.initial_points)
 
     def _write_points(self, step: int, new: KnownPoints) -> None:
@@ -163,8 +163,8 @@ class McapRecorder(Recorder):
         for topic, points in zip(CLOUDS, (new.free, new.occupied, known), strict=True):
             if len(points) > 0:
                 self._add(topic, step, partial(point_cloud, points))
-        self._points.add(new)
-        values = {name: getattr(self._points, name) for name in POINT_CLASSES}
+        self._points = self._points.merged(new)
+        values = {name: len(getattr(self._points, name)) for name in POINT_CLASSES}
         values |= {f"new_{name}": len(getattr(new, name)) for name in POINT_CLASSES}
         values |= {"step": step, "new_digest": new.digest}
         self._record("/known_points", step, values)
@@ -177,7 +177,8 @@ class McapRecorder(Recorder):
                 "before it do not give"
             )
         values = event_values(event)
-        if self._last_elites is not None and same_bits(problem.low_cost_set, self._last_elites):
+        elites = self._last_elites
+        if elites is not None and digest(problem.low_cost_set) == digest(elites):
             values["low_cost_set"] = None
         self._record(event.topic, event.step, values)
 
@@ -201,15 +202,14 @@ class McapRecorder(Recorder):
         """Whether points and grid of a problem are those of the events before."""
         assert self._points is not None
         assert self._start is not None
-        same_points = self._points.same(problem.points)
-        return same_points and problem.sdf.digest == self._start.sdf.digest
+        given = self._points.digest, self._start.sdf.digest
+        return given == (problem.points.digest, problem.sdf.digest)
 
     def _write_hypotheses(self, event: HypothesesFound) -> None:
         found, last = event.hypotheses, self._last_snapshot
         archive, repeats = None, False
         if (final := found.archive) is not None:
-            if last is not None and last.step == event.step and final.same(last.archive):
-                final, repeats = last.archive, True  # it has its digest
+            repeats = last is not None and _same(last, SnapshotTaken(event.step, final))
             archive = archive_values(event.step, final)
         values = shared_values("Hypotheses", found) | {
             "step": event.step,
@@ -277,3 +277,12 @@ class McapRecorder(Recorder):
         if hasattr(self, "_file"):
             with suppress(OSError):
                 self._file.close()
+
+
+def _same(one: SnapshotTaken, other: SnapshotTaken) -> bool:
+    """Whether two snapshots are of the same moment, and equal to the bit."""
+    first, second = (
+        (each.step, each.archive.iteration, each.archive.refinement, each.archive.digest)
+        for each in (one, other)
+    )
+    return first == second

@@ -23,7 +23,6 @@ from rich.table import Table
 
 from chsel.errors import RecordingError, SessionError
 from chsel.problem.mesh import mesh_digest
-from chsel.problem.points import GrowingPoints
 from replay.console import Console, plain_table, print_error
 from replay.events import Decided, Probe
 from replay.mcap.file import MALFORMED, McapFile, recover_hint
@@ -126,10 +125,10 @@ def step_rows(recording: Recording) -> list[dict[str, Any]]:
 
     hypotheses, distinct and best_cost are None without a result.
     """
-    points, rows = GrowingPoints(recording.start.initial_points), []
+    points, rows = recording.start.initial_points, []
     for probe in recording.probes:
-        points.add(probe.new_points)
-        row = {"step": probe.step, **{name: getattr(points, name) for name in _POINTS}}
+        points = points.merged(probe.new_points)
+        row = {"step": probe.step, **{name: len(getattr(points, name)) for name in _POINTS}}
         row |= {"posed": probe.step in recording.steps}
         row |= dict.fromkeys(("hypotheses", "distinct", "best_cost"))
         if recording.has_result(probe.step):

@@ -155,7 +155,7 @@ def _belief(
     found = online.previous
     if found is not None and len(found.cost) > 0:
         return belief_after(found, settings.belief)
-    points, workspace = online.points.all(), scene.session.workspace
+    points, workspace = online.points, scene.session.workspace
     return belief_before(scene.sdf, points, workspace, key, settings.belief)
 
 

@@ -100,8 +100,8 @@ class SessionRun:
             row: Row = {
                 "step": step.step,
                 "outcome": self._outcome,
-                "contacts": self._online.points.contacts,
-                "free_points": self._online.points.free,
+                "contacts": len(self._online.points.contacts),
+                "free_points": len(self._online.points.free),
             }
             if step.problem is not None and self.registered is not None:
                 found = self.registered.hypotheses
@@ -125,7 +125,7 @@ class SessionRun:
             row |= {"seconds": sum(self._seconds.values()), "seconds_by_stage": self._seconds}
             yield step, row
         self._check_points()
-        self._warn(check_contacts(self._online.points.all()))
+        self._warn(check_contacts(self._online.points))
         self._recorder.flush()
 
     def register(self, problem: RegistrationProblem) -> Hypotheses:
@@ -180,7 +180,7 @@ class SessionRun:
         """Choose what follows a step, and record it; numbers about the choice."""
         assert isinstance(self._session, Steerable)
         begun, before = time.perf_counter(), steering.last
-        points, found = self._online.points.all(), self._online.previous
+        points, found = self._online.points, self._online.previous
         problem, decision = steering.decide(step + 1, points, found, self._session.available())
         seconds = time.perf_counter() - begun
         if step >= 0:
@@ -197,7 +197,7 @@ class SessionRun:
     def _check_points(self) -> None:
         """Warn about points known so far; PointsError if they cannot be the object's."""
         workspace, resolution = self._session.workspace, self._session.free_resolution
-        points, diameter = self._online.points.all(), self._online.sdf.diameter
+        points, diameter = self._online.points, self._online.sdf.diameter
         self._warn(check_points(points, diameter, resolution, workspace))
 
     def _line(self, row: Row) -> str:

@@ -177,7 +177,7 @@ def test_points_in_millimetres_are_an_error(points: Any) -> None:
         ({}, "no point was given; accepted: surface, free"),
         ({"surface": [[0, 0, np.nan]]}, r"surface\[0\] is not finite"),
         ({"free": [[0, 0]]}, r"free has shape \(1, 2\); accepted: \(any, 3\)"),
-        ({"known": POINT}, "known has 1 points and known_sdf 0"),
+        ({"known": POINT}, "known_sdf has 0 entries; accepted: one per known point, 1"),
         ({"surface": POINT, "method": "magic"}, "method is 'magic'; accepted: chsel"),
         ({"surface": POINT, "preset": "best"}, "preset is 'best'; accepted: default"),
         ({"surface": POINT, "hypotheses": 0}, "hypotheses is 0"),

@@ -12,7 +12,7 @@ import trimesh
 
 from chsel.next_probe.decision_problem import Actions, Belief, Decision, DecisionProblem, HandShape
 from chsel.numerics.arrays import digest
-from chsel.problem.points import GrowingPoints, KnownPoints, Workspace
+from chsel.problem.points import KnownPoints, Workspace
 from chsel.problem.poses import compose, random_rotations
 from chsel.problem.registration_problem import ArchiveSnapshot, Hypotheses, RegistrationProblem
 from chsel.problem.sdf_grid import SdfGrid
@@ -148,7 +148,7 @@ def with_decisions(events: list[Event], *, actions: int = 4, poses: int = 3) -> 
     hand = HandShape.of(trimesh.creation.icosphere(subdivisions=1, radius=0.05))
     length = random.uniform(0.1, 0.5, actions)
     offered = Actions(_poses(random, actions), length, length + 1.0)
-    points, probed = GrowingPoints(start.initial_points), -1
+    points, probed = start.initial_points, -1
     made: list[Event] = [start, *events[1:starting], ActionsOffered(-1, offered, hand)]
 
     def decided(*, stop: str = "") -> Decided:
@@ -167,7 +167,7 @@ def with_decisions(events: list[Event], *, actions: int = 4, poses: int = 3) -> 
         )
         problem = DecisionProblem(
             start.sdf,
-            points.all(),
+            points,
             start.workspace,
             start.free_resolution,
             belief,
@@ -183,7 +183,7 @@ def with_decisions(events: list[Event], *, actions: int = 4, poses: int = 3) -> 
             made.append(decided(stop="spread" if isinstance(event, SessionEnded) else ""))
             probed = event.step
         if isinstance(event, Probe):
-            points.add(event.new_points)
+            points = points.merged(event.new_points)
         made.append(event)
     return made
 

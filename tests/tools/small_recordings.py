@@ -113,14 +113,14 @@ def steered_session(
     recorder.record(offered)
     available, found = np.ones(len(offered.actions), dtype=bool), None
     for step in range(4):
-        choice = steering.decide(step, online.points.all(), found, available)
+        choice = steering.decide(step, online.points, found, available)
         recorder.record(Decided(step - 1, *choice, steering.surprise))
         if choice.decision.stop:
             break
         available[choice.decision.chosen] = False
         probe = _probe(random, step)
         recorder.record(probe)
-        online.points.add(probe.new_points)
+        online.points = online.points.merged(probe.new_points)
         if steering.felt(probe.contacts):
             online.start_afresh(steers.settings.surprise.larger)
         truth, symmetry = start.world_from_object, symmetry_for_errors(start)

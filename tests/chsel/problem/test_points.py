@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,6 @@ from chsel.errors import PointsError
 from chsel.numerics.arrays import FloatArray
 from chsel.problem.points import (
     FreeVoxels,
-    GrowingPoints,
     KnownPoints,
     Lattice,
     Workspace,
@@ -63,17 +60,6 @@ def test_merging_appends_class_by_class_and_changes_the_digest() -> None:
     np.testing.assert_array_equal(both.contacts, [[4, 4, 4]])
     assert both.count == 5
     assert len({first.digest, second.digest, both.digest, second.merged(first).digest}) == 4
-
-
-def test_the_same_points_are_those_of_the_same_digest() -> None:
-    arrays = ({"free": [[0, 1, 2]]}, {"free": [[-0.0, 1, 2]]}, {"known": [[0, 1, 2]]})
-    points = [KnownPoints(**arrays[n]) for n in (0, 0, 1, 2)]
-    for a, b in itertools.product(points, points):
-        assert GrowingPoints(a).same(b) == (a.digest == b.digest)
-        growing = GrowingPoints(a)
-        growing.add(b)
-        for c, d in itertools.product(points, points):
-            assert growing.same(c.merged(d)) == (a.merged(b).digest == c.merged(d).digest)
 
 
 def test_voxels_keep_one_point_each_at_their_centres() -> None:

@@ -10,7 +10,6 @@ import trimesh
 
 from chsel import SdfGrid
 from chsel.errors import MeshError, MeshWarning, SdfError, SettingError
-from chsel.problem import defaults
 from chsel.problem.defaults import object_grid
 from chsel.problem.mesh import load_mesh
 from chsel.problem.sdf_grid import DEFAULT_NODES, _default_spacing, _shape, mesh_sdf
@@ -143,7 +142,7 @@ def test_a_thin_plate_has_its_distance_in_a_grid_of_few_nodes(
     assert np.abs(box_distance(on_it, size)).max() < grid.resolution / 2.0
 
 
-def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(
+def test_a_mesh_has_one_default_grid_which_is_kept_for_later_calls(
     box: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid = object_grid(box)
@@ -153,12 +152,11 @@ def test_a_mesh_has_one_default_grid_which_is_kept_while_there_is_room(
     assert object_grid(box, 0.01) is not grid
     assert object_grid(box.copy().apply_scale(0.9)) is not grid
     assert object_grid(box) is grid
-    monkeypatch.setattr("chsel.problem.defaults._KEPT_NODES", grid.values.size)
-    assert object_grid(box) is grid  # the last used, so that the others are gone
-    assert list(defaults._kept.values()) == [grid]
-    monkeypatch.setattr("chsel.problem.defaults._KEPT_NODES", grid.values.size - 1)
-    assert object_grid(box) is grid
-    assert not defaults._kept
+    for scale in (0.8, 0.7, 0.6):
+        object_grid(box.copy().apply_scale(scale))
+    assert object_grid(box) is not grid  # the oldest of more than are kept
+    monkeypatch.setattr("chsel.problem.defaults.DEFAULT_NODES", grid.values.size - 1)
+    assert object_grid(box, 0.004) is not object_grid(box, 0.004)
 
 
 def test_the_grid_covers_the_padded_box_and_holds_the_distance(grid: SdfGrid) -> None:

@@ -126,7 +126,7 @@ def test_vertices_beside_the_faces_are_points_too(tmp_path: Path) -> None:
     [
         ({"surface": np.zeros((3, 2))}, r"surface has shape \(3, 2\); accepted: \(any, 3\)"),
         ({"free": np.full((2, 3), np.nan)}, r"free\[0\] is not finite"),
-        ({"contacts": SURFACE}, "array contacts is unknown; accepted: surface, free"),
+        ({"contacts": SURFACE}, "array 'contacts' is unknown; accepted: surface, free"),
         ({"world_from_object": np.eye(4)}, "no array of points"),
         ({"known": SURFACE}, "known and known_sdf stand only together"),
         ({"known": SURFACE, "known_sdf": np.zeros(2)}, r"known_sdf has shape \(2,\)"),
