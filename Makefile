@@ -1,5 +1,6 @@
 # make probe: set up and run a session. make test: set up and run the checks of every commit.
 # make test-all: those that take long and rarely fail, too.
+# make mutants ROOM=chsel/next_probe: how many single mistakes in a room its tests notice.
 # make PYTHON=python3.12 probe: with another Python, 3.11 or newer.
 # make PIP_ARGS="--extra-index-url URL" probe: with options for pip install.
 # make VENV_ARGS=--system-site-packages probe: with the packages that PYTHON has already.
@@ -11,7 +12,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet $(PIP_ARGS) --constraint $(VENV)/constraints.txt
 
-.PHONY: probe test test-all clean
+.PHONY: probe test test-all mutants clean
 
 probe: $(VENV)/.installed
 	@if $(BIN)/python -c "import pybullet" 2>/dev/null; then session=simulated; else \
@@ -28,6 +29,10 @@ test: $(VENV)/.installed-test
 
 test-all: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "slow or not slow"
+
+mutants: $(VENV)/.installed-test
+	$(INSTALL) --editable ".[mutants]"
+	$(BIN)/python -m tests.tools.mutants $(ROOM)
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -1,0 +1,143 @@
+"""python -m tests.tools.mutants ROOM: how many single mistakes the tests of a room notice.
+
+ROOM: a folder or a file of the product. Cosmic Ray names every place where a number, an operator,
+a comparison or a condition can be changed; a random sample of these mutants is made in a copy of
+the tree, one at a time, and the tests of the room are run on each, golden digests and stored
+replays left out. Kernels are compiled again, as their code is kept by what is in the files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator
+from rich.console import Console
+
+ROOT = Path(__file__).resolve().parents[2]
+OPERATORS = [
+    "NumberReplacer",
+    "AddNot",
+    "ReplaceAndWithOr",
+    "ReplaceOrWithAnd",
+    "ReplaceTrueWithFalse",
+    "ReplaceFalseWithTrue",
+    "ReplaceUnaryOperator_Delete_USub",
+    "ReplaceUnaryOperator_Delete_Not",
+    *(
+        f"ReplaceBinaryOperator_{pair}"
+        for pair in ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "FloorDiv_Mul", "Mod_FloorDiv")
+    ),
+    *(
+        f"ReplaceComparisonOperator_{pair}"
+        for pair in (
+            "Lt_LtE",
+            "Lt_Gt",
+            "LtE_Lt",
+            "Gt_GtE",
+            "Gt_Lt",
+            "GtE_Gt",
+            "Eq_NotEq",
+            "NotEq_Eq",
+        )
+    ),
+]
+Mutant = tuple[Path, str, int]  # file, operator, its occurrence
+
+
+def mutants_of(file: Path) -> Iterator[Mutant]:
+    """Every mutant of a file."""
+    nodes = list(ast_nodes(get_ast((ROOT / file).read_text())))
+    for operator in OPERATORS:
+        change = get_operator(f"core/{operator}")()
+        count = sum(len(list(change.mutation_positions(node))) for node in nodes)
+        yield from ((file, operator, occurrence) for occurrence in range(count))
+
+
+def tests_of(room: Path) -> list[str]:
+    """The tests of a room: its folder of `tests`, or the file there that is named after it."""
+    folder = ROOT / "tests" / room
+    if folder.is_dir():
+        return [str(Path("tests") / room)]
+    named = sorted((ROOT / "tests" / room.parent).glob(f"test_{room.stem}.py"))
+    return [str(file.relative_to(ROOT)) for file in named]
+
+
+def copied_to(folder: Path) -> None:
+    """Copy all files that git knows of, or would take."""
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, names.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+
+
+def passes(folder: Path, tests: list[str], seconds: float | None = None) -> bool:
+    """Whether all tests pass in a copy; one that takes longer has noticed something."""
+    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *tests]
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, timeout=seconds
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def main() -> int:
+    """Make the mutants, run the tests, and show those that nothing noticed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.tools.mutants", description=__doc__)
+    parser.add_argument("room", type=Path, help="such as chsel/next_probe")
+    parser.add_argument("--tests", nargs="+", help="files to run (default: those of the room)")
+    parser.add_argument("--count", type=int, default=50, help="mutants of the sample")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    tests, console = arguments.tests or tests_of(arguments.room), Console()
+    files = sorted((ROOT / arguments.room).rglob("*.py")) or [ROOT / arguments.room]
+    mutants = [each for file in files for each in mutants_of(file.relative_to(ROOT))]
+    if not tests or not mutants:
+        console.print(f"error: {arguments.room} has no tests, or no code; accepted: chsel/policies")
+        return 2
+    chosen = random.Random(arguments.seed).sample(mutants, min(arguments.count, len(mutants)))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        copied_to(folder)
+        begun = time.monotonic()
+        if not passes(folder, tests):
+            console.print(f"error: {' '.join(tests)} fail as they are; accepted: tests that pass")
+            return 2
+        longest = 10.0 * (time.monotonic() - begun) + 300.0  # kernels are compiled again
+        noticed = 0
+        for number, (file, operator, occurrence) in enumerate(chosen, 1):
+            code = (ROOT / file).read_text()
+            changed = mutate_code(code, get_operator(f"core/{operator}")(), occurrence) or code
+            (folder / file).write_text(changed)
+            survived = passes(folder, tests, longest)
+            (folder / file).write_text(code)
+            noticed += not survived
+            if survived:
+                lines = difflib.unified_diff(
+                    code.splitlines(), changed.splitlines(), lineterm="", n=1
+                )
+                console.print(f"[red]not noticed[/]: {file}", *list(lines)[2:], sep="\n")
+            console.print(f"{noticed} of {number} noticed", style="dim")
+    share = 100.0 * noticed / len(chosen)
+    console.print(f"{arguments.room}: {noticed} of {len(chosen)} of {len(mutants)}, {share:.0f} %")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
